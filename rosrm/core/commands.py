@@ -1,0 +1,70 @@
+"""What the master's core can ask its runtime for, in the imperative.
+
+The runtime writes all `Record` and `Intent` of one batch to the journal before it carries out
+anything else of that batch: intent is durable before it is acted on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from rosrm.core.model import EMPTY, Assignment, InstanceId
+from rosrm.ports import Intent, Record
+
+
+@dataclass(frozen=True, slots=True)
+class Assign:
+    """Hand an assignment to a host with the answer to its open request."""
+
+    host_id: int
+    assignment: Assignment
+
+
+@dataclass(frozen=True, slots=True)
+class Withdraw:
+    """Take an assignment back.
+
+    One that was not yet fetched yields `AssignmentWithdrawn`; for one that was, the slave is
+    ordered to stop it, so that it never runs or ends.
+    """
+
+    order: int
+    host_id: int
+    instance: InstanceId
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """Ask one slave for something; `OrderAnswered` follows, also when no answer comes.
+
+    Attributes:
+        action: "stop", "restart", "start", "execute" or "report".
+        assignment: for "start".
+        executor, arguments, timeout: for "execute".
+    """
+
+    order: int
+    host_id: int
+    action: str
+    instance: InstanceId | None = None
+    assignment: Assignment | None = None
+    executor: str = ""
+    arguments: Mapping[str, Any] = field(default_factory=lambda: EMPTY)
+    timeout: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Reply:
+    """Answer a request that came with an event."""
+
+    request: int
+    accepted: bool = True
+    code: str = ""
+    message: str = ""
+    host_id: int = 0
+    host: str = ""
+
+
+Command = Assign | Withdraw | Order | Reply | Record | Intent

@@ -1,0 +1,174 @@
+"""What can happen to the master, in the past tense. Readings arrive as one batch."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from rosrm.core.model import HostDescription, InstanceId, InstanceStatus, ProcessSpec
+
+
+@dataclass(frozen=True, slots=True)
+class HostRegistered:
+    """A slave came and named itself; `instances` is what it holds already."""
+
+    request: int
+    description: HostDescription
+    instances: tuple[InstanceStatus, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class HostLeft:
+    """A slave stops in good order; its processes will be reported as ended."""
+
+    request: int
+    host_id: int
+    incarnation: int
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessRequested:
+    """A slave is under all its limits and asks for work."""
+
+    request: int
+    host_id: int
+    incarnation: int
+
+
+@dataclass(frozen=True, slots=True)
+class ReadingsReceived:
+    """N readings, at most one of each host (the newest), in parallel arrays.
+
+    Attributes:
+        host_id, incarnation, sequence, status_sequence: (N,) as in `ResourceInfo`.
+        accepting: (N,) bool: the slave is under all its limits.
+        stale: (N,) bit i: slot i is stale.
+        usage, limit: (N, RESOURCE_SLOTS) fractions.
+    """
+
+    host_id: npt.NDArray[np.int64]
+    incarnation: npt.NDArray[np.uint64]
+    sequence: npt.NDArray[np.uint64]
+    status_sequence: npt.NDArray[np.uint64]
+    accepting: npt.NDArray[np.bool_]
+    stale: npt.NDArray[np.uint32]
+    usage: npt.NDArray[np.float64]
+    limit: npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class StatusesReceived:
+    """What became of instances on a host; `complete`: these are all that it holds."""
+
+    host_id: int
+    incarnation: int
+    sequence: int
+    complete: bool
+    statuses: tuple[InstanceStatus, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class UsagesReceived:
+    """What each instance of a host uses: parallel arrays (cores, bytes)."""
+
+    host_id: int
+    incarnation: int
+    numbers: npt.NDArray[np.uint64]
+    cpu: npt.NDArray[np.float64]
+    memory: npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class SubmissionReceived:
+    """Somebody submits processes: all are taken, or none."""
+
+    request: int
+    specs: tuple[ProcessSpec, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class CancelRequested:
+    """Somebody cancels processes."""
+
+    request: int
+    names: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class RestartRequested:
+    """Somebody restarts processes where they are, or queues ended ones anew."""
+
+    request: int
+    names: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class MigrationRequested:
+    """Somebody moves a process; `host` None: the core chooses."""
+
+    request: int
+    name: str
+    host: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class HostStateRequested:
+    """Somebody cordons, uncordons or drains a host."""
+
+    request: int
+    host: str
+    action: str
+
+
+@dataclass(frozen=True, slots=True)
+class OrderAnswered:
+    """A slave answered an `Order`, or did not in time (code "timeout")."""
+
+    order: int
+    accepted: bool
+    code: str = ""
+    message: str = ""
+    result: Mapping[str, Any] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class AssignmentWithdrawn:
+    """An assignment was taken back before its slave had fetched it."""
+
+    instance: InstanceId
+
+
+@dataclass(frozen=True, slots=True)
+class PeerRefused:
+    """Somebody was turned away at the edge: another version, a message that makes no sense."""
+
+    who: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class TimePassed:
+    """Nothing else happened; deadlines are looked at."""
+
+
+Event = (
+    HostRegistered
+    | HostLeft
+    | ProcessRequested
+    | ReadingsReceived
+    | StatusesReceived
+    | UsagesReceived
+    | SubmissionReceived
+    | CancelRequested
+    | RestartRequested
+    | MigrationRequested
+    | HostStateRequested
+    | OrderAnswered
+    | AssignmentWithdrawn
+    | PeerRefused
+    | TimePassed
+)

@@ -1,0 +1,136 @@
+"""What hosts say of themselves: they come, ask for work, report readings, leave."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rosrm.core import events as happened
+from rosrm.core import lifecycle
+from rosrm.core.assigning import reconsider_set_aside
+from rosrm.core.commands import Reply
+from rosrm.core.hosts import Host, HostCondition
+from rosrm.core.state import MasterState, Wanted
+from rosrm.ports import Intent
+
+#: Seconds between two records about the same nonsense from the same host.
+_TOLD_EVERY = 10.0
+
+
+def host_registered(state: MasterState, event: happened.HostRegistered, now: float) -> None:
+    """Take a host in, unless a live slave has its name."""
+    description = event.description
+    known = state.hosts.by_name.get(description.name)
+    refusal = _why_refused(state, known, event)
+    if refusal:
+        state.record(now, "host_refused", refusal, host=description.name)
+        state.emit(Reply(event.request, False, "name_taken", refusal))
+        return
+    host = state.hosts.register(description, now)
+    if known is None:
+        save_host(state, host)
+    state.record(
+        now, "host_registered", f"{host.name} registered with {len(event.instances)} processes",
+        host=host.name,
+        facts={
+            "host_id": host.host_id, "labels": dict(description.labels),
+            "resources": {r.name: r.capacity for r in description.resources},
+            "absent": dict(description.absent),
+        },
+    )  # fmt: skip
+    lifecycle.reconcile(state, host, event.instances, now, registering=True)
+    reconsider_set_aside(state, now)
+    state.emit(Reply(event.request, host_id=host.host_id))
+
+
+def _why_refused(
+    state: MasterState, known: Host | None, event: happened.HostRegistered
+) -> str:
+    if known is None or known.description.incarnation in (0, event.description.incarnation):
+        return ""
+    if state.hosts.condition_of(known) is not HostCondition.UP:
+        return ""
+    first = known.description
+    return (
+        f"a live slave has the name {first.name!r} already: pid {first.pid} on {first.hostname}; "
+        f"give this one (pid {event.description.pid} on {event.description.hostname}) another "
+        f"`host:` in its configuration, or stop the first"
+    )
+
+
+def save_host(state: MasterState, host: Host) -> None:
+    """Make durable what is intended with a host."""
+    state.emit(
+        Intent("host", host.name, {"host_id": host.host_id, "cordoned": host.cordoned})
+    )
+
+
+def host_left(state: MasterState, event: happened.HostLeft, now: float) -> None:
+    """A slave stops in good order: what it ends goes back to the queue."""
+    host = state.hosts.find(event.host_id, event.incarnation)
+    if host is None:
+        state.emit(Reply(event.request, False, "unknown", "this host is not registered"))
+        return
+    state.hosts.set_condition(host, HostCondition.LEFT)
+    state.record(now, "host_left", f"{host.name} leaves", host=host.name)
+    for number in list(host.instances):
+        instance = state.instances[number]
+        process = state.processes[instance.id.process]
+        if process.owner == number and process.wanted is Wanted.RUN:
+            process.wanted = Wanted.REQUEUE
+            state.save(process)
+    state.emit(Reply(event.request))
+
+
+def process_requested(state: MasterState, event: happened.ProcessRequested, now: float) -> None:
+    """Note that a host asks for work; the request stays open until there is some."""
+    host = state.hosts.find(event.host_id, event.incarnation)
+    if host is None:
+        state.emit(Reply(event.request, False, "unknown", "register first"))
+        return
+    state.hosts.ask(host)
+
+
+def readings_received(state: MasterState, event: happened.ReadingsReceived, now: float) -> None:
+    """Note a batch of readings; nonsense is refused and said."""
+    refused = state.hosts.apply(event, now)
+    for row in np.flatnonzero(refused):
+        host = state.hosts.find(int(event.host_id[row]), int(event.incarnation[row]))
+        if host is not None:
+            _tell(
+                state, host, "reading_refused", now,
+                f"a reading of {host.name} was refused (NaN, negative, absurd, or a limit outside "
+                f"0..1): usage {_shown(event.usage[row])}, limit {_shown(event.limit[row])}",
+            )  # fmt: skip
+
+
+def _shown(values: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> str:
+    return "[" + ", ".join(f"{value:.3g}" for value in values[:8]) + ", …]"
+
+
+def _tell(state: MasterState, host: Host, kind: str, now: float, message: str) -> None:
+    if now - host.told.get(kind, float("-inf")) >= _TOLD_EVERY:
+        host.told[kind] = now
+        state.record(now, kind, message, host=host.name)
+
+
+def usages_received(state: MasterState, event: happened.UsagesReceived, now: float) -> None:
+    """What now shows of an instance no longer counts as in flight."""
+    host = state.hosts.find(event.host_id, event.incarnation)
+    if host is None:
+        return
+    for number, cpu, memory in zip(event.numbers, event.cpu, event.memory, strict=True):
+        instance = state.instances.get(int(number))
+        if instance is None or instance.host is not host:
+            continue
+        if not (np.isfinite(cpu) and np.isfinite(memory) and cpu >= 0.0 and memory >= 0.0):
+            _tell(state, host, "reading_refused", now, f"a usage of {instance.id} was refused")
+            continue
+        instance.seen = {"cpu": float(cpu), "memory": float(memory)}
+        for resource, amount in instance.seen.items():
+            instance.peak[resource] = max(amount, instance.peak.get(resource, 0.0))
+        lifecycle.settle_charge(state, instance, now)
+
+
+def peer_refused(state: MasterState, event: happened.PeerRefused, now: float) -> None:
+    """Somebody was turned away at the edge."""
+    state.record(now, "peer_refused", f"{event.who} was refused: {event.reason}")

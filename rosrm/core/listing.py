@@ -1,0 +1,91 @@
+"""The state as rows for people, and the story of one process."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+from rosrm.core.assigning import decide_now
+from rosrm.core.hosts import Host, HostCondition
+from rosrm.core.state import MasterState, Process, ProcessPhase
+from rosrm.core.views import HostRow, ProcessRow, ResourceRow
+
+_CONDITION: Final = {
+    HostCondition.UP: "up",
+    HostCondition.SUSPECT: "suspect",
+    HostCondition.LOST: "lost",
+    HostCondition.LEFT: "left",
+    HostCondition.EXPECTED: "lost",
+}
+
+
+def host_rows(state: MasterState, now: float) -> list[HostRow]:
+    """Every host, in order of registration."""
+    return [_host_row(state, host, now) for host in state.hosts.hosts]
+
+
+def _host_row(state: MasterState, host: Host, now: float) -> HostRow:
+    table, column = state.hosts, host.column
+    stale = set(table.stale_resources(column))
+    rows = []
+    for resource in host.description.resources:
+        at = table.resources.index(resource.name)
+        rows.append(
+            ResourceRow(
+                resource.name, resource.unit, resource.capacity, resource.scope,
+                float(table.usage[at, column]), float(table.load[at, column]),
+                float(table.limit[at, column]), resource.name in stale,
+            )
+        )  # fmt: skip
+    return HostRow(
+        host.description, host.host_id, _CONDITION[table.condition_of(host)], host.cordoned,
+        host.draining, table.is_accepting(host), now - float(table.heard[column]), tuple(rows),
+        int(table.processes[column]),
+    )  # fmt: skip
+
+
+def process_rows(state: MasterState, now: float) -> list[ProcessRow]:
+    """Every process, in order of submission."""
+    return [process_row(state, process, now) for process in state.processes.values()]
+
+
+def process_row(state: MasterState, process: Process, now: float) -> ProcessRow:
+    """One process."""
+    owner = state.instances.get(process.owner)
+    seen = owner.seen if owner else {}
+    return ProcessRow(
+        name=process.name, kind=process.spec.kind.value, state=process.phase.value,
+        host=owner.host.name if owner else "", number=process.owner,
+        pid=owner.pid if owner else 0, restarts=process.restarts, migrations=process.migrations,
+        exit_code=process.exit_code, priority=process.spec.priority,
+        queue_position=state.queue.position(process.name), since=now - process.since,
+        cpu=seen.get("cpu", 0.0), memory=int(seen.get("memory", 0.0)), reason=process.reason,
+    )  # fmt: skip
+
+
+def explanation(state: MasterState, name: str, now: float) -> Mapping[str, Any] | None:
+    """Why a process is where it is, or why it waits; None: there is no such process."""
+    process = state.processes.get(name)
+    if process is None:
+        return None
+    row = process_row(state, process, now)
+    decision, age = process.decision, now - process.decided_at
+    if process.phase in (ProcessPhase.QUEUED, ProcessPhase.SET_ASIDE):
+        kind = "waits" if process.phase is ProcessPhase.QUEUED else "set_aside"
+        decision, age = decide_now(state, process).to_json(kind), 0.0
+    return {
+        "process": name, "state": row.state, "host": row.host,
+        "reason": _reason(state, process, row.queue_position),
+        "decision": None if decision is None else {**decision, "elapsed": age},
+        "history": [
+            {"elapsed": now - at, "kind": kind, "message": message}
+            for at, kind, message in process.history
+        ],
+    }  # fmt: skip
+
+
+def _reason(state: MasterState, process: Process, position: int) -> str:
+    if process.phase is not ProcessPhase.QUEUED or position <= 1:
+        return process.reason
+    ahead = f"{position - 1} before it in the queue, {state.queue.head()} first"
+    return ahead if state.settings.backfill else f"{ahead}, and those behind wait with it"

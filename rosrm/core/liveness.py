@@ -1,0 +1,62 @@
+"""Silence: a host is first suspect (no new work), then, after its lease, lost.
+
+Ages are judged by the master's own monotonic clock alone, and never by the ROS graph.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rosrm.core import lifecycle
+from rosrm.core.commands import Order
+from rosrm.core.hosts import Host, HostCondition
+from rosrm.core.state import MasterState
+
+
+def review_liveness(state: MasterState, now: float) -> None:
+    """Move every host between up, suspect and lost by the age of its newest message."""
+    table = state.hosts
+    if not len(table):
+        return
+    age = now - table.heard
+    condition = table.condition
+    fresh = age < state.settings.suspect
+    gone = age >= state.settings.lease
+    up, suspect = condition == HostCondition.UP, condition == HostCondition.SUSPECT
+    lost = condition == HostCondition.LOST
+    silent = up & ~fresh
+    past_lease = (up | suspect) & gone
+    back = (suspect | lost) & fresh
+    for column in np.flatnonzero(silent & ~past_lease):
+        _suspect(state, table.hosts[column], float(age[column]), now)
+    for column in np.flatnonzero(past_lease):
+        _lose(state, table.hosts[column], float(age[column]), now)
+    for column in np.flatnonzero(back):
+        _welcome_back(state, table.hosts[column], now)
+
+
+def _suspect(state: MasterState, host: Host, age: float, now: float) -> None:
+    state.hosts.set_condition(host, HostCondition.SUSPECT)
+    state.record(
+        now, "host_suspect", f"{host.name} has been silent for {age:.1f} s: no new work",
+        host=host.name,
+    )  # fmt: skip
+
+
+def _lose(state: MasterState, host: Host, age: float, now: float) -> None:
+    state.hosts.set_condition(host, HostCondition.LOST)
+    state.record(
+        now, "host_lost",
+        f"{host.name} is lost: silent for {age:.1f} s, its lease is {state.settings.lease:g} s",
+        host=host.name,
+    )  # fmt: skip
+    lifecycle.lost_sight(state, host, now)
+
+
+def _welcome_back(state: MasterState, host: Host, now: float) -> None:
+    was_lost = state.hosts.condition_of(host) is HostCondition.LOST
+    state.hosts.set_condition(host, HostCondition.UP)
+    state.record(now, "host_back", f"{host.name} is heard again", host=host.name)
+    if was_lost:
+        lifecycle.regained_sight(state, host, now)
+        state.emit(Order(state.order_id(), host.host_id, "report"))

@@ -1,0 +1,129 @@
+"""Plans as data: how a process moves, step by step, and the way back from each step.
+
+A strategy proposes a `Plan`; `master.py` carries it out with `MigrationRun`. Before the commit a
+failure undoes the steps done so far, newest first, back to a running source; after it the plan is
+rolled forward. What can be neither is STUCK, and said loudly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Union
+
+from rosrm.core.model import EMPTY, InstanceId, ProcessSpec
+
+
+@dataclass(frozen=True, slots=True)
+class Move:
+    """A process to be moved, for a strategy.
+
+    Attributes:
+        spec: as submitted.
+        source: the running instance.
+        source_host: where it runs.
+        destination: the instance to be, already numbered.
+        destination_host: where it goes.
+        fallback: an instance for starting again at the source, should a stop be undone.
+        now: unix time, whole seconds (the alias of a handoff carries it).
+    """
+
+    spec: ProcessSpec
+    source: InstanceId
+    source_host: str
+    destination: InstanceId
+    destination_host: str
+    fallback: InstanceId
+    now: int
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """Start an instance on a host; done when the slave says that it runs."""
+
+    instance: InstanceId
+    host: str
+    timeout: float
+    node_name: str = ""
+    undo: Step | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class AwaitReady:
+    """Wait until an instance is ready; done when its slave says so."""
+
+    instance: InstanceId
+    host: str
+    timeout: float
+    undo: Step | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Stop:
+    """Stop an instance; done when its slave says that it has ended."""
+
+    instance: InstanceId
+    host: str
+    timeout: float
+    undo: Step | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Commit:
+    """From here on the destination owns the name; there is one in each plan."""
+
+    timeout: float = 0.0
+    undo: Step | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Execute:
+    """The open step: run an executor that the strategy's plugin registered on a slave."""
+
+    executor: str
+    host: str
+    arguments: Mapping[str, Any]
+    timeout: float
+    undo: Step | None = None
+
+
+Step = Union[Start, AwaitReady, Stop, Commit, Execute]
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """How one process moves.
+
+    Attributes:
+        steps: in order; exactly one is a `Commit`.
+        overlap: seconds that both instances may be active at once, declared; 0: never.
+        options: kept with the record of the migration.
+    """
+
+    steps: tuple[Step, ...]
+    overlap: float = 0.0
+    options: Mapping[str, Any] = field(default_factory=lambda: EMPTY)
+
+
+def plan_fault(plan: Plan, move: Move) -> str:
+    """What is wrong with a plan that a strategy proposed; "" for a sound one."""
+    commits = sum(isinstance(step, Commit) for step in plan.steps)
+    if commits != 1:
+        return f"it has {commits} commit points, not one"
+    hosts = {move.source_host, move.destination_host}
+    for step in _all_steps(plan):
+        if isinstance(step, Commit):
+            continue
+        if step.host not in hosts:
+            return f"{type(step).__name__} names the host {step.host!r}, not one of {sorted(hosts)}"
+        if not step.timeout > 0.0:
+            return f"{type(step).__name__} has no time-out"
+    return ""
+
+
+def _all_steps(plan: Plan) -> Iterator[Step]:
+    for step in plan.steps:
+        current: Step | None = step
+        while current is not None:
+            yield current
+            current = current.undo

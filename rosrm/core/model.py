@@ -1,0 +1,276 @@
+"""The values that the core thinks in.
+
+Seconds, bytes and fractions 0..1 are the base units. All values are frozen; what changes lives in
+the reducers (`master.py`, `slave.py`) and in the standing arrays of `hosts.py`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+from types import MappingProxyType
+from typing import Any, Final
+
+#: Slots of a `resource_info` message: as many resources can be reported by one host.
+RESOURCE_SLOTS: Final = 16
+
+EMPTY: Final[Mapping[str, Any]] = MappingProxyType({})
+
+
+class Kind(str, Enum):
+    """How long a process is meant to run."""
+
+    SERVICE = "service"
+    JOB = "job"
+
+
+@dataclass(frozen=True, slots=True)
+class RestartPolicy:
+    """When a process that ended is started again on its host, with a bounded back-off.
+
+    Attributes:
+        when: "never", "on-failure" or "always".
+        delay: seconds before the first restart.
+        max_delay: bound of the back-off, seconds.
+        factor: by which the delay grows with each restart.
+        attempts: most restarts within `window`; one more and the process has failed.
+        window: seconds; a process that ran as long without a restart starts afresh.
+    """
+
+    when: str = "never"
+    delay: float = 1.0
+    max_delay: float = 30.0
+    factor: float = 2.0
+    attempts: int = 5
+    window: float = 300.0
+
+
+@dataclass(frozen=True, slots=True)
+class Readiness:
+    """When an instance counts as ready.
+
+    Attributes:
+        kind: "graph" (this instance is seen in the ROS graph), "running" (the process runs), or
+            "auto": "graph" for a ROS node, "running" for everything else.
+        timeout: seconds; not ready by then, the start has failed.
+    """
+
+    kind: str = "auto"
+    timeout: float = 30.0
+
+
+@dataclass(frozen=True, slots=True)
+class StopPolicy:
+    """How a process is stopped: SIGINT, then SIGTERM, then SIGKILL, to its whole process group.
+
+    Attributes:
+        interrupt_grace: seconds between SIGINT and SIGTERM.
+        terminate_grace: seconds between SIGTERM and SIGKILL.
+    """
+
+    interrupt_grace: float = 5.0
+    terminate_grace: float = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class MigrationPolicy:
+    """How a process moves to another host.
+
+    Attributes:
+        strategy: name of a migration strategy; None: it is never moved.
+        overlap: a stateless relaunch may run both instances for a moment (start first).
+        options: the strategy's own options for this process.
+    """
+
+    strategy: str | None = None
+    overlap: bool = True
+    options: Mapping[str, Any] = field(default_factory=lambda: EMPTY)
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessSpec:
+    """One process to run, in the words of ROS 2 launch.
+
+    Exactly one of `package` with `executable`, `module` and `command` is given.
+
+    Attributes:
+        name: unique among live processes; the node's name where it is a ROS node.
+        namespace: of the node; "" or absolute.
+        parameters: ROS parameters, values as in JSON.
+        remappings: ROS name to ROS name.
+        ros: it is a ROS node and is given its name, namespace, parameters and remappings.
+        needs: declared amounts by resource name, in base units.
+        required_labels: host labels without which a host may never take it.
+        preferred_labels: among hosts that fit, those with more of these go first.
+        avoided_labels: hosts with any of these are taken only when no other fits.
+        priority: higher goes first.
+    """
+
+    name: str
+    namespace: str = ""
+    package: str | None = None
+    executable: str | None = None
+    module: str | None = None
+    command: tuple[str, ...] = ()
+    arguments: tuple[str, ...] = ()
+    parameters: Mapping[str, Any] = field(default_factory=lambda: EMPTY)
+    remappings: Mapping[str, str] = field(default_factory=lambda: EMPTY)
+    environment: Mapping[str, str] = field(default_factory=lambda: EMPTY)
+    working_directory: str | None = None
+    ros: bool = False
+    kind: Kind = Kind.SERVICE
+    restart: RestartPolicy = RestartPolicy()
+    needs: Mapping[str, float] = field(default_factory=lambda: EMPTY)
+    required_labels: Mapping[str, str] = field(default_factory=lambda: EMPTY)
+    preferred_labels: Mapping[str, str] = field(default_factory=lambda: EMPTY)
+    avoided_labels: Mapping[str, str] = field(default_factory=lambda: EMPTY)
+    priority: int = 0
+    migration: MigrationPolicy = MigrationPolicy()
+    readiness: Readiness = Readiness()
+    stop: StopPolicy = StopPolicy()
+
+    @property
+    def program(self) -> str:
+        """What it runs, in one word: the key under which its needs are learned."""
+        if self.package is not None:
+            return f"{self.package}/{self.executable}"
+        if self.module is not None:
+            return f"python -m {self.module}"
+        return " ".join(self.command)
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class InstanceId:
+    """One run of a process on one host.
+
+    Attributes:
+        process: name of the process.
+        number: grows with each assignment in the whole cluster and is never used again.
+    """
+
+    process: str
+    number: int
+
+    def __str__(self) -> str:
+        return f"{self.process}#{self.number}"
+
+
+@dataclass(frozen=True, slots=True)
+class Assignment:
+    """An order to run an instance of a process.
+
+    Attributes:
+        epoch: of the master that gave it.
+        node_name: under which the node runs; differs from the process's name in a handoff.
+    """
+
+    instance: InstanceId
+    spec: ProcessSpec
+    epoch: int
+    node_name: str
+
+
+class InstanceState(str, Enum):
+    """What a slave says of an instance that it holds."""
+
+    STARTING = "starting"
+    RUNNING = "running"
+    READY = "ready"
+    BACKOFF = "backoff"
+    STOPPING = "stopping"
+    EXITED = "exited"
+    FAILED = "failed"
+    REFUSED = "refused"
+
+    @property
+    def ended(self) -> bool:
+        """The slave holds no process for it any more and will start none."""
+        return self in _ENDED
+
+
+_ENDED: Final = frozenset({InstanceState.EXITED, InstanceState.FAILED, InstanceState.REFUSED})
+
+
+@dataclass(frozen=True, slots=True)
+class InstanceStatus:
+    """What became of one instance on its slave.
+
+    Attributes:
+        pid: of the session leader; 0: none.
+        exit_code: of the last run, where it exited by itself.
+        exit_signal: that ended the last run; 0: none.
+        restarts: by the restart policy on this host.
+        peak_memory: bytes, of the last run; 0: not known.
+        cpu_time: seconds of CPU of the last run.
+        run_time: seconds from start to end of the last run.
+        message: for people: why it failed or was refused.
+    """
+
+    instance: InstanceId
+    state: InstanceState
+    pid: int = 0
+    exit_code: int = 0
+    exit_signal: int = 0
+    restarts: int = 0
+    peak_memory: float = 0.0
+    cpu_time: float = 0.0
+    run_time: float = 0.0
+    message: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class ResourceDescription:
+    """One resource of a host.
+
+    Attributes:
+        name: "memory", "cpu", "disk", ...
+        unit: base unit of `capacity`: "B", "core", "B/s", "1".
+        capacity: what usage 1.0 stands for, > 0.
+        scope: what is measured: "machine", "cgroup", "slice" or a word of the probe's own.
+    """
+
+    name: str
+    unit: str
+    capacity: float
+    scope: str = "machine"
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """The utilisation of one resource at one time.
+
+    Attributes:
+        resource: name of the resource.
+        usage: fraction of its capacity, 0..1 (above 1 where a budget is exceeded).
+    """
+
+    resource: str
+    usage: float
+
+
+@dataclass(frozen=True, slots=True)
+class HostDescription:
+    """All about a host that does not change while its slave runs.
+
+    Attributes:
+        name: one live slave for each name.
+        incarnation: random number of this run of the slave.
+        resources: at most RESOURCE_SLOTS; the position is the slot in `resource_info`.
+        max_processes: most processes held at a time; 0: no bound.
+        period: of `resource_info`, seconds.
+        executors: that plugins offer for the open step of a plan.
+        absent: probe name to the reason why it is absent here.
+    """
+
+    name: str
+    incarnation: int
+    hostname: str = ""
+    pid: int = 0
+    software_version: str = ""
+    labels: Mapping[str, str] = field(default_factory=lambda: EMPTY)
+    resources: tuple[ResourceDescription, ...] = ()
+    max_processes: int = 0
+    period: float = 0.1
+    executors: tuple[str, ...] = ()
+    absent: Mapping[str, str] = field(default_factory=lambda: EMPTY)

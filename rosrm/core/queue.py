@@ -1,0 +1,47 @@
+"""The waiting processes: first in, first out, within a priority."""
+
+from __future__ import annotations
+
+from bisect import bisect_left, insort
+from collections.abc import Iterator
+
+_Key = tuple[int, int, str]
+
+
+class Queue:
+    """Names of waiting processes in the order in which they are served."""
+
+    def __init__(self) -> None:
+        self._keys: list[_Key] = []
+        self._of: dict[str, _Key] = {}
+
+    def add(self, name: str, priority: int, order: int) -> None:
+        """Queue a process; one that comes back with its old `order` gets its old place."""
+        if name in self._of:
+            raise ValueError(f"{name} is in the queue already")
+        key = (-priority, order, name)
+        insort(self._keys, key)
+        self._of[name] = key
+
+    def remove(self, name: str) -> None:
+        """Take a process out, wherever it stands."""
+        key = self._of.pop(name)
+        del self._keys[bisect_left(self._keys, key)]
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._of
+
+    def __len__(self) -> int:
+        return len(self._keys)
+
+    def __iter__(self) -> Iterator[str]:
+        return (name for _, _, name in list(self._keys))
+
+    def head(self) -> str | None:
+        """Who is served next."""
+        return self._keys[0][2] if self._keys else None
+
+    def position(self, name: str) -> int:
+        """1 is the head; 0: not in the queue."""
+        key = self._of.get(name)
+        return 0 if key is None else bisect_left(self._keys, key) + 1

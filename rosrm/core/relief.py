@@ -1,0 +1,168 @@
+"""Which process leaves a host that is over a limit or is being drained, and where it goes.
+
+It must relieve the resource that is over, fit where it goes without putting that host over, and of
+those the one with the largest relief goes. When no host has room nothing moves.
+"""
+
+from __future__ import annotations
+
+from rosrm.core.assigning import policy_in, ranking_of
+from rosrm.core.hosts import Host
+from rosrm.core.model import InstanceState
+from rosrm.core.moves import begin_move, why_immovable
+from rosrm.core.placement import Demand, decide
+from rosrm.core.state import Instance, MasterState, Process, larger
+
+#: Seconds between two records that nothing can be moved off a host.
+_TOLD_EVERY = 10.0
+
+
+def relieve_hosts(state: MasterState, now: float) -> None:
+    """Move processes off hosts that have been over a limit for long enough, and off drained ones."""
+    _note_limits(state, now)
+    for host in state.hosts.hosts:
+        if len(state.runs) >= state.settings.max_migrations:
+            return
+        if host.draining:
+            _drain(state, host, now)
+        elif state.settings.automatic and host.over_since:
+            _relieve(state, host, now)
+
+
+def _note_limits(state: MasterState, now: float) -> None:
+    """Since when is which host over which limit?"""
+    over = {int(column) for column in state.hosts.hosts_over_limit()}
+    for host in state.hosts.hosts:
+        if host.column not in over:
+            if host.over_since:
+                state.record(now, "under_limit", f"{host.name} is under its limits", host=host.name)
+                host.over_since.clear()
+            continue
+        names = state.hosts.over_limit(host.column)
+        for name in names:
+            if name not in host.over_since:
+                host.over_since[name] = now
+                state.record(
+                    now, "over_limit", f"{host.name} reached its limit of {name}", host=host.name,
+                    facts={"resource": name},
+                )  # fmt: skip
+        for name in set(host.over_since) - set(names):
+            del host.over_since[name]
+
+
+def _relieve(state: MasterState, host: Host, now: float) -> None:
+    if any(run.source_host is host for run in state.runs.values()):
+        return  # see first what the move under way brings
+    for resource, since in list(host.over_since.items()):
+        if now - since >= state.settings.hysteresis:
+            _relieve_resource(state, host, resource, now)
+            return
+
+
+def _relieve_resource(state: MasterState, host: Host, resource: str, now: float) -> None:
+    reasons = []
+    for instance in _largest_first(state, host, resource):
+        process = state.processes[instance.id.process]
+        reason = _why_not_now(state, process, instance, resource, now)
+        reason = reason or try_move(
+            state, process, f"{host.name} is over its limit of {resource}", now,
+            headroom=state.settings.headroom,
+        )  # fmt: skip
+        if not reason:
+            return
+        reasons.append(reason)
+    _tell_nothing_moves(state, host, resource, reasons, now)
+
+
+def _largest_first(state: MasterState, host: Host, resource: str) -> list[Instance]:
+    owned = [
+        instance
+        for instance in (state.instances[number] for number in host.instances)
+        if state.processes[instance.id.process].owner == instance.id.number
+    ]
+    return sorted(owned, key=lambda one: (-relief_of(one, resource), one.id.number))
+
+
+def relief_of(instance: Instance, resource: str) -> float:
+    """What leaves the host with an instance, base units of the resource."""
+    return instance.seen.get(resource, instance.amounts.get(resource, 0.0))
+
+
+def _why_not_now(
+    state: MasterState, process: Process, instance: Instance, resource: str, now: float
+) -> str:
+    refusal = why_immovable(state, process)
+    if refusal:
+        return refusal
+    if relief_of(instance, resource) <= 0.0:
+        return f"{process.name} uses no {resource}"
+    since_move = now - process.moved_at
+    if since_move < state.settings.cooldown:
+        return f"{process.name} moved {since_move:.0f} s ago, its cool-down is {state.settings.cooldown:g} s"
+    if instance.state is not InstanceState.READY:
+        return f"{process.name} is not ready"
+    return ""
+
+
+def try_move(
+    state: MasterState, process: Process, cause: str, now: float, *, headroom: float = 0.0,
+    host: Host | None = None,
+) -> str:  # fmt: skip
+    """Move a process to the host with the largest margin, or to a given one.
+
+    Returns:
+        "" or why it cannot go; then nothing has changed.
+    """
+    refusal = why_immovable(state, process)
+    if refusal:
+        return refusal
+    source = state.instances[process.owner]
+    estimate = state.learned.estimate(process.spec, state.settings.default_needs)
+    demand = Demand(
+        process.spec,
+        tuple(sorted(larger(estimate.amounts, source.seen).items())),
+        tuple(sorted({**process.excluded, source.host.name: "it is there already"}.items())),
+        headroom,
+    )
+    ranking = ranking_of(state, demand)
+    column = ranking.best() if host is None else host.column
+    decision = decide(ranking, policy_in(state, ranking), chosen=column)
+    if column < 0:
+        return f"no host has room for {process.name}"
+    if ranking.value[column] == float("inf"):
+        verdict = decide(ranking, policy_in(state, ranking), chosen=-1)
+        why = next((v.reason for v in verdict.verdicts if v.host == state.hosts.hosts[column].name), "")
+        return f"{process.name} does not fit on {state.hosts.hosts[column].name}: {why or 'no room'}"
+    reason = begin_move(state, process, state.hosts.hosts[column], cause, now)
+    if not reason:
+        state.note_decision(process, decision, "migrated", now)
+    return reason
+
+
+def _drain(state: MasterState, host: Host, now: float) -> None:
+    reasons = []
+    for instance in _largest_first(state, host, "memory"):
+        process = state.processes[instance.id.process]
+        if len(state.runs) >= state.settings.max_migrations:
+            return
+        if process.name in state.runs:
+            continue
+        reason = try_move(state, process, f"{host.name} is being drained", now)
+        if reason:
+            reasons.append(reason)
+    if reasons:
+        _tell_nothing_moves(state, host, "drain", reasons, now)
+
+
+def _tell_nothing_moves(
+    state: MasterState, host: Host, what: str, reasons: list[str], now: float
+) -> None:
+    key = f"nothing_moves {what}"
+    if now - host.told.get(key, float("-inf")) < _TOLD_EVERY:
+        return
+    host.told[key] = now
+    state.record(
+        now, "nothing_moves",
+        f"nothing can leave {host.name}: " + ("; ".join(reasons[:8]) or "it holds no process of ours"),
+        host=host.name, facts={"cause": what},
+    )  # fmt: skip

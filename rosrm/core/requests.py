@@ -1,0 +1,202 @@
+"""What people ask for: submit, cancel, restart, migrate, cordon, drain."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+
+from rosrm.core import events as happened
+from rosrm.core import lifecycle
+from rosrm.core.commands import Order, Reply
+from rosrm.core.intake import save_host
+from rosrm.core.relief import try_move
+from rosrm.core.state import MasterState, Process, ProcessPhase, Wanted
+
+_WAITING = (ProcessPhase.QUEUED, ProcessPhase.SET_ASIDE)
+
+
+def _refuse(state: MasterState, request: int, message: str, code: str = "invalid") -> None:
+    state.emit(Reply(request, False, code, message))
+
+
+# --- submit -----------------------------------------------------------------------------------
+
+
+def submission_received(
+    state: MasterState, event: happened.SubmissionReceived, now: float
+) -> None:
+    """Queue all of the processes, or refuse all."""
+    fault = _submission_fault(state, event)
+    if fault:
+        _refuse(state, event.request, fault, "name_taken")
+        return
+    for spec in event.specs:
+        process = Process(spec, state.next_order, ProcessPhase.QUEUED, now)
+        state.next_order += 1
+        state.processes[spec.name] = process
+        state.enqueue(process, now)
+        state.record(now, "submitted", f"{spec.name} was submitted", process=spec.name)
+        state.save(process)
+    state.emit(Reply(event.request, message=f"{_count(len(event.specs))} queued"))
+
+
+def _submission_fault(state: MasterState, event: happened.SubmissionReceived) -> str:
+    twice = [name for name, n in Counter(spec.name for spec in event.specs).items() if n > 1]
+    if twice:
+        return f"submitted twice at once: {_names(twice)}; names are unique. Nothing was queued"
+    taken = [
+        spec.name for spec in event.specs
+        if spec.name in state.processes and not state.processes[spec.name].phase.over
+    ]  # fmt: skip
+    if taken:
+        return (
+            f"in use already by a live process: {_names(taken)}. Cancel it first or choose another "
+            f"name. Nothing was queued"
+        )
+    known = set(state.strategies)
+    for spec in event.specs:
+        strategy = spec.migration.strategy
+        if strategy is not None and strategy not in known:
+            return (
+                f"{spec.name}: unknown migration strategy {strategy!r}; selected here: "
+                f"{_names(sorted(known)) or 'none'}. Nothing was queued"
+            )
+    return ""
+
+
+def _names(names: Iterable[str]) -> str:
+    named = list(names)
+    return ", ".join(named[:8]) + (f" and {len(named) - 8} more" if len(named) > 8 else "")
+
+
+def _count(number: int) -> str:
+    return "1 process" if number == 1 else f"{number} processes"
+
+
+# --- cancel, restart --------------------------------------------------------------------------
+
+
+def _known(state: MasterState, request: int, names: Iterable[str]) -> list[Process] | None:
+    """The processes of these names; a name that nobody has refuses the whole request."""
+    unknown = [name for name in names if name not in state.processes]
+    if unknown:
+        _refuse(state, request, f"no such process: {_names(unknown)}; see `rosrm ps`", "unknown")
+        return None
+    return [state.processes[name] for name in names]
+
+
+def cancel_requested(state: MasterState, event: happened.CancelRequested, now: float) -> None:
+    """Take processes out of the queue, or stop them."""
+    processes = _known(state, event.request, event.names)
+    if processes is None:
+        return
+    over = [process.name for process in processes if process.phase.over]
+    for process in processes:
+        if not process.phase.over:
+            _cancel(state, process, now)
+    ended = f"; ended before: {_names(over)}" if over else ""
+    state.emit(Reply(event.request, message=f"{_count(len(processes) - len(over))} cancelled{ended}"))
+
+
+def _cancel(state: MasterState, process: Process, now: float) -> None:
+    process.wanted = Wanted.CANCEL
+    state.record(now, "cancel_requested", f"{process.name} is to be cancelled", process=process.name)
+    if process.phase in _WAITING:
+        if process.name in state.queue:
+            state.queue.remove(process.name)
+        state.set_phase(process, ProcessPhase.CANCELLED, now)
+        state.record(now, "cancelled", f"{process.name} cancelled in the queue", process=process.name)
+    elif process.name not in state.runs:
+        owner = state.instances[process.owner]
+        state.set_phase(process, ProcessPhase.STOPPING, now, "cancelled")
+        lifecycle.stop_instance(state, owner, now)
+    state.save(process)
+
+
+def restart_requested(state: MasterState, event: happened.RestartRequested, now: float) -> None:
+    """Restart what runs where it runs; queue anew what has ended."""
+    processes = _known(state, event.request, event.names)
+    if processes is None:
+        return
+    for process in processes:
+        fault = _restart_fault(state, process)
+        if fault:
+            _refuse(state, event.request, f"{fault}. Nothing was restarted")
+            return
+    for process in processes:
+        _restart(state, process, now)
+    state.emit(Reply(event.request, message=f"{_count(len(processes))} restarted"))
+
+
+def _restart_fault(state: MasterState, process: Process) -> str:
+    if process.phase in _WAITING:
+        return f"{process.name} waits in the queue already"
+    if process.name in state.runs:
+        return f"{process.name} is moving"
+    if process.wanted is not Wanted.RUN and not process.phase.over:
+        return f"{process.name} is being stopped"
+    return ""
+
+
+def _restart(state: MasterState, process: Process, now: float) -> None:
+    state.record(now, "restart_requested", f"{process.name} is restarted", process=process.name)
+    if process.phase.over:
+        process.excluded.clear()
+        process.order = state.next_order
+        state.next_order += 1
+        state.enqueue(process, now)
+    else:
+        owner = state.instances[process.owner]
+        state.emit(Order(state.order_id(), owner.host.host_id, "restart", owner.id))
+    state.save(process)
+
+
+# --- migrate, cordon, drain -------------------------------------------------------------------
+
+
+def migration_requested(state: MasterState, event: happened.MigrationRequested, now: float) -> None:
+    """Begin to move a process."""
+    processes = _known(state, event.request, [event.name])
+    if processes is None:
+        return
+    host = None
+    if event.host is not None:
+        host = state.hosts.by_name.get(event.host)
+        if host is None:
+            _refuse_host(state, event.request, event.host)
+            return
+    (process,) = processes
+    reason = try_move(state, process, "asked for", now, host=host)
+    if reason:
+        _refuse(state, event.request, reason)
+        return
+    name = state.runs[process.name].destination_host.name
+    state.emit(Reply(event.request, message=f"{process.name} moves to {name}", host=name))
+
+
+def _refuse_host(state: MasterState, request: int, name: str) -> None:
+    there = _names(sorted(state.hosts.by_name)) or "none"
+    _refuse(state, request, f"no such host: {name!r}; there are: {there}", "unknown")
+
+
+def host_state_requested(
+    state: MasterState, event: happened.HostStateRequested, now: float
+) -> None:
+    """Cordon, uncordon or drain a host."""
+    host = state.hosts.by_name.get(event.host)
+    if host is None:
+        _refuse_host(state, event.request, event.host)
+        return
+    done = {"cordon": "cordoned", "uncordon": "uncordoned", "drain": "draining"}.get(event.action)
+    if done is None:
+        _refuse(
+            state, event.request, f"unknown action {event.action!r}; there are: cordon, uncordon, drain"
+        )
+        return
+    state.hosts.set_closed(
+        host, cordoned=event.action != "uncordon", draining=event.action == "drain"
+    )
+    host.told.clear()
+    save_host(state, host)
+    state.record(now, f"host_{done}", f"{host.name} is {done}", host=host.name)
+    state.emit(Reply(event.request, message=f"{host.name} is {done}"))

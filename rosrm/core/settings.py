@@ -1,0 +1,42 @@
+"""What the core can be told to do differently; `rosrm.config` fills it from the file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+
+
+@dataclass(frozen=True, slots=True)
+class CoreSettings:
+    """Settings of the master's core.
+
+    Attributes:
+        backfill: those behind a process that waits for room may pass it.
+        default_needs: base units by resource, for a process of which nothing is known.
+        settle: seconds after which an estimate (not a declared need) no longer counts.
+        suspect: seconds of silence after which a host gets no new work.
+        lease: seconds of silence after which a host is lost.
+        delivery_timeout: seconds within which a slave must take up an assignment.
+        cooldown: seconds after a move in which a process is not moved again on the core's accord.
+        hysteresis: seconds that a host must be over a limit before anything moves.
+        headroom: fraction by which a destination stays under each of its limits.
+        max_migrations: most migrations in flight.
+        automatic: the core moves processes from hosts that are over a limit.
+        order_retry: seconds after which an unanswered order is given again.
+    """
+
+    backfill: bool = False
+    default_needs: Mapping[str, float] = field(
+        default_factory=lambda: MappingProxyType({"memory": 64 * 2.0**20, "cpu": 0.1})
+    )
+    settle: float = 10.0
+    suspect: float = 1.0
+    lease: float = 10.0
+    delivery_timeout: float = 5.0
+    cooldown: float = 30.0
+    hysteresis: float = 2.0
+    headroom: float = 0.05
+    max_migrations: int = 2
+    automatic: bool = True
+    order_retry: float = 2.0

@@ -1,0 +1,329 @@
+"""The Protocols that plugins and adapters implement, and the values that pass through them.
+
+A plugin registers an *offer* of each thing it brings (`ProbeOffer`, `ScoringOffer`, ...): a name, a
+frozen dataclass of options, and a function that makes the object. The configuration chooses offers
+by name; their options are checked against the dataclass's annotations before anything is made.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+import numpy.typing as npt
+
+from rosrm.core.migration import Move, Plan
+from rosrm.core.model import EMPTY, ProcessSpec, Reading, ResourceDescription
+
+FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class NoOptions:
+    """For a plugin that has nothing to set."""
+
+
+# --- probes (slave) ---------------------------------------------------------------------------
+
+
+class Probe(Protocol):
+    """Reads the utilisation of one or more resources of a host.
+
+    `read` may block: it runs in a thread of its own with a deadline. A late or raising probe makes
+    its readings *stale*, never zero.
+    """
+
+    @property
+    def resources(self) -> Sequence[ResourceDescription]:
+        """What `read` reports, known when the probe is made; names are unique on a host."""
+
+    def read(self) -> Iterable[Reading]:
+        """The utilisation now: one reading for each of `resources`, fractions of the capacity."""
+
+    def close(self) -> None:
+        """Release what the probe holds; called once, at the slave's end."""
+
+
+class Sessions(Protocol):
+    """The sessions (process trees) that the slave runs, for probes whose scope is the slice."""
+
+    def pids(self) -> Sequence[int]:
+        """Every known process of the slave's sessions; may be up to 1 s behind."""
+
+    def ended_cpu_time(self) -> float:
+        """Seconds of CPU that processes which have ended used; never falls."""
+
+
+@dataclass(frozen=True)
+class ProbeContext:
+    """What a probe may know of its host when it is made.
+
+    Attributes:
+        scope: "machine", "cgroup" or "slice", as the host's configuration says; a probe's own
+            option may override it.
+        budget: for the scope "slice", base units by resource name ("memory": bytes, "cpu": cores).
+        data_directory: where the slave keeps its files (the disk that counts).
+        sessions: the slave's process trees.
+    """
+
+    scope: str
+    budget: Mapping[str, float]
+    data_directory: Path
+    sessions: Sessions
+
+
+@dataclass(frozen=True)
+class ProbeOffer:
+    """Registers a probe.
+
+    Attributes:
+        name: by which the configuration chooses it.
+        create: makes it; raises `SkipPlugin` with the reason where the hardware or driver is absent.
+        options: a frozen dataclass of its settings, each with a default.
+        summary: one line for `rosrm plugins`.
+        period: seconds between reads.
+        deadline: seconds after which a read counts as late.
+        default: chosen where the configuration names no probes.
+    """
+
+    name: str
+    create: Callable[[Any, ProbeContext], Probe]
+    options: type[Any] = NoOptions
+    summary: str = ""
+    period: float = 0.1
+    deadline: float = 1.0
+    default: bool = False
+
+
+# --- scoring (master, pure) -------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class HostView:
+    """A read-only view of N hosts for a scoring policy. Arrays run in parallel.
+
+    Attributes:
+        names: N host names.
+        resources: R resource names, the columns.
+        usage: (N, R) reading + in-flight load, fractions of the capacity; NaN where a host has no
+            such resource.
+        limit: (N, R) upper limits, fractions; 1 where a host sets none.
+        capacity: (N, R) base units for usage 1.0; NaN where a host has no such resource.
+        processes: (N,) processes held or promised.
+    """
+
+    names: Sequence[str]
+    resources: tuple[str, ...]
+    usage: FloatArray
+    limit: FloatArray
+    capacity: FloatArray
+    processes: npt.NDArray[np.int64]
+
+    def column(self, resource: str) -> FloatArray:
+        """Usage of one resource, (N,): 0 where a host has no such resource."""
+        if resource not in self.resources:
+            return np.zeros(len(self.usage))
+        return np.nan_to_num(self.usage[:, self.resources.index(resource)], copy=True, nan=0.0)
+
+
+@dataclass(frozen=True)
+class ProcessView:
+    """What a scoring policy may know of the process to place.
+
+    Attributes:
+        spec: as submitted.
+        need: (N, R) what it will use on each host, fractions of that host's capacity.
+    """
+
+    spec: ProcessSpec
+    need: FloatArray
+
+
+@dataclass(frozen=True)
+class Scores:
+    """A policy's judgement of N hosts: the lowest value goes first.
+
+    Attributes:
+        value: (N,) finite where not vetoed.
+        veto: (N,) True: this host may not take it; None: no vetoes.
+        veto_reason: says why the host at a row is vetoed.
+        reason: says how the value of the host at a row came about.
+    """
+
+    value: FloatArray
+    veto: BoolArray | None = None
+    veto_reason: Callable[[int], str] = field(default=lambda row: "vetoed by the scoring policy")
+    reason: Callable[[int], str] = field(default=lambda row: "")
+
+
+class ScoringPolicy(Protocol):
+    """Orders the hosts that fit. Pure and deterministic: the same arguments, the same scores."""
+
+    def score(self, hosts: HostView, process: ProcessView) -> Scores:
+        """Judge every row of `hosts` by itself: no row's score may depend on the other rows.
+
+        The core asks for all hosts once and then anew for single rows that have changed.
+        """
+
+
+@dataclass(frozen=True)
+class ScoringOffer:
+    """Registers a scoring policy; the fields are as in `ProbeOffer`."""
+
+    name: str
+    create: Callable[[Any], ScoringPolicy]
+    options: type[Any] = NoOptions
+    summary: str = ""
+
+
+# --- migration (master, pure; executors on the slaves) ----------------------------------------
+
+
+class MigrationStrategy(Protocol):
+    """Proposes how a process moves, as data. Pure; the core carries the plan out."""
+
+    def propose(self, move: Move) -> Plan:
+        """The steps of this move. Raises `ValueError` with the reason where it cannot move it."""
+
+
+@dataclass(frozen=True)
+class MigrationOffer:
+    """Registers a migration strategy; the fields are as in `ProbeOffer`.
+
+    Attributes:
+        executors: what the open step of its plans may name; each runs on a slave with the step's
+            arguments (a JSON object) and answers with one.
+    """
+
+    name: str
+    create: Callable[[Any], MigrationStrategy]
+    options: type[Any] = NoOptions
+    summary: str = ""
+    executors: Mapping[str, Callable[[Mapping[str, Any]], Mapping[str, Any]]] = field(
+        default_factory=lambda: EMPTY
+    )
+
+
+# --- checkpoints (master, pure) ---------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class CheckpointView:
+    """What a checkpoint policy may know of a stateful process.
+
+    Attributes:
+        spec: as submitted.
+        host: where it runs.
+        age: seconds since its newest kept state; None: none is kept.
+        kept_on: hosts that keep a state of it now.
+        hosts: every host that is up, by name, with its labels.
+    """
+
+    spec: ProcessSpec
+    host: str
+    age: float | None
+    kept_on: tuple[str, ...]
+    hosts: Mapping[str, Mapping[str, str]]
+
+
+@dataclass(frozen=True)
+class CheckpointChoice:
+    """Keep the state on `hosts` (never the process's own), at most `copies` images each."""
+
+    hosts: tuple[str, ...]
+    copies: int = 1
+
+
+class CheckpointPolicy(Protocol):
+    """Decides when the state of a process is kept, how many are, and where. Pure."""
+
+    def choose(self, process: CheckpointView) -> CheckpointChoice | None:
+        """Where to keep it now, or None: not now."""
+
+
+@dataclass(frozen=True)
+class CheckpointOffer:
+    """Registers a checkpoint policy; the fields are as in `ProbeOffer`."""
+
+    name: str
+    create: Callable[[Any], CheckpointPolicy]
+    options: type[Any] = NoOptions
+    summary: str = ""
+
+
+# --- the durable record -----------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """One line of the event record, and the intent that it changes.
+
+    Attributes:
+        kind: past tense: "submitted", "assigned", ...
+        process: that it concerns; "" for none.
+        host: that it concerns; "" for none.
+        message: one sentence for people.
+        facts: JSON-able particulars.
+    """
+
+    kind: str
+    process: str = ""
+    host: str = ""
+    message: str = ""
+    facts: Mapping[str, Any] = field(default_factory=lambda: EMPTY)
+
+
+@dataclass(frozen=True, slots=True)
+class StoredRecord:
+    """A record as the journal keeps it.
+
+    Attributes:
+        sequence: 1, 2, 3, ... without a gap.
+        wall_time: unix time by the master's clock, seconds.
+        elapsed: seconds since this master's start, by its monotonic clock.
+    """
+
+    sequence: int
+    wall_time: float
+    elapsed: float
+    record: Record
+
+
+@dataclass(frozen=True, slots=True)
+class Intent:
+    """What shall be, durably: the newest value under a key replaces the older ones.
+
+    Attributes:
+        table: "process", "migration", "host", "learned", "cluster".
+        key: within the table.
+        value: JSON-able; None: the key is gone.
+    """
+
+    table: str
+    key: str
+    value: Mapping[str, Any] | None
+
+
+@runtime_checkable
+class Journal(Protocol):
+    """Keeps intent and the event record. What `write` has returned from survives a SIGKILL."""
+
+    def write(
+        self, records: Sequence[Record], intents: Sequence[Intent], now: float
+    ) -> Sequence[StoredRecord]:
+        """Append records and replace intents in one atomic group; raises `JournalError`."""
+
+    def intents(self, table: str) -> Mapping[str, Mapping[str, Any]]:
+        """All intents of a table by key."""
+
+    def records(
+        self, *, after: int = 0, process: str = "", host: str = "", newest: int = 1000
+    ) -> Sequence[StoredRecord]:
+        """The newest matching records after a sequence, oldest first."""
+
+    def close(self) -> None:
+        """Flush and release the files."""

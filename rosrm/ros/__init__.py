@@ -1,0 +1,1 @@
+"""The only place that imports rclpy, with `rosrm.node`: transport, graph, message <-> value."""

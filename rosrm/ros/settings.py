@@ -1,0 +1,45 @@
+"""How rosrm joins ROS: domain, discovery and transports. Imports no ROS itself."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class RosSettings:
+    """How a part of rosrm joins ROS; None and "" leave the environment's own word.
+
+    Attributes:
+        domain: ROS_DOMAIN_ID.
+        discovery_range: "localhost", "subnet", "off" or "system_default".
+        discovery_server: "host:port" of a Fast DDS discovery server, instead of multicast.
+        transports: FASTDDS_BUILTIN_TRANSPORTS, for example "UDPv4".
+        namespace: under which rosrm's topics and services live.
+    """
+
+    domain: int | None = None
+    discovery_range: str = ""
+    discovery_server: str = ""
+    transports: str = ""
+    namespace: str = "/rosrm"
+
+    def environment(self) -> Mapping[str, str]:
+        """The environment variables that carry these settings, for ourselves and for children."""
+        variables = {
+            "ROS_DOMAIN_ID": "" if self.domain is None else str(self.domain),
+            "ROS_AUTOMATIC_DISCOVERY_RANGE": self.discovery_range.upper(),
+            "ROS_DISCOVERY_SERVER": self.discovery_server,
+            "FASTDDS_BUILTIN_TRANSPORTS": self.transports,
+        }
+        return {name: value for name, value in variables.items() if value}
+
+    def describe(self) -> str:
+        """Domain, RMW and discovery in force, for messages."""
+        joined = {**os.environ, **self.environment()}
+        return (
+            f"domain {joined.get('ROS_DOMAIN_ID', '0')}, "
+            f"RMW {joined.get('RMW_IMPLEMENTATION', 'rmw_fastrtps_cpp')}, "
+            f"discovery {joined.get('ROS_DISCOVERY_SERVER') or joined.get('ROS_AUTOMATIC_DISCOVERY_RANGE', 'SUBNET')}"
+        )
