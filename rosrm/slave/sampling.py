@@ -1,0 +1,439 @@
+"""Reads the probes of a host without ever waiting for one.
+
+The slave's 10 Hz loop is the only clock: each call of `Sampler.latest` hands the probes that are
+due to a thread and returns what earlier reads have brought, so it takes microseconds whatever the
+probes do. The rules:
+
+- A probe begins in a thread of its own. Ten quick reads in a row earn it a place in the thread that
+  all quick probes share (one wake-up a cycle, not one a probe); one slow read loses it again.
+- A read that is slow while others queue behind it keeps the thread it hangs in; the others get a
+  fresh one at the next cycle. A probe is never read twice at a time, so a hanging probe costs one
+  thread, however long it hangs.
+- A probe that is late, raises or answers nonsense makes its readings *stale*: they keep their last
+  value, never zero. Why is reported once, and so is the recovery.
+- Before its first reading a resource counts as full and stale, so that no work is drawn to a host
+  that has not been measured.
+
+Readings are one cycle old. A read in the loop itself would cost some 30 us a cycle less, but then a
+probe that was quick a thousand times could still hang the loop at the next read.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from queue import SimpleQueue
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from rosrm.core.model import RESOURCE_SLOTS, ResourceDescription
+from rosrm.errors import ConfigError, PluginError
+from rosrm.ports import Probe
+
+#: A read that takes longer, in seconds, is too slow to share a thread.
+QUICK: Final = 0.05
+#: As many quick reads in a row earn a probe its place in the shared thread.
+TRUSTED_AFTER: Final = 10
+#: A usage above this many times the capacity is nonsense (a small budget can be exceeded far).
+ABSURD_USAGE: Final = 1000.0
+#: At most this many reports of one probe in REPORT_WINDOW seconds: a flapping probe floods nothing.
+REPORTS: Final = 6
+REPORT_WINDOW: Final = 60.0
+
+
+@dataclass(frozen=True, slots=True)
+class SampledProbe:
+    """A probe as the sampler reads it.
+
+    Attributes:
+        name: of its offer.
+        period: seconds between reads; never shorter than the period of `latest` calls.
+        deadline: seconds after which a read counts as late.
+    """
+
+    name: str
+    probe: Probe
+    period: float = 0.1
+    deadline: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class ProbeReport:
+    """The readings of a probe went stale, or came back.
+
+    Attributes:
+        resources: names of the readings concerned.
+        reason: why they are stale; "" on recovery.
+    """
+
+    probe: str
+    resources: tuple[str, ...]
+    stale: bool
+    reason: str
+
+    def __str__(self) -> str:
+        """One sentence for the event record."""
+        names = ", ".join(self.resources)
+        if self.stale:
+            return f"probe {self.probe}: {names} stale: {self.reason}"
+        return f"probe {self.probe}: {names} read again"
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """The newest readings of all probes.
+
+    Attributes:
+        usage: (RESOURCE_SLOTS,) float32 fractions of the capacity, by slot; 0 where not in use.
+        stale: bit i: the reading of slot i is older than its deadline.
+        reports: what has changed since the sample before.
+    """
+
+    usage: npt.NDArray[np.float32]
+    stale: int
+    reports: tuple[ProbeReport, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class _Outcome:
+    """What one read brought: values in the order of the probe's resources, or why there are none."""
+
+    values: tuple[float, ...]
+    reason: str
+    seconds: float
+
+
+class Sampler:
+    """Reads probes in the background; `latest` is called by one loop, never waits.
+
+    Args:
+        probes: at most RESOURCE_SLOTS resources in all; their order gives the slots.
+        clock: monotonic seconds, the same as the `now` of `latest`.
+
+    Raises:
+        ConfigError: two probes report one resource, or there are too many resources.
+        PluginError: a probe that describes its resources wrongly.
+    """
+
+    def __init__(
+        self, probes: Sequence[SampledProbe], *, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self.resources: Final = _slots(probes)
+        self._clock = clock
+        self._progress = threading.Event()
+        self._shared = _Lane("rosrm-probes")
+        self._left: list[_Lane] = []
+        self._watched: list[_Watched] = []
+        self._usage = np.zeros(RESOURCE_SLOTS, np.float32)
+        first = 0
+        for sampled in probes:
+            watched = _Watched(sampled, first, clock, self._progress)
+            self._watched.append(watched)
+            first += len(watched.names)
+        self._usage[:first] = 1.0
+        self._stale = self.present
+
+    @property
+    def present(self) -> int:
+        """Bit i: slot i is in use."""
+        return (1 << len(self.resources)) - 1
+
+    def latest(self, now: float) -> Sample:
+        """The newest readings, and a new read of each probe that is due. Never waits.
+
+        Args:
+            now: monotonic seconds.
+        """
+        reports: list[ProbeReport] = []
+        for watched in self._watched:
+            if watched.busy:
+                self._mind_running(watched, now)
+            else:
+                self._take_outcome(watched)
+            report = watched.report(now)
+            if report is not None:
+                reports.append(report)
+            if not watched.busy and watched.is_due(now):
+                watched.lane.put(watched.prepare(now))
+        return Sample(self._usage.copy(), self._stale, tuple(reports))
+
+    def settle(self, timeout: float) -> bool:
+        """Wait until no read is under way.
+
+        Args:
+            timeout: seconds.
+
+        Returns:
+            False: it passed and a read still runs.
+        """
+        end = time.monotonic() + timeout
+        while any(watched.busy for watched in self._watched):
+            if not self._progress.wait(max(0.0, end - time.monotonic())):
+                return False
+            self._progress.clear()
+        return True
+
+    def first(self, timeout: float = 2.0) -> Sample:
+        """Read every probe once and wait for the answers: the sample to register with.
+
+        Args:
+            timeout: seconds; a probe that has not answered by then stays stale.
+        """
+        reports = self.latest(self._clock()).reports
+        self.settle(timeout)
+        sample = self.latest(self._clock())
+        return Sample(sample.usage, sample.stale, reports + sample.reports)
+
+    def close(self, timeout: float = 2.0) -> tuple[str, ...]:
+        """Close every probe, each in the thread that reads it; no further call may follow.
+
+        Args:
+            timeout: seconds for all of them together.
+
+        Returns:
+            Names of the probes that hang or raised, and so were left unclosed.
+        """
+        for watched in self._watched:
+            watched.lane.put(watched.close)
+        lanes = {id(lane): lane for lane in [*(w.lane for w in self._watched), self._shared]}
+        end = time.monotonic() + timeout
+        for lane in lanes.values():
+            lane.end()
+        for lane in [*lanes.values(), *self._left]:
+            lane.join(max(0.0, end - time.monotonic()))
+        return tuple(watched.name for watched in self._watched if not watched.closed)
+
+    def _mind_running(self, watched: _Watched, now: float) -> None:
+        """A read is under way: free those behind it when it is slow, mark it when it is late."""
+        running = watched.running(now)
+        if running > QUICK and watched.lane is self._shared:
+            self._shared = self._shared.succeed()
+            for other in self._watched:
+                if other.lane is not watched.lane or other is watched:
+                    continue
+                other.lane = self._shared
+            watched.lane = _Lane(f"rosrm-probe-{watched.name}")
+        if running > watched.deadline:
+            self._mark(watched, f"no answer within {watched.deadline:g} s")
+
+    def _take_outcome(self, watched: _Watched) -> None:
+        """A read has ended: publish its values, and choose the thread of the next."""
+        outcome, watched.outcome = watched.outcome, None
+        if outcome is None:
+            return
+        if outcome.values:
+            self._usage[watched.slots] = outcome.values
+        if outcome.seconds > watched.deadline:
+            self._mark(watched, f"answered after {outcome.seconds:.3g} s")
+        else:
+            self._mark(watched, outcome.reason)
+        self._choose_lane(watched, outcome.seconds)
+
+    def _choose_lane(self, watched: _Watched, seconds: float) -> None:
+        if seconds > QUICK:
+            watched.quick_reads = 0
+            if watched.lane is self._shared:
+                watched.lane = _Lane(f"rosrm-probe-{watched.name}")
+            return
+        watched.quick_reads += 1
+        if watched.quick_reads >= TRUSTED_AFTER and watched.lane is not self._shared:
+            watched.lane.end()
+            self._left = [lane for lane in self._left if lane.alive()] + [watched.lane]
+            watched.lane = self._shared
+
+    def _mark(self, watched: _Watched, reason: str) -> None:
+        watched.reason = reason
+        if reason:
+            self._stale |= watched.mask
+        else:
+            self._stale &= ~watched.mask
+
+
+class _Lane:
+    """A thread that carries out one call after another; it starts with the first."""
+
+    def __init__(self, name: str, queue: SimpleQueue[Callable[[], None] | None] | None = None):
+        self._name = name
+        self._queue: SimpleQueue[Callable[[], None] | None] = queue or SimpleQueue()
+        self._thread: threading.Thread | None = None
+        self._dismissed = False
+
+    def put(self, call: Callable[[], None]) -> None:
+        """Queue a call."""
+        if self._thread is None:
+            self._start()
+        self._queue.put(call)
+
+    def succeed(self) -> _Lane:
+        """Leave the thread to the call that it hangs in; a new one takes over the queue."""
+        self._dismissed = True
+        lane = _Lane(self._name, self._queue)
+        lane._start()
+        return lane
+
+    def end(self) -> None:
+        """End the thread when it has carried out what is queued."""
+        self._queue.put(None)
+
+    def alive(self) -> bool:
+        """Its thread still runs."""
+        return self._thread is not None and self._thread.is_alive()
+
+    def join(self, timeout: float) -> None:
+        """Wait for the end of the thread, at most `timeout` seconds."""
+        if self._thread is not None:
+            self._thread.join(timeout)
+
+    def _start(self) -> None:
+        # A daemon: a probe that hangs in the kernel must not keep the slave from ending.
+        self._thread = threading.Thread(target=self._serve, name=self._name, daemon=True)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        # Without a time-out, as it waits for orders alone: `end` is always among them.
+        while not self._dismissed and (call := self._queue.get()) is not None:
+            call()
+
+
+class _Watched:
+    """One probe under watch.
+
+    Handed to and fro by `busy`: while it is True only the reading thread writes `started` and
+    `outcome`, and clears `busy` last; while it is False only the loop writes.
+    """
+
+    def __init__(
+        self,
+        sampled: SampledProbe,
+        first: int,
+        clock: Callable[[], float],
+        progress: threading.Event,
+    ) -> None:
+        self.name = sampled.name
+        self.names = tuple(resource.name for resource in sampled.probe.resources)
+        self.deadline = sampled.deadline
+        self.slots = slice(first, first + len(self.names))
+        self.mask = ((1 << len(self.names)) - 1) << first
+        self.lane = _Lane(f"rosrm-probe-{sampled.name}")
+        self.quick_reads = 0
+        self.reason = ""
+        self.busy = False
+        self.closed = False
+        self.outcome: _Outcome | None = None
+        self._started: float | None = None
+        self._probe = sampled.probe
+        self._period = sampled.period
+        self._clock = clock
+        self._progress = progress
+        self._due = -math.inf
+        self._reported = ""
+        self._report_times: list[float] = []
+
+    def is_due(self, now: float) -> bool:
+        """A quarter of a period early counts as due, so that jitter skips no cycle."""
+        return now + self._period / 4 >= self._due
+
+    def prepare(self, now: float) -> Callable[[], None]:
+        """The read to carry out, counted as under way from now on."""
+        following = self._due + self._period
+        self._due = following if following > now else now + self._period
+        self._started = None
+        self.busy = True
+        return self._read
+
+    def running(self, now: float) -> float:
+        """Seconds since the read under way began; 0 while it is queued."""
+        return 0.0 if self._started is None else now - self._started
+
+    def report(self, now: float) -> ProbeReport | None:
+        """What there is to say anew, bounded in number."""
+        if bool(self.reason) == bool(self._reported):
+            return None
+        self._report_times = [t for t in self._report_times if now - t < REPORT_WINDOW]
+        if len(self._report_times) >= REPORTS:
+            return None
+        self._report_times.append(now)
+        self._reported = self.reason
+        reason = self.reason
+        if len(self._report_times) == REPORTS:
+            reason += f" (it changes often: silent for up to {REPORT_WINDOW:g} s)"
+        return ProbeReport(self.name, self.names, bool(self.reason), reason)
+
+    def close(self) -> None:
+        """Close the probe, in the thread that reads it."""
+        try:
+            self._probe.close()
+        except BaseException:  # noqa: BLE001 - a plugin's fault must not stop the slave's end
+            return
+        self.closed = True
+
+    def _read(self) -> None:
+        started = self._clock()
+        self._started = started
+        values: tuple[float, ...] = ()
+        reason = ""
+        try:
+            values = _values(self._probe, self.names)
+        except _Nonsense as nonsense:
+            reason = str(nonsense)
+        except BaseException as error:  # noqa: BLE001 - the guard: whatever a plugin raises, even
+            # SystemExit, makes its readings stale and harms nothing else.
+            reason = f"read() raised {type(error).__name__}: {error}"
+        self.outcome = _Outcome(values, reason, self._clock() - started)
+        self.busy = False
+        self._progress.set()
+
+
+class _Nonsense(Exception):
+    """What a probe answered cannot be a reading; the text says why."""
+
+
+def _values(probe: Probe, names: tuple[str, ...]) -> tuple[float, ...]:
+    """Read a probe and check every value before any is used."""
+    values: dict[str, float] = {}
+    for reading in probe.read():
+        if reading.resource not in names:
+            raise _Nonsense(f"a reading of {reading.resource!r}, which it did not announce")
+        if reading.resource in values:
+            raise _Nonsense(f"two readings of {reading.resource!r}")
+        usage = float(reading.usage)
+        if not 0.0 <= usage <= ABSURD_USAGE:  # also where it is NaN
+            raise _Nonsense(f"usage {usage} of {reading.resource!r} is not a fraction of it")
+        values[reading.resource] = usage
+    missing = [name for name in names if name not in values]
+    if missing:
+        raise _Nonsense(f"no reading of {', '.join(missing)}")
+    return tuple(values[name] for name in names)
+
+
+def _slots(probes: Sequence[SampledProbe]) -> tuple[ResourceDescription, ...]:
+    """The resources in the order of their slots, each checked."""
+    resources: list[ResourceDescription] = []
+    owner: dict[str, str] = {}
+    for sampled in probes:
+        for resource in sampled.probe.resources:
+            if not resource.name:
+                raise PluginError(f"probe {sampled.name}: a resource without a name")
+            if not (math.isfinite(resource.capacity) and resource.capacity > 0):
+                raise PluginError(
+                    f"probe {sampled.name}: capacity {resource.capacity} of {resource.name!r}; "
+                    "it must be finite and above 0"
+                )
+            if resource.name in owner:
+                raise ConfigError(
+                    f"resource {resource.name!r} is reported by the probes "
+                    f"{owner[resource.name]!r} and {sampled.name!r}; choose one of them"
+                )
+            owner[resource.name] = sampled.name
+            resources.append(resource)
+    if len(resources) > RESOURCE_SLOTS:
+        raise ConfigError(
+            f"{len(resources)} resources ({', '.join(owner)}); at most {RESOURCE_SLOTS} fit into "
+            "resource_info: choose fewer probes"
+        )
+    return tuple(resources)
