@@ -1,0 +1,62 @@
+"""Marks on settings whose form in a file differs from their value.
+
+pydantic calls the hooks below when it reads a file; nothing else does, so that the settings can be
+imported without it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True)
+class NullIsEmpty:
+    """Options may be left out after the colon: null stands for none."""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+        """Tells pydantic to put `{}` for null."""
+        from pydantic_core import core_schema
+
+        return core_schema.no_info_before_validator_function(
+            lambda given: {} if given is None else given, handler(source)
+        )
+
+
+@dataclass(frozen=True)
+class OptionsByName:
+    """Plugins are named in a list, or in a mapping from name to options."""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+        """Tells pydantic to make a list of names a mapping to no options."""
+        from pydantic_core import core_schema
+
+        return core_schema.no_info_before_validator_function(self.named, handler(source))
+
+    @staticmethod
+    def named(given: Any) -> Any:
+        """A list of names as a mapping; anything else as it is."""
+        if not isinstance(given, list):
+            return given
+        strange = [name for name in given if not isinstance(name, str)]
+        if strange:
+            raise ValueError(f"{strange[0]!r} is not a name; options go into a mapping")
+        twice = [name for name in given if given.count(name) > 1]
+        if twice:
+            raise ValueError(f"{twice[0]!r} is named twice")
+        return {name: {} for name in given}
+
+
+@dataclass(frozen=True)
+class RosSection:
+    """The section `ros` is nested in a file and flat as a value."""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+        """Tells pydantic to read the file's form and to make the value of it."""
+        from pydantic_core import core_schema
+
+        from rosrm.config.ros import RosInFile
+
+        return core_schema.no_info_after_validator_function(
+            RosInFile.settings, handler.generate_schema(RosInFile)
+        )

@@ -1,0 +1,63 @@
+"""The section `ros` of both files."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from typing import Annotated, Final, Literal
+
+from pydantic import AfterValidator
+
+from rosrm.config.units import Quantity
+from rosrm.ros.settings import RosSettings
+
+_DEFAULT: Final = RosSettings()
+_SERVER: Final = re.compile(r"[^\s:;]+:\d{1,5}(;[^\s:;]*(:\d{1,5})?)*|[^\s:;]+")
+_NAMESPACE: Final = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
+_TRANSPORTS: Final = ("DEFAULT", "DEFAULTv6", "SHM", "UDPv4", "UDPv6", "LARGE_DATA", "P2P")
+
+
+def _server(given: str) -> str:
+    if given and not _SERVER.fullmatch(given):
+        raise ValueError(f'{given!r} is not "host:port"')
+    return given
+
+
+def _namespace(given: str) -> str:
+    if not _NAMESPACE.fullmatch(given):
+        raise ValueError(f'{given!r} is not an absolute ROS namespace such as "/rosrm"')
+    return given
+
+
+def _transports(given: str) -> str:
+    if given and given.split("?")[0] not in _TRANSPORTS:
+        raise ValueError(f"{given!r} is unknown. Allowed: {', '.join(_TRANSPORTS)}")
+    return given
+
+
+@dataclass(frozen=True, slots=True)
+class DiscoveryInFile:
+    """How participants find each other: by multicast within a range, or by a server."""
+
+    range: Literal["", "localhost", "subnet", "off", "system_default"] = ""
+    server: Annotated[str, AfterValidator(_server)] = _DEFAULT.discovery_server
+
+
+@dataclass(frozen=True, slots=True)
+class RosInFile:
+    """The section as it is written."""
+
+    domain: Annotated[int, Quantity(high=232, whole=True)] | None = _DEFAULT.domain
+    discovery: DiscoveryInFile = field(default_factory=DiscoveryInFile)
+    transports: Annotated[str, AfterValidator(_transports)] = _DEFAULT.transports
+    namespace: Annotated[str, AfterValidator(_namespace)] = _DEFAULT.namespace
+
+    def settings(self) -> RosSettings:
+        """The same as a value."""
+        return RosSettings(
+            domain=self.domain,
+            discovery_range=self.discovery.range,
+            discovery_server=self.discovery.server,
+            transports=self.transports,
+            namespace=self.namespace,
+        )

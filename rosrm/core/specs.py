@@ -1,0 +1,76 @@
+"""A process spec as plain JSON values, for the journal: complete, so that defaults may change."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any, Final
+
+from rosrm.core.model import (
+    Kind,
+    MigrationPolicy,
+    ProcessSpec,
+    Readiness,
+    RestartPolicy,
+    StopPolicy,
+)
+
+_POLICIES: Final[Mapping[str, type[Any]]] = {
+    "restart": RestartPolicy,
+    "migration": MigrationPolicy,
+    "readiness": Readiness,
+    "stop": StopPolicy,
+}
+_TUPLES: Final = ("command", "arguments")
+_MAPPINGS: Final = (
+    "parameters",
+    "remappings",
+    "environment",
+    "needs",
+    "required_labels",
+    "preferred_labels",
+    "avoided_labels",
+)
+_FIELDS: Final = {
+    kind.__name__: tuple(f.name for f in fields(kind))
+    for kind in (ProcessSpec, RestartPolicy, MigrationPolicy, Readiness, StopPolicy)
+}
+
+
+def spec_to_dict(spec: ProcessSpec) -> dict[str, Any]:
+    """All fields of a spec, as JSON has them."""
+    plain = {name: getattr(spec, name) for name in _FIELDS["ProcessSpec"]}
+    plain["kind"] = spec.kind.value
+    for name in _TUPLES:
+        plain[name] = list(plain[name])
+    for name in _MAPPINGS:
+        plain[name] = dict(plain[name])
+    for name, kind in _POLICIES.items():
+        plain[name] = {inner: getattr(plain[name], inner) for inner in _FIELDS[kind.__name__]}
+    plain["migration"]["options"] = dict(plain["migration"]["options"])
+    return plain
+
+
+def spec_from_dict(plain: Mapping[str, Any]) -> ProcessSpec:
+    """The inverse of `spec_to_dict`; what is missing has its default.
+
+    Raises:
+        ValueError: for a field that this version does not know.
+    """
+    values = dict(_known(ProcessSpec, plain))
+    if "kind" in values:
+        values["kind"] = Kind(values["kind"])
+    for name in _TUPLES:
+        if name in values:
+            values[name] = tuple(values[name])
+    for name, kind in _POLICIES.items():
+        if name in values:
+            values[name] = kind(**_known(kind, values[name]))
+    return ProcessSpec(**values)
+
+
+def _known(kind: type[Any], plain: Mapping[str, Any]) -> Mapping[str, Any]:
+    strange = set(plain).difference(_FIELDS[kind.__name__])
+    if strange:
+        raise ValueError(f"unknown field of {kind.__name__}: {', '.join(sorted(strange))}")
+    return plain

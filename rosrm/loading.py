@@ -1,0 +1,227 @@
+"""Finds the installed plugins and calls their hooks, each by itself.
+
+A plugin that does not import, raises in a hook or misspells one is reported as broken, with its
+distribution, the hook and the place of its definition; the others go on.
+"""
+
+from __future__ import annotations
+
+import inspect
+import logging
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import MISSING, dataclass, fields, is_dataclass
+from difflib import get_close_matches
+from importlib.metadata import EntryPoint, entry_points
+from types import SimpleNamespace
+from typing import Any, Final, TypeAlias
+
+import pluggy
+
+from rosrm import hookspecs
+from rosrm.ports import CheckpointOffer, MigrationOffer, ProbeOffer, ScoringOffer
+
+Offer: TypeAlias = "ProbeOffer | ScoringOffer | MigrationOffer | CheckpointOffer"
+
+#: What each hook registers, and of which type its offers are.
+HOOKS: Final[Mapping[str, tuple[str, type[Any]]]] = {
+    "register_probes": ("probe", ProbeOffer),
+    "register_scoring_policies": ("scoring", ScoringOffer),
+    "register_migration_strategies": ("migration", MigrationOffer),
+    "register_checkpoint_policies": ("checkpoint", CheckpointOffer),
+}
+
+#: Seconds after which a plugin that is still being loaded is named in the log.
+SLOW_LOADING: Final = 5.0
+
+#: What a plugin may do wrong; a plugin that calls `sys.exit` must not end the master.
+FAULTS: Final = (Exception, SystemExit)
+
+_log = logging.getLogger("rosrm.plugins")
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where a plugin comes from: its entry point's name, its distribution's name and version."""
+
+    plugin: str
+    distribution: str = ""
+
+    def __str__(self) -> str:
+        return f"plugin {self.plugin!r}" + (f" of {self.distribution}" if self.distribution else "")
+
+
+@dataclass(frozen=True)
+class Offered:
+    """One offer: its kind is "probe", "scoring", "migration" or "checkpoint"."""
+
+    kind: str
+    offer: Offer
+    source: Source
+
+
+@dataclass(frozen=True)
+class Broken:
+    """What cannot be used, and why; `kind` and `name` are "" where they are not known."""
+
+    source: Source
+    reason: str
+    kind: str = ""
+    name: str = ""
+
+
+@dataclass
+class Loaded:
+    """What the plugins bring."""
+
+    offers: list[Offered]
+    broken: list[Broken]
+
+
+def load_installed(slow_after: float = SLOW_LOADING) -> Loaded:
+    """Load every plugin under the entry-point group."""
+    loaded = Loaded([], [])
+    for source, point in _installed():
+        with _said_when_slow(source, slow_after):
+            _load(loaded, source, point.load)
+    return loaded
+
+
+def load_objects(plugins: Mapping[str, object]) -> Loaded:
+    """Take modules or objects as plugins, by name, without an installation (for tests)."""
+    loaded = Loaded([], [])
+    for name, plugin in plugins.items():
+        _load(loaded, Source(name), lambda plugin=plugin: plugin)  # type: ignore[misc]
+    return loaded
+
+
+def describe_fault(fault: BaseException) -> str:
+    """An exception in one line."""
+    text = " ".join(str(fault).split())
+    return f"{type(fault).__name__}: {text}" if text else type(fault).__name__
+
+
+def definition(function: object) -> str:
+    """Where a function or class is defined, for messages; "" where that is not known."""
+    try:
+        target: Any = inspect.unwrap(function)  # type: ignore[arg-type]
+        return f"{inspect.getsourcefile(target)}:{inspect.getsourcelines(target)[1]}"
+    except (TypeError, OSError):
+        return ""
+
+
+def _installed() -> Iterable[tuple[Source, EntryPoint]]:
+    """Each entry point once, in the order of names, even where a folder is twice on the path."""
+    found: dict[tuple[str, str], tuple[Source, EntryPoint]] = {}
+    for point in entry_points(group=hookspecs.GROUP):
+        distribution = f"{point.dist.name} {point.dist.version}" if point.dist else ""
+        found.setdefault((distribution, point.name), (Source(point.name, distribution), point))
+    return [found[key] for key in sorted(found)]
+
+
+@contextmanager
+def _said_when_slow(source: Source, after: float) -> Iterator[None]:
+    def say() -> None:
+        _log.warning("%s is still being loaded after %g s", source, after)
+
+    timer = threading.Timer(after, say)
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
+def _load(loaded: Loaded, source: Source, load: Callable[[], object]) -> None:
+    try:
+        plugin = load()
+    except FAULTS as fault:
+        loaded.broken.append(Broken(source, f"does not import: {describe_fault(fault)}"))
+        return
+    for reason in _misspelt(plugin):
+        loaded.broken.append(Broken(source, reason))
+    for hook, function in _hooks_of(plugin).items():
+        _take(loaded, source, hook, function)
+
+
+def _hooks_of(plugin: object) -> Mapping[str, Callable[..., Any]]:
+    marked = _marked(plugin)
+    return {hook: marked[hook] for hook in HOOKS if hook in marked}
+
+
+def _marked(plugin: object) -> Mapping[str, Callable[..., Any]]:
+    """The functions of a plugin that `@hookimpl` marks, by the hook that they implement."""
+    marked: dict[str, Callable[..., Any]] = {}
+    for name in dir(plugin):
+        function = getattr(plugin, name, None)
+        mark = getattr(function, f"{hookspecs.GROUP}_impl", None)
+        if callable(function) and isinstance(mark, Mapping):
+            marked[mark.get("specname") or name] = function
+    return marked
+
+
+def _misspelt(plugin: object) -> Iterable[str]:
+    marked = _marked(plugin)
+    for hook, function in marked.items():
+        if hook not in HOOKS:
+            near = get_close_matches(hook, HOOKS, 1)
+            meant = f"; did you mean {near[0]!r}?" if near else "."
+            yield (
+                f"unknown hook {hook!r} ({definition(function)}){meant} Allowed: {', '.join(HOOKS)}"
+            )
+    for hook in HOOKS:
+        unmarked = getattr(plugin, hook, None)
+        if callable(unmarked) and hook not in marked:
+            yield f"{hook} ({definition(unmarked)}) lacks the mark @hookimpl of rosrm.hookspecs"
+
+
+def _take(loaded: Loaded, source: Source, hook: str, function: Callable[..., Any]) -> None:
+    kind, wanted = HOOKS[hook]
+    place = f"{hook} ({definition(function)})"
+    try:
+        answer = _call(hook, function)
+    except FAULTS as fault:
+        loaded.broken.append(Broken(source, f"{place} failed with {describe_fault(fault)}", kind))
+        return
+    if isinstance(answer, str) or not isinstance(answer, Sequence):
+        reason = f"{place} returned {type(answer).__name__}, not a list of {wanted.__name__}"
+        loaded.broken.append(Broken(source, reason, kind))
+        return
+    for offer in answer:
+        fault_found = _fault_of(offer, wanted)
+        if fault_found:
+            name = str(getattr(offer, "name", ""))
+            loaded.broken.append(Broken(source, f"{place}: {fault_found}", kind, name))
+        else:
+            loaded.offers.append(Offered(kind, offer, source))
+
+
+def _call(hook: str, function: Callable[..., Any]) -> Any:
+    """Through pluggy, which checks the arguments; alone, so that no plugin wraps another's hooks."""
+    alone = pluggy.PluginManager(hookspecs.GROUP)
+    alone.add_hookspecs(hookspecs)
+    alone.register(SimpleNamespace(**{hook: function}))
+    answers = getattr(alone.hook, hook)()
+    return answers[0] if answers else ()
+
+
+def _fault_of(offer: object, wanted: type[Any]) -> str:
+    """Why an offer cannot be taken; "" where it can."""
+    if not isinstance(offer, wanted):
+        return f"offers {offer!r}, which is not a {wanted.__name__}"
+    name: object = getattr(offer, "name", None)
+    if not isinstance(name, str) or not name.strip():
+        return f"offers something without a name: {name!r}"
+    if not callable(getattr(offer, "create", None)):
+        return f"{name!r}: `create` cannot be called"
+    options: object = getattr(offer, "options", None)
+    if not (isinstance(options, type) and is_dataclass(options)):
+        return f"{name!r}: `options` is not a dataclass but {options!r}"
+    bare = [
+        f.name
+        for f in fields(options)
+        if f.init and f.default is MISSING and f.default_factory is MISSING
+    ]
+    return f"{name!r}: option {bare[0]!r} has no default" if bare else ""

@@ -1,0 +1,300 @@
+"""Chooses plugins by name, makes them, and says of each what became of it.
+
+Imports no pydantic: the runtimes of master and slave use it too. They get options that have been
+checked; `rosrm.config.options` checks those of a file against the same offers.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+from typing import Any, Final, TypeVar, cast
+
+from rosrm.config.plain import from_plain
+from rosrm.core.model import EMPTY, RESOURCE_SLOTS, ResourceDescription
+from rosrm.core.views import PluginRow
+from rosrm.errors import ConfigError, PluginError, SkipPlugin
+from rosrm.loading import (
+    FAULTS,
+    SLOW_LOADING,
+    Broken,
+    Loaded,
+    Offer,
+    Offered,
+    definition,
+    describe_fault,
+    load_installed,
+    load_objects,
+)
+from rosrm.ports import (
+    CheckpointPolicy,
+    MigrationOffer,
+    MigrationStrategy,
+    Probe,
+    ProbeContext,
+    ProbeOffer,
+    ScoringPolicy,
+)
+
+#: What the kinds of offers are called in messages.
+TITLES: Final[Mapping[str, str]] = {
+    "probe": "probe",
+    "scoring": "scoring policy",
+    "migration": "migration strategy",
+    "checkpoint": "checkpoint policy",
+}
+
+Executor = Callable[[Mapping[str, Any]], Mapping[str, Any]]
+NameToOptions = Mapping[str, Mapping[str, Any]]
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class MadeProbe:
+    """A probe that is present on this host; period and deadline are of its offer, seconds."""
+
+    name: str
+    probe: Probe
+    resources: tuple[ResourceDescription, ...]
+    period: float
+    deadline: float
+
+
+@dataclass(frozen=True)
+class Probes:
+    """The probes of a host.
+
+    Attributes:
+        made: those present.
+        absent: name to the reason, of those that are absent or broken here.
+    """
+
+    made: tuple[MadeProbe, ...]
+    absent: Mapping[str, str]
+
+
+class Registry:
+    """The plugins of this installation. `discover` is how to get one."""
+
+    def __init__(self, loaded: Loaded) -> None:
+        self._offers: dict[tuple[str, str], Offered] = {}
+        self._broken: list[Broken] = list(loaded.broken)
+        self._outcome: dict[tuple[str, str], tuple[str, str]] = {}
+        self._keep_single(loaded.offers)
+
+    @classmethod
+    def discover(cls, slow_after: float = SLOW_LOADING) -> Registry:
+        """Load the installed plugins; what is broken is kept with its reason, and raises nothing.
+
+        Args:
+            slow_after: seconds after which a plugin that is still being loaded is logged by name.
+        """
+        return cls(load_installed(slow_after))
+
+    @classmethod
+    def of(cls, **plugins: object) -> Registry:
+        """From modules or objects with hooks, without an installation (for tests)."""
+        return cls(load_objects(plugins))
+
+    # --- what there is ------------------------------------------------------------------------
+
+    @property
+    def broken(self) -> Sequence[Broken]:
+        """What cannot be used, and why."""
+        return tuple(self._broken)
+
+    def names(self, kind: str) -> tuple[str, ...]:
+        """The names on offer of one kind."""
+        return tuple(sorted(name for of_kind, name in self._offers if of_kind == kind))
+
+    def offer(self, kind: str, name: str) -> Offer:
+        """The offer of a name; raises `ConfigError` with what there is instead."""
+        return self._offered(kind, name).offer
+
+    def default_probes(self) -> NameToOptions:
+        """The probes that a host has where its configuration names none, without options."""
+        offers = [self.offer("probe", name) for name in self.names("probe")]
+        chosen = {o.name: EMPTY for o in offers if isinstance(o, ProbeOffer) and o.default}
+        if not chosen:
+            raise ConfigError(
+                "no probe is installed, so this host could not be measured. "
+                "Install rosrm-resources, or write `probes: {}` to run without."
+                + self._broken_note("probe")
+            )
+        return chosen
+
+    def rows(self, *kinds: str, host: str = "") -> list[PluginRow]:
+        """One row for each offer and each fault of these kinds (of all where none is given).
+
+        State and reason are as the calls below have left them: "available" until something was
+        made, then "selected", "absent" or "broken".
+        """
+        rows = []
+        for (kind, name), offered in sorted(self._offers.items()):
+            state, reason = self._outcome.get((kind, name), ("available", offered.offer.summary))
+            rows.append(PluginRow(kind, name, offered.source.distribution, state, reason, host))
+        for broken in self._broken:
+            kind, name = broken.kind or "plugin", broken.name or broken.source.plugin
+            rows.append(
+                PluginRow(kind, name, broken.source.distribution, "broken", broken.reason, host)
+            )
+        return [row for row in rows if not kinds or row.kind in (*kinds, "plugin")]
+
+    # --- what is made of it -------------------------------------------------------------------
+
+    def scoring(self, name: str, options: Mapping[str, Any] = EMPTY) -> ScoringPolicy:
+        """Make a scoring policy; raises `ConfigError` or `PluginError`."""
+        return cast(ScoringPolicy, self._required("scoring", name, options))
+
+    def checkpoint(
+        self, name: str | None, options: Mapping[str, Any] = EMPTY
+    ) -> CheckpointPolicy | None:
+        """Make a checkpoint policy, None for none; raises `ConfigError` or `PluginError`."""
+        if name is None:
+            return None
+        return cast(CheckpointPolicy, self._required("checkpoint", name, options))
+
+    def migrations(self, chosen: NameToOptions) -> dict[str, MigrationStrategy]:
+        """Make migration strategies by name, in this order; raises as `scoring` does."""
+        return {
+            name: cast(MigrationStrategy, self._required("migration", name, options))
+            for name, options in chosen.items()
+        }
+
+    def executors(self) -> dict[str, Executor]:
+        """What the open steps of plans may name on this host, from all migration offers."""
+        executors: dict[str, Executor] = {}
+        for name in self.names("migration"):
+            offer = cast(MigrationOffer, self.offer("migration", name))
+            for executor, function in offer.executors.items():
+                if executor in executors:
+                    raise PluginError(f"two plugins register an executor {executor!r}")
+                executors[executor] = function
+        return executors
+
+    def probes(self, chosen: NameToOptions | None, context: ProbeContext) -> Probes:
+        """Make the probes of a host, the default ones for None.
+
+        One that is absent here or fails is left out with its reason, and the others go on.
+
+        Raises:
+            ConfigError: for an unknown name or option.
+        """
+        made: list[MadeProbe] = []
+        absent: dict[str, str] = {}
+        for name, options in (self.default_probes() if chosen is None else chosen).items():
+            try:
+                made.append(self._probe(name, options, context, made))
+            except SkipPlugin as skip:
+                absent[name] = str(skip)
+                self._outcome["probe", name] = ("absent", str(skip))
+            except PluginError as fault:
+                absent[name] = str(fault)
+        return Probes(tuple(made), absent)
+
+    def _probe(
+        self,
+        name: str,
+        options: Mapping[str, Any],
+        context: ProbeContext,
+        before: Sequence[MadeProbe],
+    ) -> MadeProbe:
+        offer = cast(ProbeOffer, self.offer("probe", name))
+        probe = self._make("probe", name, options, context)
+        try:
+            resources = tuple(probe.resources)
+            fault = _fault_of_resources(resources, before)
+        except FAULTS as raised:
+            resources, fault = (), f"its `resources` raised {describe_fault(raised)}"
+        if fault:
+            _close_quietly(probe)
+            raise self._fault("probe", name, fault)
+        return MadeProbe(name, probe, resources, offer.period, offer.deadline)
+
+    def _required(self, kind: str, name: str, options: Mapping[str, Any]) -> Any:
+        """Make what the master cannot do without: absent here is an error."""
+        try:
+            return self._make(kind, name, options)
+        except SkipPlugin as skip:
+            self._outcome[kind, name] = ("absent", str(skip))
+            raise ConfigError(f"{TITLES[kind]} {name!r} is absent here: {skip}") from skip
+
+    def _make(self, kind: str, name: str, options: Mapping[str, Any], *more: Any) -> Any:
+        offer = self.offer(kind, name)
+        try:
+            settings = from_plain(offer.options, options)
+        except ValueError as wrong:
+            raise ConfigError(f"options of {TITLES[kind]} {name!r}: {wrong}") from wrong
+        create = cast(Callable[..., Any], offer.create)
+        try:
+            thing = create(settings, *more)
+        except SkipPlugin:
+            raise
+        except FAULTS as fault:
+            reason = f"`create` ({definition(create)}) raised {describe_fault(fault)}"
+            raise self._fault(kind, name, reason) from fault
+        self._outcome[kind, name] = ("selected", offer.summary)
+        return thing
+
+    def _fault(self, kind: str, name: str, reason: str) -> PluginError:
+        self._outcome[kind, name] = ("broken", reason)
+        return PluginError(
+            f"{TITLES[kind]} {name!r} of {self._offers[kind, name].source}: {reason}"
+        )
+
+    # --- how a name is found ------------------------------------------------------------------
+
+    def _keep_single(self, offers: Sequence[Offered]) -> None:
+        """A name that two plugins offer belongs to neither: which one runs must not be chance."""
+        for offered in offers:
+            key = (offered.kind, offered.offer.name)
+            same = [other for other in offers if (other.kind, other.offer.name) == key]
+            if len(same) == 1:
+                self._offers[key] = offered
+            else:
+                sources = " and ".join(str(other.source) for other in same)
+                reason = f"offered twice, by {sources}: uninstall one"
+                self._broken.append(Broken(offered.source, reason, *key))
+
+    def _offered(self, kind: str, name: str) -> Offered:
+        if (kind, name) in self._offers:
+            return self._offers[kind, name]
+        title, names = TITLES[kind], self.names(kind)
+        near = get_close_matches(name, names, 1)
+        meant = f"; did you mean {near[0]!r}?" if near else "."
+        installed = f" Installed: {', '.join(names)}." if names else " None is installed."
+        raise ConfigError(
+            f"unknown {title} {name!r}{meant}{installed}{self._broken_note(kind, name)}"
+        )
+
+    def _broken_note(self, kind: str, name: str = "") -> str:
+        """What is broken and might be what is missing; only the name itself where that is known."""
+        might = [b for b in self._broken if b.kind in ("", kind)]
+        same = [b for b in might if name and b.name == name]
+        reasons = dict.fromkeys(f"{b.source}: {b.reason}" for b in same or might)
+        return " Broken: " + "; ".join(reasons) + "." if reasons else ""
+
+
+def _fault_of_resources(
+    resources: Sequence[ResourceDescription], before: Sequence[MadeProbe]
+) -> str:
+    """Why a host cannot take these resources; "" where it can."""
+    taken = {resource.name: other.name for other in before for resource in other.resources}
+    for resource in resources:
+        if resource.name in taken:
+            return f"reads {resource.name!r}, as {taken[resource.name]!r} does already"
+        if not (math.isfinite(resource.capacity) and resource.capacity > 0.0):
+            return f"gives {resource.name!r} a capacity of {resource.capacity!r}, not above 0"
+    if len(taken) + len(resources) > RESOURCE_SLOTS:
+        return f"brings the resources of this host to more than {RESOURCE_SLOTS}"
+    return ""
+
+
+def _close_quietly(probe: Probe) -> None:
+    """Close what is given up; that it fails to close as well adds nothing."""
+    try:
+        probe.close()
+    except FAULTS:
+        return
