@@ -39,8 +39,8 @@ from rosrm.ports import Probe
 QUICK: Final = 0.05
 #: As many quick reads in a row earn a probe its place in the shared thread.
 TRUSTED_AFTER: Final = 10
-#: A usage above this many times the capacity is nonsense (a small budget can be exceeded far).
-ABSURD_USAGE: Final = 1000.0
+#: A usage above this is no measurement but a mistake; the master refuses it (`core/hosts.py`).
+ABSURD_USAGE: Final = 64.0
 #: At most this many reports of one probe in REPORT_WINDOW seconds: a flapping probe floods nothing.
 REPORTS: Final = 6
 REPORT_WINDOW: Final = 60.0

@@ -1,0 +1,137 @@
+"""Finds the control groups (version 1 and 2) that bound a process, and what bounds it there.
+
+A limit may stand at the process's own group or at any group above it, so all of them are looked
+at. Inside a container the groups above its own are out of sight; what can be seen is what counts.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class Group:
+    """The control group of a process for one controller.
+
+    Attributes:
+        version: 1 or 2.
+        mount: top of the hierarchy as it is seen from here.
+        directory: of the group; `mount` itself or below.
+    """
+
+    version: int
+    mount: Path
+    directory: Path
+
+    def upward(self) -> Iterator[Path]:
+        """The directories of the group and of all those above it that can be seen."""
+        directory = self.directory
+        while True:
+            yield directory
+            if directory == self.mount:
+                return
+            directory = directory.parent
+
+
+@dataclass(frozen=True)
+class _Mount:
+    root: str
+    point: Path
+    version: int
+    controllers: frozenset[str]
+
+
+def find_group(controller: str, root: Path = Path("/"), pid: str = "self") -> Group | None:
+    """The group of a process for a controller; None: no such hierarchy is mounted.
+
+    Args:
+        controller: "memory", "cpu", "cpuacct", "cpuset".
+        root: of the file system, for recorded trees.
+        pid: whose group; "self" for this process.
+    """
+    mounts = _mounts(root, pid)
+    paths = _paths(root, pid)
+    # A controller that is mounted as version 1 is not available to version 2 at the same time.
+    for mount in sorted(mounts, key=lambda mount: mount.version):
+        name = controller if mount.version == 1 else ""
+        if (mount.version == 2 or controller in mount.controllers) and name in paths:
+            directory = _below(mount, paths[name])
+            return Group(mount.version, mount.point, directory)
+    return None
+
+
+def read_number(path: Path) -> float | None:
+    """A number of a control file; None: the file is not there, or says "max" (or -1): no limit."""
+    try:
+        word = path.read_text().split()[0]
+    except (OSError, IndexError):
+        return None
+    if word in ("max", "-1"):
+        return None
+    return float(word)
+
+
+def count_cpus(text: str) -> int:
+    """How many CPUs a list such as "0-3,8" names."""
+    count = 0
+    for part in text.strip().split(","):
+        first, _, last = part.partition("-")
+        if first:
+            count += int(last or first) - int(first) + 1
+    return count
+
+
+def _paths(root: Path, pid: str) -> dict[str, str]:
+    """Controller to the path of the group; version 2 under ""."""
+    paths: dict[str, str] = {}
+    try:
+        lines = (root / "proc" / pid / "cgroup").read_text().splitlines()
+    except OSError:
+        return paths
+    for line in lines:
+        _, controllers, path = line.split(":", 2)
+        for controller in controllers.split(","):
+            paths[controller] = path
+    return paths
+
+
+def _mounts(root: Path, pid: str) -> list[_Mount]:
+    mounts = []
+    try:
+        lines = (root / "proc" / pid / "mountinfo").read_text().splitlines()
+    except OSError:
+        return []
+    for line in lines:
+        before, _, after = line.partition(" - ")
+        kind, _, options = after.split(" ", 2)
+        if kind not in ("cgroup", "cgroup2"):
+            continue
+        fields = before.split(" ")
+        point = root / _unescaped(fields[4]).lstrip("/")
+        controllers = frozenset(options.split(","))
+        version = 1 if kind == "cgroup" else 2
+        mounts.append(_Mount(_unescaped(fields[3]), point, version, controllers))
+    return mounts
+
+
+def _unescaped(path: str) -> str:
+    r"""Mountinfo writes a space as \040."""
+    return re.sub(r"\\([0-7]{3})", lambda match: chr(int(match.group(1), 8)), path)
+
+
+def _below(mount: _Mount, path: str) -> Path:
+    """The directory of a group below its mount, or the nearest above it that can be seen."""
+    if mount.root != "/":
+        # A container without a cgroup namespace: only a part of the hierarchy is mounted.
+        inside = path == mount.root or path.startswith(mount.root + "/")
+        path = path[len(mount.root) :] if inside else "/"
+    parts = [part for part in path.split("/") if part]
+    if ".." in parts:  # a group above the root of our namespace: out of sight
+        parts = []
+    while parts and not os.path.isdir(mount.point.joinpath(*parts)):
+        parts.pop()
+    return mount.point.joinpath(*parts)

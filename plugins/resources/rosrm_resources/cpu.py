@@ -1,0 +1,317 @@
+"""The probe `cpu`: cores in use, as a mean over the last second."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Final
+
+from annotated_types import Gt, Le
+
+from rosrm.ports import ProbeContext, Sessions
+from rosrm_resources.cgroups import Group, count_cpus, find_group, read_number
+from rosrm_resources.files import KeptFile, ProcessFiles
+from rosrm_resources.gauge import Gauge, GaugeProbe, Scope, budget
+from rosrm_resources.rate import Rate
+
+_TICKS: Final = float(os.sysconf("SC_CLK_TCK"))
+#: Seconds by which `Sessions.pids` may be behind; so old may the CPU time of a new pid be.
+_BEHIND: Final = 1.1
+
+
+@dataclass(frozen=True)
+class CpuOptions:
+    """Settings of the probe `cpu`.
+
+    Attributes:
+        scope: what is measured; None: as the host's configuration says.
+        window: seconds over which the usage is a mean.
+    """
+
+    scope: Scope | None = None
+    window: Annotated[float, Gt(0), Le(60)] = 1.0
+
+
+def create(options: CpuOptions, context: ProbeContext) -> GaugeProbe:
+    """Make the probe for the scope that is set."""
+    scope = options.scope or context.scope
+    gauge: Gauge | None = None
+    if scope == "slice":
+        gauge = SliceCpu(budget(context, "cpu", "cores"), context.sessions, options.window)
+    elif scope == "cgroup":
+        gauge = CgroupCpu.find(options.window)
+    return GaugeProbe("cpu", "core", gauge or MachineCpu(options.window))
+
+
+class MachineCpu:
+    """All cores of the machine. Time stolen by a hypervisor counts as used: it cannot be had.
+
+    Read from /proc/stat itself, the same way as `psutil.cpu_times` does: ten times a second that
+    costs a third.
+
+    Args:
+        window: seconds.
+        proc: where the process file system is mounted.
+    """
+
+    scope: Final = "machine"
+
+    def __init__(self, window: float, proc: Path = Path("/proc")) -> None:
+        self.capacity: Final = float(os.cpu_count() or 1)
+        self._file = KeptFile(proc / "stat", 256)
+        busy, total = self._times()
+        # A busy machine must not look idle in its first reading, to which work may be sent.
+        guess = min(os.getloadavg()[0], self.capacity)
+        self._rate = Rate(window, total, busy, guess)
+
+    def usage(self) -> float:
+        """Fraction of all cores in use."""
+        busy, total = self._times()
+        # Per second of total time, which passes as fast on all cores together as on the clock.
+        return self._rate.update(total, busy) / self.capacity
+
+    def close(self) -> None:
+        """Close /proc/stat."""
+        self._file.close()
+
+    def _times(self) -> tuple[float, float]:
+        """Busy seconds of all cores together, and the seconds that have passed."""
+        line = self._file.read().split(b"\n", 1)[0]
+        # user nice system idle iowait irq softirq steal; guest time is part of user.
+        times = [int(field) for field in line.split()[1:9]]
+        idle = times[3] + times[4]
+        total = sum(times)
+        return (total - idle) / _TICKS, total / _TICKS / self.capacity
+
+
+class CgroupCpu:
+    """The cores that the control group may use, by quota or by set.
+
+    Where several groups above each other have a limit, the one with the least room counts.
+
+    Args:
+        limits: (directory of a group, cores that it may use), the smallest gives the capacity.
+        read_time: opens what gives the CPU seconds of the group in a directory.
+        window: seconds.
+        clock: monotonic seconds.
+    """
+
+    scope: Final = "cgroup"
+
+    def __init__(
+        self,
+        limits: list[tuple[Path, float]],
+        read_time: Callable[[Path], GroupTime],
+        window: float,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.capacity: Final = min(cores for _, cores in limits)
+        self._clock = clock
+        now = clock()
+        self._levels: list[tuple[float, GroupTime, Rate]] = []
+        for directory, cores in limits:
+            used = read_time(directory)
+            self._levels.append((cores, used, Rate(window, now, used.seconds())))
+
+    @classmethod
+    def find(
+        cls,
+        window: float,
+        root: Path = Path("/"),
+        clock: Callable[[], float] = time.monotonic,
+    ) -> CgroupCpu | None:
+        """For the group of this process; None: it may use the whole machine.
+
+        Args:
+            window: seconds.
+            root: of the file system, for recorded trees.
+            clock: monotonic seconds.
+        """
+        group = find_group("cpu", root)
+        if group is None:
+            return None
+        limits = _cpu_limits(group, root)
+        if not limits:
+            return None
+        return cls(limits, lambda directory: GroupTime(group, directory, root), window, clock)
+
+    def usage(self) -> float:
+        """Fraction of the capacity that is not to be had any more."""
+        now = self._clock()
+        room = min(cores - rate.update(now, used.seconds()) for cores, used, rate in self._levels)
+        return max(0.0, 1.0 - room / self.capacity)
+
+    def close(self) -> None:
+        """Close the control files."""
+        for _, used, _ in self._levels:
+            used.close()
+
+
+class GroupTime:
+    """CPU time that a control group and those below it have used.
+
+    Args:
+        group: of the controller "cpu".
+        directory: of that group or of one above it.
+        root: of the file system, for recorded trees.
+    """
+
+    def __init__(self, group: Group, directory: Path, root: Path) -> None:
+        self._version = group.version
+        if group.version == 2:
+            self._file = KeptFile(directory / "cpu.stat", 512)
+            return
+        # In version 1 the time is kept by another controller, which may be mounted elsewhere.
+        account = find_group("cpuacct", root)
+        if account is not None and not (directory / "cpuacct.usage").exists():
+            same = account.mount / directory.relative_to(group.mount)
+            directory = same if same.exists() else account.directory
+        self._file = KeptFile(directory / "cpuacct.usage", 64)
+
+    def seconds(self) -> float:
+        """CPU seconds so far."""
+        content = self._file.read()
+        if self._version == 1:
+            return int(content) * 1e-9
+        after = content.split(b"usage_usec ", 1)[1]
+        return int(after.split(b"\n", 1)[0]) * 1e-6
+
+    def close(self) -> None:
+        """Close the control file."""
+        self._file.close()
+
+
+def _cpu_limits(group: Group, root: Path) -> list[tuple[Path, float]]:
+    """The groups whose cores are bounded below those of the machine, and to how many."""
+    machine = float(os.cpu_count() or 1)
+    limits = []
+    for directory in group.upward():
+        cores = _quota(group.version, directory)
+        if cores is not None and cores < machine:
+            limits.append((directory, cores))
+    cpus = _set_size(root)
+    if cpus is not None and cpus < machine:
+        limits.append((group.directory, float(cpus)))
+    return limits
+
+
+def _quota(version: int, directory: Path) -> float | None:
+    """Cores that a group may use by its quota; None: no quota."""
+    if version == 1:
+        quota = read_number(directory / "cpu.cfs_quota_us")
+        period = read_number(directory / "cpu.cfs_period_us")
+    else:
+        quota = read_number(directory / "cpu.max")
+        period = 1.0 if quota is None else float((directory / "cpu.max").read_text().split()[1])
+    return quota / period if quota is not None and period else None
+
+
+def _set_size(root: Path) -> int | None:
+    """CPUs of the set that the group is confined to; the kernel has counted in those above it."""
+    group = find_group("cpuset", root)
+    if group is None:
+        return None
+    name = "cpuset.effective_cpus" if group.version == 1 else "cpuset.cpus.effective"
+    try:
+        text = (group.directory / name).read_text()
+    except OSError:  # the controller is not switched on for this group
+        return None
+    return count_cpus(text) or None
+
+
+class SliceCpu:
+    """The cores that the slave's own process tree uses, against a budget.
+
+    Args:
+        cores: the budget.
+        sessions: the process tree.
+        window: seconds.
+        proc: where the process file system is mounted.
+        clock: monotonic seconds.
+    """
+
+    scope: Final = "slice"
+
+    def __init__(
+        self,
+        cores: float,
+        sessions: Sessions,
+        window: float,
+        proc: Path = Path("/proc"),
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.capacity: Final = cores
+        self._time = TreeTime(sessions, proc, clock())
+        self._clock = clock
+        self._rate = Rate(window, clock(), self._time.seconds(clock()))
+
+    def usage(self) -> float:
+        """Fraction of the budget in use."""
+        now = self._clock()
+        return self._rate.update(now, self._time.seconds(now)) / self.capacity
+
+    def close(self) -> None:
+        """Close the process files."""
+        self._time.close()
+
+
+class TreeTime:
+    """A counter of the CPU time of a changing set of processes that never falls.
+
+    A child that has ended lives on in the time of its parent, which waited for it; a leader that
+    has ended keeps its last known time until `Sessions` has taken it over as ended.
+    """
+
+    def __init__(self, sessions: Sessions, proc: Path, now: float) -> None:
+        self._sessions = sessions
+        self._files = ProcessFiles(proc, "stat")
+        self._leader_time: dict[int, float] = {}
+        self._machine = float(os.cpu_count() or 1)
+        self._at = now
+        self._before = self._sum()
+        self._seconds = 0.0
+
+    def seconds(self, now: float) -> float:
+        """CPU seconds since this counter was made.
+
+        Args:
+            now: monotonic seconds.
+        """
+        total = self._sum()
+        grown = total - self._before
+        # Time is lost where an orphan ends, and comes at once where a long-running process is
+        # taken over from an earlier slave: neither is load of this moment.
+        most = self._machine * (now - self._at + _BEHIND)
+        self._seconds += min(max(0.0, grown), most)
+        self._before, self._at = total, now
+        return self._seconds
+
+    def close(self) -> None:
+        """Close the process files."""
+        self._files.close()
+
+    def _sum(self) -> float:
+        ended = -1.0
+        pids = self._sessions.pids()
+        # A session that ends between the two calls would count twice or not at all.
+        while ended != self._sessions.ended_cpu_time():
+            ended = self._sessions.ended_cpu_time()
+            pids = self._sessions.pids()
+        total = ended
+        leaders: dict[int, float] = {}
+        for pid, line in self._files.read(pids):
+            # The name, in parentheses, may itself hold spaces and parentheses.
+            fields = line[line.rindex(b")") + 2 :].split(None, 15)
+            used = (int(fields[11]) + int(fields[12]) + int(fields[13]) + int(fields[14])) / _TICKS
+            total += used
+            if int(fields[3]) == pid:
+                leaders[pid] = used
+        for pid, used in self._leader_time.items():
+            if pid not in leaders and pid in pids:
+                total += used
+                leaders[pid] = used
+        self._leader_time = leaders
+        return total

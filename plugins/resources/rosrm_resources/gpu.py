@@ -1,0 +1,140 @@
+"""The probe `gpu`: how busy NVIDIA GPUs are (`gpu`), and how full their memory (`gpu_memory`)."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from statistics import fmean
+from typing import Annotated, Any, Final, Literal
+
+from annotated_types import Ge
+
+from rosrm.core.model import Reading, ResourceDescription
+from rosrm.errors import ConfigError, SkipPlugin
+from rosrm.ports import ProbeContext
+
+_LIBRARY: Final = "libnvidia-ml.so.1"
+
+
+@dataclass(frozen=True)
+class GpuOptions:
+    """Settings of the probe `gpu`.
+
+    Attributes:
+        devices: numbers of the GPUs that count, as `nvidia-smi` gives them; (): all.
+        combine: how several GPUs make one reading. "max": the fullest counts, and the capacity is
+            that of the smallest; a process that takes the first GPU it finds is then safe
+            wherever it lands. "mean": for processes that spread over all of them by themselves;
+            the capacity is the sum.
+    """
+
+    devices: tuple[Annotated[int, Ge(0)], ...] = ()
+    combine: Literal["max", "mean"] = "max"
+
+
+def create(options: GpuOptions, context: ProbeContext) -> GpuProbe:
+    """Make the probe.
+
+    Raises:
+        SkipPlugin: no NVIDIA driver or GPU is here.
+    """
+    nvml = load_nvml()
+    try:
+        return GpuProbe(options, nvml)
+    except BaseException:
+        nvml.nvmlShutdown()
+        raise
+
+
+def load_nvml() -> Any:
+    """The module `pynvml`, initialised.
+
+    Raises:
+        SkipPlugin: the driver is not here or not running.
+    """
+    # Looked for first: where there is no driver the module would only take 3 MiB.
+    try:
+        ctypes.CDLL(_LIBRARY)
+    except OSError:
+        raise SkipPlugin(f"no NVIDIA driver: {_LIBRARY} is not installed") from None
+    import pynvml  # type: ignore[import-untyped,unused-ignore]  # it brings no types
+
+    try:
+        pynvml.nvmlInit()
+    except pynvml.NVMLError as error:
+        raise SkipPlugin(f"no NVIDIA driver: {error}") from None
+    return pynvml
+
+
+class GpuProbe:
+    """Reads GPUs through NVML.
+
+    Args:
+        options: which GPUs, and how they make one reading.
+        nvml: the module `pynvml`, initialised; the probe shuts it down.
+    """
+
+    def __init__(self, options: GpuOptions, nvml: Any) -> None:
+        self._nvml = nvml
+        self._combine: Callable[[list[float]], float] = max if options.combine == "max" else fmean
+        self._handles = _handles(nvml, options.devices)
+        self._usages: list[tuple[str, Callable[[Any], float]]] = []
+        self._resources: list[ResourceDescription] = []
+        # A GPU that is cut into instances tells no utilisation, one built into a SoC no memory.
+        if self._can(self._busy):
+            count = 1.0 if options.combine == "max" else float(len(self._handles))
+            self._offer("gpu", "1", count, self._busy)
+        if self._can(self._memory):
+            sizes = [float(nvml.nvmlDeviceGetMemoryInfo(handle).total) for handle in self._handles]
+            size = min(sizes) if options.combine == "max" else sum(sizes)
+            self._offer("gpu_memory", "B", size, self._memory)
+        if not self._resources:
+            raise SkipPlugin("the NVIDIA GPU tells neither its utilisation nor its memory")
+
+    @property
+    def resources(self) -> Sequence[ResourceDescription]:
+        """`gpu` and `gpu_memory`, those that the GPUs tell."""
+        return self._resources
+
+    def read(self) -> Sequence[Reading]:
+        """Utilisation over the driver's last sampling period, and memory in use."""
+        return [
+            Reading(name, self._combine([usage(handle) for handle in self._handles]))
+            for name, usage in self._usages
+        ]
+
+    def close(self) -> None:
+        """Let go of the driver."""
+        self._nvml.nvmlShutdown()
+
+    def _offer(self, name: str, unit: str, capacity: float, usage: Callable[[Any], float]) -> None:
+        self._resources.append(ResourceDescription(name, unit, capacity, "machine"))
+        self._usages.append((name, usage))
+
+    def _can(self, usage: Callable[[Any], float]) -> bool:
+        try:
+            for handle in self._handles:
+                usage(handle)
+        except self._nvml.NVMLError:
+            return False
+        return True
+
+    def _busy(self, handle: Any) -> float:
+        return float(self._nvml.nvmlDeviceGetUtilizationRates(handle).gpu) / 100.0
+
+    def _memory(self, handle: Any) -> float:
+        memory = self._nvml.nvmlDeviceGetMemoryInfo(handle)
+        return float(memory.used) / float(memory.total)
+
+
+def _handles(nvml: Any, devices: Sequence[int]) -> list[Any]:
+    count = int(nvml.nvmlDeviceGetCount())
+    if count == 0:
+        raise SkipPlugin("the NVIDIA driver sees no GPU")
+    unknown = [device for device in devices if device >= count]
+    if unknown:
+        raise ConfigError(
+            f"probe gpu: devices {unknown} do not exist; there are {count}: 0 to {count - 1}"
+        )
+    return [nvml.nvmlDeviceGetHandleByIndex(device) for device in devices or range(count)]
