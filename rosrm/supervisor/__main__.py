@@ -1,0 +1,67 @@
+"""Starts the supervisor of one host: `python -m rosrm.supervisor --state DIR`.
+
+First stage: it becomes a daemon of its own session, so that neither a terminal's Ctrl-C nor the
+end of the slave reaches it, and a subreaper, which only ctypes can ask for. Then it executes the
+bare interpreter (see `bare.py`), which keeps the subreaper's role and sheds this stage's memory.
+
+The slave runs this file by its path in an interpreter without site-packages, which starts faster
+and past the ROS wheels' bootstrapper: so it imports the standard library only.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ctypes
+import os
+import sys
+
+_PR_SET_CHILD_SUBREAPER = 36
+
+
+def main() -> None:
+    """Parse the command line, detach, and go on as the bare interpreter."""
+    parser = argparse.ArgumentParser(
+        prog="python -m rosrm.supervisor",
+        description="The parent of one host's processes; it outlives the slave.",
+    )
+    parser.add_argument("--state", required=True, metavar="DIR", help="the host's state directory")
+    parser.add_argument("--log-max-bytes", type=int, default=10 << 20, help="of one log file")
+    parser.add_argument("--log-keep", type=int, default=2, help="older files for each instance")
+    parser.add_argument("--log-instances", type=int, default=5, help="logs kept of one process")
+    parser.add_argument("--log-processes", type=int, default=500, help="processes with logs kept")
+    parser.add_argument("--foreground", action="store_true", help="stay a child of the caller")
+    options = parser.parse_args()
+    state = os.path.abspath(options.state)
+    if not options.foreground:
+        _detach()
+    _become_subreaper()
+    limits = (
+        options.log_max_bytes,
+        options.log_keep,
+        options.log_instances,
+        options.log_processes,
+    )
+    bare = os.path.join(os.path.dirname(os.path.abspath(__file__)), "bare.py")
+    command = [sys.executable, "-I", "-S", bare, state, *(str(limit) for limit in limits)]
+    os.execv(sys.executable, command)
+
+
+def _detach() -> None:
+    """Go on as an orphan in a session that has no terminal and can get none."""
+    if os.fork():
+        os._exit(0)
+    os.setsid()
+    if os.fork():
+        os._exit(0)
+    os.chdir("/")
+
+
+def _become_subreaper() -> None:
+    """The children's orphans become this process's own; kept over exec, not over fork."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0):
+        number = ctypes.get_errno()
+        sys.exit(f"this kernel has no subreapers: {os.strerror(number)}")
+
+
+main()

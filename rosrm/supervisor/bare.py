@@ -1,0 +1,34 @@
+"""Where the bare interpreter of the supervisor begins: `python -I -S bare.py STATE LIMITS...`.
+
+Without site-packages (-S) no `.pth` file runs: neither the ROS wheels' bootstrapper nor an
+environment's imports. So this file finds the `rosrm` package itself, which it lies in.
+
+It writes one line to its standard output, "ready" or what is wrong, and then lets go of it.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+
+
+def main() -> None:
+    """Listen in the state directory, say so, and serve until the shutdown."""
+    package = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+    sys.path.append(os.path.dirname(package))  # last: the standard library goes first
+
+    from rosrm.supervisor import endpoint
+    from rosrm.supervisor.logs import LogLimits
+    from rosrm.supervisor.server import Server
+
+    state, *limits = sys.argv[1:]
+    try:
+        listener = endpoint.listen(state)
+    except endpoint.EndpointError as error:
+        sys.exit(f"{error}")
+    server = Server(state, listener, LogLimits(*(int(limit) for limit in limits)))
+    endpoint.let_go_of_terminal(state)
+    server.run()
+
+
+main()

@@ -1,0 +1,106 @@
+"""Starts one process: a session leader, its output in a file, nothing inherited but that.
+
+`os.posix_spawn` shares the parent's memory until the exec (vfork), so a spawn costs half a
+millisecond. It cannot change the directory: the supervisor, which has one thread, goes there.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+from collections.abc import Mapping
+from typing import Final
+
+#: A failure that may pass: the same spawn is tried again where the restart policy says so.
+_TRANSIENT: Final = frozenset(
+    {errno.EAGAIN, errno.ENOMEM, errno.EMFILE, errno.ENFILE, errno.ETXTBSY}
+)
+#: Python ignores some signals; a process starts with each at its default.
+_EVERY_SIGNAL: Final = [
+    number for number in signal.valid_signals() if number not in (signal.SIGKILL, signal.SIGSTOP)
+]
+
+
+class SpawnError(Exception):
+    """The process cannot be started; its text says what was tried, where, and what is wrong.
+
+    Attributes:
+        transient: the same may work later.
+    """
+
+    def __init__(self, message: str, *, transient: bool = False) -> None:
+        super().__init__(message)
+        self.transient = transient
+
+
+def spawn(
+    argv: tuple[str, ...], environment: Mapping[str, str], directory: str, null: int, log: int
+) -> int:
+    """Start a process and return its pid. Raises SpawnError.
+
+    Args:
+        argv: its command line; the first word is looked up in its own PATH.
+        environment: the whole of it.
+        directory: where it runs.
+        null: descriptor that becomes its standard input.
+        log: descriptor that becomes its standard output and error.
+    """
+    _enter(directory)
+    path = find_executable(argv[0], environment)
+    try:
+        return os.posix_spawn(
+            path,
+            argv,
+            environment,
+            file_actions=[
+                (os.POSIX_SPAWN_DUP2, null, 0),
+                (os.POSIX_SPAWN_DUP2, log, 1),
+                (os.POSIX_SPAWN_DUP2, log, 2),
+            ],
+            setsid=True,
+            setsigmask=(),
+            setsigdef=_EVERY_SIGNAL,
+        )
+    except OSError as error:
+        transient = error.errno in _TRANSIENT
+        raise SpawnError(_why(path, error), transient=transient) from None
+    except ValueError as error:  # a NUL byte in an argument, a "=" in a variable's name
+        raise SpawnError(f"{argv[0]!r} cannot be started: {error}") from None
+    finally:
+        os.chdir("/")  # hold no mount of a user's busy
+
+
+def _enter(directory: str) -> None:
+    try:
+        os.chdir(directory)
+    except OSError as error:
+        message = f"the working directory {directory!r} cannot be entered: {error.strerror}"
+        raise SpawnError(message) from None
+
+
+def find_executable(word: str, environment: Mapping[str, str]) -> str:
+    """The file that a command's first word stands for. Raises SpawnError."""
+    if "/" in word:
+        return word
+    search = environment.get("PATH", os.defpath)
+    passed_over = ""
+    for directory in search.split(os.pathsep):
+        path = os.path.join(directory or ".", word)
+        if os.path.isfile(path):
+            if os.access(path, os.X_OK):
+                return path
+            passed_over = f" ({path} is there, but is not executable)"
+    raise SpawnError(f"no executable {word!r} was found in PATH, {search}{passed_over}")
+
+
+def _why(path: str, error: OSError) -> str:
+    if error.errno == errno.ENOENT and os.path.exists(path):
+        return f"{path} cannot be started: the interpreter in its first line does not exist"
+    if error.errno == errno.ENOENT:
+        return f"no executable {path!r} exists"
+    if error.errno == errno.EACCES:
+        return f"{path} cannot be started: it is not executable, or may not be reached"
+    if error.errno == errno.ENOEXEC:
+        return f"{path} cannot be started: it is neither a program nor a script with #!"
+    return f"{path} cannot be started: {error.strerror}"

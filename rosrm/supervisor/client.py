@@ -1,0 +1,369 @@
+"""The slave's side of its supervisor."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import select
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from rosrm.core.model import (
+    InstanceId,
+    InstanceState,
+    InstanceStatus,
+    RestartPolicy,
+    StopPolicy,
+)
+from rosrm.core.supervision import (
+    Forgotten,
+    RestartOrdered,
+    RestartRule,
+    ShutdownOrdered,
+    StopOrdered,
+    StopRule,
+)
+from rosrm.errors import SupervisorError
+from rosrm.supervisor import endpoint, paths, protocol
+from rosrm.supervisor.logs import LogLimits
+
+__all__ = ["LaunchOrder", "LogLimits", "SupervisorClient", "SupervisorEnded", "log_path"]
+
+#: Seconds for the supervisor to take what it is sent.
+SEND_TIMEOUT: Final = 5.0
+_CHUNK: Final = 1 << 16
+
+
+class SupervisorEnded(SupervisorError):
+    """The shutdown that was asked for is complete: nothing runs any more."""
+
+
+@dataclass(frozen=True, slots=True)
+class LaunchOrder:
+    """What is to be started.
+
+    Attributes:
+        argv: the command line; its first word is looked up in the PATH of `environment`.
+        environment: the whole of it, nothing is inherited.
+        working_directory: None: one of its own, below the state directory.
+    """
+
+    instance: InstanceId
+    argv: tuple[str, ...]
+    environment: Mapping[str, str]
+    working_directory: str | None = None
+    restart: RestartPolicy = RestartPolicy()
+    stop: StopPolicy = StopPolicy()
+
+
+def log_path(state_directory: Path, instance: InstanceId) -> Path:
+    """The file that an instance writes its output to; older parts: `.1`, `.2`, ... behind it."""
+    return Path(paths.log_file(str(state_directory), instance.process, instance.number))
+
+
+class SupervisorClient:
+    """A connection to the supervisor of this host.
+
+    One thread may wait in `receive` while others order.
+
+    Attributes:
+        instances: what the supervisor knew when the connection was made: every instance that has
+            not been forgotten, final statuses included.
+        notes: what the supervisor found wrong with its record, for people.
+        pid: of the supervisor.
+    """
+
+    def __init__(self, peer: socket.socket, state_directory: Path) -> None:
+        self._peer = peer
+        self._state = state_directory
+        self._lines = protocol.Lines()
+        self._received: list[InstanceStatus] = []
+        self._failure: SupervisorError | None = None
+        self._ending = False
+        self._sending = threading.Lock()
+        self._base: Mapping[str, str] | None = None
+        self._base_id = ""
+        self.instances: tuple[InstanceStatus, ...] = ()
+        self.notes: tuple[str, ...] = ()
+        self.pid = 0
+
+    @classmethod
+    def connect(
+        cls,
+        state_directory: Path,
+        *,
+        start: bool = True,
+        log: LogLimits = LogLimits(),
+        timeout: float = 5.0,
+    ) -> SupervisorClient:
+        """Connect to the supervisor of a state directory, and start one where none listens.
+
+        Raises:
+            SupervisorError: there is none and none can be started in time, or it turned us down.
+        """
+        state = Path(os.path.abspath(state_directory))
+        deadline = time.monotonic() + timeout
+        peer = _connect_or_start(state, start, log, deadline)
+        client = cls(peer, state)
+        try:
+            client._introduce(log, deadline)
+        except BaseException:
+            client.close()
+            raise
+        return client
+
+    # --- orders -------------------------------------------------------------------------------
+
+    def start(self, orders: Sequence[LaunchOrder]) -> None:
+        """Have instances started; repeating an order starts nothing twice."""
+        with self._sending:
+            lines = [protocol.encode_order(launch) for launch in map(self._launch, orders)]
+            if orders and self._base is None:
+                self._choose_base(orders[0].environment)
+                lines = [protocol.encode_order(launch) for launch in map(self._launch, orders)]
+            self._send(b"".join(lines))
+
+    def stop(self, instance: InstanceId) -> None:
+        """SIGINT, SIGTERM, SIGKILL to all of it; never heard of: it will never be started."""
+        self._order(StopOrdered(_key(instance)))
+
+    def restart(self, instance: InstanceId) -> None:
+        """Stop it, then start it again; the restart policy does not count this."""
+        self._order(RestartOrdered(_key(instance)))
+
+    def forget(self, instances: Iterable[InstanceId]) -> None:
+        """Their final statuses are kept elsewhere now: the supervisor need not."""
+        forgotten = tuple(Forgotten(_key(instance)) for instance in instances)
+        if forgotten:
+            self._order(protocol.Forget(forgotten))
+
+    def shutdown(self) -> None:
+        """Stop everything, then end the supervisor; `receive` tells all of it."""
+        self._order(ShutdownOrdered())
+
+    # --- answers ------------------------------------------------------------------------------
+
+    def fileno(self) -> int:
+        """Readable when `receive` has something; for a selector."""
+        return self._peer.fileno()
+
+    def receive(self, timeout: float | None = None) -> list[InstanceStatus]:
+        """The statuses that have come, oldest first; [] when none came in time.
+
+        Raises:
+            SupervisorEnded: the shutdown is complete.
+            SupervisorError: the supervisor is gone, or turned us down.
+        """
+        deadline = None if timeout is None else time.monotonic() + timeout
+        while not self._received:
+            if self._failure is not None:
+                raise self._failure
+            wait = None if deadline is None else max(0.0, deadline - time.monotonic())
+            if not _readable(self._peer, wait):
+                return []
+            self._read()
+        received, self._received = self._received, []
+        return received
+
+    def close(self) -> None:
+        """Leave; the instances go on."""
+        self._peer.close()
+
+    def __enter__(self) -> SupervisorClient:
+        """The connection is closed with the block."""
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        """Close it."""
+        self.close()
+
+    # --- sending ------------------------------------------------------------------------------
+
+    def _launch(self, order: LaunchOrder) -> protocol.Launch:
+        base = self._base or {}
+        changes: dict[str, str | None] = {
+            name: value for name, value in order.environment.items() if base.get(name) != value
+        }
+        changes.update((name, None) for name in base if name not in order.environment)
+        restart, stop = order.restart, order.stop
+        return protocol.Launch(
+            _key(order.instance),
+            order.argv,
+            self._base_id,
+            changes,
+            order.working_directory,
+            RestartRule(*(getattr(restart, name) for name in RestartRule._fields)),
+            StopRule(*(getattr(stop, name) for name in StopRule._fields)),
+        )
+
+    def _choose_base(self, environment: Mapping[str, str]) -> None:
+        """Environments differ little: send one whole, and of the others what differs from it."""
+        self._base = dict(environment)
+        text = json.dumps(self._base, sort_keys=True).encode()
+        self._base_id = hashlib.sha256(text).hexdigest()[:16]
+        self._send(protocol.encode_order(protocol.Environment(self._base_id, self._base)))
+
+    def _order(self, order: protocol.Order) -> None:
+        with self._sending:
+            self._send(protocol.encode_order(order))
+
+    def _send(self, data: bytes) -> None:
+        view = memoryview(data)
+        deadline = time.monotonic() + SEND_TIMEOUT
+        while view:
+            try:
+                view = view[self._peer.send(view, socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL) :]
+            except BlockingIOError:
+                if not _writable(self._peer, max(0.0, deadline - time.monotonic())):
+                    message = f"{self._name()} took no order within {SEND_TIMEOUT:g} s"
+                    raise SupervisorError(message) from None
+            except OSError as error:
+                raise SupervisorError(f"{self._name()} is gone: {error.strerror}") from None
+
+    # --- receiving ----------------------------------------------------------------------------
+
+    def _introduce(self, log: LogLimits, deadline: float) -> None:
+        self._order(protocol.Hello(protocol.PROTOCOL, os.getpid(), log))
+        while not self.pid:
+            if self._failure is not None:
+                raise self._failure
+            if not _readable(self._peer, max(0.0, deadline - time.monotonic())):
+                raise SupervisorError(f"{self._name()} did not answer in time")
+            self._read()
+
+    def _read(self) -> None:
+        try:
+            data = self._peer.recv(_CHUNK, socket.MSG_DONTWAIT)
+        except BlockingIOError:
+            return
+        except OSError as error:
+            self._fail(SupervisorError(f"{self._name()} is gone: {error.strerror}"))
+            return
+        if not data and self._ending:
+            self._fail(SupervisorEnded(f"{self._name()} has ended, and all its processes"))
+        elif not data:
+            self._fail(SupervisorError(f"{self._name()} is gone; its processes go on"))
+        try:
+            for line in self._lines.feed(data):
+                self._take(protocol.parse(line))
+        except (protocol.ProtocolError, KeyError, TypeError, ValueError) as error:
+            self._fail(SupervisorError(f"{self._name()} cannot be understood: {error}"))
+
+    def _take(self, fields: Mapping[str, object]) -> None:
+        told = fields["tell"]
+        if told == "status":
+            self._received.append(_status(fields["status"]))
+        elif told == "welcome":
+            self._take_welcome(fields)
+        elif told == "refused":
+            self._fail(SupervisorError(str(fields["message"])))
+        elif told == "ended":
+            self._ending = True
+        else:
+            raise ValueError(f"it tells {told!r}, which this version does not know")
+
+    def _take_welcome(self, fields: Mapping[str, object]) -> None:
+        number, pid = fields["protocol"], fields["pid"]
+        notes, instances = fields["notes"], fields["instances"]
+        if number != protocol.PROTOCOL:
+            raise ValueError(f"it speaks protocol {number!r}, this is {protocol.PROTOCOL}")
+        assert isinstance(pid, int)
+        assert isinstance(notes, list)
+        assert isinstance(instances, list)
+        self.pid = pid
+        self.notes = tuple(str(note) for note in notes)
+        self.instances = tuple(_status(value) for value in instances)
+
+    def _fail(self, failure: SupervisorError) -> None:
+        """Remember what ends the connection; what came before it is delivered first."""
+        if self._failure is None:
+            self._failure = failure
+
+    def _name(self) -> str:
+        pid = f" (pid {self.pid})" if self.pid else ""
+        return f"the supervisor{pid} of {self._state}"
+
+
+# --- starting one -----------------------------------------------------------------------------
+
+
+def _connect_or_start(state: Path, start: bool, log: LogLimits, deadline: float) -> socket.socket:
+    while True:
+        try:
+            return endpoint.connect(str(state))
+        except (FileNotFoundError, ConnectionRefusedError):
+            if not start:
+                raise SupervisorError(f"no supervisor serves {state}") from None
+        except OSError as error:
+            raise SupervisorError(f"{state} cannot be used: {error.strerror}") from None
+        problem = _start(state, log, deadline)
+        if problem and time.monotonic() > deadline:
+            raise SupervisorError(f"the supervisor of {state} did not start: {problem}")
+        if problem and "another supervisor" not in problem:
+            raise SupervisorError(f"the supervisor of {state} did not start: {problem}")
+        if problem:
+            # Somebody else's is about to listen or about to end: neither can be awaited from here.
+            time.sleep(0.02)
+
+
+def _start(state: Path, log: LogLimits, deadline: float) -> str:
+    """Start a supervisor and wait for its first line; "" when it is ready, else what is wrong."""
+    main = Path(__file__).with_name("__main__.py")
+    names = ("--log-max-bytes", "--log-keep", "--log-instances", "--log-processes")
+    limits = [f"{name}={value}" for name, value in zip(names, log, strict=True)]
+    command = [sys.executable, "-I", "-S", str(main), "--state", str(state), *limits]
+    process = subprocess.Popen(
+        command,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        start_new_session=True,
+    )
+    assert process.stdout is not None
+    with process.stdout as output:
+        said = b""
+        while not said.startswith(b"ready\n"):
+            if not _readable(output, max(0.0, deadline - time.monotonic())):
+                said += b"it was not ready in time"
+                break
+            part = os.read(output.fileno(), _CHUNK)
+            if not part:
+                break
+            said += part
+    process.wait()
+    return "" if said == b"ready\n" else said.decode(errors="replace").strip() or "it said nothing"
+
+
+def _readable(file: socket.socket | object, timeout: float | None) -> bool:
+    return _poll(file, select.POLLIN, timeout)
+
+
+def _writable(file: socket.socket, timeout: float) -> bool:
+    return _poll(file, select.POLLOUT, timeout)
+
+
+def _poll(file: object, event: int, timeout: float | None) -> bool:
+    poll = select.poll()
+    poll.register(file, event)  # type: ignore[arg-type]
+    return bool(poll.poll(None if timeout is None else timeout * 1000.0))
+
+
+# --- values -----------------------------------------------------------------------------------
+
+
+def _key(instance: InstanceId) -> tuple[str, int]:
+    return (instance.process, instance.number)
+
+
+def _status(value: object) -> InstanceStatus:
+    assert isinstance(value, list)
+    status = protocol.read_status(value)
+    return InstanceStatus(InstanceId(*status.instance), InstanceState(status.state), *status[2:])

@@ -1,0 +1,92 @@
+"""Both ends of `supervisor.sock`, and the lock that lets one supervisor serve a state directory."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import socket
+from typing import Final
+
+from rosrm.supervisor import paths
+
+#: Its own log is begun anew at the next start when it has grown so large.
+MOST_OWN_LOG: Final = 1 << 20
+
+
+class EndpointError(Exception):
+    """The state directory cannot be served; its text says why."""
+
+
+def listen(state: str) -> socket.socket:
+    """Become the one supervisor of a state directory. Raises EndpointError."""
+    try:
+        os.makedirs(state, mode=0o700, exist_ok=True)
+        os.chmod(state, 0o700)
+        _lock(state)
+        return _bind(state)
+    except OSError as error:
+        raise EndpointError(f"the state directory {state} cannot be used: {error}") from None
+
+
+def connect(state: str) -> socket.socket:
+    """Connect to the supervisor of a state directory. Raises OSError where none listens."""
+    peer = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    directory = os.open(state, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        peer.connect(_short_path(directory))
+    except OSError:
+        peer.close()
+        raise
+    finally:
+        os.close(directory)
+    return peer
+
+
+def let_go_of_terminal(state: str) -> None:
+    """Say "ready" to whoever waits for it; from here on troubles go to the supervisor's own log."""
+    os.write(1, b"ready\n")
+    path = os.path.join(state, paths.OWN_LOG)
+    null = os.open(os.devnull, os.O_RDWR)
+    log = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o600)
+    if os.fstat(log).st_size > MOST_OWN_LOG:
+        os.ftruncate(log, 0)
+    for source, target in ((null, 0), (null, 1), (log, 2)):
+        os.dup2(source, target)
+    os.close(null)
+    os.close(log)
+
+
+def _lock(state: str) -> None:
+    """Hold the lock until the process ends; the kernel gives it back, even after a SIGKILL."""
+    file = os.open(os.path.join(state, paths.LOCK), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        holder = os.read(file, 20).decode().strip() or "unknown"
+        raise EndpointError(
+            f"another supervisor (pid {holder}) serves the state directory {state}"
+        ) from None
+    os.ftruncate(file, 0)
+    os.pwrite(file, f"{os.getpid()}\n".encode(), 0)
+
+
+def _bind(state: str) -> socket.socket:
+    path = os.path.join(state, paths.SOCKET)
+    if os.path.lexists(path):
+        os.unlink(path)  # of a supervisor that was killed: the lock is ours
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    directory = os.open(state, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
+    umask = os.umask(0o177)
+    try:
+        listener.bind(_short_path(directory))
+    finally:
+        os.umask(umask)
+        os.close(directory)
+    listener.listen(16)
+    listener.setblocking(False)
+    return listener
+
+
+def _short_path(directory: int) -> str:
+    """A socket's path holds 108 bytes; a state directory's may be longer."""
+    return f"/proc/self/fd/{directory}/{paths.SOCKET}"

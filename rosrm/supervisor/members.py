@@ -1,0 +1,121 @@
+"""Reads in /proc which processes belong to an instance.
+
+An instance is its session leader and what descends from it: processes in the leader's group or
+session, and those that left it (a daemon of their own) but carry the marks which the supervisor
+puts into each environment. Only a daemon that also cleans its environment escapes.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from typing import NamedTuple
+
+#: Marks in a process's environment: its instance, and the state directory of its supervisor.
+INSTANCE_MARK = "ROSRM_INSTANCE"
+SUPERVISOR_MARK = "ROSRM_SUPERVISOR"
+
+
+class Stat(NamedTuple):
+    """What /proc/PID/stat says; `start` (clock ticks since boot) tells a reused pid apart."""
+
+    pid: int
+    state: str
+    parent: int
+    group: int
+    session: int
+    start: int
+
+    @property
+    def alive(self) -> bool:
+        """It is not just waiting to be reaped."""
+        return self.state not in "ZX"
+
+
+def read_stat(pid: int) -> Stat | None:
+    """None: there is no such process."""
+    try:
+        with open(f"/proc/{pid}/stat", "rb") as file:
+            text = file.read()
+    except OSError:
+        return None
+    # The second field, the name in brackets, may hold spaces and brackets itself.
+    fields = text[text.rindex(b")") + 2 :].split()
+    return Stat(
+        pid, fields[0].decode(), int(fields[1]), int(fields[2]), int(fields[3]), int(fields[19])
+    )
+
+
+def read_marks(pid: int) -> tuple[str, str]:
+    """The instance and supervisor that a process's environment names; "" where it names none."""
+    try:
+        with open(f"/proc/{pid}/environ", "rb") as file:
+            variables = file.read().split(b"\0")
+    except OSError:
+        return "", ""
+    marks = {}
+    for variable in variables:
+        name, _, value = variable.partition(b"=")
+        marks[name] = value
+    return (
+        os.fsdecode(marks.get(INSTANCE_MARK.encode(), b"")),
+        os.fsdecode(marks.get(SUPERVISOR_MARK.encode(), b"")),
+    )
+
+
+def everyone() -> Iterator[Stat]:
+    """Every process that is alive; a walk over /proc, so only for rare occasions."""
+    for name in os.listdir("/proc"):
+        if name.isdigit():
+            stat = read_stat(int(name))
+            if stat is not None and stat.alive:
+                yield stat
+
+
+def find_members(leader: int, mark: str, supervisor: str) -> list[Stat]:
+    """Who is alive of the instance whose session leader is, or just was, `leader`."""
+    return [
+        stat
+        for stat in everyone()
+        if leader in (stat.session, stat.group) or read_marks(stat.pid) == (mark, supervisor)
+    ]
+
+
+def find_marked(supervisor: str) -> dict[str, list[Stat]]:
+    """Who is alive of each instance of a supervisor, by the mark.
+
+    By the marks alone: it is for instances whose leader's pid may have been reused since.
+    """
+    found: dict[str, list[Stat]] = {}
+    for stat in everyone():
+        mark, owner = read_marks(stat.pid)
+        if mark and owner == supervisor:
+            found.setdefault(mark, []).append(stat)
+    return found
+
+
+def group_is_alive(leader: int) -> bool:
+    """Some process of the group exists; ask right after the leader was reaped."""
+    try:
+        os.killpg(leader, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True  # it exists, though it runs as somebody else
+    return True
+
+
+def own_children() -> list[int]:
+    """The pids of this process's children, those that it adopted included."""
+    me = os.getpid()
+    try:
+        with open(f"/proc/self/task/{me}/children", "rb") as file:
+            return [int(pid) for pid in file.read().split()]
+    except FileNotFoundError:  # a kernel without CONFIG_PROC_CHILDREN
+        return [stat.pid for stat in everyone() if stat.parent == me]
+
+
+def boot_id() -> str:
+    """Another one after each boot: what was recorded before it runs no more."""
+    with open("/proc/sys/kernel/random/boot_id") as file:
+        return file.read().strip()

@@ -1,0 +1,44 @@
+"""Where the supervisor keeps its files, below the state directory of its host.
+
+supervisor.sock                the slave connects here
+supervisor.lock                held by the one live supervisor; holds its pid
+supervisor.log                 its own troubles
+instances.jsonl                the durable record
+logs/PROCESS/NUMBER.log        what an instance writes; NUMBER.log.1 is older, and so on
+logs/PROCESS/NUMBER.*          further files of that instance (its parameters)
+work/PROCESS/                  working directory of a process that names none
+"""
+
+from __future__ import annotations
+
+import os
+
+SOCKET = "supervisor.sock"
+LOCK = "supervisor.lock"
+OWN_LOG = "supervisor.log"
+RECORD = "instances.jsonl"
+
+_SAFE = frozenset("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_-.")
+
+
+def safe_name(process: str) -> str:
+    """A process's name as the name of one file; different names stay different."""
+    safe = "".join(
+        c if c in _SAFE else "".join(f"%{b:02X}" for b in os.fsencode(c)) for c in process
+    )
+    return "%2E" + safe[1:] if safe.startswith(".") else safe
+
+
+def log_directory(state: str, process: str) -> str:
+    """Where the logs of all instances of a process are."""
+    return os.path.join(state, "logs", safe_name(process))
+
+
+def log_file(state: str, process: str, number: int) -> str:
+    """The log of one instance."""
+    return os.path.join(log_directory(state, process), f"{number}.log")
+
+
+def work_directory(state: str, process: str) -> str:
+    """Where a process runs that names no working directory."""
+    return os.path.join(state, "work", safe_name(process))

@@ -1,0 +1,347 @@
+"""The event loop of the supervisor: carries out what `rosrm.core.supervision` decides.
+
+One thread. Each round: take what came in, let the core decide, record, spawn a few, tell. What is
+told was recorded before; what is spawned was recorded as about to be.
+"""
+
+from __future__ import annotations
+
+import os
+import selectors
+import signal
+import socket
+import sys
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Final
+
+from rosrm.core import supervision
+from rosrm.core.supervision import Event, Key, SpawnFailed, Spawned
+from rosrm.supervisor import children, paths, protocol, takeover
+from rosrm.supervisor.connection import Connection
+from rosrm.supervisor.family import Family, mark
+from rosrm.supervisor.logs import LogKeeper, LogLimits
+from rosrm.supervisor.members import INSTANCE_MARK, SUPERVISOR_MARK
+from rosrm.supervisor.record import Record
+
+#: Spawns between two looks at everything else.
+SPAWNS_A_ROUND: Final = 8
+#: Seconds between attempts to write the record while the disk is full.
+RECORD_AGAIN: Final = 1.0
+#: Seconds that the client has for reading what it is told at the end.
+LAST_WORDS: Final = 1.0
+
+
+class Server:
+    """The supervisor of one state directory.
+
+    Args:
+        state: the state directory, absolute.
+        listener: the listening socket.
+        limits: of the logs.
+    """
+
+    def __init__(self, state: str, listener: socket.socket, limits: LogLimits) -> None:
+        self._state = state
+        self._listener = listener
+        self._selector = selectors.DefaultSelector()
+        self._core = supervision.Supervision()
+        self._family = Family(state, self._selector, self._happened)
+        self._record = Record(state)
+        self._logs = LogKeeper(state, limits)
+        self._null = os.open(os.devnull, os.O_RDWR | os.O_CLOEXEC)
+        self._launches: dict[Key, protocol.Launch] = {}
+        self._environments: dict[str, dict[str, str]] = {}
+        self._notes: list[str] = []
+        self._spawns: deque[Key] = deque()
+        self._telling: list[bytes] = []
+        self._client: Connection | None = None
+        self._leaving = False
+
+    def run(self) -> None:
+        """Until the shutdown is complete."""
+        self._watch(self._listener, self._accept)
+        self._watch_signals()
+        self._take_over()
+        while True:
+            self._round()
+            if self._leaving:
+                break
+            for key, _ in self._selector.select(self._timeout()):
+                call: Callable[[], None] = key.data
+                call()
+        self._leave()
+
+    def _round(self) -> None:
+        """Everything that is due without waiting."""
+        now = time.monotonic()
+        deadline = self._core.deadline()
+        if deadline is not None and deadline <= now:
+            self._happened(supervision.TimePassed())
+        self._logs.look(now)
+        self._spawn_some()
+        if self._record.is_large():
+            self._rewrite_record()
+        self._record.flush()
+        self._tell()
+
+    def _timeout(self) -> float | None:
+        if self._spawns:
+            return 0.0
+        deadlines = [self._core.deadline(), self._logs.deadline()]
+        if self._record.trouble:
+            deadlines.append(time.monotonic() + RECORD_AGAIN)
+        due = [deadline for deadline in deadlines if deadline is not None]
+        return max(0.0, min(due) - time.monotonic()) if due else None
+
+    def _leave(self) -> None:
+        os.unlink(os.path.join(self._state, paths.SOCKET))
+        if self._client is not None:
+            self._client.finish(protocol.encode_ended(), LAST_WORDS)
+
+    # --- the core's commands ------------------------------------------------------------------
+
+    def _happened(self, event: Event) -> None:
+        for command in self._core.handle(event, time.monotonic()):
+            self._execute(command)
+
+    def _execute(self, command: supervision.Command) -> None:
+        if isinstance(command, supervision.Tell):
+            self._note_status(command.instance)
+        elif isinstance(command, supervision.Spawn):
+            self._spawns.append(command.instance)
+        elif isinstance(command, supervision.Signal):
+            self._family.signal(command.instance, command.number)
+        elif isinstance(command, supervision.Unspawn):
+            self._unspawn(command.instance)
+        elif isinstance(command, supervision.Drop):
+            self._drop(command.instance)
+        else:
+            self._leaving = True
+
+    def _note_status(self, key: Key) -> None:
+        instance = self._core.instances[key]
+        if instance.ended:
+            self._launches.pop(key, None)
+            self._logs.release(key)
+        if not instance.pid and instance.phase != supervision.STOPPING:
+            self._family.release(key)
+        self._record.state(instance, self._family.birth(key))
+        self._telling.append(protocol.encode_status(protocol.Status.of(instance)))
+
+    def _unspawn(self, key: Key) -> None:
+        if key in self._spawns:
+            self._spawns.remove(key)
+            self._happened(SpawnFailed(key, ""))
+
+    def _drop(self, key: Key) -> None:
+        self._record.dead(key, self._core.dead[key[0]])
+        try:
+            os.rmdir(paths.work_directory(self._state, key[0]))
+        except OSError:
+            return  # what a process left there is its user's
+
+    def _tell(self) -> None:
+        telling = b"".join(self._telling)
+        self._telling.clear()
+        if self._client is not None and telling:
+            self._send(self._client, telling)
+
+    # --- spawning -----------------------------------------------------------------------------
+
+    def _spawn_some(self) -> None:
+        if not self._spawns:
+            return
+        keys = [self._spawns.popleft() for _ in range(min(len(self._spawns), SPAWNS_A_ROUND))]
+        self._record.spawning(keys)
+        durable = self._record.flush()
+        for key in keys:
+            if durable:
+                self._spawn(key)
+            else:
+                failed = f"not started, for it could not be recorded: {self._record.trouble}"
+                self._happened(SpawnFailed(key, failed, transient=True))
+
+    def _spawn(self, key: Key) -> None:
+        try:
+            pid = self._spawn_process(key)
+        except children.SpawnError as error:
+            self._happened(SpawnFailed(key, str(error), error.transient))
+            return
+        self._family.add_child(key, pid)
+        self._logs.watch(key, time.monotonic())
+        self._happened(Spawned(key, pid))
+
+    def _spawn_process(self, key: Key) -> int:
+        launch = self._launches.get(key)
+        if launch is None:
+            raise children.SpawnError("its order was lost with a part of the record")
+        directory = launch.directory or paths.work_directory(self._state, key[0])
+        try:
+            if launch.directory is None:
+                os.makedirs(directory, mode=0o700, exist_ok=True)
+            self._logs.prune(key[0], self._core.instances)
+            log = self._logs.open(key)
+        except OSError as error:
+            message = f"{error.filename or directory} cannot be made: {error.strerror}"
+            raise children.SpawnError(message, transient=True) from None
+        try:
+            return children.spawn(
+                launch.argv, self._environment(launch), directory, self._null, log
+            )
+        finally:
+            os.close(log)
+
+    def _environment(self, launch: protocol.Launch) -> dict[str, str]:
+        environment = dict(self._environments[launch.environment])
+        for name, value in launch.changes.items():
+            if value is None:
+                environment.pop(name, None)
+            else:
+                environment[name] = value
+        environment[INSTANCE_MARK] = mark(launch.instance)
+        environment[SUPERVISOR_MARK] = self._state
+        return environment
+
+    # --- the record ---------------------------------------------------------------------------
+
+    def _take_over(self) -> None:
+        recorded = takeover.restore(self._state, self._core, self._family)
+        self._launches.update(recorded.launches)
+        self._environments.update(recorded.environments)
+        self._notes = recorded.notes
+        for note in recorded.notes:
+            print(note, file=sys.stderr)
+        for event in takeover.what_happened(recorded, self._state, self._core, self._family):
+            self._happened(event)
+        self._rewrite_record()
+        for instance in self._core.instances.values():
+            if instance.pid:
+                self._logs.watch(instance.key, time.monotonic())
+
+    def _rewrite_record(self) -> None:
+        used = {launch.environment for launch in self._launches.values()}
+        for identity in [identity for identity in self._environments if identity not in used]:
+            if self._client is None or identity != self._client.environment:
+                del self._environments[identity]
+        self._record.rewrite(self._core, self._launches, self._environments, self._family.birth)
+
+    # --- the client ---------------------------------------------------------------------------
+
+    def _accept(self) -> None:
+        peer, _ = self._listener.accept()
+        connection = Connection(peer)
+        self._watch(connection, lambda: self._heard(connection))
+        if connection.uid not in (0, os.geteuid()):
+            self._refuse(connection, "this supervisor belongs to another user")
+
+    def _heard(self, connection: Connection) -> None:
+        try:
+            for line in connection.read():
+                if not connection.closing:
+                    self._obey(connection, protocol.decode_order(line))
+        except protocol.ProtocolError as error:
+            self._refuse(connection, str(error))
+        self._send(connection, b"")
+
+    def _obey(self, connection: Connection, order: protocol.Order) -> None:
+        if isinstance(order, protocol.Hello):
+            self._welcome(connection, order)
+        elif connection is not self._client:
+            raise protocol.ProtocolError("say hello first")
+        elif isinstance(order, protocol.Environment):
+            self._learn_environment(connection, order)
+        elif isinstance(order, protocol.Launch):
+            self._start(order)
+        elif isinstance(order, protocol.Forget):
+            for forgotten in order.instances:
+                self._happened(forgotten)
+        else:
+            self._happened(order)
+
+    def _welcome(self, connection: Connection, hello: protocol.Hello) -> None:
+        if connection is self._client:
+            raise protocol.ProtocolError("hello was said already")
+        if hello.protocol != protocol.PROTOCOL:
+            raise protocol.ProtocolError(
+                f"this supervisor (pid {os.getpid()}) speaks protocol {protocol.PROTOCOL}, "
+                f"you speak {hello.protocol}"
+            )
+        if self._client is not None and not self._client_is_gone(self._client):
+            raise protocol.ProtocolError(
+                f"another slave (pid {self._client.pid}) is connected to the supervisor of "
+                f"{self._state}; one host has one slave"
+            )
+        self._client = connection
+        self._logs.limits = hello.log
+        self._telling.clear()  # all that it would say is in the statuses
+        statuses = [protocol.Status.of(instance) for instance in self._core.instances.values()]
+        self._record.flush()
+        connection.send(protocol.encode_welcome(os.getpid(), self._notes, statuses))
+
+    def _client_is_gone(self, client: Connection) -> bool:
+        """Its end may have come in the same round as its successor."""
+        self._heard(client)
+        return client.gone
+
+    def _learn_environment(self, client: Connection, order: protocol.Environment) -> None:
+        client.environment = order.id
+        if order.id not in self._environments:
+            self._environments[order.id] = dict(order.variables)
+            self._record.environment(order.id, order.variables)
+
+    def _start(self, launch: protocol.Launch) -> None:
+        if launch.environment not in self._environments:
+            raise protocol.ProtocolError(f"unknown environment {launch.environment!r}")
+        if launch.instance not in self._core.instances:
+            self._launches[launch.instance] = launch
+            self._record.launch(launch)
+        self._happened(supervision.StartOrdered(launch.instance, launch.restart, launch.stop))
+
+    def _refuse(self, connection: Connection, message: str) -> None:
+        connection.closing = True
+        connection.send(protocol.encode_refusal(message))
+
+    def _send(self, connection: Connection, data: bytes) -> None:
+        """Send, and wait for the peer to read or drop it as need be."""
+        if not connection.gone:
+            connection.send(data)
+        if connection.gone:
+            self._part(connection)
+            return
+        writes = selectors.EVENT_WRITE if connection.has_unsent else 0
+        call = self._selector.get_key(connection).data
+        self._selector.modify(connection, selectors.EVENT_READ | writes, call)
+
+    def _part(self, connection: Connection) -> None:
+        if connection.fileno() < 0:
+            return
+        self._selector.unregister(connection)
+        connection.close()
+        if connection is self._client:
+            self._client = None
+            self._happened(supervision.ClientLost())
+
+    # --- signals ------------------------------------------------------------------------------
+
+    def _watch_signals(self) -> None:
+        """SIGCHLD and SIGTERM wake the loop through a pipe; a terminal's signals do not count."""
+        heard, wakeup = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
+        signal.set_wakeup_fd(wakeup, warn_on_full_buffer=False)
+        for number in (signal.SIGCHLD, signal.SIGTERM):
+            signal.signal(number, lambda number, frame: None)
+        for number in (signal.SIGINT, signal.SIGHUP):
+            signal.signal(number, signal.SIG_IGN)
+        self._selector.register(heard, selectors.EVENT_READ, lambda: self._signalled(heard))
+        self._family.reap()
+
+    def _signalled(self, heard: int) -> None:
+        numbers = os.read(heard, 4096)
+        if signal.SIGCHLD in numbers:
+            self._family.reap()
+        if signal.SIGTERM in numbers:
+            self._happened(supervision.ShutdownOrdered())
+
+    def _watch(self, file: socket.socket | Connection, call: Callable[[], None]) -> None:
+        self._selector.register(file, selectors.EVENT_READ, call)

@@ -1,0 +1,82 @@
+"""A new supervisor takes over what an earlier one of the same host recorded.
+
+A process is known again by its pid together with its start time. Nothing is started that may run or
+may have run already; whose end nobody saw has an unknown exit code.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+
+from rosrm.core import supervision
+from rosrm.core.supervision import (
+    UNKNOWN_EXIT,
+    Cleared,
+    Event,
+    Exited,
+    Instance,
+    Resumed,
+    Spawned,
+    SpawnFailed,
+    Supervision,
+)
+from rosrm.supervisor import members, record
+from rosrm.supervisor.family import Family, mark
+from rosrm.supervisor.members import Stat
+from rosrm.supervisor.record import Recorded
+
+
+def restore(state: str, core: Supervision, family: Family) -> Recorded:
+    """Read the record into the core, and find the leaders that live on."""
+    recorded = record.read(state)
+    core.dead.update(recorded.dead)
+    for instance in recorded.instances.values():
+        if not recorded.same_boot and instance.deadline is not None:
+            instance.deadline = time.monotonic()  # the clock began anew with this boot
+        core.restore(instance)
+        leader = members.read_stat(instance.pid) if instance.pid and recorded.same_boot else None
+        birth = recorded.births[instance.key]
+        if leader is not None and leader.alive and leader.start == birth:
+            family.take_over(instance.key, leader)
+    return recorded
+
+
+def what_happened(
+    recorded: Recorded, state: str, core: Supervision, family: Family
+) -> Iterator[Event]:
+    """What became of each instance while no supervisor ran."""
+    waiting = [
+        instance
+        for instance in core.instances.values()
+        if not instance.ended and not family.birth(instance.key)
+    ]
+    marked = members.find_marked(state) if waiting else {}
+    for instance in waiting:
+        left = marked.get(mark(instance.key), [])
+        if instance.phase == supervision.STARTING:
+            yield _start_of(instance, left, recorded, family)
+        elif instance.phase in (supervision.RUNNING, supervision.STOPPING):
+            yield from _end_of(instance, left, family)
+
+
+def _start_of(instance: Instance, found: list[Stat], recorded: Recorded, family: Family) -> Event:
+    """A start was ordered, and no outcome recorded."""
+    leaders = [stat for stat in found if stat.pid == stat.session]
+    if instance.key not in recorded.spawning:
+        return Resumed(instance.key)
+    if leaders:
+        family.take_over(instance.key, leaders[0])
+        return Spawned(instance.key, leaders[0].pid)
+    family.kill(found)
+    lost = "the supervisor was killed while it started this: how that went is not known"
+    return SpawnFailed(instance.key, lost, transient=True)
+
+
+def _end_of(instance: Instance, left: list[Stat], family: Family) -> Iterator[Event]:
+    """It ran, and its leader is no more."""
+    family.watch_strays(instance.key, left)
+    if instance.pid:
+        yield Exited(instance.key, UNKNOWN_EXIT, leftovers=bool(left))
+    elif not left:
+        yield Cleared(instance.key)
