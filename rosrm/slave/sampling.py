@@ -26,14 +26,16 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from queue import SimpleQueue
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import numpy.typing as npt
 
-from rosrm.core.model import RESOURCE_SLOTS, ResourceDescription
-from rosrm.errors import ConfigError, PluginError
-from rosrm.ports import Probe
+from rosrm.core.model import RESOURCE_SLOTS
+
+if TYPE_CHECKING:
+    from rosrm.ports import Probe
+    from rosrm.registry import MadeProbe
 
 #: A read that takes longer, in seconds, is too slow to share a thread.
 QUICK: Final = 0.05
@@ -44,22 +46,6 @@ ABSURD_USAGE: Final = 64.0
 #: At most this many reports of one probe in REPORT_WINDOW seconds: a flapping probe floods nothing.
 REPORTS: Final = 6
 REPORT_WINDOW: Final = 60.0
-
-
-@dataclass(frozen=True, slots=True)
-class SampledProbe:
-    """A probe as the sampler reads it.
-
-    Attributes:
-        name: of its offer.
-        period: seconds between reads; never shorter than the period of `latest` calls.
-        deadline: seconds after which a read counts as late.
-    """
-
-    name: str
-    probe: Probe
-    period: float = 0.1
-    deadline: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +87,7 @@ class Sample:
 
 @dataclass(frozen=True, slots=True)
 class _Outcome:
-    """What one read brought: values in the order of the probe's resources, or why there are none."""
+    """What a read brought: values in the order of the probe's resources, or why there are none."""
 
     values: tuple[float, ...]
     reason: str
@@ -112,18 +98,15 @@ class Sampler:
     """Reads probes in the background; `latest` is called by one loop, never waits.
 
     Args:
-        probes: at most RESOURCE_SLOTS resources in all; their order gives the slots.
+        probes: as the registry made and checked them; the order of their resources gives the
+            slots.
         clock: monotonic seconds, the same as the `now` of `latest`.
-
-    Raises:
-        ConfigError: two probes report one resource, or there are too many resources.
-        PluginError: a probe that describes its resources wrongly.
     """
 
     def __init__(
-        self, probes: Sequence[SampledProbe], *, clock: Callable[[], float] = time.monotonic
+        self, probes: Sequence[MadeProbe], *, clock: Callable[[], float] = time.monotonic
     ) -> None:
-        self.resources: Final = _slots(probes)
+        self.resources: Final = tuple(resource for made in probes for resource in made.resources)
         self._clock = clock
         self._progress = threading.Event()
         self._shared = _Lane("rosrm-probes")
@@ -131,8 +114,8 @@ class Sampler:
         self._watched: list[_Watched] = []
         self._usage = np.zeros(RESOURCE_SLOTS, np.float32)
         first = 0
-        for sampled in probes:
-            watched = _Watched(sampled, first, clock, self._progress)
+        for made in probes:
+            watched = _Watched(made, first, clock, self._progress)
             self._watched.append(watched)
             first += len(watched.names)
         self._usage[:first] = 1.0
@@ -257,7 +240,9 @@ class Sampler:
 class _Lane:
     """A thread that carries out one call after another; it starts with the first."""
 
-    def __init__(self, name: str, queue: SimpleQueue[Callable[[], None] | None] | None = None):
+    def __init__(
+        self, name: str, queue: SimpleQueue[Callable[[], None] | None] | None = None
+    ) -> None:
         self._name = name
         self._queue: SimpleQueue[Callable[[], None] | None] = queue or SimpleQueue()
         self._thread: threading.Thread | None = None
@@ -309,25 +294,25 @@ class _Watched:
 
     def __init__(
         self,
-        sampled: SampledProbe,
+        made: MadeProbe,
         first: int,
         clock: Callable[[], float],
         progress: threading.Event,
     ) -> None:
-        self.name = sampled.name
-        self.names = tuple(resource.name for resource in sampled.probe.resources)
-        self.deadline = sampled.deadline
+        self.name = made.name
+        self.names = tuple(resource.name for resource in made.resources)
+        self.deadline = made.deadline
         self.slots = slice(first, first + len(self.names))
         self.mask = ((1 << len(self.names)) - 1) << first
-        self.lane = _Lane(f"rosrm-probe-{sampled.name}")
+        self.lane = _Lane(f"rosrm-probe-{made.name}")
         self.quick_reads = 0
         self.reason = ""
         self.busy = False
         self.closed = False
         self.outcome: _Outcome | None = None
         self._started: float | None = None
-        self._probe = sampled.probe
-        self._period = sampled.period
+        self._probe = made.probe
+        self._period = made.period
         self._clock = clock
         self._progress = progress
         self._due = -math.inf
@@ -409,31 +394,3 @@ def _values(probe: Probe, names: tuple[str, ...]) -> tuple[float, ...]:
     if missing:
         raise _Nonsense(f"no reading of {', '.join(missing)}")
     return tuple(values[name] for name in names)
-
-
-def _slots(probes: Sequence[SampledProbe]) -> tuple[ResourceDescription, ...]:
-    """The resources in the order of their slots, each checked."""
-    resources: list[ResourceDescription] = []
-    owner: dict[str, str] = {}
-    for sampled in probes:
-        for resource in sampled.probe.resources:
-            if not resource.name:
-                raise PluginError(f"probe {sampled.name}: a resource without a name")
-            if not (math.isfinite(resource.capacity) and resource.capacity > 0):
-                raise PluginError(
-                    f"probe {sampled.name}: capacity {resource.capacity} of {resource.name!r}; "
-                    "it must be finite and above 0"
-                )
-            if resource.name in owner:
-                raise ConfigError(
-                    f"resource {resource.name!r} is reported by the probes "
-                    f"{owner[resource.name]!r} and {sampled.name!r}; choose one of them"
-                )
-            owner[resource.name] = sampled.name
-            resources.append(resource)
-    if len(resources) > RESOURCE_SLOTS:
-        raise ConfigError(
-            f"{len(resources)} resources ({', '.join(owner)}); at most {RESOURCE_SLOTS} fit into "
-            "resource_info: choose fewer probes"
-        )
-    return tuple(resources)

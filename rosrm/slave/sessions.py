@@ -110,7 +110,7 @@ class SessionTable:
 
     def _find_members(self) -> None:
         found: dict[int, list[int]] = {leader: [leader] for leader in self._members}
-        for entry in os.listdir(self._proc):
+        for entry in os.listdir(self._proc):  # noqa: PTH208 - a Path for each process costs 2 us
             if not entry.isdigit():
                 continue
             pid = int(entry)
