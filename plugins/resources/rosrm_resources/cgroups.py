@@ -6,7 +6,6 @@ at. Inside a container the groups above its own are out of sight; what can be se
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -132,6 +131,6 @@ def _below(mount: _Mount, path: str) -> Path:
     parts = [part for part in path.split("/") if part]
     if ".." in parts:  # a group above the root of our namespace: out of sight
         parts = []
-    while parts and not os.path.isdir(mount.point.joinpath(*parts)):
+    while parts and not mount.point.joinpath(*parts).is_dir():
         parts.pop()
     return mount.point.joinpath(*parts)

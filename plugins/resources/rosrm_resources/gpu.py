@@ -33,7 +33,7 @@ class GpuOptions:
     combine: Literal["max", "mean"] = "max"
 
 
-def create(options: GpuOptions, context: ProbeContext) -> GpuProbe:
+def create(options: GpuOptions, _context: ProbeContext) -> GpuProbe:
     """Make the probe.
 
     Raises:
@@ -58,7 +58,7 @@ def load_nvml() -> Any:
         ctypes.CDLL(_LIBRARY)
     except OSError:
         raise SkipPlugin(f"no NVIDIA driver: {_LIBRARY} is not installed") from None
-    import pynvml  # type: ignore[import-untyped,unused-ignore]  # it brings no types
+    import pynvml  # noqa: PLC0415 - see above
 
     try:
         pynvml.nvmlInit()

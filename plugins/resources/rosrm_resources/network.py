@@ -34,7 +34,7 @@ class NetworkOptions:
     window: Annotated[float, Gt(0), Le(60)] = 2.0
 
 
-def create(options: NetworkOptions, context: ProbeContext) -> NetworkProbe:
+def create(options: NetworkOptions, _context: ProbeContext) -> NetworkProbe:
     """Make the probe.
 
     Raises:
@@ -141,7 +141,6 @@ def _counters() -> dict[str, tuple[float, float]]:
 
 
 def _psutil() -> Any:
-    """The module, imported here: it takes 2 MiB of the slave, and only this probe needs it."""
-    import psutil  # type: ignore[import-untyped,unused-ignore]  # its stubs are a package apart
+    import psutil  # noqa: PLC0415 - it takes 2 MiB of the slave, and only this probe needs it
 
     return psutil
