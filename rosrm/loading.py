@@ -199,7 +199,7 @@ def _take(loaded: Loaded, source: Source, hook: str, function: Callable[..., Any
 
 
 def _call(hook: str, function: Callable[..., Any]) -> Any:
-    """Through pluggy, which checks the arguments; alone, so that no plugin wraps another's hooks."""
+    """Through pluggy, which checks the arguments; alone: no plugin wraps the hooks of another."""
     alone = pluggy.PluginManager(hookspecs.GROUP)
     alone.add_hookspecs(hookspecs)
     alone.register(SimpleNamespace(**{hook: function}))

@@ -46,6 +46,13 @@ TITLES: Final[Mapping[str, str]] = {
     "checkpoint": "checkpoint policy",
 }
 
+#: Where rosrm's own plugins of a kind are, for who has none.
+_SHIPPED_IN: Final[Mapping[str, str]] = {
+    "probe": "rosrm-resources",
+    "scoring": "rosrm-scoring",
+    "migration": "rosrm-migration",
+}
+
 Executor = Callable[[Mapping[str, Any]], Mapping[str, Any]]
 NameToOptions = Mapping[str, Mapping[str, Any]]
 T = TypeVar("T")
@@ -264,9 +271,10 @@ class Registry:
         title, names = TITLES[kind], self.names(kind)
         near = get_close_matches(name, names, 1)
         meant = f"; did you mean {near[0]!r}?" if near else "."
-        installed = f" Installed: {', '.join(names)}." if names else " None is installed."
+        shipped = f"; {_SHIPPED_IN[kind]} brings rosrm's own" if kind in _SHIPPED_IN else ""
+        installed = f"Installed: {', '.join(names)}." if names else f"None is installed{shipped}."
         raise ConfigError(
-            f"unknown {title} {name!r}{meant}{installed}{self._broken_note(kind, name)}"
+            f"unknown {title} {name!r}{meant} {installed}{self._broken_note(kind, name)}"
         )
 
     def _broken_note(self, kind: str, name: str = "") -> str:

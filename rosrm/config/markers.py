@@ -6,6 +6,7 @@ imported without it.
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +17,7 @@ class NullIsEmpty:
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
         """Tells pydantic to put `{}` for null."""
-        from pydantic_core import core_schema
+        from pydantic_core import core_schema  # noqa: PLC0415 - only files need pydantic
 
         return core_schema.no_info_before_validator_function(
             lambda given: {} if given is None else given, handler(source)
@@ -29,7 +30,7 @@ class OptionsByName:
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
         """Tells pydantic to make a list of names a mapping to no options."""
-        from pydantic_core import core_schema
+        from pydantic_core import core_schema  # noqa: PLC0415 - only files need pydantic
 
         return core_schema.no_info_before_validator_function(self.named, handler(source))
 
@@ -51,12 +52,56 @@ class OptionsByName:
 class RosSection:
     """The section `ros` is nested in a file and flat as a value."""
 
+    def in_file(self) -> type[Any]:
+        """The form in a file."""
+        from rosrm.config.ros import RosInFile  # noqa: PLC0415 - only files need pydantic
+
+        return RosInFile
+
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
         """Tells pydantic to read the file's form and to make the value of it."""
-        from pydantic_core import core_schema
+        from pydantic_core import core_schema  # noqa: PLC0415 - only files need pydantic
 
-        from rosrm.config.ros import RosInFile
-
+        form: Any = self.in_file()
         return core_schema.no_info_after_validator_function(
-            RosInFile.settings, handler.generate_schema(RosInFile)
+            form.settings, handler.generate_schema(form)
         )
+
+
+@dataclass(frozen=True)
+class PlainWord:
+    """Text that may be written without quotes even where YAML sees a number or a boolean."""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+        """Tells pydantic to make text of a scalar."""
+        from pydantic_core import core_schema  # noqa: PLC0415 - only files need pydantic
+
+        return core_schema.no_info_before_validator_function(self.text, handler(source))
+
+    @staticmethod
+    def text(given: Any) -> Any:
+        """A scalar as text; anything else as it is."""
+        if isinstance(given, bool):
+            return "true" if given else "false"
+        return str(given) if isinstance(given, (int, float)) else given
+
+
+@dataclass(frozen=True)
+class Words:
+    """A list of words, or one text that is split as a shell would."""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+        """Tells pydantic to split a text."""
+        from pydantic_core import core_schema  # noqa: PLC0415 - only files need pydantic
+
+        return core_schema.no_info_before_validator_function(self.split, handler(source))
+
+    @staticmethod
+    def split(given: Any) -> Any:
+        """A text or list as words; anything else as it is."""
+        if not isinstance(given, str):
+            return tuple(given) if isinstance(given, list) else given
+        try:
+            return tuple(shlex.split(given))
+        except ValueError as error:
+            raise ValueError(f"{given!r} cannot be split into words: {error}") from None

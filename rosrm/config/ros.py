@@ -30,7 +30,7 @@ def _namespace(given: str) -> str:
 
 
 def _transports(given: str) -> str:
-    if given and given.split("?")[0] not in _TRANSPORTS:
+    if given and given.split("?", maxsplit=1)[0] not in _TRANSPORTS:
         raise ValueError(f"{given!r} is unknown. Allowed: {', '.join(_TRANSPORTS)}")
     return given
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
-from rosrm.config.markers import NullIsEmpty, OptionsByName, RosSection
+from rosrm.config.markers import NullIsEmpty, OptionsByName, PlainWord, RosSection
 from rosrm.config.plain import from_plain, to_plain
 from rosrm.config.units import (
     Amount,
@@ -49,8 +49,16 @@ def default_state(name: str, role: str) -> Path:
 
 
 @dataclass(frozen=True, slots=True)
-class PolicyChoice:
-    """A policy chosen by name, with its own options; None: none."""
+class ScoringChoice:
+    """The policy that orders the hosts that fit, by name, with its own options."""
+
+    policy: str = "weighted"
+    options: Options = field(default_factory=lambda: EMPTY)
+
+
+@dataclass(frozen=True, slots=True)
+class CheckpointChoice:
+    """The policy that keeps states of processes, with its own options; None: none are kept."""
 
     policy: str | None = None
     options: Options = field(default_factory=lambda: EMPTY)
@@ -151,7 +159,7 @@ class ClusterConfig:
     Attributes:
         name: of the cluster and its master.
         ros: domain, discovery and transports.
-        state: the master's directory; "" in a file's place stands for the default.
+        state: the master's directory; by default under XDG_STATE_HOME.
         scoring: the policy that orders the hosts that fit.
         migration: what moves.
         queue: what waits.
@@ -161,22 +169,20 @@ class ClusterConfig:
         journal: of events and intent.
         checkpoint: the policy that keeps states of processes, if any.
         delivery_timeout: seconds within which a slave must take up an assignment.
-        source: the file that this was read from, for messages.
     """
 
     name: str = "rosrm"
     ros: Ros = field(default_factory=RosSettings)
     state: Path = Path()
-    scoring: PolicyChoice = PolicyChoice("weighted")
+    scoring: ScoringChoice = field(default_factory=ScoringChoice)
     migration: MigrationSettings = field(default_factory=MigrationSettings)
     queue: QueueSettings = field(default_factory=QueueSettings)
     defaults: ProcessDefaults = field(default_factory=ProcessDefaults)
     liveness: LivenessSettings = field(default_factory=LivenessSettings)
     control: ControlSettings = field(default_factory=ControlSettings)
     journal: JournalSettings = field(default_factory=JournalSettings)
-    checkpoint: PolicyChoice = field(default_factory=PolicyChoice)
+    checkpoint: CheckpointChoice = field(default_factory=CheckpointChoice)
     delivery_timeout: PositiveSeconds = _CORE.delivery_timeout
-    source: str = ""
 
     def __post_init__(self) -> None:
         """Fill in the state directory, which depends on the name."""
@@ -233,7 +239,7 @@ class HostConfig:
     Attributes:
         host: name of the host; one live slave for each name.
         ros: domain, discovery and transports.
-        state: the slave's directory.
+        state: the slave's directory; by default under XDG_STATE_HOME.
         labels: what processes may require, prefer or avoid.
         scope: what the probes measure: the machine, the cgroup that the slave runs in, or the
             slave's own process tree against `budget`.
@@ -244,13 +250,12 @@ class HostConfig:
         max_processes: most processes held at a time; 0: no bound.
         logs: of the processes.
         on_stop: a slave that is stopped stops its processes, or keeps them with the supervisor.
-        source: the file that this was read from, for messages.
     """
 
     host: str = field(default_factory=socket.gethostname)
     ros: Ros = field(default_factory=RosSettings)
     state: Path = Path()
-    labels: Mapping[str, str] = field(default_factory=lambda: EMPTY)
+    labels: Mapping[str, Annotated[str, PlainWord()]] = field(default_factory=lambda: EMPTY)
     scope: Literal["machine", "cgroup", "slice"] = "machine"
     budget: Mapping[str, Amount] = field(default_factory=lambda: EMPTY)
     limits: Mapping[str, Fraction] = field(default_factory=lambda: dict(DEFAULT_LIMITS))
@@ -259,7 +264,6 @@ class HostConfig:
     max_processes: Count = 0
     logs: LogSettings = field(default_factory=LogSettings)
     on_stop: Literal["stop", "keep"] = "stop"
-    source: str = ""
 
     def __post_init__(self) -> None:
         """Fill in the state directory, which depends on the name, and the default limits."""

@@ -54,6 +54,22 @@ _EXAMPLES: Final = {
 _NUMBER_AND_UNIT: Final = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(\S*)\s*")
 
 
+class UnfitAmount(ValueError):
+    """An amount that fits no resource; the resource, where it is known, says it better."""
+
+    def __init__(self, text: str, given: object) -> None:
+        super().__init__(text)
+        self.given = given
+
+    def of(self, resource: str) -> str:
+        """What is wrong with it as an amount of one resource."""
+        try:
+            amount_of(resource, self.given)
+        except ValueError as error:
+            return str(error)
+        return str(self)
+
+
 @dataclass(frozen=True)
 class Quantity:
     """Marks a number that may carry a unit and must lie within a range.
@@ -122,9 +138,17 @@ class Quantity:
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
         """Tells pydantic to call `parse`; pydantic alone calls this."""
-        from pydantic_core import core_schema
+        from pydantic_core import core_schema  # noqa: PLC0415 - only files need pydantic
 
-        return core_schema.no_info_plain_validator_function(self.parse)
+        return core_schema.no_info_plain_validator_function(self._parse_in_file)
+
+    def _parse_in_file(self, given: object) -> float:
+        try:
+            return self.parse(given)
+        except ValueError as error:
+            if self.measures == "amount":
+                raise UnfitAmount(str(error), given) from None
+            raise
 
 
 Seconds = Annotated[float, Quantity("duration")]
@@ -133,8 +157,9 @@ Bytes = Annotated[int, Quantity("size", whole=True)]
 Fraction = Annotated[float, Quantity(high=1.0, hint="a fraction: 0.8 means 80 %")]
 Count = Annotated[int, Quantity(high=2**31 - 1, whole=True)]
 PositiveCount = Annotated[int, Quantity(low=1, high=2**31 - 1, whole=True)]
+ANY_AMOUNT: Final = Quantity("amount")
 #: Of any resource; `amount_of` knows more where the resource is known.
-Amount = Annotated[float, Quantity("amount")]
+Amount = Annotated[float, ANY_AMOUNT]
 
 _MEASURES: Final = {"memory": "size", "disk": "size", "cpu": "cores"}
 

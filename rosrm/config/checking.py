@@ -1,0 +1,171 @@
+"""Checks a document against a dataclass by pydantic, and says what is wrong in our own words."""
+
+from __future__ import annotations
+
+import json
+import types
+from collections.abc import Iterator, Mapping
+from dataclasses import fields, is_dataclass
+from difflib import get_close_matches
+from functools import cache
+from typing import (
+    Annotated,
+    Any,
+    Final,
+    TypeVar,
+    Union,
+    cast,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
+
+from pydantic import BaseModel, ConfigDict, ValidationError, create_model
+
+from rosrm.config.documents import Node, Problems
+from rosrm.config.units import UnfitAmount
+
+T = TypeVar("T")
+
+_STRICT: Final = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
+
+#: What a pydantic error of a type wanted to see.
+_WANTED: Final = {
+    "bool_type": "true or false",
+    "int_type": "a whole number",
+    "int_from_float": "a whole number",
+    "float_type": "a number",
+    "finite_number": "a finite number",
+    "string_type": "text",
+    "path_type": "a path",
+    "dataclass_type": "a mapping",
+    "dict_type": "a mapping",
+    "mapping_type": "a mapping",
+    "list_type": "a list",
+    "tuple_type": "a list",
+}
+
+
+def validated(wanted: type[T], node: Node, problems: Problems, where: str = "") -> T | None:
+    """The value of a document, or None with every problem noted.
+
+    Args:
+        wanted: a dataclass; its annotations say what is allowed.
+        node: the document or a part of it.
+        problems: where to note what is wrong.
+        where: goes before the path of each value in messages.
+    """
+    try:
+        holder: Any = _holder(cast(Any, wanted)).model_validate_json(
+            json.dumps({"value": node.plain()})
+        )
+    except ValidationError as error:
+        for found in error.errors(include_url=False):
+            _note(wanted, node, dict(found), problems, where)
+        return None
+    return cast(T, holder.value)
+
+
+def described(value: Any) -> str:
+    """A given value for a message, short."""
+    if value is None:
+        return "nothing (null)"
+    if isinstance(value, Mapping):
+        return "a mapping"
+    if isinstance(value, (list, tuple)):
+        return "a list"
+    text = json.dumps(value, ensure_ascii=False)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def near(given: str, allowed: Mapping[str, Any] | list[str] | tuple[str, ...]) -> str:
+    """'; did you mean X?' or '.', and what is allowed."""
+    close = get_close_matches(given, list(allowed), 1)
+    meant = f"; did you mean {close[0]!r}?" if close else "."
+    return f"{meant} Allowed: {', '.join(allowed) or 'none'}"
+
+
+@cache
+def _holder(wanted: type[Any]) -> type[BaseModel]:
+    """A model around the dataclass: this is how pydantic passes strictness on to all inside it."""
+    return create_model("Holder", __config__=_STRICT, value=(wanted, ...))
+
+
+def _note(
+    wanted: type[Any], node: Node, error: Mapping[str, Any], problems: Problems, where: str
+) -> None:
+    path = tuple(step for step in error["loc"][1:] if step != "[key]")
+    target = node.deepest(path)
+    if error["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
+        inside = dotted(path[:-1], where)
+        note = f"unknown key {path[-1]!r}" + (f" in {inside}" if inside else "")
+        allowed = list(_allowed(wanted, path[:-1]))
+        problems.add(target.key_place or target.place, note + near(str(path[-1]), allowed))
+        return
+    prefix = dotted(path, where)
+    problems.add(target.place, (f"{prefix}: " if prefix else "") + _said(error))
+
+
+def dotted(path: tuple[str | int, ...], where: str = "") -> str:
+    """A path as people write it: `processes[2].restart.delay`."""
+    text = where
+    for step in path:
+        text += f"[{step}]" if isinstance(step, int) else f".{step}" if text else step
+    return text
+
+
+def _said(error: Mapping[str, Any]) -> str:
+    kind, given = error["type"], error.get("input")
+    if kind == "value_error":
+        return _cause(error["ctx"]["error"], error["loc"])
+    if kind in ("missing", "missing_argument"):
+        return "is missing"
+    if kind == "literal_error":
+        return _not_one_of(given, error["ctx"]["expected"])
+    if kind in _WANTED:
+        return f"{_WANTED[kind]} is wanted, not {described(given)}"
+    return f"{error['msg'][:1].lower()}{error['msg'][1:]}, and {described(given)} is given"
+
+
+def _cause(error: ValueError, path: tuple[str | int, ...]) -> str:
+    return error.of(str(path[-1])) if isinstance(error, UnfitAmount) else str(error)
+
+
+def _not_one_of(given: Any, expected: str) -> str:
+    words = [word.strip().strip("'") for word in expected.replace(" or ", ", ").split(",")]
+    allowed = [word for word in words if word]
+    return f"{described(given)} is unknown{near(str(given), allowed)}"
+
+
+def _allowed(wanted: Any, path: tuple[str | int, ...]) -> Iterator[str]:
+    """The keys of the dataclass at a path."""
+    if not path:
+        if is_dataclass(wanted):
+            yield from (f.name for f in fields(wanted) if f.init)
+        return
+    for inner in _inside(wanted, path[0]):
+        yield from _allowed(inner, path[1:])
+
+
+def _inside(wanted: Any, step: str | int) -> Iterator[Any]:
+    """The types that may stand under a key or index of a type, unwrapped."""
+    if is_dataclass(wanted) and isinstance(wanted, type):
+        hint = get_type_hints(wanted, include_extras=True).get(str(step))
+        yield from _unwrapped(hint)
+        return
+    arguments = get_args(wanted)
+    if arguments:
+        yield from _unwrapped(arguments[-1] if isinstance(step, str) else arguments[0])
+
+
+def _unwrapped(hint: Any) -> Iterator[Any]:
+    origin = get_origin(hint)
+    if origin is Annotated:
+        inner, *marks = get_args(hint)
+        in_file = [mark.in_file() for mark in marks if hasattr(mark, "in_file")]
+        yield from _unwrapped(in_file[0] if in_file else inner)
+    elif origin in (Union, types.UnionType):
+        for choice in get_args(hint):
+            yield from _unwrapped(choice)
+    else:
+        yield hint

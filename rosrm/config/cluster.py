@@ -1,0 +1,81 @@
+"""`cluster.yaml`: the settings of a master."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from rosrm.config.checking import validated
+from rosrm.config.documents import Node, Problems, read
+from rosrm.config.options import PluginCheck
+from rosrm.config.rules import check_amounts, check_name, settled
+from rosrm.config.settings import ClusterConfig
+from rosrm.registry import Registry
+
+
+def load_cluster(path: str | Path, registry: Registry | None = None) -> ClusterConfig:
+    """Read a master's settings; raises one `ConfigError` for everything that is wrong.
+
+    Args:
+        path: of the file.
+        registry: the installed plugins; without it the names of plugins and their options are taken
+            as they are.
+    """
+    root, problems = read(path), Problems()
+    config = validated(ClusterConfig, root, problems)
+    _check_rules(root, config, problems)
+    config = _with_options(root, config or ClusterConfig(), PluginCheck(registry, problems))
+    problems.raise_any()
+    return replace(config, state=settled(config.state, path))
+
+
+def _check_rules(root: Node, config: ClusterConfig | None, problems: Problems) -> None:
+    check_name(root.get("name"), "cluster", problems)
+    check_amounts(root.get("defaults", "needs"), "defaults.needs", problems)
+    if config is not None and config.liveness.suspect >= config.liveness.lease:
+        problems.add(
+            root.deepest(("liveness", "suspect")).place,
+            f"liveness.suspect ({config.liveness.suspect:g} s) must be less than "
+            f"liveness.lease ({config.liveness.lease:g} s)",
+        )
+    if root.get("checkpoint", "options") is not None and not _given(root, "checkpoint"):
+        place = root.deepest(("checkpoint", "options")).place
+        problems.add(place, "checkpoint.options: options of no policy; name one in `policy`")
+
+
+def _with_options(root: Node, config: ClusterConfig, plugins: PluginCheck) -> ClusterConfig:
+    """The same with the options of plugins checked; a default choice is looked up as well."""
+    scoring = _given(root, "scoring") or config.scoring.policy
+    checkpoint = _given(root, "checkpoint")
+    named = root.get("migration", "strategies")
+    if named is None:
+        strategies = {
+            name: plugins.choice("migration", name, root, None)
+            for name in config.migration.strategies
+        }
+    else:
+        strategies = plugins.by_name("migration", named)
+    return replace(
+        config,
+        scoring=replace(config.scoring, options=_options(root, "scoring", scoring, plugins)),
+        checkpoint=replace(
+            config.checkpoint, options=_options(root, "checkpoint", checkpoint, plugins)
+        ),
+        migration=replace(config.migration, strategies=strategies),
+    )
+
+
+def _given(root: Node, section: str) -> str | None:
+    node = root.get(section, "policy")
+    return node.value if node is not None and isinstance(node.value, str) else None
+
+
+def _options(
+    root: Node, section: str, policy: str | None, plugins: PluginCheck
+) -> Mapping[str, Any]:
+    if policy is None:
+        return {}
+    named = root.get(section, "policy") or root.get(section) or root
+    return plugins.choice(section, policy, named, root.get(section, "options"))

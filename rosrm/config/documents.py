@@ -1,0 +1,261 @@
+"""YAML with the place of every value, for messages that name line and column.
+
+Plain words are read as YAML 1.2 reads them: only `true` and `false` are booleans (not `on` or
+`no`), `010` is ten, and nothing becomes a date.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final, Union
+
+import yaml
+
+from rosrm.errors import ConfigError
+
+#: Most values in one file; those behind an alias count each time that it stands for them.
+MOST_VALUES: Final = 200_000
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Place:
+    """Where something stands; line and column count from 1."""
+
+    file: str
+    line: int
+    column: int
+
+    def __str__(self) -> str:
+        return f"{self.file}:{self.line}:{self.column}"
+
+
+@dataclass(frozen=True, slots=True)
+class Node:
+    """One value of a document, its place, and the place of the key before it, if any."""
+
+    value: Value
+    place: Place
+    key_place: Place | None = None
+
+    def plain(self) -> Any:
+        """The value alone, as JSON has it."""
+        if isinstance(self.value, Mapping):
+            return {key: item.plain() for key, item in self.value.items()}
+        if isinstance(self.value, tuple):
+            return [item.plain() for item in self.value]
+        return self.value
+
+    def get(self, *path: str | int) -> Node | None:
+        """The value at a path, None where there is none."""
+        node: Node | None = self
+        for step in path:
+            node = None if node is None else node.child(step)
+        return node
+
+    def deepest(self, path: tuple[str | int, ...]) -> Node:
+        """The value at a path or, where that is missing, what would hold it."""
+        node = self
+        for step in path:
+            inner = node.child(step)
+            if inner is None:
+                return node
+            node = inner
+        return node
+
+    def child(self, step: str | int) -> Node | None:
+        """The value under a key or index."""
+        if isinstance(self.value, Mapping) and isinstance(step, str):
+            return self.value.get(step)
+        if isinstance(self.value, tuple) and isinstance(step, int) and step < len(self.value):
+            return self.value[step]
+        return None
+
+    @property
+    def items(self) -> Mapping[str, Node]:
+        """The members of a mapping; none for anything else."""
+        return self.value if isinstance(self.value, Mapping) else {}
+
+
+Value = Union[None, bool, int, float, str, "tuple[Node, ...]", "Mapping[str, Node]"]
+
+
+@dataclass
+class Problems:
+    """Everything that is wrong with a file, to be said at once."""
+
+    found: dict[tuple[Place, str], None] = field(default_factory=dict)
+
+    def __bool__(self) -> bool:
+        return bool(self.found)
+
+    def add(self, place: Place, text: str) -> None:
+        """Note a problem; the same one at the same place is noted once."""
+        self.found[place, text] = None
+
+    def raise_any(self) -> None:
+        """Raise one `ConfigError` for all of them, if there are any."""
+        if not self.found:
+            return
+        lines = [f"{place}: {text}" for place, text in sorted(self.found)]
+        if len(lines) == 1:
+            raise ConfigError(lines[0])
+        raise ConfigError("\n  ".join([f"{len(lines)} errors in {self._file()}", *lines]))
+
+    def _file(self) -> str:
+        return next(iter(self.found))[0].file
+
+
+def read(path: str | Path) -> Node:
+    """Read a file; raises `ConfigError` for what is unreadable, with line and column."""
+    return parse(_text(Path(path)), str(path))
+
+
+def parse(text: str, file: str) -> Node:
+    """The document in a text; an empty one is an empty mapping."""
+    try:
+        root = _Loader(text).get_single_node()
+        return Node({}, Place(file, 1, 1)) if root is None else _Builder(file).build(root)
+    except yaml.MarkedYAMLError as error:
+        raise ConfigError(f"{_place_of(error, file)}: unreadable YAML: {_said(error)}") from None
+    except yaml.reader.ReaderError as error:
+        line = text.count("\n", 0, error.position) + 1
+        column = error.position - (text.rfind("\n", 0, error.position) + 1) + 1
+        raise ConfigError(
+            f"{Place(file, line, column)}: unreadable YAML: the character "
+            f"#x{ord(text[error.position]):04x} is not allowed"
+        ) from None
+    except RecursionError:
+        raise ConfigError(f"{file}: unreadable YAML: nested too deeply") from None
+
+
+def _text(path: Path) -> str:
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = content.count(b"\n", 0, error.start) + 1
+        column = error.start - (content.rfind(b"\n", 0, error.start) + 1) + 1
+        raise ConfigError(f"{Place(str(path), line, column)}: not UTF-8 text") from None
+
+
+def _place_of(error: yaml.MarkedYAMLError, file: str) -> Place:
+    mark = error.problem_mark or error.context_mark
+    return Place(file, mark.line + 1, mark.column + 1) if mark else Place(file, 1, 1)
+
+
+def _said(error: yaml.MarkedYAMLError) -> str:
+    return " ".join(part for part in (error.context, error.problem) if part)
+
+
+# --- YAML 1.2's words -------------------------------------------------------------------------
+
+
+class _Loader(yaml.SafeLoader):
+    """Composes nodes with marks, with the words of YAML 1.2's core schema."""
+
+    yaml_implicit_resolvers: dict[Any, Any] = {}  # noqa: RUF012 - PyYAML's own shape
+
+
+_TAG: Final = "tag:yaml.org,2002:"
+_DECIMAL: Final = r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?"
+_WORDS: Final = {
+    "null": (r"~|null|Null|NULL|", ["~", "n", "N", ""]),
+    "bool": (r"true|True|TRUE|false|False|FALSE", list("tTfF")),
+    "int": (r"[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+", list("-+0123456789")),
+    "float": (
+        _DECIMAL + r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)",
+        list("-+0123456789."),
+    ),
+}
+for _name, (_pattern, _first) in _WORDS.items():
+    _Loader.add_implicit_resolver(f"{_TAG}{_name}", re.compile(f"^(?:{_pattern})$"), _first)
+
+
+def _integer(text: str) -> int:
+    if text.startswith(("0o", "0x")):
+        return int(text[2:], 8 if text[1] == "o" else 16)
+    return int(text)
+
+
+_SCALARS: Final[Mapping[str, Any]] = {
+    f"{_TAG}null": lambda _: None,
+    f"{_TAG}bool": lambda text: text.lower() == "true",
+    f"{_TAG}int": _integer,
+    f"{_TAG}float": lambda text: float(text.lower().replace(".inf", "inf").replace(".nan", "nan")),
+    f"{_TAG}str": str,
+}
+
+
+class _Builder:
+    """Turns PyYAML's nodes into ours, noting every fault of form on the way."""
+
+    def __init__(self, file: str) -> None:
+        self._file = file
+        self._problems = Problems()
+        self._open: set[int] = set()
+        self._count = 0
+
+    def build(self, root: yaml.Node) -> Node:
+        node = self._node(root, None)
+        self._problems.raise_any()
+        return node
+
+    def _node(self, node: yaml.Node, key_place: Place | None) -> Node:
+        place = self._place(node)
+        self._count += 1
+        if id(node) in self._open:
+            raise ConfigError(f"{place}: an alias that stands for itself")
+        if self._count > MOST_VALUES:
+            raise ConfigError(f"{place}: more than {MOST_VALUES} values")
+        self._open.add(id(node))
+        value = self._value(node, place)
+        self._open.discard(id(node))
+        return Node(value, place, key_place)
+
+    def _value(self, node: yaml.Node, place: Place) -> Value:
+        if isinstance(node, yaml.MappingNode) and node.tag == f"{_TAG}map":
+            return dict(self._members(node))
+        if isinstance(node, yaml.SequenceNode) and node.tag == f"{_TAG}seq":
+            return tuple(self._node(item, None) for item in node.value)
+        if isinstance(node, yaml.ScalarNode) and node.tag in _SCALARS:
+            return self._scalar(node, place)
+        self._problems.add(place, f"the tag {node.tag!r} is not allowed")
+        return None
+
+    def _scalar(self, node: yaml.ScalarNode, place: Place) -> Value:
+        try:
+            value: Value = _SCALARS[node.tag](node.value)
+        except ValueError as error:
+            self._problems.add(place, f"{node.value!r} cannot be read: {error}")
+            return None
+        return value
+
+    def _members(self, mapping: yaml.MappingNode) -> Iterator[tuple[str, Node]]:
+        first: dict[str, Place] = {}
+        for key, item in mapping.value:
+            place = self._place(key)
+            if not isinstance(key, yaml.ScalarNode) or key.tag != f"{_TAG}str":
+                text = repr(key.value) if isinstance(key, yaml.ScalarNode) else "this"
+                self._problems.add(
+                    place, f"a key must be text, and {text} is not; put it in quotes"
+                )
+                continue
+            if key.value in first:
+                before = first[key.value]
+                self._problems.add(
+                    place,
+                    f"the key {key.value!r} is given twice, first at line {before.line}, "
+                    f"column {before.column}",
+                )
+                continue
+            first[key.value] = place
+            yield key.value, self._node(item, place)
+
+    def _place(self, node: yaml.Node) -> Place:
+        return Place(self._file, node.start_mark.line + 1, node.start_mark.column + 1)

@@ -1,0 +1,145 @@
+"""`foreach`: one entry of a work file for many processes alike.
+
+    foreach: {i: "range(0, 60)", size: [small, large]}     # every pair: 120 processes
+    foreach: [{i: 1, mb: 8}, {i: 2, mb: 80}]               # these two
+
+In every text of the entry `{i}` stands for the value, `{i:02d}` for the value in Python's format;
+a text that is nothing but `{i}` becomes the value itself, number or text. `{{` is a plain brace.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Iterator, Mapping
+from typing import Final
+
+from rosrm.config.checking import described, near
+from rosrm.config.documents import Node, Problems
+
+#: Most processes that one entry may stand for.
+MOST: Final = 10_000
+
+Scalar = bool | int | float | str
+Row = Mapping[str, Scalar]
+
+_RANGE: Final = re.compile(r"range\(\s*(-?\d+)\s*(?:,\s*(-?\d+)\s*)?(?:,\s*(-?\d+)\s*)?\)")
+_PIECE: Final = re.compile(r"\{\{|\}\}|\{([^{}]*)\}|[{}]")
+_WHOLE: Final = re.compile(r"\{([A-Za-z_]\w*)\}")
+
+
+def rows_of(foreach: Node, problems: Problems) -> list[Row]:
+    """The values that each process is made with; every fault is noted."""
+    if isinstance(foreach.value, tuple):
+        rows = [_row(item, problems) for item in foreach.value]
+        _check_same_names(foreach, rows, problems)
+    elif foreach.items:
+        names = {name: _values(name, node, problems) for name, node in foreach.items.items()}
+        rows = _product(foreach, names, problems)
+    else:
+        problems.add(
+            foreach.place,
+            f"foreach: a mapping from a name to its values is wanted, "
+            f"such as {{i: range(0, 60)}}, not {described(foreach.plain())}",
+        )
+        return []
+    if not rows:
+        problems.add(foreach.place, "foreach: stands for no process at all")
+    return rows
+
+
+def substituted(node: Node, row: Row, problems: Problems) -> Node:
+    """A document with the values of one row put into every text of it, keys too."""
+    if isinstance(node.value, str):
+        return Node(_text(node, node.value, row, problems), node.place, node.key_place)
+    if isinstance(node.value, tuple):
+        items = tuple(substituted(item, row, problems) for item in node.value)
+        return Node(items, node.place, node.key_place)
+    if isinstance(node.value, Mapping):
+        members = {
+            str(_text(item, key, row, problems)): substituted(item, row, problems)
+            for key, item in node.items.items()
+        }
+        return Node(members, node.place, node.key_place)
+    return node
+
+
+def _row(item: Node, problems: Problems) -> Row:
+    if not item.items:
+        problems.add(item.place, "foreach: each of a list is a mapping from names to values")
+    return {name: value for name, node in item.items.items() for value in _one(node, problems)}
+
+
+def _check_same_names(foreach: Node, rows: list[Row], problems: Problems) -> None:
+    items = foreach.value if isinstance(foreach.value, tuple) else ()
+    for node, row in zip(items, rows, strict=True):
+        if set(row) != set(rows[0]):
+            problems.add(
+                node.place,
+                f"foreach: gives {', '.join(row)}, and the first of the list "
+                f"{', '.join(rows[0])}: all must give the same names",
+            )
+
+
+def _values(name: str, node: Node, problems: Problems) -> list[Scalar]:
+    if not name.isidentifier():
+        problems.add(node.key_place or node.place, f"foreach: {name!r} is not a name")
+    if isinstance(node.value, str) and (found := _RANGE.fullmatch(node.value)):
+        bounds = [int(bound) for bound in found.groups() if bound is not None]
+        if len(bounds) == 3 and bounds[2] == 0:
+            problems.add(node.place, f"foreach.{name}: a step of 0")
+            return []
+        return list(itertools.islice(range(*bounds), MOST + 1))
+    if isinstance(node.value, tuple):
+        return [value for item in node.value for value in _one(item, problems)]
+    problems.add(
+        node.place,
+        f"foreach.{name}: a list or range(first, end) is wanted, not {described(node.plain())}",
+    )
+    return []
+
+
+def _one(node: Node, problems: Problems) -> Iterator[Scalar]:
+    if isinstance(node.value, (bool, int, float, str)):
+        yield node.value
+    else:
+        problems.add(
+            node.place, f"foreach: text or a number is wanted, not {described(node.plain())}"
+        )
+
+
+def _product(foreach: Node, names: Mapping[str, list[Scalar]], problems: Problems) -> list[Row]:
+    count = 1
+    for values in names.values():
+        count *= len(values)
+    if count > MOST:
+        problems.add(foreach.place, f"foreach: stands for more than {MOST} processes")
+        return []
+    return [dict(zip(names, values, strict=True)) for values in itertools.product(*names.values())]
+
+
+def _text(node: Node, text: str, row: Row, problems: Problems) -> Scalar:
+    whole = _WHOLE.fullmatch(text)
+    if whole and whole[1] in row:
+        return row[whole[1]]
+
+    def put(found: re.Match[str]) -> str:
+        try:
+            return _piece(found, row)
+        except ValueError as error:
+            problems.add(node.place, f"{text!r}: {error}")
+            return found[0]
+
+    return _PIECE.sub(put, text)
+
+
+def _piece(found: re.Match[str], row: Row) -> str:
+    if found[0] in ("{{", "}}"):
+        return found[0][0]
+    if found[1] is None:
+        raise ValueError(f"a single brace; write {found[0] * 2} for a plain one")
+    name, _, form = found[1].partition(":")
+    if name not in row:
+        hint = "" if name.isidentifier() else "; write {{ and }} for plain braces"
+        raise ValueError(f"unknown name {name!r}{near(name, list(row))}{hint}")
+    return format(row[name], form)

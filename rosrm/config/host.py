@@ -1,0 +1,51 @@
+"""`host.yaml`: the settings of a slave."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from rosrm.config.checking import validated
+from rosrm.config.documents import Node, Problems, read
+from rosrm.config.options import PluginCheck
+from rosrm.config.rules import check_amounts, check_name, settled
+from rosrm.config.settings import HostConfig
+from rosrm.registry import Registry
+
+#: What a slice is measured against, and so must be given for it.
+_OF_A_SLICE = ("memory", "cpu")
+
+
+def load_host(path: str | Path, registry: Registry | None = None) -> HostConfig:
+    """Read a slave's settings; raises one `ConfigError` for everything that is wrong.
+
+    Args:
+        path: of the file.
+        registry: the installed plugins; without it the names of plugins and their options are taken
+            as they are.
+    """
+    root, problems = read(path), Problems()
+    config = validated(HostConfig, root, problems)
+    _check_rules(root, problems)
+    chosen = root.get("probes")
+    probes = PluginCheck(registry, problems).by_name("probe", chosen)
+    problems.raise_any()
+    assert config is not None  # else there was a problem
+    if chosen is None or chosen.value is None:
+        return replace(config, state=settled(config.state, path))
+    return replace(config, state=settled(config.state, path), probes=probes)
+
+
+def _check_rules(root: Node, problems: Problems) -> None:
+    check_name(root.get("host"), "host", problems)
+    check_amounts(root.get("budget"), "budget", problems, above=True)
+    scope, budget = root.get("scope"), root.get("budget")
+    if scope is None or scope.value != "slice":
+        return
+    missing = [name for name in _OF_A_SLICE if budget is None or budget.child(name) is None]
+    if missing:
+        problems.add(
+            (budget or scope).place,
+            f"scope: a slice needs its budget of {' and '.join(missing)}, "
+            "for example `budget: {memory: 2GiB, cpu: 1.0}`",
+        )

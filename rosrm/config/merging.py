@@ -1,0 +1,76 @@
+"""Makes an entry of a work file complete: shorthands written out, `defaults` merged under it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Final
+
+from rosrm.config.documents import Node
+
+#: What says which program runs: an entry's own word displaces all of the defaults'.
+_PROGRAM: Final = ("package", "executable", "module", "command")
+
+
+def written_out(entry: Node) -> Node:
+    """The same with every shorthand in its long form, so that merging knows the parts."""
+    members = {
+        name: _LONG_FORMS[name](node) if name in _LONG_FORMS else node
+        for name, node in entry.items.items()
+    }
+    return Node(members, entry.place, entry.key_place)
+
+
+def merged(defaults: Node, entry: Node) -> Node:
+    """An entry with the defaults under it, mappings merged in depth; both written out."""
+    under = dict(defaults.items)
+    if any(name in entry.items for name in _PROGRAM):
+        under = {name: node for name, node in under.items() if name not in _PROGRAM}
+    if entry.get("migration", "strategy") is not None and "migration" in under:
+        under["migration"] = _without(under["migration"], "options")
+    return _in_depth(Node(under, entry.place), entry)
+
+
+def _in_depth(under: Node, over: Node) -> Node:
+    if not isinstance(under.value, Mapping) or not isinstance(over.value, Mapping):
+        return over
+    members = dict(under.items)
+    for name, node in over.items.items():
+        members[name] = _in_depth(members[name], node) if name in members else node
+    return Node(members, over.place, over.key_place)
+
+
+def _without(node: Node, name: str) -> Node:
+    members = {key: item for key, item in node.items.items() if key != name}
+    return Node(members, node.place, node.key_place) if node.items else node
+
+
+def _word(name: str) -> Callable[[Node], Node]:
+    """`restart: always` stands for `restart: {when: always}`."""
+
+    def long_form(node: Node) -> Node:
+        if isinstance(node.value, Mapping):
+            return node
+        return Node({name: Node(node.value, node.place)}, node.place, node.key_place)
+
+    return long_form
+
+
+def _pairs(node: Node) -> Node:
+    """`[[from, to]]` stands for `{from: to}`, as in ROS 2 launch."""
+    if not isinstance(node.value, tuple):
+        return node
+    members: dict[str, Node] = {}
+    for item in node.value:
+        pair = item.value
+        if not isinstance(pair, tuple) or len(pair) != 2 or not isinstance(pair[0].value, str):
+            return node
+        members[pair[0].value] = pair[1]
+    return Node(members, node.place, node.key_place)
+
+
+_LONG_FORMS: Final[Mapping[str, Callable[[Node], Node]]] = {
+    "restart": _word("when"),
+    "migration": _word("strategy"),
+    "readiness": _word("kind"),
+    "remappings": _pairs,
+}

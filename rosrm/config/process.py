@@ -1,0 +1,244 @@
+"""One process as a work file describes it, and the rules that it must keep."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, fields
+from typing import Annotated, Any, Final, Literal
+
+from rosrm.config.markers import NullIsEmpty, PlainWord, Words
+from rosrm.config.units import Amount, Count, PositiveSeconds, Quantity, Seconds
+from rosrm.core.model import (
+    EMPTY,
+    Kind,
+    MigrationPolicy,
+    ProcessSpec,
+    Readiness,
+    RestartPolicy,
+    StopPolicy,
+)
+
+_RESTART: Final = RestartPolicy()
+_READINESS: Final = Readiness()
+_STOP: Final = StopPolicy()
+
+Text = Annotated[str, PlainWord()]
+Labels = Annotated[Mapping[str, Text], NullIsEmpty()]
+ListOfWords = Annotated[tuple[Text, ...], Words()]
+
+
+@dataclass(frozen=True, slots=True)
+class RestartInFile:
+    """When a process that ended is started again on its host."""
+
+    when: Literal["never", "on-failure", "always"] = "never"
+    delay: Seconds = _RESTART.delay
+    max_delay: Seconds = _RESTART.max_delay
+    factor: Annotated[float, Quantity(low=1.0, high=100.0)] = _RESTART.factor
+    attempts: Count = _RESTART.attempts
+    window: PositiveSeconds = _RESTART.window
+
+
+@dataclass(frozen=True, slots=True)
+class MigrationInFile:
+    """How a process moves to another host; no strategy: it stays."""
+
+    strategy: str | None = None
+    overlap: bool = True
+    options: Annotated[Mapping[str, Any], NullIsEmpty()] = field(default_factory=lambda: EMPTY)
+
+
+@dataclass(frozen=True, slots=True)
+class ReadinessInFile:
+    """When an instance counts as ready."""
+
+    kind: Literal["auto", "graph", "running"] = "auto"
+    timeout: PositiveSeconds = _READINESS.timeout
+
+
+@dataclass(frozen=True, slots=True)
+class StopInFile:
+    """The time between SIGINT, SIGTERM and SIGKILL."""
+
+    interrupt_grace: Seconds = _STOP.interrupt_grace
+    terminate_grace: Seconds = _STOP.terminate_grace
+
+
+@dataclass(frozen=True, slots=True)
+class LabelsInFile:
+    """The host labels that a process requires, prefers or avoids."""
+
+    required: Labels = field(default_factory=lambda: EMPTY)
+    preferred: Labels = field(default_factory=lambda: EMPTY)
+    avoided: Labels = field(default_factory=lambda: EMPTY)
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessInFile:
+    """One process, in the words of ROS 2 launch; shorthands have been written out."""
+
+    name: str
+    namespace: str = ""
+    package: str | None = None
+    executable: str | None = None
+    module: str | None = None
+    command: ListOfWords = ()
+    arguments: ListOfWords = ()
+    parameters: Mapping[str, Any] = field(default_factory=lambda: EMPTY)
+    remappings: Mapping[str, str] = field(default_factory=lambda: EMPTY)
+    environment: Mapping[str, Text] = field(default_factory=lambda: EMPTY)
+    working_directory: str | None = None
+    ros: bool | None = None
+    kind: Literal["service", "job"] = "service"
+    restart: RestartInFile = field(default_factory=RestartInFile)
+    needs: Mapping[str, Amount] = field(default_factory=lambda: EMPTY)
+    labels: LabelsInFile = field(default_factory=LabelsInFile)
+    priority: Annotated[int, Quantity(low=-(2**31), high=2**31 - 1, whole=True)] = 0
+    migration: MigrationInFile = field(default_factory=MigrationInFile)
+    readiness: ReadinessInFile = field(default_factory=ReadinessInFile)
+    stop: StopInFile = field(default_factory=StopInFile)
+
+    @property
+    def is_ros(self) -> bool:
+        """A ROS node: as said, else whatever comes from a ROS package."""
+        return self.package is not None if self.ros is None else self.ros
+
+    def spec(self) -> ProcessSpec:
+        """The same as the core takes it."""
+        return ProcessSpec(
+            name=self.name,
+            namespace=self.namespace,
+            package=self.package,
+            executable=self.executable,
+            module=self.module,
+            command=self.command,
+            arguments=self.arguments,
+            parameters=dict(flattened(self.parameters)),
+            remappings=self.remappings,
+            environment=self.environment,
+            working_directory=self.working_directory,
+            ros=self.is_ros,
+            kind=Kind(self.kind),
+            restart=_same(RestartPolicy, self.restart),
+            needs=self.needs,
+            required_labels=self.labels.required,
+            preferred_labels=self.labels.preferred,
+            avoided_labels=self.labels.avoided,
+            priority=self.priority,
+            migration=_same(MigrationPolicy, self.migration),
+            readiness=_same(Readiness, self.readiness),
+            stop=_same(StopPolicy, self.stop),
+        )
+
+
+def _same(wanted: type[Any], of: Any) -> Any:
+    """A value of the core with the fields of its form in the file."""
+    return wanted(**{f.name: getattr(of, f.name) for f in fields(wanted)})
+
+
+def flattened(parameters: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
+    """Nested parameters by their dotted names, as ROS has them."""
+    for name, value in parameters.items():
+        if isinstance(value, Mapping):
+            yield from flattened(value, f"{before}{name}.")
+        else:
+            yield f"{before}{name}", value
+
+
+# --- rules ------------------------------------------------------------------------------------
+
+_NODE_NAME: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,199}")
+_NAMESPACE: Final = re.compile(r"/|(/[A-Za-z_][A-Za-z0-9_]*)+")
+_ROS_ONLY: Final = ("namespace", "parameters", "remappings")
+
+
+@dataclass(frozen=True, slots=True)
+class Complaint:
+    """A rule that is broken: the path of the culprit in the entry, and what is wrong."""
+
+    path: tuple[str, ...]
+    text: str
+
+
+def complaints(process: ProcessInFile) -> Iterator[Complaint]:
+    """Every rule that a well-formed process breaks."""
+    yield from _about_program(process)
+    if process.is_ros:
+        yield from _about_node(process)
+    else:
+        yield from _about_others(process)
+    yield from _about_surroundings(process)
+    if process.restart.max_delay < process.restart.delay:
+        text = "restart.max_delay must not be less than restart.delay"
+        yield Complaint(("restart", "max_delay"), text)
+
+
+def _about_program(process: ProcessInFile) -> Iterator[Complaint]:
+    programs = {
+        "package + executable": process.package or process.executable,
+        "module": process.module,
+        "command": process.command,
+    }
+    given = [name for name, value in programs.items() if value]
+    if len(given) != 1:
+        said = " and ".join(given) if given else "nothing"
+        rule = "exactly one of package + executable, module and command is wanted"
+        yield Complaint((), f"{rule}, and {said} is given")
+    elif process.package and not process.executable:
+        text = f"package {process.package!r} is given without an executable"
+        yield Complaint(("package",), text)
+    elif process.executable and not process.package:
+        text = f"executable {process.executable!r} is given without a package"
+        advice = "a program that is in no ROS package goes under `command`"
+        yield Complaint(("executable",), f"{text}; {advice}")
+
+
+def _about_others(process: ProcessInFile) -> Iterator[Complaint]:
+    for name in _ROS_ONLY:
+        if getattr(process, name):
+            text = f"{name}: only a ROS node has one; say `ros: true` if this is one"
+            yield Complaint((name,), text)
+    if process.readiness.kind == "graph":
+        text = "readiness: only a ROS node is seen in the graph"
+        yield Complaint(("readiness", "kind"), text)
+
+
+def _about_node(process: ProcessInFile) -> Iterator[Complaint]:
+    if not _NODE_NAME.fullmatch(process.name):
+        allowed = "at most 200 letters, digits and '_', the first of them not a digit"
+        text = f"{process.name!r} cannot be the name of a ROS node. Allowed: {allowed}"
+        yield Complaint(("name",), text)
+    if process.namespace and not _NAMESPACE.fullmatch(process.namespace):
+        text = f"{process.namespace!r} is not an absolute namespace such as '/robot1'"
+        yield Complaint(("namespace",), text)
+    for name, value in flattened(process.parameters):
+        fault = _fault_of_parameter(value)
+        if fault:
+            yield Complaint(("parameters", *name.split(".")), f"parameters.{name}: {fault}")
+
+
+def _about_surroundings(process: ProcessInFile) -> Iterator[Complaint]:
+    directory = process.working_directory
+    if directory is not None and not directory.startswith(("/", "~")):
+        text = (
+            f"working_directory: {directory!r} is not absolute. It is one of the host that runs "
+            "the process; leave it out for a directory of the process's own"
+        )
+        yield Complaint(("working_directory",), text)
+    for name, value in process.environment.items():
+        if not name or "=" in name or "\0" in name + value:
+            yield Complaint(("environment", name), f"environment: {name!r} cannot be a variable")
+
+
+def _fault_of_parameter(value: Any) -> str:
+    if value is None:
+        return "a value is wanted; ROS has no null"
+    items = value if isinstance(value, list) else [value]
+    kinds = {type(item) for item in items}
+    if kinds - {bool, int, float, str}:
+        return "a list of ROS holds booleans, numbers or text"
+    if any(isinstance(item, float) and not math.isfinite(item) for item in items):
+        return "a finite number is wanted"
+    return "a list of ROS holds values of one type" if len(kinds) > 1 else ""

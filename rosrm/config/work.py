@@ -1,0 +1,115 @@
+"""`work.yaml`: the processes to run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+from rosrm.config.checking import near, validated
+from rosrm.config.documents import Node, Place, Problems, read
+from rosrm.config.foreach import rows_of, substituted
+from rosrm.config.merging import merged, written_out
+from rosrm.config.options import PluginCheck
+from rosrm.config.process import ProcessInFile, complaints
+from rosrm.config.rules import check_amounts, check_name
+from rosrm.core.model import ProcessSpec
+from rosrm.registry import Registry
+
+_SECTIONS: Final = ("processes", "defaults")
+#: Of one entry alone: neither makes sense for all.
+_NOT_IN_DEFAULTS: Final = ("name", "foreach")
+
+
+def load_work(path: str | Path, registry: Registry | None = None) -> tuple[ProcessSpec, ...]:
+    """Read the processes of a file; raises one `ConfigError` for everything that is wrong.
+
+    Args:
+        path: of the file.
+        registry: the installed plugins, to check the migration strategies against; without it they
+            are taken as they are (the master checks them).
+    """
+    root, problems = read(path), Problems()
+    entries = _entries(root, problems)
+    defaults = _defaults(root, problems)
+    plugins = PluginCheck(registry, problems)
+    nodes = [
+        node
+        for entry in entries
+        for node in _expanded(merged(defaults, written_out(entry)), problems)
+    ]
+    specs = [_process(node, plugins, problems) for node in nodes]
+    _refuse_namesakes(nodes, problems)
+    problems.raise_any()
+    return tuple(spec for spec in specs if spec is not None)
+
+
+def _entries(root: Node, problems: Problems) -> Sequence[Node]:
+    for name, node in root.items.items():
+        if name not in _SECTIONS:
+            place = node.key_place or node.place
+            problems.add(place, f"unknown key {name!r}{near(name, _SECTIONS)}")
+    processes = root.get("processes")
+    if processes is None or not isinstance(processes.value, tuple) or not processes.value:
+        place = (processes or root).place
+        problems.add(place, "processes: a list of at least one process is wanted")
+        return ()
+    for entry in processes.value:
+        if not isinstance(entry.value, Mapping):
+            problems.add(entry.place, "processes: each of the list is a mapping, with a `name`")
+    return [entry for entry in processes.value if isinstance(entry.value, Mapping)]
+
+
+def _defaults(root: Node, problems: Problems) -> Node:
+    defaults = root.get("defaults") or Node({}, root.place)
+    if not isinstance(defaults.value, Mapping):
+        problems.add(defaults.place, "defaults: a mapping is wanted")
+    for name in _NOT_IN_DEFAULTS:
+        node = defaults.get(name)
+        if node is not None:
+            problems.add(node.key_place or node.place, f"defaults: {name} belongs to one process")
+    return written_out(defaults)
+
+
+def _expanded(entry: Node, problems: Problems) -> Iterator[Node]:
+    """The entry itself or, with `foreach`, one for each of its rows."""
+    foreach = entry.get("foreach")
+    if foreach is None:
+        yield entry
+        return
+    alike = Node({k: v for k, v in entry.items.items() if k != "foreach"}, entry.place)
+    for row in rows_of(foreach, problems):
+        faults = Problems()
+        made = substituted(alike, row, faults)
+        problems.found.update(faults.found)
+        if not faults:
+            yield made
+
+
+def _process(node: Node, plugins: PluginCheck, problems: Problems) -> ProcessSpec | None:
+    check_name(node.get("name"), "process", problems)
+    check_amounts(node.get("needs"), "needs", problems)
+    process = validated(ProcessInFile, node, problems)
+    if process is None:
+        return None
+    for complaint in complaints(process):
+        problems.add(node.deepest(complaint.path).place, complaint.text)
+    strategy = process.migration.strategy
+    if strategy is None:
+        return process.spec()
+    named = node.deepest(("migration", "strategy"))
+    options = plugins.choice("migration", strategy, named, node.get("migration", "options"))
+    return replace(process, migration=replace(process.migration, options=options)).spec()
+
+
+def _refuse_namesakes(nodes: Sequence[Node], problems: Problems) -> None:
+    first: dict[str, Place] = {}
+    for name in filter(None, (node.get("name") for node in nodes)):
+        before = first.setdefault(str(name.value), name.place)
+        if before is not name.place:
+            problems.add(
+                name.place,
+                f"duplicate process name {name.value!r}, first given at line {before.line}, "
+                f"column {before.column}",
+            )
