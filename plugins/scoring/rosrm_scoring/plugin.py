@@ -1,0 +1,29 @@
+"""Registers the scoring policies."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rosrm.hookspecs import hookimpl
+from rosrm.ports import ScoringOffer
+from rosrm_scoring.threshold import Threshold, ThresholdOptions
+from rosrm_scoring.weighted import Weighted, WeightedOptions
+
+
+@hookimpl
+def register_scoring_policies() -> Sequence[ScoringOffer]:
+    """Offer `weighted`, which is the paper's, and `threshold`, which keeps off the limits."""
+    return [
+        ScoringOffer(
+            name="weighted",
+            create=Weighted,
+            options=WeightedOptions,
+            summary="Eq. 1: weight x usage, summed over the resources",
+        ),
+        ScoringOffer(
+            name="threshold",
+            create=Threshold,
+            options=ThresholdOptions,
+            summary="Eq. 1, a steep cost near a limit and a veto at it",
+        ),
+    ]

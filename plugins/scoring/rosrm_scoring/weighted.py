@@ -1,0 +1,97 @@
+"""Eq. 1 of the paper: score = w_mem * memusage + w_cpu * cpuusage + w_disk * diskusage.
+
+The administrator chooses the weights, each from 0 to 1. By default memory weighs 1, cpu 0.5 and
+disk 0: memory that runs out kills processes, so it counts most; cpu that runs out only slows them,
+and its reading swings, so it counts half, which is enough to keep jobs that compute off a host that
+computes already; how full a disk is says little about what one more process would find there. The
+limits hold whatever the weights are.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Annotated, Final
+
+import numpy as np
+from annotated_types import Ge, Le
+
+from rosrm.ports import FloatArray, HostView, ProcessView, Scores
+
+Weight = Annotated[float, Ge(0), Le(1)]
+
+DEFAULT_WEIGHTS: Final[Mapping[str, Weight]] = MappingProxyType(
+    {"memory": 1.0, "cpu": 0.5, "disk": 0.0}
+)
+
+
+@dataclass(frozen=True)
+class WeightedOptions:
+    """Settings of the policy `weighted`.
+
+    Attributes:
+        weights: by resource, 0..1; a resource that is not named weighs 0, so what is given here
+            replaces the defaults as a whole.
+    """
+
+    weights: Mapping[str, Weight] = field(default_factory=lambda: DEFAULT_WEIGHTS)
+
+
+class Weighted:
+    """Implements `rosrm.ports.ScoringPolicy` by Eq. 1.
+
+    Args:
+        options: the weights.
+    """
+
+    def __init__(self, options: WeightedOptions) -> None:
+        self._sum = WeightedSum(options.weights)
+
+    def score(self, hosts: HostView, process: ProcessView) -> Scores:  # noqa: ARG002 - by usage alone
+        """The weighted sum of the usages; the host with the most room has the lowest."""
+        return Scores(self._sum.of(hosts), reason=lambda row: self._sum.reason(hosts, row))
+
+
+class WeightedSum:
+    """Eq. 1 for any number of hosts at once.
+
+    Args:
+        weights: by resource, 0..1.
+    """
+
+    def __init__(self, weights: Mapping[str, float]) -> None:
+        self._weights = {name: weight for name, weight in weights.items() if weight > 0}
+        self.largest: Final = sum(self._weights.values())
+
+    def of(self, hosts: HostView) -> FloatArray:
+        """(N,) the sum for each host; what a host has not, it does not use.
+
+        One column after another, never as a matrix product: its rounding depends on the number of
+        rows, and a host must score alike alone and among others.
+        """
+        total: FloatArray | None = None
+        for name, weight in self._weights.items():
+            if name not in hosts.resources:
+                continue
+            term = known(hosts.usage[:, hosts.resources.index(name)]) * weight
+            total = term if total is None else np.add(total, term, out=total)
+        return np.zeros(len(hosts.usage)) if total is None else total
+
+    def reason(self, hosts: HostView, row: int) -> str:
+        """The sum of one host, written out."""
+        terms = []
+        for name, weight in self._weights.items():
+            if name in hosts.resources:
+                usage = float(hosts.usage[row, hosts.resources.index(name)])
+                terms.append(f"{weight:g} x {name} {0.0 if math.isnan(usage) else usage:.1%}")
+        return " + ".join(terms) or "no resource that weighs is read on any host"
+
+
+def known(column: FloatArray) -> FloatArray:
+    """A column with 0 where a host has no such resource (NaN)."""
+    # One product tells whether there is any NaN, in a tenth of the time that replacing takes.
+    if math.isnan(column.dot(column)):
+        return np.nan_to_num(column, nan=0.0)
+    return column
