@@ -1,27 +1,28 @@
 """What the supervisor of one host does with its instances: a pure state machine.
 
-    phase       event            what follows                                   next phase
-    (unknown)   StartOrdered     Spawn                                          starting
-                                 where its number is dead, or all is stopped:   refused
-    (unknown)   StopOrdered      a start that comes late is refused             refused
-    starting    Spawned          -                                              running
-                                 where a stop came in between: SIGINT           stopping
-                SpawnFailed      final, or by policy where it may pass          failed | backoff
-                StopOrdered      Unspawn (what is in hand is stopped later)     starting
-                Resumed          Spawn (the supervisor was restarted)           starting
-    running     Exited           by policy                                      exited | failed | backoff
-                                 where others of its session live: SIGINT       stopping
-                StopOrdered      SIGINT                                         stopping
-                RestartOrdered   SIGINT, to start again afterwards              stopping
-    stopping    TimePassed       SIGTERM, then SIGKILL, then SIGKILL again      stopping
-                Exited           as was meant (end, restart, policy)            exited | starting | ...
-                                 where others of its session live: -            stopping
-                Cleared          as was meant                                   exited | starting | ...
-                StopOrdered      it is meant to end                             stopping
-    backoff     TimePassed       Spawn                                          starting
-                RestartOrdered   Spawn, the count of restarts afresh            starting
-                StopOrdered      -                                              exited
-    ended       Forgotten        Drop; its number is dead                       (unknown)
+    phase     event            what follows                                  next phase
+    -         StartOrdered     Spawn                                         starting
+                               its number is dead, or all is stopped: -      refused
+    -         StopOrdered      - (a start that comes late is refused)        refused
+              RestartOrdered   -                                             refused
+    starting  Spawned          -                                             running
+                               a stop came in between: SIGINT                stopping
+              SpawnFailed      final, or by policy where it may pass         failed, backoff
+              StopOrdered      Unspawn (one in hand is stopped later)        starting
+              Resumed          Spawn (the supervisor was restarted)          starting
+    running   Exited           by policy                                     exited, failed, backoff
+                               others of its session live: SIGINT            stopping
+              StopOrdered      SIGINT                                        stopping
+              RestartOrdered   SIGINT, to start again afterwards             stopping
+    stopping  TimePassed       SIGTERM, then SIGKILL, then SIGKILL again     stopping
+              Exited           as was meant (end, restart, policy)           exited, starting, ...
+                               others of its session live: -                 stopping
+              Cleared          as was meant (end, restart, policy)           exited, starting, ...
+              StopOrdered      now it is meant to end                        stopping
+    backoff   TimePassed       Spawn                                         starting
+              RestartOrdered   Spawn, the count of restarts afresh           starting
+              StopOrdered      -                                             exited
+    ended     Forgotten        Drop; its number is dead                      -
 
 Whatever is not in the table changes nothing; an order that changes nothing has its status told
 again, as DDS may repeat it. Every change of an instance is told (`Tell`). A signal goes to every
@@ -35,7 +36,7 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Callable, Iterator
-from typing import Final, NamedTuple, Union
+from typing import Final, NamedTuple
 
 #: Process name and number: what `InstanceId` holds.
 Key = tuple[str, int]
@@ -170,20 +171,20 @@ class ClientLost(NamedTuple):
     """Nobody listens. The instances keep running: fencing by a timer would have its place here."""
 
 
-Event = Union[
-    StartOrdered,
-    StopOrdered,
-    RestartOrdered,
-    Forgotten,
-    Resumed,
-    Spawned,
-    SpawnFailed,
-    Exited,
-    Cleared,
-    TimePassed,
-    ShutdownOrdered,
-    ClientLost,
-]
+Event = (
+    StartOrdered
+    | StopOrdered
+    | RestartOrdered
+    | Forgotten
+    | Resumed
+    | Spawned
+    | SpawnFailed
+    | Exited
+    | Cleared
+    | TimePassed
+    | ShutdownOrdered
+    | ClientLost
+)
 
 
 # --- commands: what to do ---------------------------------------------------------------------
@@ -224,7 +225,7 @@ class Leave(NamedTuple):
     """All has ended (or cannot be ended): the supervisor ends too."""
 
 
-Command = Union[Spawn, Unspawn, Signal, Tell, Drop, Leave]
+Command = Spawn | Unspawn | Signal | Tell | Drop | Leave
 
 
 # --- the state --------------------------------------------------------------------------------

@@ -43,7 +43,7 @@ def main() -> None:
     )
     bare = os.path.join(os.path.dirname(os.path.abspath(__file__)), "bare.py")
     command = [sys.executable, "-I", "-S", bare, state, *(str(limit) for limit in limits)]
-    os.execv(sys.executable, command)
+    os.execv(sys.executable, command)  # noqa: S606 - no shell is wanted
 
 
 def _detach() -> None:

@@ -17,6 +17,7 @@ def main() -> None:
     package = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
     sys.path.append(os.path.dirname(package))  # last: the standard library goes first
 
+    # ruff: noqa: PLC0415 - these can be imported only now
     from rosrm.supervisor import endpoint
     from rosrm.supervisor.logs import LogLimits
     from rosrm.supervisor.server import Server

@@ -12,9 +12,9 @@ import sys
 import threading
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from rosrm.core.model import (
     InstanceId,
@@ -35,10 +35,14 @@ from rosrm.errors import SupervisorError
 from rosrm.supervisor import endpoint, paths, protocol
 from rosrm.supervisor.logs import LogLimits
 
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
 __all__ = ["LaunchOrder", "LogLimits", "SupervisorClient", "SupervisorEnded", "log_path"]
 
 #: Seconds for the supervisor to take what it is sent.
 SEND_TIMEOUT: Final = 5.0
+DEFAULT_LOG_LIMITS: Final = LogLimits()
 _CHUNK: Final = 1 << 16
 
 
@@ -60,8 +64,8 @@ class LaunchOrder:
     argv: tuple[str, ...]
     environment: Mapping[str, str]
     working_directory: str | None = None
-    restart: RestartPolicy = RestartPolicy()
-    stop: StopPolicy = StopPolicy()
+    restart: RestartPolicy = field(default_factory=RestartPolicy)
+    stop: StopPolicy = field(default_factory=StopPolicy)
 
 
 def log_path(state_directory: Path, instance: InstanceId) -> Path:
@@ -101,7 +105,7 @@ class SupervisorClient:
         state_directory: Path,
         *,
         start: bool = True,
-        log: LogLimits = LogLimits(),
+        log: LogLimits = DEFAULT_LOG_LIMITS,
         timeout: float = 5.0,
     ) -> SupervisorClient:
         """Connect to the supervisor of a state directory, and start one where none listens.
@@ -177,7 +181,7 @@ class SupervisorClient:
         """Leave; the instances go on."""
         self._peer.close()
 
-    def __enter__(self) -> SupervisorClient:
+    def __enter__(self) -> Self:
         """The connection is closed with the block."""
         return self
 

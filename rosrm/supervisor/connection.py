@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import socket
 import struct
-import sys
 from typing import Final
 
+from rosrm.supervisor import own_log
 from rosrm.supervisor.protocol import Lines
 
 #: A client that leaves so many bytes unread is cut off; it hears everything anew when it returns.
@@ -83,7 +83,7 @@ class Connection:
         try:
             self._peer.sendall(self._unsent + data)
         except OSError as error:
-            print(f"the client (pid {self.pid}) was not told the rest: {error}", file=sys.stderr)
+            own_log.say(f"the client (pid {self.pid}) was not told the rest: {error}")
 
     def close(self) -> None:
         """Release the socket."""

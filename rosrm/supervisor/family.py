@@ -10,11 +10,10 @@ from __future__ import annotations
 import os
 import selectors
 import signal
-import sys
 from collections.abc import Callable, Iterable
 
 from rosrm.core.supervision import UNKNOWN_EXIT, Cleared, Event, Exited, Key
-from rosrm.supervisor import members
+from rosrm.supervisor import members, own_log
 from rosrm.supervisor.members import Stat
 
 
@@ -125,7 +124,7 @@ class Family:
                 key = self._owner(pid)
                 self._adopted[pid] = key
                 if key is not None and key not in self._sessions:
-                    print(f"killed {pid}, left over by {mark(key)}", file=sys.stderr)
+                    own_log.say(f"killed {pid}, left over by {mark(key)}")
                     send_signal(pid, signal.SIGKILL)
 
     def _owner(self, pid: int) -> Key | None:
@@ -211,7 +210,7 @@ def send_signal(pid: int, number: int) -> None:
     except ProcessLookupError:
         return
     except PermissionError as error:
-        print(f"signal {number} to {pid}: {error.strerror}", file=sys.stderr)
+        own_log.say(f"signal {number} to {pid}: {error.strerror}")
 
 
 def _send_to_group(session: int, number: int) -> None:
@@ -220,7 +219,7 @@ def _send_to_group(session: int, number: int) -> None:
     except ProcessLookupError:
         return
     except PermissionError as error:
-        print(f"signal {number} to the group {session}: {error.strerror}", file=sys.stderr)
+        own_log.say(f"signal {number} to the group {session}: {error.strerror}")
 
 
 def _send_by_pidfd(pidfd: int, number: int) -> None:
@@ -229,4 +228,4 @@ def _send_by_pidfd(pidfd: int, number: int) -> None:
     except ProcessLookupError:
         return
     except PermissionError as error:
-        print(f"signal {number} to a left-over process: {error.strerror}", file=sys.stderr)
+        own_log.say(f"signal {number} to a left-over process: {error.strerror}")

@@ -8,12 +8,11 @@ interval.
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Iterable
 from typing import Final, NamedTuple
 
 from rosrm.core.supervision import Key
-from rosrm.supervisor import paths
+from rosrm.supervisor import own_log, paths
 
 #: Seconds between two looks while logs grow, and while they do not.
 BUSY: Final = 0.2
@@ -94,7 +93,7 @@ class LogKeeper:
         try:
             rotate(path, size, self.limits)
         except OSError as error:
-            print(f"{path} was cut, but not kept: {error}", file=sys.stderr)
+            own_log.say(f"{path} was cut, but not kept: {error}")
         return 0
 
     def prune(self, process: str, live: Iterable[Key]) -> None:

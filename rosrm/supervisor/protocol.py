@@ -33,7 +33,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from typing import Any, Final, NamedTuple, Union
+from typing import Any, Final, NamedTuple
 
 from rosrm.core.supervision import (
     Forgotten,
@@ -91,7 +91,7 @@ class Forget(NamedTuple):
     instances: tuple[Forgotten, ...]
 
 
-Order = Union[Hello, Environment, Launch, StopOrdered, RestartOrdered, Forget, ShutdownOrdered]
+Order = Hello | Environment | Launch | StopOrdered | RestartOrdered | Forget | ShutdownOrdered
 
 
 class Status(NamedTuple):

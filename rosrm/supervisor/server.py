@@ -10,15 +10,14 @@ import os
 import selectors
 import signal
 import socket
-import sys
 import time
 from collections import deque
 from collections.abc import Callable
 from typing import Final
 
 from rosrm.core import supervision
-from rosrm.core.supervision import Event, Key, SpawnFailed, Spawned
-from rosrm.supervisor import children, paths, protocol, takeover
+from rosrm.core.supervision import Event, Key, Spawned, SpawnFailed
+from rosrm.supervisor import children, own_log, paths, protocol, takeover
 from rosrm.supervisor.connection import Connection
 from rosrm.supervisor.family import Family, mark
 from rosrm.supervisor.logs import LogKeeper, LogLimits
@@ -212,7 +211,7 @@ class Server:
         self._environments.update(recorded.environments)
         self._notes = recorded.notes
         for note in recorded.notes:
-            print(note, file=sys.stderr)
+            own_log.say(note)
         for event in takeover.what_happened(recorded, self._state, self._core, self._family):
             self._happened(event)
         self._rewrite_record()
@@ -330,7 +329,7 @@ class Server:
         heard, wakeup = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
         signal.set_wakeup_fd(wakeup, warn_on_full_buffer=False)
         for number in (signal.SIGCHLD, signal.SIGTERM):
-            signal.signal(number, lambda number, frame: None)
+            signal.signal(number, lambda *_: None)
         for number in (signal.SIGINT, signal.SIGHUP):
             signal.signal(number, signal.SIG_IGN)
         self._selector.register(heard, selectors.EVENT_READ, lambda: self._signalled(heard))

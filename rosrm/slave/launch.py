@@ -1,0 +1,80 @@
+"""From an assignment to an order for the supervisor: command line, environment, parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from rosrm.core.model import Assignment, ProcessSpec
+from rosrm.errors import LaunchError
+from rosrm.slave import ament_index
+from rosrm.slave.environment import process_environment
+from rosrm.slave.ros_arguments import join_arguments, parameters_text, ros_arguments
+from rosrm.supervisor.client import LaunchOrder, log_path
+
+
+def launch_order(
+    assignment: Assignment,
+    base_environment: Mapping[str, str],
+    python: str,
+    *,
+    host: str,
+    state_directory: Path,
+) -> LaunchOrder:
+    """What the supervisor is to start for an assignment; its parameters are written to a file.
+
+    Args:
+        assignment: what is to run.
+        base_environment: the slave's own, its ROS settings included.
+        python: the interpreter for modules.
+        host: name of this host in rosrm.
+        state_directory: of this host's supervisor; the parameters lie beside the instance's log.
+
+    Raises:
+        LaunchError: what was looked for, and where.
+    """
+    spec = assignment.spec
+    environment = process_environment(assignment, base_environment, host)
+    command = _command(spec, environment, python)
+    if spec.ros or spec.package is not None:
+        parameters_file = _write_parameters(assignment, state_directory)
+        ros = ros_arguments(spec, assignment.node_name, parameters_file)
+        arguments = join_arguments(spec.arguments, ros)
+    else:
+        arguments = list(spec.arguments)
+    return LaunchOrder(
+        instance=assignment.instance,
+        argv=(*command, *arguments),
+        environment=environment,
+        working_directory=spec.working_directory,
+        restart=spec.restart,
+        stop=spec.stop,
+    )
+
+
+def _command(spec: ProcessSpec, environment: Mapping[str, str], python: str) -> tuple[str, ...]:
+    """What comes before the arguments."""
+    if spec.package is not None:
+        if spec.executable is None:
+            raise LaunchError(f"{spec.name!r} names the package {spec.package!r}, no executable")
+        prefixes = ament_index.search_path(environment, python)
+        return (str(ament_index.find_executable(spec.package, spec.executable, prefixes)),)
+    if spec.module is not None:
+        return (python, "-m", spec.module)
+    if not spec.command:
+        raise LaunchError(f"{spec.name!r} says nothing to run: package, module or command")
+    return spec.command
+
+
+def _write_parameters(assignment: Assignment, state_directory: Path) -> str | None:
+    """Beside the instance's log, to be pruned with it."""
+    text = parameters_text(assignment.spec.parameters)
+    if not text:
+        return None
+    path = log_path(state_directory, assignment.instance).with_suffix(".parameters.yaml")
+    try:
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise LaunchError(f"the parameters cannot be written to {path}: {error}") from None
+    return str(path)

@@ -1,0 +1,12 @@
+"""The supervisor's own troubles, for people: `supervisor.log` is its standard error."""
+
+from __future__ import annotations
+
+import sys
+import time
+
+
+def say(text: str) -> None:
+    """One line, with the time by this host's clock."""
+    sys.stderr.write(f"{time.strftime('%Y-%m-%dT%H:%M:%S')} {text}\n")
+    sys.stderr.flush()
