@@ -1,0 +1,44 @@
+"""For authors of plugins: fakes, and contracts as test classes to inherit.
+
+A contract is what the core relies on; rosrm's own plugins pass the same ones. With pytest::
+
+    from rosrm.testing import ProbeContract
+    from thermometer.plugin import register_probes
+
+    class TestThermometer(ProbeContract):
+        offer = register_probes()[0]
+        options = {"sensor": "cpu"}
+
+Where a plugin says that it is absent (`SkipPlugin`), its contract is skipped with that reason.
+For readable failures, `pytest.register_assert_rewrite("rosrm.testing")` in a conftest.py.
+"""
+
+from rosrm.testing.journals import JournalContract, MemoryJournal
+from rosrm.testing.migrations import MigrationContract, before_commit
+from rosrm.testing.probes import (
+    FakeClock,
+    FakeProbe,
+    FakeSessions,
+    ProbeContract,
+    made_probe,
+    probe_context,
+)
+from rosrm.testing.scoring import ScoringContract, host_view, one_row, process_view, vetoes
+
+__all__ = [
+    "FakeClock",
+    "FakeProbe",
+    "FakeSessions",
+    "JournalContract",
+    "MemoryJournal",
+    "MigrationContract",
+    "ProbeContract",
+    "ScoringContract",
+    "before_commit",
+    "host_view",
+    "made_probe",
+    "one_row",
+    "probe_context",
+    "process_view",
+    "vetoes",
+]

@@ -1,0 +1,133 @@
+"""A journal in memory, and what the master relies on in one."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from unittest import SkipTest
+
+from rosrm.ports import Intent, Journal, Record, StoredRecord
+
+
+@dataclass
+class MemoryJournal:
+    """A journal that forgets; implements `rosrm.ports.Journal`.
+
+    Attributes:
+        stored: every record, oldest first.
+        tables: intents by table and key.
+        closed: `close` was called.
+    """
+
+    stored: list[StoredRecord] = field(default_factory=list)
+    tables: dict[str, dict[str, Mapping[str, Any]]] = field(default_factory=dict)
+    closed: bool = False
+
+    def write(
+        self, records: Sequence[Record], intents: Sequence[Intent], now: float
+    ) -> Sequence[StoredRecord]:
+        """Append records and replace intents."""
+        first = len(self.stored) + 1
+        wall = time.time()
+        stored = [StoredRecord(first + at, wall, now, record) for at, record in enumerate(records)]
+        self.stored += stored
+        for intent in intents:
+            table = self.tables.setdefault(intent.table, {})
+            if intent.value is None:
+                table.pop(intent.key, None)
+            else:
+                table[intent.key] = json.loads(json.dumps(dict(intent.value)))
+        return stored
+
+    def intents(self, table: str) -> Mapping[str, Mapping[str, Any]]:
+        """All intents of a table by key."""
+        return dict(self.tables.get(table, {}))
+
+    def records(
+        self, *, after: int = 0, process: str = "", host: str = "", newest: int = 1000
+    ) -> Sequence[StoredRecord]:
+        """The newest matching records after a sequence, oldest first."""
+        matching = [
+            stored
+            for stored in self.stored
+            if stored.sequence > after
+            and process in ("", stored.record.process)
+            and host in ("", stored.record.host)
+        ]
+        return matching[max(0, len(matching) - newest) :]
+
+    def close(self) -> None:
+        """Remember that it was."""
+        self.closed = True
+
+
+class JournalContract:
+    """What the master relies on in a journal. Override `open`.
+
+    Attributes:
+        durable: what was written is there again when the journal is opened anew.
+    """
+
+    durable = True
+
+    def open(self, directory: Path) -> Journal:
+        """The journal in a directory, made where it is not there yet."""
+        raise NotImplementedError
+
+    def test_numbers_records_without_a_gap(self, tmp_path: Path) -> None:
+        """Sequences go 1, 2, 3, ... over all groups; time stamps are kept."""
+        journal = self.open(tmp_path)
+        assert isinstance(journal, Journal)
+        first = journal.write([Record("submitted", "p"), Record("assigned", "p", "h")], [], 0.5)
+        second = journal.write([Record("ended", "p", "h", facts={"code": 3})], [], 1.5)
+        assert [stored.sequence for stored in [*first, *second]] == [1, 2, 3]
+        assert [stored.elapsed for stored in journal.records()] == [0.5, 0.5, 1.5]
+        assert list(journal.records()) == [*first, *second]
+        journal.close()
+
+    def test_selects_records(self, tmp_path: Path) -> None:
+        """By process, by host, after a sequence; of too many the newest, oldest first."""
+        journal = self.open(tmp_path)
+        journal.write(
+            [Record("a", "p", "h"), Record("b", "q", "h"), Record("c", "p", "i"), Record("d")],
+            [],
+            0,
+        )
+        kinds = {
+            "a b c d": journal.records(),
+            "a c": journal.records(process="p"),
+            "a b": journal.records(host="h"),
+            "c": journal.records(process="p", after=1),
+            "c d": journal.records(newest=2),
+            "": journal.records(process="unknown"),
+        }
+        for expected, found in kinds.items():
+            assert " ".join(stored.record.kind for stored in found) == expected
+        journal.close()
+
+    def test_newest_intent_counts(self, tmp_path: Path) -> None:
+        """A later value replaces the earlier one, also within a group; None takes the key away."""
+        journal = self.open(tmp_path)
+        journal.write([], [Intent("process", "p", {"n": 1}), Intent("process", "q", {"n": 1})], 0)
+        journal.write([], [Intent("process", "p", {"n": 2}), Intent("process", "p", {"n": 3})], 0)
+        journal.write([], [Intent("process", "q", None), Intent("process", "gone", None)], 0)
+        assert journal.intents("process") == {"p": {"n": 3}}
+        assert journal.intents("migration") == {}
+        journal.close()
+
+    def test_survives_being_closed(self, tmp_path: Path) -> None:
+        """Records, intents and the count go on where they were."""
+        if not self.durable:
+            raise SkipTest("this journal is not durable")
+        journal = self.open(tmp_path)
+        journal.write([Record("a")], [Intent("host", "h", {"cordoned": True})], 0)
+        journal.close()
+        again = self.open(tmp_path)
+        assert again.intents("host") == {"h": {"cordoned": True}}
+        assert [stored.sequence for stored in again.write([Record("b")], [], 0)] == [2]
+        assert [stored.record.kind for stored in again.records()] == ["a", "b"]
+        again.close()

@@ -1,0 +1,101 @@
+"""What the master relies on in a migration strategy."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from rosrm.core.migration import Commit, Execute, Move, Plan, Start, Step, Stop
+from rosrm.core.migration import plan_fault as fault_of
+from rosrm.core.model import EMPTY, InstanceId, ProcessSpec
+from rosrm.ports import MigrationOffer, MigrationStrategy
+
+
+class MigrationContract:
+    """What the master relies on in a migration strategy.
+
+    Attributes:
+        offer: what is tested.
+        options: settings by name; the others have their defaults.
+        spec: of a process that the strategy can move.
+    """
+
+    offer: MigrationOffer
+    options: Mapping[str, Any] = EMPTY
+    spec: ProcessSpec = ProcessSpec("p", command=("true",))
+
+    def make(self) -> MigrationStrategy:
+        """A new strategy; override it where more is needed."""
+        return self.offer.create(self.offer.options(**self.options))
+
+    def moves(self) -> Sequence[Move]:
+        """The same move of a process that may overlap with itself, and of one that may not."""
+        move = Move(
+            spec=self.spec,
+            source=InstanceId(self.spec.name, 1),
+            source_host="a",
+            destination=InstanceId(self.spec.name, 2),
+            destination_host="b",
+            fallback=InstanceId(self.spec.name, 3),
+            now=1_700_000_000,
+        )
+        policies = [replace(self.spec.migration, overlap=overlap) for overlap in (True, False)]
+        return [replace(move, spec=replace(self.spec, migration=policy)) for policy in policies]
+
+    def test_plan_is_sound(self) -> None:
+        """One commit point, hosts of this move only, a time-out for every wait."""
+        for move in self.moves():
+            assert fault_of(self.make().propose(move), move) == ""
+
+    def test_is_pure(self) -> None:
+        """The same move gives the same plan, also with another object of the strategy."""
+        strategy, twin = self.make(), self.make()
+        for move in self.moves():
+            assert strategy.propose(move) == strategy.propose(move)
+            assert twin.propose(move) == strategy.propose(move)
+
+    def test_can_be_undone_before_the_commit(self) -> None:
+        """A started destination would be stopped again, and a stopped source started."""
+        for move in self.moves():
+            for step in before_commit(self.make().propose(move)):
+                if isinstance(step, Start) and step.instance == move.destination:
+                    assert isinstance(step.undo, (Stop, Execute)), "the start has no way back"
+                if isinstance(step, Stop) and step.instance == move.source:
+                    assert isinstance(step.undo, (Start, Execute)), "the stop has no way back"
+
+    def test_numbers_are_used_once(self) -> None:
+        """A source that is started again runs under the number kept for it, not its old one."""
+        for move in self.moves():
+            for step in self.make().propose(move).steps:
+                if isinstance(step, Stop) and isinstance(step.undo, Start):
+                    assert step.undo.instance == move.fallback
+
+    def test_an_overlap_is_declared(self) -> None:
+        """A destination of the same name that starts before the source has stopped says so."""
+        for move in self.moves():
+            plan = self.make().propose(move)
+            stopped = False
+            for step in plan.steps:
+                stopped = stopped or isinstance(step, Execute)  # what that does is not known here
+                if isinstance(step, Stop) and step.instance == move.source:
+                    stopped = True
+                if isinstance(step, Start) and step.instance == move.destination and not stopped:
+                    same_name = step.node_name in ("", move.spec.name)
+                    assert plan.overlap > 0 or not same_name
+                    assert move.spec.migration.overlap or not same_name
+
+    def test_executors_are_its_own(self) -> None:
+        """An open step names an executor of the same offer, with arguments that are JSON."""
+        for move in self.moves():
+            for step in self.make().propose(move).steps:
+                if isinstance(step, Execute):
+                    assert step.executor in self.offer.executors
+                    json.dumps(dict(step.arguments))
+
+
+def before_commit(plan: Plan) -> Sequence[Step]:
+    """The steps of a plan that can still be undone."""
+    commit = next(at for at, step in enumerate(plan.steps) if isinstance(step, Commit))
+    return plan.steps[:commit]

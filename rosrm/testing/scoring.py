@@ -1,0 +1,167 @@
+"""Hosts and processes for scoring policies, and what the master relies on in one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from rosrm.core.model import EMPTY, ProcessSpec
+from rosrm.ports import (
+    BoolArray,
+    FloatArray,
+    HostView,
+    ProcessView,
+    Scores,
+    ScoringOffer,
+    ScoringPolicy,
+)
+
+
+def host_view(
+    usage: Mapping[str, Sequence[float]],
+    *,
+    limit: float = 1.0,
+    capacity: float = 1.0,
+    processes: Sequence[int] = (),
+) -> HostView:
+    """Hosts h0, h1, ... for a scoring policy.
+
+    Args:
+        usage: by resource, one fraction for each host; NaN: the host has none.
+        limit: of every resource on every host, fraction.
+        capacity: base units, likewise.
+        processes: by host; (): none anywhere.
+    """
+    # The core keeps one row a resource; a policy sees the transpose, as here.
+    table = np.array(list(usage.values()), np.float64).reshape(len(usage), -1)
+    missing = np.isnan(table)
+    hosts = table.shape[1]
+    return HostView(
+        names=[f"h{host}" for host in range(hosts)],
+        resources=tuple(usage),
+        usage=table.T,
+        limit=np.full_like(table, limit).T,
+        capacity=np.where(missing, np.nan, capacity).T,
+        processes=np.array(processes or [0] * hosts, np.int64),
+    )
+
+
+def process_view(hosts: HostView, needs: Mapping[str, float] = EMPTY) -> ProcessView:
+    """A process to place, for a scoring policy.
+
+    Args:
+        hosts: where it could go.
+        needs: base units by resource.
+    """
+    need = np.zeros(hosts.usage.shape[::-1])
+    for name, amount in needs.items():
+        if name in hosts.resources:
+            row = hosts.resources.index(name)
+            need[row] = amount / hosts.capacity[:, row]
+    return ProcessView(ProcessSpec("p", command=("true",), needs=dict(needs)), need.T)
+
+
+class ScoringContract:
+    """What the master relies on in a scoring policy.
+
+    Attributes:
+        offer: what is tested.
+        options: settings by name; the others have their defaults.
+    """
+
+    offer: ScoringOffer
+    options: Mapping[str, Any] = EMPTY
+
+    def make(self) -> ScoringPolicy:
+        """A new policy; override it where more is needed."""
+        return self.offer.create(self.offer.options(**self.options))
+
+    def cases(self) -> Sequence[tuple[HostView, ProcessView]]:
+        """Hosts and processes of many kinds, the same in every run."""
+        chance = np.random.default_rng(7)
+        cases = []
+        for count in (1, 2, 7, 100, 1000):
+            usage = {name: chance.random(count) * 1.2 for name in ("memory", "cpu", "disk", "gpu")}
+            usage["gpu"][chance.random(count) < 0.5] = np.nan
+            hosts = host_view({name: list(column) for name, column in usage.items()}, limit=0.9)
+            cases.append((hosts, process_view(hosts, {"memory": 0.05, "cpu": 0.1})))
+        lean = host_view({"memory": [0.2, 0.4]})
+        cases.append((lean, process_view(lean)))
+        bare = host_view({"something": [0.2, 0.4]})
+        cases.append((bare, process_view(bare)))
+        return cases
+
+    def test_scores_every_host(self) -> None:
+        """One number a host, finite where it is not vetoed, and never NaN."""
+        for hosts, process in self.cases():
+            scores = self.make().score(hosts, process)
+            count = len(hosts.names)
+            assert np.shape(scores.value) == (count,)
+            assert not np.isnan(scores.value).any()
+            assert np.isfinite(scores.value[~vetoes(scores, count)]).all()
+
+    def test_rows_are_independent(self) -> None:
+        """A host scores alike, to the last bit, alone and among others."""
+        policy = self.make()
+        for hosts, process in self.cases():
+            together = policy.score(hosts, process)
+            for row in range(0, len(hosts.names), 1 + len(hosts.names) // 50):
+                alone = policy.score(*one_row(hosts, process, row))
+                assert alone.value[0] == together.value[row]
+                assert vetoes(alone, 1)[0] == vetoes(together, len(hosts.names))[row]
+
+    def test_is_pure(self) -> None:
+        """The same arguments give the same scores, and stay as they were."""
+        policy, twin = self.make(), self.make()
+        for hosts, process in self.cases():
+            arrays = (hosts.usage, hosts.limit, hosts.capacity, hosts.processes, process.need)
+            before = [array.copy() for array in arrays]
+            first = policy.score(hosts, process)
+            kept = first.value.copy()
+            policy.score(*one_row(hosts, process, 0))
+            assert np.array_equal(policy.score(hosts, process).value, kept)
+            assert np.array_equal(twin.score(hosts, process).value, kept)
+            assert np.array_equal(first.value, kept), "an answer changed after it was given"
+            for array, copy in zip(arrays, before, strict=True):
+                assert np.array_equal(array, copy, equal_nan=True), "an argument was changed"
+
+    def test_gives_reasons(self) -> None:
+        """Every score and every veto can be explained in words."""
+        for hosts, process in self.cases():
+            scores = self.make().score(hosts, process)
+            vetoed = vetoes(scores, len(hosts.names))
+            for row in range(min(20, len(hosts.names))):
+                reason = scores.veto_reason(row) if vetoed[row] else scores.reason(row)
+                assert isinstance(reason, str)
+                assert reason or not vetoed[row]
+
+    def test_no_hosts(self) -> None:
+        """None to judge is no error."""
+        hosts = host_view({"memory": [], "cpu": []})
+        assert len(self.make().score(hosts, process_view(hosts)).value) == 0
+
+
+def vetoes(scores: Scores, count: int) -> BoolArray:
+    """(N,) the vetoes of a judgement of `count` hosts, all False where it has none."""
+    return np.zeros(count, np.bool_) if scores.veto is None else scores.veto
+
+
+def one_row(hosts: HostView, process: ProcessView, row: int) -> tuple[HostView, ProcessView]:
+    """The same question for one host alone."""
+    one = slice(row, row + 1)
+
+    def part(array: FloatArray) -> FloatArray:
+        return array[one]
+
+    alone = HostView(
+        hosts.names[one],
+        hosts.resources,
+        part(hosts.usage),
+        part(hosts.limit),
+        part(hosts.capacity),
+        hosts.processes[one],
+    )
+    return alone, replace(process, need=part(process.need))
