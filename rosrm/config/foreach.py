@@ -29,23 +29,26 @@ _WHOLE: Final = re.compile(r"\{([A-Za-z_]\w*)\}")
 
 
 def rows_of(foreach: Node, problems: Problems) -> list[Row]:
-    """The values that each process is made with; every fault is noted."""
+    """The values that each process is made with; none, with every fault noted, if there is any."""
+    faults = Problems()
+    rows = _rows(foreach, faults)
+    if not rows and not faults:
+        faults.add(foreach.place, "foreach: stands for no process at all")
+    problems.found.update(faults.found)
+    return [] if faults else rows
+
+
+def _rows(foreach: Node, problems: Problems) -> list[Row]:
     if isinstance(foreach.value, tuple):
         rows = [_row(item, problems) for item in foreach.value]
         _check_same_names(foreach, rows, problems)
-    elif foreach.items:
+        return rows
+    if foreach.items:
         names = {name: _values(name, node, problems) for name, node in foreach.items.items()}
-        rows = _product(foreach, names, problems)
-    else:
-        problems.add(
-            foreach.place,
-            f"foreach: a mapping from a name to its values is wanted, "
-            f"such as {{i: range(0, 60)}}, not {described(foreach.plain())}",
-        )
-        return []
-    if not rows:
-        problems.add(foreach.place, "foreach: stands for no process at all")
-    return rows
+        return _product(foreach, names, problems)
+    wanted = "a mapping from a name to its values is wanted, such as {i: range(0, 60)}"
+    problems.add(foreach.place, f"foreach: {wanted}, not {described(foreach.plain())}")
+    return []
 
 
 def substituted(node: Node, row: Row, problems: Problems) -> Node:

@@ -105,11 +105,16 @@ def _process(node: Node, plugins: PluginCheck, problems: Problems) -> ProcessSpe
 
 def _refuse_namesakes(nodes: Sequence[Node], problems: Problems) -> None:
     first: dict[str, Place] = {}
-    for name in filter(None, (node.get("name") for node in nodes)):
-        before = first.setdefault(str(name.value), name.place)
-        if before is not name.place:
-            problems.add(
-                name.place,
-                f"duplicate process name {name.value!r}, first given at line {before.line}, "
-                f"column {before.column}",
-            )
+    for node in nodes:
+        name = node.get("name")
+        if name is None or not isinstance(name.value, str):
+            continue
+        before = first.get(name.value)
+        if before is None:
+            first[name.value] = name.place
+        elif before == name.place:
+            text = f"foreach gives every process the name {name.value!r}; put one of its names in"
+            problems.add(name.place, text)
+        else:
+            where = f"first given at line {before.line}, column {before.column}"
+            problems.add(name.place, f"duplicate process name {name.value!r}, {where}")

@@ -1,0 +1,94 @@
+"""Whatever stands in a file, a loader answers with a value or with one `ConfigError`."""
+
+from __future__ import annotations
+
+import json
+from contextlib import suppress
+from dataclasses import fields
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rosrm.config import load_cluster, load_host, load_work
+from rosrm.config.process import (
+    LabelsInFile,
+    MigrationInFile,
+    ProcessInFile,
+    ReadinessInFile,
+    RestartInFile,
+)
+from rosrm.config.ros import DiscoveryInFile, RosInFile
+from rosrm.config.settings import ClusterConfig, HostConfig, MigrationSettings, ScoringChoice
+from rosrm.errors import ConfigError
+
+KEYS = sorted(
+    {
+        f.name
+        for kind in (
+            ClusterConfig,
+            HostConfig,
+            MigrationSettings,
+            ScoringChoice,
+            RosInFile,
+            DiscoveryInFile,
+            ProcessInFile,
+            LabelsInFile,
+            MigrationInFile,
+            ReadinessInFile,
+            RestartInFile,
+        )
+        for f in fields(kind)
+    }
+    | {"processes", "foreach", "memory", "cpu", "i"}
+)
+WORDS = ["", "a", "{i}", "{", "range(3)", "5s", "2GiB", "slice", "relaunch", "x 'y", "job"]
+
+scalars = st.none() | st.booleans() | st.integers(-3, 3) | st.floats() | st.sampled_from(WORDS)
+values = st.recursive(
+    scalars,
+    lambda inner: (
+        st.lists(inner, max_size=3) | st.dictionaries(st.sampled_from(KEYS), inner, max_size=4)
+    ),
+    max_leaves=12,
+)
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory):
+    return tmp_path_factory.mktemp("any") / "f.yaml"
+
+
+@pytest.mark.parametrize("load", [load_cluster, load_host, load_work])
+@given(root=st.dictionaries(st.sampled_from(KEYS), values, max_size=6))
+@settings(max_examples=60, deadline=None)
+def test_any_document_is_taken_or_refused(path, load, root):
+    path.write_text(json.dumps(root), encoding="utf-8")
+    with suppress(ConfigError):
+        load(path)
+
+
+@given(root=st.lists(st.dictionaries(st.sampled_from(KEYS), values, max_size=6), min_size=1))
+@settings(max_examples=60, deadline=None)
+def test_any_list_of_processes_is_taken_or_refused(path, root):
+    path.write_text(json.dumps({"processes": root}), encoding="utf-8")
+    with suppress(ConfigError):
+        load_work(path)
+
+
+@pytest.mark.parametrize("load", [load_cluster, load_host, load_work])
+@given(text=st.text(max_size=40))
+@settings(max_examples=100, deadline=None)
+def test_any_text_is_taken_or_refused(path, load, text):
+    path.write_text(text, encoding="utf-8", newline="")
+    with suppress(ConfigError):
+        load(path)
+
+
+@pytest.mark.parametrize("load", [load_cluster, load_host, load_work])
+@given(content=st.binary(max_size=20))
+@settings(max_examples=50, deadline=None)
+def test_any_bytes_are_taken_or_refused(path, load, content):
+    path.write_bytes(content)
+    with suppress(ConfigError):
+        load(path)

@@ -1,0 +1,194 @@
+"""`cluster.yaml`: every setting is read, and every fault has its place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Annotated
+
+import pytest
+from annotated_types import Le
+
+from rosrm.config import ClusterConfig, load_cluster
+from rosrm.config.units import Fraction, Seconds
+from rosrm.core.settings import CoreSettings
+from rosrm.hookspecs import hookimpl
+from rosrm.ports import MigrationOffer, ScoringOffer
+from rosrm.registry import Registry
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Options of a scoring policy."""
+
+    mem: Fraction = 1.0
+    cpu: Annotated[float, Le(0.5)] = 0.0
+    window: Seconds = 1.0
+    order: tuple[str, ...] = ()
+
+
+@hookimpl
+def register_scoring_policies():
+    return [ScoringOffer("weighted", lambda options: options, Weights)]
+
+
+@hookimpl
+def register_migration_strategies():
+    return [MigrationOffer("relaunch", lambda options: options)]
+
+
+@pytest.fixture
+def registry():
+    return Registry.of(
+        ours=SimpleNamespace(
+            register_scoring_policies=register_scoring_policies,
+            register_migration_strategies=register_migration_strategies,
+        )
+    )
+
+
+def test_an_empty_file_gives_the_defaults(file):
+    assert load_cluster(file("")) == ClusterConfig()
+    assert ClusterConfig().core() == CoreSettings()
+
+
+def test_every_setting_is_read(file, tmp_path):
+    config = load_cluster(
+        file(
+            """
+            name: lab
+            ros:
+              domain: 7
+              discovery: {range: localhost, server: "10.0.0.1:11811"}
+              transports: UDPv4
+              namespace: /fleet/rosrm
+            state: here
+            scoring: {policy: threshold, options: {a: 1}}
+            migration:
+              strategies: {relaunch: , handoff: {x: 2}}
+              cooldown: 1min
+              hysteresis: 500ms
+              headroom: 0.1
+              max_in_flight: 3
+              automatic: false
+            queue: {backfill: true}
+            defaults: {needs: {memory: 1GiB, cpu: 1}, settle: 5s}
+            liveness: {suspect: 2s, lease: 20s}
+            control: {max_age: 3s, beat_period: 100ms, order_retry: 1s}
+            journal: {sync: full, keep_events: 10}
+            checkpoint: {policy: often, options: {b: 2}}
+            delivery_timeout: 4s
+            """
+        )
+    )
+    assert (config.name, config.state) == ("lab", tmp_path / "here")
+    assert (config.ros.domain, config.ros.discovery_range) == (7, "localhost")
+    assert (config.ros.discovery_server, config.ros.transports) == ("10.0.0.1:11811", "UDPv4")
+    assert config.ros.namespace == "/fleet/rosrm"
+    assert (config.scoring.policy, config.scoring.options) == ("threshold", {"a": 1})
+    assert dict(config.migration.strategies) == {"relaunch": {}, "handoff": {"x": 2}}
+    assert config.core() == CoreSettings(
+        backfill=True,
+        default_needs={"memory": 2.0**30, "cpu": 1.0},
+        settle=5.0,
+        suspect=2.0,
+        lease=20.0,
+        delivery_timeout=4.0,
+        cooldown=60.0,
+        hysteresis=0.5,
+        headroom=0.1,
+        max_migrations=3,
+        automatic=False,
+        order_retry=1.0,
+    )
+    assert (config.control.max_age, config.control.beat_period) == (3.0, 0.1)
+    assert (config.journal.sync, config.journal.keep_events) == ("full", 10)
+    assert (config.checkpoint.policy, config.checkpoint.options) == ("often", {"b": 2})
+    assert ClusterConfig.from_json(config.to_json()) == config
+
+
+def test_everything_wrong_is_said_at_once_each_with_its_place(refusal):
+    said = refusal(
+        load_cluster,
+        """
+        name: "two words"
+        scorring: {policy: x}
+        ros: {domain: 300, discovery: {range: local}}
+        migration: {headroom: 5, automatic: yes, strategies: [a, a]}
+        liveness: {suspect: 20s}
+        journal:
+        queue: []
+        defaults: {needs: {cpu: 5MB}}
+        """,
+    )
+    expected = [
+        "f.yaml:2:7: 'two words' cannot be the name of a cluster",
+        "f.yaml:3:1: unknown key 'scorring'; did you mean 'scoring'? Allowed: name, ros",
+        "f.yaml:4:15: ros.domain: 300 is not within 0..232",
+        """f.yaml:4:39: ros.discovery.range: "local" is unknown; did you mean 'localhost'?""",
+        "f.yaml:5:23: migration.headroom: 5 is not within 0..1 (a fraction: 0.8 means 80 %)",
+        'f.yaml:5:37: migration.automatic: true or false is wanted, not "yes"',
+        "f.yaml:5:54: migration.strategies: 'a' is named twice",
+        "f.yaml:7:9: journal: a mapping is wanted, not nothing (null)",
+        "f.yaml:8:8: queue: a mapping is wanted, not a list",
+        "f.yaml:9:25: defaults.needs.cpu: unknown unit 'MB'. Allowed: core, cores",
+    ]
+    lines = said.splitlines()
+    assert lines[0] == f"{len(expected)} errors in f.yaml"
+    for line, start in zip(lines[1:], expected, strict=True):
+        assert line.strip().startswith(start)
+
+
+def test_a_lease_outlasts_the_suspicion(refusal):
+    said = refusal(load_cluster, "liveness:\n  suspect: 20s\n")
+    assert said == ("f.yaml:2:12: liveness.suspect (20 s) must be less than liveness.lease (10 s)")
+
+
+def test_options_of_no_policy_are_refused(refusal):
+    assert "f.yaml:1:23: checkpoint.options: options of no policy" in refusal(
+        load_cluster, "checkpoint: {options: {a: 1}}"
+    )
+
+
+def test_a_wrong_type_and_an_unknown_plugin_are_said_together(refusal, registry):
+    said = refusal(load_cluster, "name: 5\nscoring: {policy: wieghted}\n", registry)
+    assert "f.yaml:1:7: name: text is wanted, not 5" in said
+    assert (
+        "f.yaml:2:11: unknown scoring policy 'wieghted'; did you mean 'weighted'? "
+        "Installed: weighted." in said
+    )
+
+
+def test_options_are_checked_against_the_plugin_and_kept_in_base_units(file, registry):
+    config = load_cluster(
+        file("scoring: {options: {mem: 0.5, window: 2min, order: [a]}}"), registry
+    )
+    assert config.scoring.policy == "weighted"
+    assert config.scoring.options == {"mem": 0.5, "cpu": 0.0, "window": 120.0, "order": ["a"]}
+    assert registry.scoring("weighted", config.scoring.options) == Weights(0.5, 0.0, 120.0, ("a",))
+
+
+def test_a_wrong_option_names_plugin_option_allowed_ones_and_place(refusal, registry):
+    said = refusal(load_cluster, "scoring: {options: {mem: 1.5, cpu: 0.6, memory: 1}}", registry)
+    title = "options of scoring policy 'weighted'"
+    assert f"f.yaml:1:26: {title}.mem: 1.5 is not within 0..1" in said
+    assert f"f.yaml:1:36: {title}.cpu: input should be less than or equal to 0.5" in said
+    assert f"f.yaml:1:41: unknown key 'memory' in {title}; did you mean 'mem'?" in said
+    assert "Allowed: mem, cpu, window, order" in said
+
+
+def test_options_for_a_plugin_without_any_are_refused(refusal, registry):
+    said = refusal(load_cluster, "migration: {strategies: {relaunch: {fast: true}}}", registry)
+    assert "unknown key 'fast' in options of migration strategy 'relaunch'" in said
+    assert "Allowed: none" in said
+
+
+def test_options_that_are_no_mapping_are_refused(refusal, registry):
+    said = refusal(load_cluster, "scoring: {options: [1]}", registry)
+    assert "f.yaml:1:20: scoring.options: a mapping is wanted, not a list" in said
+
+
+def test_a_default_plugin_that_is_not_installed_is_said_too(refusal):
+    said = refusal(load_cluster, "", Registry.of())
+    assert "unknown scoring policy 'weighted'. None is installed; rosrm-scoring brings" in said
+    assert "unknown migration strategy 'relaunch'" in said

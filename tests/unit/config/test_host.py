@@ -1,0 +1,125 @@
+"""`host.yaml`: every setting is read, and every fault has its place."""
+
+from __future__ import annotations
+
+import socket
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import pytest
+
+from rosrm.config import HostConfig, load_host
+from rosrm.hookspecs import hookimpl
+from rosrm.ports import ProbeOffer
+from rosrm.registry import Registry
+
+
+@dataclass(frozen=True)
+class DiskOptions:
+    """Options of a probe."""
+
+    path: str = "/"
+
+
+@hookimpl
+def register_probes():
+    return [ProbeOffer("disk", lambda options, context: options, DiskOptions, default=True)]
+
+
+@pytest.fixture
+def registry():
+    return Registry.of(ours=SimpleNamespace(register_probes=register_probes))
+
+
+def test_an_empty_file_gives_the_defaults(file):
+    config = load_host(file(""))
+    assert config == HostConfig()
+    assert config.host == socket.gethostname()
+    assert config.limits == {"memory": 0.8, "cpu": 0.9, "disk": 0.9}
+    assert config.period == pytest.approx(0.1)
+
+
+def test_every_setting_is_read(file, tmp_path, registry):
+    config = load_host(
+        file(
+            """
+            host: robot-1
+            ros: {domain: 3}
+            state: here
+            labels: {camera: front, gpu: true, floor: 2}
+            scope: slice
+            budget: {memory: 2GiB, cpu: 1.0, disk: 10GB}
+            limits: {memory: 0.7, gpu: 0.95}
+            rate: 20
+            probes: {disk: {path: /data}}
+            max_processes: 4
+            logs: {max_bytes: 1MB, keep: 1}
+            on_stop: keep
+            """
+        ),
+        registry,
+    )
+    assert (config.host, config.ros.domain, config.state) == ("robot-1", 3, tmp_path / "here")
+    assert config.labels == {"camera": "front", "gpu": "true", "floor": "2"}
+    assert (config.scope, config.budget["memory"]) == ("slice", 2.0**31)
+    assert config.limits == {"memory": 0.7, "cpu": 0.9, "disk": 0.9, "gpu": 0.95}
+    assert (config.rate, config.period) == (20.0, 0.05)
+    assert config.probes == {"disk": {"path": "/data"}}
+    assert (config.max_processes, config.on_stop) == (4, "keep")
+    assert (config.logs.max_bytes, config.logs.keep) == (1_000_000, 1)
+    assert HostConfig.from_json(config.to_json()) == config
+
+
+def test_probes_may_be_a_list_of_names_or_none_at_all(file, registry):
+    assert load_host(file("probes: [disk]"), registry).probes == {"disk": {"path": "/"}}
+    assert load_host(file("probes: {}"), registry).probes == {}
+    assert load_host(file("probes:"), registry).probes is None
+
+
+def test_a_limit_outside_0_to_1_is_refused(refusal):
+    said = refusal(load_host, "limits: {memory: 80, cpu: -0.1}")
+    assert "f.yaml:1:18: limits.memory: 80 is not within 0..1 (a fraction: 0.8 means 80 %)" in said
+    assert "f.yaml:1:27: limits.cpu: -0.1 is not within 0..1" in said
+
+
+def test_a_slice_needs_a_budget_above_zero(refusal):
+    assert "f.yaml:1:8: scope: a slice needs its budget of memory and cpu" in refusal(
+        load_host, "scope: slice"
+    )
+    assert "f.yaml:2:9: scope: a slice needs its budget of cpu" in refusal(
+        load_host, "scope: slice\nbudget: {memory: 2GiB}"
+    )
+    assert "f.yaml:2:18: budget.memory: must be above 0" in refusal(
+        load_host, "scope: slice\nbudget: {memory: 0, cpu: 1}"
+    )
+
+
+def test_an_unknown_probe_and_a_wrong_option_are_refused_with_their_place(refusal, registry):
+    said = refusal(load_host, "probes:\n  disc: {}\n  disk: {paht: 5}\n", registry)
+    assert "f.yaml:2:3: unknown probe 'disc'; did you mean 'disk'? Installed: disk." in said
+    assert "f.yaml:3:10: unknown key 'paht' in options of probe 'disk'; did you mean 'path'" in said
+
+
+def test_other_values_are_refused_with_what_is_allowed(refusal):
+    said = refusal(
+        load_host,
+        """
+        host: bad/name
+        scope: container
+        rate: 0
+        max_processes: -1
+        logs: {max_bytes: 10}
+        on_stop: restart
+        labels: {a: [1]}
+        """,
+    )
+    for expected in (
+        "f.yaml:2:7: 'bad/name' cannot be the name of a host",
+        'f.yaml:3:8: scope: "container" is unknown. Allowed: machine, cgroup, slice',
+        "f.yaml:4:7: rate: 0 is not within 0.1..1000 (Hz)",
+        "f.yaml:5:16: max_processes: -1 is not within 0..",
+        "f.yaml:6:19: logs.max_bytes: 10 is not at least 4096",
+        'f.yaml:7:10: on_stop: "restart" is unknown. Allowed: stop, keep',
+        "f.yaml:8:13: labels.a: text is wanted, not a list",
+    ):
+        assert expected in said

@@ -1,0 +1,257 @@
+"""`work.yaml`: processes in the words of ROS 2 launch, and every fault with its place."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+
+from rosrm.config import load_work
+from rosrm.core.model import Kind, MigrationPolicy, Readiness, RestartPolicy, StopPolicy
+from rosrm.hookspecs import hookimpl
+from rosrm.ports import MigrationOffer
+from rosrm.registry import Registry
+
+
+def one(path):
+    (spec,) = load_work(path)
+    return spec
+
+
+def test_every_word_is_read(file):
+    spec = one(
+        file(
+            """
+            processes:
+              - name: camera
+                namespace: /robot1
+                package: image_tools
+                executable: cam2image
+                arguments: [--rate, 5, --verbose]
+                parameters: {width: 320, frame: {id: cam, ids: [1, 2]}}
+                remappings: {image: /front/image}
+                environment: {RATE: 5, DEBUG: true}
+                working_directory: /data
+                kind: job
+                restart: {when: on-failure, delay: 2s, max_delay: 1min, attempts: 3}
+                needs: {memory: 500MB, cpu: 0.5, network: 1 MB/s}
+                labels: {required: {camera: front}, preferred: {gpu: true}, avoided: {slow: 1}}
+                priority: 5
+                migration: {strategy: relaunch, overlap: false, options: {a: 1}}
+                readiness: {kind: graph, timeout: 10s}
+                stop: {interrupt_grace: 1s, terminate_grace: 500ms}
+            """
+        )
+    )
+    assert (spec.name, spec.namespace, spec.program) == (
+        "camera",
+        "/robot1",
+        "image_tools/cam2image",
+    )
+    assert spec.arguments == ("--rate", "5", "--verbose")
+    assert spec.parameters == {"width": 320, "frame.id": "cam", "frame.ids": [1, 2]}
+    assert spec.remappings == {"image": "/front/image"}
+    assert spec.environment == {"RATE": "5", "DEBUG": "true"}
+    assert (spec.working_directory, spec.ros, spec.kind) == ("/data", True, Kind.JOB)
+    assert spec.restart == RestartPolicy("on-failure", delay=2.0, max_delay=60.0, attempts=3)
+    assert spec.needs == {"memory": 5e8, "cpu": 0.5, "network": 1e6}
+    assert spec.required_labels == {"camera": "front"}
+    assert (spec.preferred_labels, spec.avoided_labels) == ({"gpu": "true"}, {"slow": "1"})
+    assert spec.priority == 5
+    assert spec.migration == MigrationPolicy("relaunch", False, {"a": 1})
+    assert spec.readiness == Readiness("graph", 10.0)
+    assert spec.stop == StopPolicy(1.0, 0.5)
+
+
+@pytest.mark.parametrize(
+    ("entry", "field", "value"),
+    [
+        ("command: sleep '1 0'", "command", ("sleep", "1 0")),
+        ("command: [sleep, 10]", "command", ("sleep", "10")),
+        ("command: x, restart: always", "restart", RestartPolicy("always")),
+        ("command: x, migration: relaunch", "migration", MigrationPolicy("relaunch")),
+        ("command: x, migration: null", "migration", MigrationPolicy()),
+        ("command: x, readiness: running", "readiness", Readiness("running")),
+        ("package: p, executable: e", "ros", True),
+        ("package: p, executable: e, ros: false", "ros", False),
+        ("module: m", "ros", False),
+        ("module: m, ros: true, remappings: [[a, b]]", "remappings", {"a": "b"}),
+    ],
+)
+def test_shorthands_stand_for_the_long_forms(file, entry, field, value):
+    assert getattr(one(file(f"processes: [{{name: a, {entry}}}]")), field) == value
+
+
+def test_defaults_lie_under_each_process_in_depth(file):
+    first, second = load_work(
+        file(
+            """
+            defaults:
+              module: m
+              needs: {memory: 10MB, cpu: 1}
+              restart: on-failure
+              migration: {strategy: relaunch, overlap: false, options: {a: 1}}
+            processes:
+              - {name: a, needs: {memory: 20MB}, restart: {delay: 5s}}
+              - {name: b, command: x, migration: other}
+            """
+        )
+    )
+    assert (first.module, first.needs) == ("m", {"memory": 20e6, "cpu": 1.0})
+    assert first.restart == RestartPolicy("on-failure", delay=5.0)
+    assert first.migration == MigrationPolicy("relaunch", False, {"a": 1})
+    assert (second.module, second.command) == (None, ("x",))
+    assert second.migration == MigrationPolicy("other", False, {})
+
+
+def test_foreach_makes_many_alike(file):
+    specs = load_work(
+        file(
+            """
+            processes:
+              - name: "hold_{mb:02d}_{who}"
+                foreach: {mb: "range(8, 25, 8)", who: [ann, bob]}
+                command: "hold {mb} {{mb}}"
+                needs: {memory: "{mb}MB"}
+                priority: "{mb}"
+            """
+        )
+    )
+    assert [spec.name for spec in specs[:3]] == ["hold_08_ann", "hold_08_bob", "hold_16_ann"]
+    assert len(specs) == 6
+    assert specs[-1].command == ("hold", "24", "{mb}")
+    assert (specs[-1].needs, specs[-1].priority) == ({"memory": 24e6}, 24)
+
+
+def test_foreach_rows_may_be_listed(file):
+    specs = load_work(
+        file(
+            """
+            processes:
+              - name: "p{i}"
+                foreach: [{i: 1, mb: 8}, {i: 7, mb: 80}]
+                command: hold {mb}
+            """
+        )
+    )
+    assert [(spec.name, spec.command[1]) for spec in specs] == [("p1", "8"), ("p7", "80")]
+
+
+def test_braces_are_plain_without_foreach(file):
+    assert one(file("processes: [{name: a, command: ['echo', '${HOME}']}]")).command[1] == "${HOME}"
+
+
+@pytest.mark.parametrize(
+    ("foreach", "name", "said"),
+    [
+        ("{i: range(3)}", "n{j}", "f.yaml:1:20: 'n{j}': unknown name 'j'. Allowed: i"),
+        ("{i: range(3)}", "n", "f.yaml:1:20: foreach gives every process the name 'n'"),
+        ("{i: range(3)}", "n{i", "a single brace; write {{ for a plain one"),
+        ("{i: range(3)}", "n{i:zz}", "'n{i:zz}': Unknown format code 'z'"),
+        ("{i: range(3)}", "n{i.x}", "unknown name 'i.x'"),
+        ("{i: range(0)}", "n{i}", "f.yaml:1:37: foreach: stands for no process at all"),
+        ("{i: 'range(0,5,0)'}", "n{i}", "f.yaml:1:41: foreach.i: a step of 0"),
+        ("{i: range(10001)}", "n{i}", "foreach: stands for more than 10000 processes"),
+        ("{i: 5}", "n{i}", "f.yaml:1:41: foreach.i: a list or range(first, end) is wanted, not 5"),
+        ("{i: [[1]]}", "n{i}", "f.yaml:1:42: foreach: text or a number is wanted, not a list"),
+        ("[{i: 1}, {j: 1}]", "n{i}", "f.yaml:1:46: foreach: gives j, and the first of the list i"),
+        ("3", "n", "f.yaml:1:34: foreach: a mapping from a name to its values is wanted"),
+    ],
+)
+def test_a_wrong_foreach_is_refused_with_its_place(refusal, foreach, name, said):
+    text = f"processes: [{{name: '{name}', foreach: {foreach}, command: x}}]"
+    assert said in refusal(load_work, text)
+
+
+def test_duplicate_names_are_refused_naming_both_places(refusal):
+    said = refusal(
+        load_work,
+        """
+        processes:
+          - {name: a1, command: x}
+          - {name: "a{i}", foreach: {i: [0, 1]}, command: x}
+        """,
+    )
+    assert said == ("f.yaml:4:12: duplicate process name 'a1', first given at line 3, column 12")
+
+
+@pytest.mark.parametrize(
+    ("entry", "said"),
+    [
+        ("name: a", "f.yaml:1:13: exactly one of package + executable, module and command"),
+        ("name: a, command: x, module: y", "and module and command is given"),
+        ("name: a, package: p", "f.yaml:1:32: package 'p' is given without an executable"),
+        ("name: a, executable: e", "executable 'e' is given without a package; a program that"),
+        ("command: x", "f.yaml:1:13: name: is missing"),
+        ("name: a b, command: x", "f.yaml:1:20: 'a b' cannot be the name of a process"),
+        ("name: a-b, package: p, executable: e", "'a-b' cannot be the name of a ROS node"),
+        ("name: a, command: x, parameters: {b: 1}", "parameters: only a ROS node has one"),
+        ("name: a, command: x, namespace: /b", "namespace: only a ROS node has one"),
+        ("name: a, command: x, readiness: graph", "only a ROS node is seen in the graph"),
+        ("name: a, module: x, ros: true, namespace: b", "'b' is not an absolute namespace"),
+        ("name: a, module: x, ros: true, parameters: {b: }", "parameters.b: a value is wanted"),
+        ("name: a, module: x, ros: true, parameters: {b: [1, a]}", "values of one type"),
+        ("name: a, module: x, ros: true, parameters: {b: .nan}", "a finite number is wanted"),
+        ("name: a, command: x, working_directory: d", "f.yaml:1:54: working_directory: 'd' is"),
+        ("name: a, command: x, environment: {A=B: c}", "'A=B' cannot be a variable"),
+        ("name: a, command: x, restart: sometimes", 'restart.when: "sometimes" is unknown'),
+        ("name: a, command: x, restart: {when: always, delay: 1h}", "max_delay must not be less"),
+        ("name: a, command: x, kind: jobs", """kind: "jobs" is unknown; did you mean 'job'?"""),
+        ("name: a, command: x, priority: high", "priority: 'high' is not a whole number"),
+        ("name: a, command: x, needs: {memory: lots}", "needs.memory: 'lots' is not a number"),
+        ('name: a, command: "echo \'x"', "cannot be split into words: No closing quotation"),
+        ("name: a, comand: x", "unknown key 'comand'; did you mean 'command'?"),
+        ("name: a, command: x, labels: {need: {}}", "unknown key 'need' in labels"),
+        ("name: a, module: x, ros: true, remappings: [[a]]", "remappings: a mapping is wanted"),
+    ],
+)
+def test_a_wrong_entry_is_refused_with_its_place(refusal, entry, said):
+    assert said in refusal(load_work, f"processes: [{{{entry}}}]")
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "f.yaml:1:1: processes: a list of at least one process is wanted"),
+        ("processes: []", "f.yaml:1:12: processes: a list of at least one"),
+        ("processes: [a]", "f.yaml:1:13: processes: each of the list is a mapping"),
+        ("proceses: []", "f.yaml:1:1: unknown key 'proceses'; did you mean 'processes'?"),
+        ("defaults: {name: x}\nprocesses: []", "f.yaml:1:12: defaults: name belongs to one"),
+        ("defaults: 5\nprocesses: []", "f.yaml:1:11: defaults: a mapping is wanted"),
+    ],
+)
+def test_a_wrong_file_is_refused_with_its_place(refusal, text, said):
+    assert said in refusal(load_work, text)
+
+
+def test_a_fault_in_defaults_is_said_once_at_its_place(refusal):
+    said = refusal(
+        load_work,
+        """
+        defaults: {needs: {memory: 64mib}}
+        processes: [{name: a, command: x}, {name: b, command: x}]
+        """,
+    )
+    assert said.startswith("f.yaml:2:28: needs.memory: unknown unit 'mib'; did you mean 'MiB'?")
+
+
+@hookimpl
+def register_migration_strategies():
+    return [MigrationOffer("relaunch", lambda options: options)]
+
+
+def test_with_a_registry_the_strategy_and_its_options_are_checked(refusal):
+    registry = Registry.of(
+        ours=SimpleNamespace(register_migration_strategies=register_migration_strategies)
+    )
+    said = refusal(
+        load_work,
+        """
+        processes:
+          - {name: a, command: x, migration: relunch}
+          - {name: b, command: x, migration: {strategy: relaunch, options: {fast: 1}}}
+        """,
+        registry,
+    )
+    assert "f.yaml:3:38: unknown migration strategy 'relunch'; did you mean 'relaunch'?" in said
+    assert "f.yaml:4:69: unknown key 'fast' in options of migration strategy 'relaunch'" in said

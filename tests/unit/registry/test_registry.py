@@ -1,0 +1,261 @@
+"""The registry: plugins are chosen by name, and each that fails is named with the reason."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import pytest
+
+from rosrm.core.model import Reading, ResourceDescription
+from rosrm.errors import ConfigError, PluginError, SkipPlugin
+from rosrm.hookspecs import hookimpl
+from rosrm.ports import CheckpointOffer, MigrationOffer, ProbeContext, ProbeOffer, ScoringOffer
+from rosrm.registry import Registry
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of a plugin."""
+
+    ratio: float = 0.5
+
+
+class Probe:
+    """Reads nothing of interest."""
+
+    def __init__(self, *names, capacity=1.0):
+        self.resources = [ResourceDescription(name, "1", capacity) for name in names]
+        self.closed = False
+
+    def read(self):
+        return [Reading(resource.name, 0.0) for resource in self.resources]
+
+    def close(self):
+        self.closed = True
+
+
+def plugin(**hooks):
+    """A plugin whose hooks answer with these offers (or raise them)."""
+
+    def implement(name, answer):
+        def hook():
+            if isinstance(answer, BaseException):
+                raise answer
+            return answer
+
+        hook.__name__ = name
+        return hookimpl(hook)
+
+    return SimpleNamespace(**{name: implement(name, answer) for name, answer in hooks.items()})
+
+
+def probes(*offers):
+    return Registry.of(ours=plugin(register_probes=list(offers)))
+
+
+def offered(name, create=None, **more):
+    return ProbeOffer(name, create or (lambda options, context: Probe(name)), **more)
+
+
+@pytest.fixture
+def context(tmp_path):
+    return ProbeContext("machine", {}, tmp_path, SimpleNamespace())
+
+
+def test_each_kind_is_made_by_name_with_its_options():
+    registry = Registry.of(
+        ours=plugin(
+            register_scoring_policies=[ScoringOffer("s", lambda options: options, Options)],
+            register_migration_strategies=[MigrationOffer("m", lambda options: options, Options)],
+            register_checkpoint_policies=[CheckpointOffer("c", lambda options: options, Options)],
+        )
+    )
+    assert registry.scoring("s", {"ratio": 1}) == Options(1.0)
+    assert registry.migrations({"m": {}}) == {"m": Options()}
+    assert registry.checkpoint("c") == Options()
+    assert registry.checkpoint(None) is None
+    assert [(row.kind, row.state) for row in registry.rows()] == [
+        ("checkpoint", "selected"),
+        ("migration", "selected"),
+        ("scoring", "selected"),
+    ]
+
+
+def test_an_unknown_name_is_refused_with_what_is_there_and_what_is_broken():
+    registry = Registry.of(
+        good=plugin(register_scoring_policies=[ScoringOffer("weighted", lambda options: None)]),
+        bad=plugin(register_scoring_policies=OSError("no such table")),
+    )
+    with pytest.raises(ConfigError) as refused:
+        registry.scoring("wieghted")
+    said = str(refused.value)
+    assert (
+        "unknown scoring policy 'wieghted'; did you mean 'weighted'? Installed: weighted." in said
+    )
+    assert "Broken: plugin 'bad': register_scoring_policies (" in said
+    assert "failed with OSError: no such table" in said
+
+
+def test_a_wrong_option_is_refused_with_what_is_allowed():
+    registry = Registry.of(
+        ours=plugin(register_scoring_policies=[ScoringOffer("s", lambda options: None, Options)])
+    )
+    with pytest.raises(ConfigError, match=r"options of scoring policy 's': unknown a; allowed: ra"):
+        registry.scoring("s", {"a": 1})
+    with pytest.raises(ConfigError, match=r"ratio: float is wanted, not 'x'"):
+        registry.scoring("s", {"ratio": "x"})
+
+
+def test_a_plugin_that_raises_when_it_is_made_is_named_with_its_definition():
+    def create(options):
+        return {}["weight"]
+
+    registry = Registry.of(ours=plugin(register_scoring_policies=[ScoringOffer("s", create)]))
+    with pytest.raises(PluginError) as refused:
+        registry.scoring("s")
+    said = str(refused.value)
+    assert said.startswith("scoring policy 's' of plugin 'ours': `create` (")
+    assert "test_registry.py:" in said
+    assert said.endswith("raised KeyError: 'weight'")
+    assert registry.rows("scoring")[0].state == "broken"
+
+
+def test_a_policy_that_is_absent_is_refused_with_its_reason():
+    def create(options):
+        raise SkipPlugin("no licence")
+
+    registry = Registry.of(ours=plugin(register_scoring_policies=[ScoringOffer("s", create)]))
+    with pytest.raises(ConfigError, match="scoring policy 's' is absent here: no licence"):
+        registry.scoring("s")
+
+
+def test_a_name_offered_twice_belongs_to_neither_and_both_are_named():
+    registry = Registry.of(
+        a=plugin(register_scoring_policies=[ScoringOffer("s", lambda options: 1)]),
+        b=plugin(register_scoring_policies=[ScoringOffer("s", lambda options: 2)]),
+    )
+    with pytest.raises(ConfigError, match="offered twice, by plugin 'a' and plugin 'b': uninstall"):
+        registry.scoring("s")
+    assert {row.state for row in registry.rows()} == {"broken"}
+
+
+@pytest.mark.parametrize(
+    ("answer", "said"),
+    [
+        (5, "returned int, not a list of ProbeOffer"),
+        ("cpu", "returned str, not a list of ProbeOffer"),
+        ([ScoringOffer("s", lambda options: None)], "which is not a ProbeOffer"),
+        ([ProbeOffer("", Probe)], "offers something without a name: ''"),
+        ([ProbeOffer("p", None)], "'p': `create` cannot be called"),
+        ([ProbeOffer("p", Probe, options=dict)], "'p': `options` is not a dataclass"),
+        ([ProbeOffer("p", Probe, options=Reading)], "'p': option 'resource' has no default"),
+        (SystemExit(1), "failed with SystemExit: 1"),
+        (ValueError("x"), "failed with ValueError: x"),
+    ],
+)
+def test_a_hook_that_answers_nonsense_is_broken_and_the_others_go_on(answer, said):
+    registry = Registry.of(
+        bad=plugin(register_probes=answer), good=plugin(register_probes=[offered("fine")])
+    )
+    assert registry.names("probe") == ("fine",)
+    (broken,) = registry.broken
+    assert said in broken.reason
+    assert "register_probes (" in broken.reason
+
+
+def test_a_misspelt_hook_is_reported_with_the_allowed_ones():
+    @hookimpl
+    def register_probe():
+        return []
+
+    registry = Registry.of(ours=SimpleNamespace(register_probe=register_probe))
+    (broken,) = registry.broken
+    assert broken.reason.startswith("unknown hook 'register_probe' (")
+    assert "did you mean 'register_probes'? Allowed: register_probes, register_sc" in broken.reason
+
+
+def test_a_hook_without_its_mark_is_reported():
+    registry = Registry.of(ours=SimpleNamespace(register_probes=list))
+    (broken,) = registry.broken
+    assert "lacks the mark @hookimpl" in broken.reason
+
+
+def test_a_hook_with_an_argument_that_it_does_not_get_is_reported():
+    @hookimpl
+    def register_probes(config):
+        return []
+
+    registry = Registry.of(ours=SimpleNamespace(register_probes=register_probes))
+    (broken,) = registry.broken
+    assert "{'config'} are declared in the hookimpl but can not be found" in broken.reason
+
+
+def test_probes_that_are_absent_or_broken_are_left_out_with_their_reason(context):
+    def skip(options, context):
+        raise SkipPlugin("no NVIDIA driver")
+
+    def fail(options, context):
+        raise OSError("no /proc")
+
+    registry = probes(offered("cpu"), offered("gpu", skip), offered("net", fail))
+    result = registry.probes({"cpu": {}, "gpu": {}, "net": {}}, context)
+    assert [made.name for made in result.made] == ["cpu"]
+    assert result.absent["gpu"] == "no NVIDIA driver"
+    assert "raised OSError: no /proc" in result.absent["net"]
+    states = {row.name: row.state for row in registry.rows("probe", host="h")}
+    assert states == {"cpu": "selected", "gpu": "absent", "net": "broken"}
+
+
+def test_the_default_probes_are_those_that_say_so(context):
+    registry = probes(offered("cpu", default=True, period=0.5, deadline=2.0), offered("other"))
+    (made,) = registry.probes(None, context).made
+    assert (made.name, made.period, made.deadline) == ("cpu", 0.5, 2.0)
+    assert registry.probes({}, context).made == ()
+
+
+def test_a_host_without_any_probe_must_say_so(context):
+    with pytest.raises(ConfigError, match=r"no probe is installed.*rosrm-resources.*probes: \{\}"):
+        Registry.of().probes(None, context)
+
+
+def test_an_unknown_probe_stops_the_slave_at_its_start(context):
+    with pytest.raises(ConfigError, match="unknown probe 'cqu'; did you mean 'cpu'"):
+        probes(offered("cpu")).probes({"cqu": {}}, context)
+
+
+@pytest.mark.parametrize(
+    ("second", "said"),
+    [
+        (Probe("a"), "reads 'a', as 'first' does already"),
+        (Probe("b", capacity=0.0), "gives 'b' a capacity of 0.0, not above 0"),
+        (Probe("b", capacity=float("nan")), "gives 'b' a capacity of nan"),
+        (Probe(*(f"r{i}" for i in range(16))), "more than 16"),
+        (SimpleNamespace(), "its `resources` raised AttributeError"),
+    ],
+)
+def test_a_probe_whose_resources_cannot_be_taken_is_closed_and_left_out(context, second, said):
+    registry = probes(
+        offered("first", lambda options, context: Probe("a")),
+        offered("second", lambda options, context: second),
+    )
+    result = registry.probes({"first": {}, "second": {}}, context)
+    assert [made.name for made in result.made] == ["first"]
+    assert said in result.absent["second"]
+    assert getattr(second, "closed", True)
+
+
+def test_executors_come_from_every_migration_offer_and_are_unique():
+    def run(arguments):
+        return {}
+
+    def offer(name, executor):
+        return MigrationOffer(name, lambda options: None, executors={executor: run})
+
+    good = Registry.of(
+        ours=plugin(register_migration_strategies=[offer("a", "x"), offer("b", "y")])
+    )
+    assert sorted(good.executors()) == ["x", "y"]
+    bad = Registry.of(ours=plugin(register_migration_strategies=[offer("a", "x"), offer("b", "x")]))
+    with pytest.raises(PluginError, match="two plugins register an executor 'x'"):
+        bad.executors()
