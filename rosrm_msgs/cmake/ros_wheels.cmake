@@ -33,17 +33,23 @@ function(_rosrm_drop_missing_includes)
 endfunction()
 
 # 3. Some three hundred small generated files, most of whose compile time goes into the same headers:
-#    compile them in batches (a third less CPU time). rosidl_generator_c and
-#    rosidl_typesupport_introspection_cpp do not bear it: their files repeat file-local names and
-#    specialise templates after use.
-function(_rosrm_compile_in_batches)
+#    compile them in batches, or where files specialise templates after use, with precompiled headers
+#    (together 40 % less CPU time). rosidl_generator_c bears neither: its files repeat file-local names.
+function(_rosrm_compile_faster)
   foreach(_part IN ITEMS fastrtps_c fastrtps_cpp introspection_c c cpp)
     set(_target ${PROJECT_NAME}__rosidl_typesupport_${_part})
     if(TARGET ${_target})
       set_target_properties(${_target} PROPERTIES UNITY_BUILD ON UNITY_BUILD_BATCH_SIZE 20)
     endif()
   endforeach()
+  set(_target ${PROJECT_NAME}__rosidl_typesupport_introspection_cpp)
+  if(TARGET ${_target})
+    target_precompile_headers(${_target} PRIVATE
+      <algorithm> <array> <memory> <string> <vector>
+      <rosidl_runtime_cpp/bounded_vector.hpp>
+      <rosidl_typesupport_introspection_cpp/message_introspection.hpp>)
+  endif()
 endfunction()
 
 cmake_language(DEFER CALL _rosrm_drop_missing_includes)
-cmake_language(DEFER CALL _rosrm_compile_in_batches)
+cmake_language(DEFER CALL _rosrm_compile_faster)

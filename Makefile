@@ -1,0 +1,57 @@
+# Everything goes through .venv, which `make setup` makes; every target below sees to it first.
+# Nothing needs to be activated.
+
+PYTHON ?= python3
+LAYERS ?= unit contract integration ros faults
+ARGS   ?=
+
+SHELL := /bin/bash
+BIN   := .venv/bin
+BENCHMARKS := decide latency throughput slave_cost balance
+
+# .venv is complete in itself. What another environment left behind (a sourced ROS 2, or the
+# bootstrapper of the ROS wheels in another virtual environment) would mix its libraries with these.
+unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE LD_LIBRARY_PATH PYTHONPATH PYTHONHOME VIRTUAL_ENV
+unexport AMENT_PREFIX_PATH CMAKE_PREFIX_PATH COLCON_PREFIX_PATH ROS_DISTRO RMW_IMPLEMENTATION
+
+# By default DDS multicasts on every interface: what runs from here stays on this machine.
+export ROS_AUTOMATIC_DISCOVERY_RANGE := LOCALHOST
+
+.DEFAULT_GOAL := help
+.PHONY: help setup test lint format demo bench clean
+
+help: ## this list
+	@echo "make TARGET, each sets up what it needs:"
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  %-8s%s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@echo "Variables: PYTHON=python3.12 (setup), LAYERS=\"unit ros\" ARGS=\"-k name\" (test)"
+
+setup: ## make .venv with all that the other targets need
+	@command -v $(PYTHON) >/dev/null || { \
+	  echo "make setup: no '$(PYTHON)' here; install Python 3.10 to 3.13 or say PYTHON=/path/to/it" >&2; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || { \
+	  echo "make setup: $(PYTHON) is $$($(PYTHON) --version 2>&1); rosrm needs Python 3.10 to 3.13:" \
+	       "make setup PYTHON=python3.12" >&2; exit 1; }
+	@$(PYTHON) scripts/setup.py $(if $(filter-out file,$(origin PYTHON)),--chosen)
+
+test: setup ## lint, types and all tests (LAYERS and ARGS narrow it down)
+	@$(BIN)/python scripts/run_tests.py --layers $(LAYERS) $(ARGS)
+
+lint: setup ## ruff, the architecture's contracts, mypy
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/lint-imports
+	$(BIN)/mypy
+
+format: setup ## mend what ruff can mend
+	$(BIN)/ruff check --fix
+	$(BIN)/ruff format
+
+demo: setup ## three hosts on this machine map a LiDAR drive: out/demo/
+	@$(BIN)/python -m rosrm_examples.demo --out out/demo
+
+bench: setup ## all benchmarks; each ends with one line of JSON
+	@set -e; for name in $(BENCHMARKS); do echo "== $$name"; $(BIN)/python -m benchmarks.$$name; done
+
+clean: ## remove .venv, results and caches
+	rm -rf .venv build out dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	find . -name __pycache__ -type d -not -path './.git/*' -prune -exec rm -rf {} +

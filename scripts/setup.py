@@ -1,0 +1,318 @@
+"""Make `.venv`, with all that the demo, the tests and the benchmarks need: `make setup`.
+
+Run by the Python that the environment shall have, with the standard library alone. What is done
+already is not done again: a stamp in `.venv` holds digests of what went into it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import fcntl
+import hashlib
+import importlib.util
+import json
+import os
+import platform
+import re
+import shutil
+import subprocess
+import sys
+import sysconfig
+import time
+from collections import deque
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+VENV = ROOT / ".venv"
+PYTHON = VENV / "bin" / "python"
+LOG = VENV / "setup.log"
+STAMP = VENV / "rosrm-setup.json"
+INTERFACES = ROOT / "rosrm_msgs"
+CONSTRAINTS = ROOT / "constraints.txt"
+
+#: There are ROS 2 Jazzy wheels for these.
+OLDEST, NEWEST = (3, 10), (3, 13)
+
+#: Lines of pip, CMake and ninja that tell how far they are.
+PROGRESS = re.compile(
+    r"^\s*(?P<step>Collecting \S+|Downloading \S+|Obtaining \S+|Building wheel for \S+|"
+    r"Installing \S+ dependencies|Installing collected packages|\[\d+/\d+\] .*)"
+)
+
+
+class SetupError(Exception):
+    """What hinders, where, and what to do about it."""
+
+
+def main() -> int:
+    """Make or mend the environment; say what is done while it is done."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument(
+        "--chosen", action="store_true", help="this Python was asked for: remake a .venv of another"
+    )
+    options = parser.parse_args()
+    with Path(__file__).open() as lock:
+        wait_for(lock.fileno())
+        try:
+            set_up(remake_other_version=options.chosen)
+        except SetupError as error:
+            print(f"\nmake setup: {error}", file=sys.stderr)
+            return 1
+        except KeyboardInterrupt:
+            print("\nmake setup: interrupted; run it again to go on", file=sys.stderr)
+            return 130
+    return 0
+
+
+def wait_for(lock: int) -> None:
+    """Let one run at a time work on the environment."""
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        print("Another `make setup` is at work here: waiting for it.", flush=True)
+        fcntl.flock(lock, fcntl.LOCK_EX)
+
+
+def set_up(*, remake_other_version: bool) -> None:
+    """Do the steps that are not done yet."""
+    wanted = {"interfaces": interfaces_digest(), "packages": packages_digest()}
+    if not venv_usable(remake_other_version=remake_other_version):
+        check_machine()
+        make_venv()
+    done = read_stamp()
+    if done == wanted:
+        return
+    check_machine()
+    began = time.monotonic()
+    steps = Steps(total=3 if done.get("interfaces") == wanted["interfaces"] else 4)
+    steps.run("pip and the build backends", *pip("install", *BACKENDS))
+    if done.get("interfaces") != wanted["interfaces"]:
+        steps.run(
+            "the ROS interfaces: generated and compiled, about a minute",
+            *pip(
+                "install",
+                "--verbose",  # pip shows how far the compiler is only then
+                "--force-reinstall",
+                "--no-deps",
+                "--build-constraint",
+                CONSTRAINTS,
+                INTERFACES,
+            ),
+        )
+        write_stamp({"interfaces": wanted["interfaces"]})
+    steps.run(
+        "ROS 2 Jazzy, rosrm, its plugins and examples, the tools for the tests",
+        *pip("install", "--no-build-isolation", *editables(extras="ros,plot,test")),
+    )
+    steps.run(
+        "do they work together?",
+        PYTHON,
+        "-c",
+        "import rclpy, rosrm, rosrm_msgs.msg as m; m.ResourceInfo.__import_type_support__()",
+    )
+    write_stamp(wanted)
+    print(f"      .venv is ready ({time.monotonic() - began:.0f} s in all)", flush=True)
+
+
+# ----------------------------------------------------------------------------- what is there
+
+
+def interfaces_digest() -> str:
+    """Digest of all that the build of rosrm_msgs reads."""
+    files = [p for p in INTERFACES.rglob("*") if p.is_file() and "__pycache__" not in p.parts]
+    return digest(files)
+
+
+def packages_digest() -> str:
+    """Digest of all that says which packages the environment holds."""
+    return digest([CONSTRAINTS, Path(__file__), *(d / "pyproject.toml" for d in distributions())])
+
+
+def digest(files: list[Path]) -> str:
+    """SHA-256 of names and contents."""
+    total = hashlib.sha256()
+    for path in sorted(files):
+        content = path.read_bytes()
+        total.update(f"{path.relative_to(ROOT)} {len(content)}\n".encode())
+        total.update(content)
+    return total.hexdigest()
+
+
+def distributions() -> list[Path]:
+    """The folders of the repository's own distributions, the core first."""
+    others = [*sorted(ROOT.glob("plugins/*")), ROOT / "examples"]
+    return [ROOT, *(d for d in others if (d / "pyproject.toml").is_file())]
+
+
+def venv_usable(*, remake_other_version: bool) -> bool:
+    """Whether `.venv` runs where it stands, with no other Python than the one asked for."""
+    if not PYTHON.exists():
+        return False
+    probe = "import sys; print(*sys.version_info[:2], sys.prefix)"
+    answer = subprocess.run([PYTHON, "-c", probe], capture_output=True, text=True, check=False)
+    major, minor, prefix = (*answer.stdout.strip().split(" ", 2), "", "", "")[:3]
+    if answer.returncode != 0 or Path(prefix) != VENV:
+        print("      .venv was made elsewhere or is broken: it is made anew")
+        return False
+    if remake_other_version and (major, minor) != tuple(map(str, sys.version_info[:2])):
+        print(f"      .venv has Python {major}.{minor}, asked for is {short_version()}: made anew")
+        return False
+    return True
+
+
+def read_stamp() -> dict[str, str]:
+    """What went into the environment, as far as that was finished."""
+    try:
+        stamp = json.loads(STAMP.read_text())
+    except (OSError, ValueError):
+        return {}
+    return stamp if isinstance(stamp, dict) else {}
+
+
+def write_stamp(done: dict[str, str]) -> None:
+    """Remember what went into the environment."""
+    STAMP.write_text(json.dumps(done, indent=2) + "\n")
+
+
+# ---------------------------------------------------------------------------- what is needed
+
+
+def check_machine() -> None:
+    """Refuse, with the way out, a machine on which a later step would fail."""
+    if not OLDEST <= sys.version_info[:2] <= NEWEST:
+        candidates = [f"python3.{m}" for m in range(NEWEST[1], OLDEST[1] - 1, -1)]
+        found = next((name for name in candidates if shutil.which(name)), None)
+        hint = f"make setup PYTHON={found}" if found else "install one of them: PYTHON=/path/to/it"
+        raise SetupError(
+            f"{sys.executable} is Python {short_version()}; the ROS 2 Jazzy wheels are for 3.10 to "
+            f"3.13. {hint}"
+        )
+    if sys.platform != "linux" or platform.machine() != "x86_64":
+        raise SetupError(
+            f"the ROS 2 Jazzy wheels are for Linux on x86-64, this is {sys.platform} on "
+            f"{platform.machine()}. With ROS 2 installed (apt), follow the README instead."
+        )
+    missing = []
+    if not importlib.util.find_spec("venv") or not importlib.util.find_spec("ensurepip"):
+        missing.append(("Python's venv module (with ensurepip)", "python3-venv"))
+    if not any(map(shutil.which, filter(None, [os.environ.get("CC"), "cc", "gcc", "clang"]))):
+        missing.append(("a C compiler", "gcc"))
+    if not any(map(shutil.which, filter(None, [os.environ.get("CXX"), "c++", "g++", "clang++"]))):
+        missing.append(("a C++ compiler", "g++"))
+    if not (Path(sysconfig.get_path("include")) / "Python.h").is_file():
+        missing.append((f"the headers of Python {short_version()} (Python.h)", "python3-dev"))
+    if missing:
+        raise SetupError(
+            f"missing: {', '.join(what for what, _ in missing)}. On Debian or Ubuntu: "
+            f"sudo apt install {' '.join(package for _, package in missing)}"
+        )
+
+
+def short_version() -> str:
+    """The version of this Python, as in `3.12`."""
+    return ".".join(map(str, sys.version_info[:2]))
+
+
+# --------------------------------------------------------------------------------- the steps
+
+
+def make_venv() -> None:
+    """Make `.venv` from the Python that runs this."""
+    print(f"      .venv from {sys.executable} (Python {platform.python_version()})", flush=True)
+    shutil.rmtree(VENV, ignore_errors=True)
+    made = subprocess.run(
+        [sys.executable, "-m", "venv", VENV], capture_output=True, text=True, check=False
+    )
+    if made.returncode != 0:
+        raise SetupError(f"python -m venv failed:\n{made.stdout}{made.stderr}")
+
+
+#: Installed first, so that rosrm's own distributions install without a build environment each.
+BACKENDS = ("pip", "hatchling", "editables", "setuptools")
+
+
+def pip(command: str, *arguments: object) -> tuple[object, ...]:
+    """A pip command of the environment, held to the exact versions."""
+    return (PYTHON, "-m", "pip", command, "--constraint", CONSTRAINTS, *arguments)
+
+
+def editables(*, extras: str) -> list[object]:
+    """Arguments that install the repository's distributions so that edits count at once."""
+    arguments: list[object] = []
+    for folder in distributions():
+        arguments += ["--editable", f"{folder}[{extras}]" if folder == ROOT else folder]
+    return arguments
+
+
+class Steps:
+    """Runs commands one after another, and shows how far they are."""
+
+    def __init__(self, total: int) -> None:
+        self.total = total
+        self.number = 0
+        LOG.write_text("")
+
+    def run(self, title: str, *command: object) -> None:
+        """Run one command; its output goes to the log, its progress to the terminal."""
+        self.number += 1
+        print(f"[{self.number}/{self.total}] {title}", flush=True)
+        began = time.monotonic()
+        last_lines: deque[str] = deque(maxlen=30)
+        environment = {**os.environ, "PYTHONUNBUFFERED": "1", "PIP_DISABLE_PIP_VERSION_CHECK": "1"}
+        with (
+            LOG.open("a") as log,
+            subprocess.Popen(
+                [str(word) for word in command],
+                cwd=ROOT,
+                env=environment,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                text=True,
+                errors="replace",
+            ) as process,
+        ):
+            progress = ProgressLine(began)
+            for line in process.stdout or ():
+                log.write(line)
+                last_lines.append(line)
+                progress.show(line)
+            progress.clear()
+        if process.returncode != 0:
+            raise SetupError(
+                f"this failed: {title}. Its last lines (all of them are in "
+                f"{LOG.relative_to(ROOT)}):\n\n{''.join(last_lines)}"
+            )
+        print(f"      done in {time.monotonic() - began:.0f} s", flush=True)
+
+
+class ProgressLine:
+    """Where the running command is: rewritten in place on a terminal, now and then elsewhere."""
+
+    def __init__(self, began: float) -> None:
+        self.began = began
+        self.terminal = sys.stdout.isatty()
+        self.shown = began
+
+    def show(self, line: str) -> None:
+        """Take a line of output; show it if it tells how far the command is."""
+        match = PROGRESS.match(line)
+        now = time.monotonic()
+        if match is None or now - self.shown < (0.1 if self.terminal else 10.0):
+            return
+        self.shown = now
+        text = f"      {now - self.began:3.0f} s  {match['step']}"
+        if self.terminal:
+            width = shutil.get_terminal_size().columns - 1
+            print(f"\r\033[K{text[:width]}", end="", flush=True)
+        else:
+            print(text[:100], flush=True)
+
+    def clear(self) -> None:
+        """Leave the line free for what comes next."""
+        if self.terminal:
+            print("\r\033[K", end="", flush=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,19 @@
+"""What all tests share: each is marked with the folder that it lies in."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+HERE = Path(__file__).parent
+
+# By default DDS multicasts on every interface: what a test starts stays on this machine.
+os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        layer = item.path.relative_to(HERE).parts[0]
+        item.add_marker(getattr(pytest.mark, layer))
