@@ -46,6 +46,12 @@ def create(options: CpuOptions, context: ProbeContext) -> GaugeProbe:
     return GaugeProbe("cpu", "core", gauge or MachineCpu(options.window))
 
 
+def machine_cores(proc: Path = Path("/proc")) -> float:
+    """Cores of the machine that are switched on, whatever this process may use of them."""
+    lines = (proc / "stat").read_text().splitlines()
+    return float(max(1, sum(line.startswith("cpu") for line in lines) - 1))
+
+
 class MachineCpu:
     """All cores of the machine. Time stolen by a hypervisor counts as used: it cannot be had.
 
@@ -60,7 +66,7 @@ class MachineCpu:
     scope: Final = "machine"
 
     def __init__(self, window: float, proc: Path = Path("/proc")) -> None:
-        self.capacity: Final = float(os.cpu_count() or 1)
+        self.capacity: Final = machine_cores(proc)
         self._file = KeptFile(proc / "stat", 256)
         busy, total = self._times()
         # A busy machine must not look idle in its first reading, to which work may be sent.
@@ -186,7 +192,7 @@ class GroupTime:
 
 def _cpu_limits(group: Group, root: Path) -> list[tuple[Path, float]]:
     """The groups whose cores are bounded below those of the machine, and to how many."""
-    machine = float(os.cpu_count() or 1)
+    machine = machine_cores(root / "proc")
     limits = []
     for directory in group.upward():
         cores = _quota(group.version, directory)
@@ -269,7 +275,7 @@ class TreeTime:
         self._sessions = sessions
         self._files = ProcessFiles(proc, "stat")
         self._leader_time: dict[int, float] = {}
-        self._machine = float(os.cpu_count() or 1)
+        self._machine = machine_cores(proc)
         self._at = now
         self._before = self._sum()
         self._seconds = 0.0

@@ -1,0 +1,16 @@
+"""Every journal holds one contract."""
+
+from rosrm.journal import SqliteJournal
+from rosrm.testing import JournalContract, MemoryJournal
+
+
+class TestSqlite(JournalContract):
+    def open(self, directory):
+        return SqliteJournal(directory / "journal.sqlite")
+
+
+class TestMemory(JournalContract):
+    durable = False
+
+    def open(self, directory):
+        return MemoryJournal()

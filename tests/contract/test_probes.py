@@ -1,0 +1,119 @@
+"""Every shipped probe holds the contract that a third party's holds, in every scope."""
+
+from pathlib import Path
+
+import pytest
+
+from rosrm.core.model import Reading, ResourceDescription
+from rosrm.ports import ProbeOffer
+from rosrm.slave.sessions import SessionTable
+from rosrm.testing import FakeProbe, ProbeContract, probe_context
+from rosrm_resources.plugin import register_probes
+
+OFFERS = {offer.name: offer for offer in register_probes()}
+CGROUP = probe_context("cgroup")
+SLICE = probe_context(
+    "slice",
+    budget={"cpu": 1.0, "memory": 2.0**31, "disk": 1e9},
+    data_directory=Path(__file__).parent,
+    sessions=SessionTable(),
+)
+
+
+class TestCpu(ProbeContract):
+    offer = OFFERS["cpu"]
+
+
+class TestCpuOfCgroup(TestCpu):
+    context = CGROUP
+
+
+class TestCpuOfSlice(TestCpu):
+    context = SLICE
+
+
+class TestMemory(ProbeContract):
+    offer = OFFERS["memory"]
+
+
+class TestMemoryOfCgroup(TestMemory):
+    context = CGROUP
+
+
+class TestMemoryOfSlice(TestMemory):
+    context = SLICE
+
+
+class TestDisk(ProbeContract):
+    offer = OFFERS["disk"]
+
+
+class TestDiskOfSlice(TestDisk):
+    context = SLICE
+
+
+class TestGpu(ProbeContract):
+    offer = OFFERS["gpu"]
+
+
+class TestNetwork(ProbeContract):
+    offer = OFFERS["network"]
+    options = {"interfaces": ("lo",), "capacity": 1e9}
+
+
+def test_each_shipped_probe_is_here():
+    """A probe that is added to the plugin must be added here."""
+    held = {contract.offer.name for contract in ProbeContract.__subclasses__()}
+    assert set(OFFERS) <= held
+
+
+class TestFake(ProbeContract):
+    """The fake of `rosrm.testing` is a probe as well."""
+
+    offer = ProbeOffer("fake", lambda options, context: FakeProbe(a=0.5, b=0.1), summary="a fake")
+
+
+class _Leaking(FakeProbe):
+    def __init__(self):
+        super().__init__(a=0.5)
+        self.file = open(__file__)  # noqa: SIM115 - the leak is the point
+        _LEAKED.append(self.file)
+
+
+_LEAKED = []
+
+
+class _Nameless(FakeProbe):
+    resources = (ResourceDescription("", "1", 1.0),)
+
+
+class _Boundless(FakeProbe):
+    resources = (ResourceDescription("a", "1", 0.0),)
+
+
+class _Chatty(FakeProbe):
+    def read(self):
+        return [Reading("a", 0.1), Reading("b", 0.1)]
+
+
+@pytest.mark.parametrize(
+    ("make", "test"),
+    [
+        (_Nameless, "test_resources_are_well_described"),
+        (_Boundless, "test_resources_are_well_described"),
+        (lambda: FakeProbe(a=float("nan")), "test_reads_each_resource_once"),
+        (lambda: FakeProbe(a=-0.1), "test_reads_each_resource_once"),
+        (lambda: _Chatty(a=0.1), "test_reads_each_resource_once"),
+        (_Leaking, "test_close_releases_files"),
+    ],
+)
+def test_contract_catches(make, test):
+    """A probe that breaks the contract fails the test of that clause."""
+    contract = ProbeContract()
+    contract.offer = ProbeOffer("bad", lambda options, context: make(), summary="bad")
+    try:
+        with pytest.raises(AssertionError):
+            getattr(contract, test)()
+    finally:
+        while _LEAKED:
+            _LEAKED.pop().close()

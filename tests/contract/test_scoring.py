@@ -1,0 +1,77 @@
+"""Every shipped scoring policy holds the contract that a third party's holds."""
+
+import numpy as np
+import pytest
+
+from rosrm.ports import Scores, ScoringOffer
+from rosrm.testing import ScoringContract
+from rosrm_scoring.plugin import register_scoring_policies
+
+OFFERS = {offer.name: offer for offer in register_scoring_policies()}
+
+
+class TestWeighted(ScoringContract):
+    offer = OFFERS["weighted"]
+
+
+class TestWeightedByGpu(TestWeighted):
+    options = {"weights": {"gpu": 1.0, "gpu_memory": 0.3, "cpu": 0.1}}
+
+
+class TestThreshold(ScoringContract):
+    offer = OFFERS["threshold"]
+
+
+class TestNarrowThreshold(TestThreshold):
+    options = {"enter": 0.5, "leave": 0.4, "watch": ("gpu",), "weights": {}}
+
+
+def test_each_shipped_policy_is_here():
+    """A policy that is added to the plugin must be added here."""
+    held = {contract.offer.name for contract in ScoringContract.__subclasses__()}
+    assert set(OFFERS) <= held
+
+
+class _Relative:
+    def score(self, hosts, process):
+        memory = hosts.column("memory")
+        return Scores(memory - (memory.mean() if len(memory) else 0.0))
+
+
+class _NaN:
+    def score(self, hosts, process):
+        return Scores(hosts.usage[:, -1] * 1.0)
+
+
+class _Standing:
+    buffer = np.zeros(0)
+
+    def score(self, hosts, process):
+        if len(self.buffer) < len(hosts.names):
+            _Standing.buffer = np.zeros(len(hosts.names))
+        value = self.buffer[: len(hosts.names)]
+        value[:] = hosts.column("memory")
+        return Scores(value)
+
+
+class _Mutating:
+    def score(self, hosts, process):
+        hosts.usage[:] = 0.0
+        return Scores(np.zeros(len(hosts.names)))
+
+
+@pytest.mark.parametrize(
+    ("policy", "test"),
+    [
+        (_Relative, "test_rows_are_independent"),
+        (_NaN, "test_scores_every_host"),
+        (_Standing, "test_is_pure"),
+        (_Mutating, "test_is_pure"),
+    ],
+)
+def test_contract_catches(policy, test):
+    """A policy that breaks the contract fails the test of that clause."""
+    contract = ScoringContract()
+    contract.offer = ScoringOffer("bad", lambda options: policy())
+    with pytest.raises(AssertionError):
+        getattr(contract, test)()

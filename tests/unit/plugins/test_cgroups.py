@@ -1,0 +1,193 @@
+"""Finding the control groups of a process, and what bounds it there."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from rosrm.testing import FakeClock
+from rosrm_resources.cgroups import count_cpus, find_group, read_number
+from rosrm_resources.cpu import CgroupCpu
+from rosrm_resources.memory import CgroupMemory
+
+TREES = Path(__file__).parents[2] / "data" / "cgroup_v2"
+RECORDED = sorted(path.name for path in TREES.iterdir() if (path / "proc").is_dir())
+MIB = 2.0**20
+GIB = 2.0**30
+
+
+@pytest.fixture
+def tree(tmp_path):
+    """Copies a recorded tree, so that a test may change it."""
+
+    def copy(name):
+        return Path(shutil.copytree(TREES / name, tmp_path / name))
+
+    return copy
+
+
+def grow_cpu(directory, seconds):
+    """Let a group use CPU time."""
+    file = directory / "cpu.stat"
+    first, rest = file.read_text().split("\n", 1)
+    used = int(first.removeprefix("usage_usec ")) + int(seconds * 1e6)
+    file.write_text(f"usage_usec {used}\n{rest}")
+
+
+def test_memory_of_a_container():
+    """The container's limit is the capacity, and page cache that is inactive is not usage."""
+    gauge = CgroupMemory.find(TREES / "docker")
+    assert gauge.capacity == 2 * GIB
+    assert gauge.usage() == pytest.approx(600 * MIB / (2 * GIB))
+    gauge.close()
+
+
+def test_cpu_of_a_container(tree):
+    """The quota is the capacity, and usage is the time used over time passed."""
+    root, clock = tree("docker"), FakeClock()
+    gauge = CgroupCpu.find(1.0, root, clock)
+    assert gauge.capacity == 1.5
+    grow_cpu(root / "sys/fs/cgroup", 0.75)
+    clock.advance(1.0)
+    assert gauge.usage() == pytest.approx(0.5)
+    gauge.close()
+
+
+def test_least_room_above_counts_for_memory():
+    """The tightest limit is the capacity; a fuller group above leaves only its own room."""
+    gauge = CgroupMemory.find(TREES / "systemd")
+    assert gauge.capacity == 3 * GIB  # memory.high of the service itself
+    assert gauge.usage() == pytest.approx(1 - (4096 - 3600) / 3072)  # room in robot.slice
+    gauge.close()
+
+
+def test_least_room_above_counts_for_cpu(tree):
+    """Siblings that use up the quota above leave less than the own quota."""
+    root, clock = tree("systemd"), FakeClock()
+    gauge = CgroupCpu.find(1.0, root, clock)
+    assert gauge.capacity == 2.0
+    grow_cpu(root / "sys/fs/cgroup/robot.slice", 3.5)
+    grow_cpu(root / "sys/fs/cgroup/robot.slice/robot-perception.slice/rosrm.service", 0.2)
+    clock.advance(1.0)
+    assert gauge.usage() == pytest.approx(0.75)  # 0.5 of 4 cores are left, of 2
+    gauge.close()
+
+
+def test_unlimited_group_is_none():
+    """Without any limit the machine is what counts."""
+    assert CgroupMemory.find(TREES / "unlimited") is None
+    assert CgroupCpu.find(1.0, TREES / "unlimited") is None
+
+
+def test_limit_of_the_whole_machine_is_none(tree):
+    """A limit at or above what the machine has bounds nothing."""
+    root = tree("docker")
+    (root / "sys/fs/cgroup/memory.max").write_text(f"{16 * 2**30}\n")
+    (root / "sys/fs/cgroup/cpu.max").write_text("800000 100000\n")
+    assert CgroupMemory.find(root) is None
+    assert CgroupCpu.find(1.0, root) is None
+
+
+def test_container_without_a_namespace_of_its_own():
+    """Where only a part of the hierarchy is mounted, the path of the group starts outside it."""
+    root = TREES / "kubernetes"
+    assert find_group("memory", root).directory == root / "sys/fs/cgroup"
+    assert CgroupMemory.find(root).capacity == GIB
+
+
+def test_set_of_cpus_is_a_limit():
+    """A group that is confined to two CPUs has two cores."""
+    assert CgroupCpu.find(1.0, TREES / "kubernetes").capacity == 2.0
+
+
+def test_version_1_beside_version_2(tmp_path):
+    """In a hybrid set-up a controller of version 1 is found where it is mounted."""
+    (tmp_path / "proc/self").mkdir(parents=True)
+    (tmp_path / "proc/self/cgroup").write_text("4:memory:/job\n3:cpu,cpuacct:/\n0::/job\n")
+    (tmp_path / "proc/self/mountinfo").write_text(
+        "32 31 0:29 / /cg/memory\\040v1 rw,relatime - cgroup cgroup rw,memory\n"
+        "33 31 0:30 / /cg/cpu rw,relatime - cgroup cgroup rw,cpu,cpuacct\n"
+        "41 31 0:38 / /cg/unified rw,relatime - cgroup2 cgroup2 rw\n"
+    )
+    (tmp_path / "cg/memory v1/job").mkdir(parents=True)
+    found = find_group("memory", tmp_path)
+    assert (found.version, found.directory) == (1, tmp_path / "cg/memory v1/job")
+    assert find_group("cpu", tmp_path).version == 1
+    assert find_group("io", tmp_path).version == 2
+
+
+def test_memory_of_version_1(tmp_path):
+    """Version 1 has other names, and its cache is the total with the groups below."""
+    (tmp_path / "memory.usage_in_bytes").write_text("1000000\n")
+    (tmp_path / "memory.stat").write_text("inactive_file 7\ntotal_inactive_file 400000\n")
+    gauge = CgroupMemory([(tmp_path, 2e6)], version=1)
+    assert gauge.usage() == pytest.approx(0.3)
+    gauge.close()
+
+
+def test_cpu_of_version_1(tmp_path):
+    """Version 1 keeps quota and used time in two controllers, mounted at two places."""
+    (tmp_path / "proc/self").mkdir(parents=True)
+    (tmp_path / "proc/stat").write_text("cpu 1\n" + "".join(f"cpu{n} 1\n" for n in range(4)))
+    (tmp_path / "proc/self/cgroup").write_text("2:cpu:/job\n3:cpuacct:/job\n")
+    (tmp_path / "proc/self/mountinfo").write_text(
+        "32 31 0:29 / /cg/cpu rw - cgroup cgroup rw,cpu\n"
+        "33 31 0:30 / /cg/acct rw - cgroup cgroup rw,cpuacct\n"
+    )
+    for place, content in {
+        "cpu/job/cpu.cfs_quota_us": "50000\n",
+        "cpu/job/cpu.cfs_period_us": "100000\n",
+        "cpu/cpu.cfs_quota_us": "-1\n",
+        "cpu/cpu.cfs_period_us": "100000\n",
+        "acct/job/cpuacct.usage": "0\n",
+    }.items():
+        file = tmp_path / "cg" / place
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(content)
+    clock = FakeClock()
+    gauge = CgroupCpu.find(1.0, tmp_path, clock)
+    assert gauge.capacity == 0.5
+    (tmp_path / "cg/acct/job/cpuacct.usage").write_text("100000000\n")
+    clock.advance(1.0)
+    assert gauge.usage() == pytest.approx(0.2)
+    gauge.close()
+
+
+def test_group_that_cannot_be_seen(tmp_path):
+    """A path that does not exist here falls back to the nearest group above."""
+    (tmp_path / "proc/self").mkdir(parents=True)
+    (tmp_path / "proc/self/cgroup").write_text("0::/a/gone/b\n")
+    (tmp_path / "proc/self/mountinfo").write_text("1 1 0:1 / /cg rw - cgroup2 cgroup2 rw\n")
+    (tmp_path / "cg/a").mkdir(parents=True)
+    assert find_group("memory", tmp_path).directory == tmp_path / "cg/a"
+    (tmp_path / "proc/self/cgroup").write_text("0::/../../other\n")
+    assert find_group("memory", tmp_path).directory == tmp_path / "cg"
+
+
+def test_no_control_groups(tmp_path):
+    """A machine without any is no error: the machine is what counts."""
+    assert find_group("memory", tmp_path) is None
+
+
+@pytest.mark.parametrize("name", RECORDED)
+def test_every_recorded_tree_reads(name):
+    """Whatever was recorded, the gauges are there with sane values, or the machine counts."""
+    for gauge in (CgroupMemory.find(TREES / name), CgroupCpu.find(1.0, TREES / name)):
+        if gauge is not None:
+            assert gauge.capacity > 0
+            assert 0 <= gauge.usage() <= 10
+            gauge.close()
+
+
+@pytest.mark.parametrize(("text", "count"), [("0-3,8", 5), ("0", 1), ("", 0), ("2-3\n", 2)])
+def test_counts_cpus(text, count):
+    """A list of CPUs as the kernel writes it."""
+    assert count_cpus(text) == count
+
+
+@pytest.mark.parametrize(("text", "number"), [("max", None), ("-1", None), ("", None), ("5 9", 5)])
+def test_reads_limits(tmp_path, text, number):
+    """ "max" and -1 are no limit, nor is an empty or missing file."""
+    (tmp_path / "limit").write_text(text)
+    assert read_number(tmp_path / "limit") == number
+    assert read_number(tmp_path / "missing") is None

@@ -1,0 +1,85 @@
+"""The policy `weighted`: Eq. 1 of the paper."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rosrm.testing import host_view, one_row, process_view
+from rosrm_scoring.weighted import Weighted, WeightedOptions
+
+usages = st.one_of(st.floats(0, 2), st.just(float("nan")))
+
+
+@st.composite
+def hosts(draw):
+    count = draw(st.integers(1, 30))
+    names = draw(st.lists(st.sampled_from(["memory", "cpu", "disk", "gpu"]), unique=True))
+    columns = st.lists(usages, min_size=count, max_size=count)
+    return host_view({name: draw(columns) for name in names or ["memory"]})
+
+
+weights = st.dictionaries(
+    st.sampled_from(["memory", "cpu", "disk", "gpu", "absent"]), st.floats(0, 1)
+)
+
+
+def score(view, **given_weights):
+    policy = Weighted(WeightedOptions(given_weights) if given_weights else WeightedOptions())
+    return policy.score(view, process_view(view))
+
+
+def test_is_equation_1():
+    """The score is w_mem x memory + w_cpu x cpu + w_disk x disk."""
+    view = host_view({"memory": [0.5, 0.1], "cpu": [0.2, 0.4], "disk": [0.9, 0.3]})
+    scores = score(view, memory=1.0, cpu=0.5, disk=0.1)
+    assert scores.value == pytest.approx([0.5 + 0.1 + 0.09, 0.1 + 0.2 + 0.03])
+    assert scores.veto is None
+
+
+def test_default_weighs_memory_most():
+    """By default memory counts full, cpu half, disk nothing."""
+    view = host_view({"memory": [0.5, 0.4], "cpu": [0.1, 0.4], "disk": [0.0, 1.0]})
+    assert score(view).value == pytest.approx([0.55, 0.6])
+
+
+def test_named_weights_replace_all_defaults():
+    """A resource that is not named weighs nothing."""
+    view = host_view({"memory": [0.5], "cpu": [0.2]})
+    assert score(view, cpu=1.0).value == pytest.approx([0.2])
+
+
+def test_absent_resource_is_not_used():
+    """A host without a GPU uses none, so it goes before one whose GPU is in use."""
+    view = host_view({"memory": [0.5, 0.5], "gpu": [float("nan"), 0.2]})
+    assert score(view, memory=1.0, gpu=1.0).value == pytest.approx([0.5, 0.7])
+
+
+def test_reason_is_the_sum_written_out():
+    """The score of a host is explained by its terms."""
+    view = host_view({"memory": [0.5, 0.25], "cpu": [0.1, float("nan")]})
+    assert score(view).reason(0) == "1 x memory 50.0% + 0.5 x cpu 10.0%"
+    assert score(view).reason(1) == "1 x memory 25.0% + 0.5 x cpu 0.0%"
+    assert "no resource" in score(view, network=1.0).reason(0)
+
+
+@given(hosts(), weights)
+def test_rows_are_independent(view, given_weights):
+    """A host scores alike alone and among others, to the last bit."""
+    policy = Weighted(WeightedOptions(given_weights))
+    process = process_view(view)
+    together = policy.score(view, process).value
+    assert np.isfinite(together).all()
+    for row in range(len(view.names)):
+        assert policy.score(*one_row(view, process, row)).value[0] == together[row]
+
+
+@given(hosts(), weights, st.floats(0, 1))
+def test_more_usage_never_scores_lower(view, given_weights, more):
+    """A fuller host is never preferred for being fuller."""
+    fuller = host_view(
+        {name: list(view.usage[:, column] + more) for column, name in enumerate(view.resources)}
+    )
+    policy = Weighted(WeightedOptions(given_weights))
+    before = policy.score(view, process_view(view)).value
+    assert (policy.score(fuller, process_view(fuller)).value >= before).all()
