@@ -1,0 +1,1 @@
+"""Migration strategies of rosrm."""

@@ -1,0 +1,418 @@
+"""The slave's reducer: (state, event, now) -> commands. Each kind of event is one row below.
+
+======================  =========================================================================
+what happened           what the core does
+======================  =========================================================================
+Registered              remembers the master's epoch; older ones are refused from now on
+AssignmentsReceived     has them launched, once; one that was stopped before is refused
+LaunchRefused           reports that the host cannot run it, and why
+StopOrdered             has it stopped; one never heard of will never be started
+RestartOrdered          has it stopped and started again here
+ReportRequested         reports everything
+SupervisorReported      follows the instance; a new run must become ready anew
+SeenInGraph             the instance is ready
+TimePassed              an instance that is not ready in time is stopped; old ends are forgotten
+======================  =========================================================================
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from rosrm.core.model import (
+    Assignment,
+    InstanceId,
+    InstanceState,
+    InstanceStatus,
+    ProcessSpec,
+)
+
+#: Seconds for which the end of an instance is kept for a master that did not hear of it.
+REMEMBER_END: Final = 60.0
+#: Orders to stop what was never heard of that are remembered.
+_TOMBSTONES: Final = 10_000
+
+
+# --- what can happen --------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Registered:
+    """The master took this host in."""
+
+    epoch: int
+
+
+@dataclass(frozen=True, slots=True)
+class AssignmentsReceived:
+    """The master assigned instances to this host."""
+
+    assignments: tuple[Assignment, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class LaunchRefused:
+    """An instance cannot be started here."""
+
+    instance: InstanceId
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class StopOrdered:
+    """The master wants an instance to end for good."""
+
+    instance: InstanceId
+
+
+@dataclass(frozen=True, slots=True)
+class RestartOrdered:
+    """The master wants an instance to start again here."""
+
+    instance: InstanceId
+
+
+@dataclass(frozen=True, slots=True)
+class ReportRequested:
+    """The master wants to know of every instance."""
+
+
+@dataclass(frozen=True, slots=True)
+class SupervisorReported:
+    """The supervisor says what became of instances."""
+
+    statuses: tuple[InstanceStatus, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class SeenInGraph:
+    """This very instance, not a namesake, is in the ROS graph."""
+
+    instance: InstanceId
+
+
+@dataclass(frozen=True, slots=True)
+class TimePassed:
+    """Nothing else happened; deadlines are looked at."""
+
+
+# --- what is asked for ------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Launch:
+    """Have the supervisor start instances."""
+
+    assignments: tuple[Assignment, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Stop:
+    """Have the supervisor stop an instance."""
+
+    instance: InstanceId
+
+
+@dataclass(frozen=True, slots=True)
+class Restart:
+    """Have the supervisor restart an instance."""
+
+    instance: InstanceId
+
+
+@dataclass(frozen=True, slots=True)
+class Forget:
+    """Let the supervisor forget ended instances."""
+
+    instances: tuple[InstanceId, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """Tell the master; `complete`: these are all."""
+
+    statuses: tuple[InstanceStatus, ...]
+    complete: bool = False
+
+
+Command = Launch | Stop | Restart | Forget | Report
+
+
+# --- the state --------------------------------------------------------------------------------
+
+
+@dataclass(slots=True)
+class Held:
+    """One instance on this host.
+
+    Attributes:
+        status: as it was reported last.
+        spec: None where this slave found it running at its own start.
+        node_name: fully qualified name of its node; "" where it is none.
+        ready_by: deadline for becoming ready; None: it is ready, or does not run.
+        unready: why it was stopped, where it did not become ready in time.
+    """
+
+    status: InstanceStatus
+    spec: ProcessSpec | None = None
+    node_name: str = ""
+    ready_by: float | None = None
+    unready: str = ""
+    ended_at: float = 0.0
+
+
+@dataclass(slots=True)
+class SlaveState:
+    """All that the slave's core knows."""
+
+    epoch: int = 0
+    held: dict[InstanceId, Held] = field(default_factory=dict)
+    tombstones: dict[InstanceId, None] = field(default_factory=dict)
+
+    def statuses(self) -> tuple[InstanceStatus, ...]:
+        """Of every instance, ended ones that are still remembered included."""
+        return tuple(held.status for held in self.held.values())
+
+    def live(self) -> int:
+        """How many instances have not ended."""
+        return sum(not held.status.state.ended for held in self.held.values())
+
+    def awaited_in_graph(self) -> Mapping[InstanceId, Held]:
+        """Instances that become ready by being seen in the ROS graph."""
+        return {
+            instance: held
+            for instance, held in self.held.items()
+            if held.ready_by is not None and held.node_name
+        }
+
+
+def under_limits(
+    usage: npt.NDArray[np.float32], limit: npt.NDArray[np.float32], present: int, stale: int
+) -> bool:
+    """Whether a host may ask for work: every reading is fresh and under its limit.
+
+    Args:
+        usage, limit: (slots,) fractions.
+        present, stale: bit i speaks of slot i.
+    """
+    if stale & present:
+        return False
+    used = bin(present).count("1")
+    return bool((usage[:used] < limit[:used]).all())
+
+
+def awaits_graph(spec: ProcessSpec) -> bool:
+    """Whether an instance is ready when it is seen in the ROS graph, not as soon as it runs."""
+    kind = spec.readiness.kind
+    return kind == "graph" or (kind == "auto" and spec.ros)
+
+
+# --- handlers ---------------------------------------------------------------------------------
+
+_Commands = list[Command]
+
+
+def _registered(state: SlaveState, event: Registered, now: float) -> _Commands:
+    state.epoch = max(state.epoch, event.epoch)
+    return []
+
+
+def _assigned(state: SlaveState, event: AssignmentsReceived, now: float) -> _Commands:
+    launches, refusals = [], []
+    for assignment in event.assignments:
+        instance = assignment.instance
+        if instance in state.held:
+            continue  # the order came twice
+        refusal = _why_not(state, assignment)
+        if refusal:
+            status = InstanceStatus(instance, InstanceState.REFUSED, message=refusal)
+            state.held[instance] = Held(status, ended_at=now)
+            refusals.append(status)
+            continue
+        name = _qualified(assignment) if awaits_graph(assignment.spec) else ""
+        state.held[instance] = Held(
+            InstanceStatus(instance, InstanceState.STARTING), assignment.spec, name
+        )
+        launches.append(assignment)
+    commands: _Commands = []
+    if launches:
+        commands.append(Launch(tuple(launches)))
+    if refusals:
+        commands.append(Report(tuple(refusals)))
+    return commands
+
+
+def _why_not(state: SlaveState, assignment: Assignment) -> str:
+    if assignment.epoch < state.epoch:
+        return f"assigned in epoch {assignment.epoch}, this is epoch {state.epoch}"
+    if assignment.instance in state.tombstones:
+        return "it was stopped before it was started"
+    return ""
+
+
+def _qualified(assignment: Assignment) -> str:
+    namespace = "/" + assignment.spec.namespace.strip("/")
+    return f"{namespace.rstrip('/')}/{assignment.node_name}"
+
+
+def _launch_refused(state: SlaveState, event: LaunchRefused, now: float) -> _Commands:
+    held = state.held[event.instance]
+    held.status = InstanceStatus(event.instance, InstanceState.REFUSED, message=event.reason)
+    held.ready_by, held.ended_at = None, now
+    return [Report((held.status,))]
+
+
+def _stop_ordered(state: SlaveState, event: StopOrdered, now: float) -> _Commands:
+    held = state.held.get(event.instance)
+    if held is not None and held.status.state.ended:
+        return [Report((held.status,))]
+    if held is not None:
+        return [Stop(event.instance)]
+    _bury(state, event.instance)
+    status = InstanceStatus(
+        event.instance, InstanceState.REFUSED, message="it was stopped before it was started"
+    )
+    state.held[event.instance] = Held(status, ended_at=now)
+    return [Report((status,))]
+
+
+def _bury(state: SlaveState, instance: InstanceId) -> None:
+    state.tombstones[instance] = None
+    while len(state.tombstones) > _TOMBSTONES:
+        del state.tombstones[next(iter(state.tombstones))]
+
+
+def _restart_ordered(state: SlaveState, event: RestartOrdered, now: float) -> _Commands:
+    held = state.held.get(event.instance)
+    if held is None or held.status.state.ended:
+        return [] if held is None else [Report((held.status,))]
+    held.ready_by, held.unready = None, ""
+    return [Restart(event.instance)]
+
+
+def _report_requested(state: SlaveState, event: ReportRequested, now: float) -> _Commands:
+    return [Report(state.statuses(), complete=True)]
+
+
+def _supervisor_reported(state: SlaveState, event: SupervisorReported, now: float) -> _Commands:
+    changed = [
+        status
+        for reported in event.statuses
+        if (status := _follow(state, reported, now)) is not None
+    ]
+    return [Report(tuple(changed))] if changed else []
+
+
+def _follow(state: SlaveState, reported: InstanceStatus, now: float) -> InstanceStatus | None:
+    """Take over what the supervisor says; None: that is known."""
+    held = state.held.get(reported.instance)
+    if held is None:
+        held = state.held[reported.instance] = Held(reported)
+        if reported.state is InstanceState.RUNNING:
+            held.status = replace(reported, state=InstanceState.READY)
+    elif reported.state is InstanceState.RUNNING:
+        if held.status.state is InstanceState.READY and held.status.pid == reported.pid:
+            return None
+        held.status = _running(held, reported, now)
+    else:
+        held.ready_by = None
+        held.status = _with_unready(held, reported)
+    if held.status.state.ended:
+        held.ended_at = now
+        _bury(state, reported.instance)
+    return held.status
+
+
+def _running(held: Held, reported: InstanceStatus, now: float) -> InstanceStatus:
+    """A new run: ready at once, or to be seen in the graph first."""
+    if not held.node_name or held.spec is None:
+        return replace(reported, state=InstanceState.READY)
+    held.ready_by = now + held.spec.readiness.timeout
+    return reported
+
+
+def _with_unready(held: Held, reported: InstanceStatus) -> InstanceStatus:
+    if not held.unready or not reported.state.ended:
+        return reported
+    return replace(reported, state=InstanceState.FAILED, message=held.unready)
+
+
+def _seen(state: SlaveState, event: SeenInGraph, now: float) -> _Commands:
+    held = state.held.get(event.instance)
+    if held is None or held.ready_by is None:
+        return []
+    held.ready_by = None
+    held.status = replace(held.status, state=InstanceState.READY)
+    return [Report((held.status,))]
+
+
+def _time_passed(state: SlaveState, event: TimePassed, now: float) -> _Commands:
+    commands: _Commands = []
+    forgotten = []
+    for instance, held in state.held.items():
+        if held.ready_by is not None and now >= held.ready_by and held.spec is not None:
+            held.ready_by = None
+            held.unready = (
+                f"not ready within {held.spec.readiness.timeout:g} s: no node {held.node_name} of "
+                f"this instance was seen in the ROS graph"
+            )
+            commands.append(Stop(instance))
+        elif held.status.state.ended and now - held.ended_at >= REMEMBER_END:
+            forgotten.append(instance)
+    if forgotten:
+        for instance in forgotten:
+            del state.held[instance]
+        commands.append(Forget(tuple(forgotten)))
+    return commands
+
+
+_Handler = Callable[[SlaveState, Any, float], _Commands]
+
+#: The transition table.
+HANDLERS: Final[Mapping[type, _Handler]] = MappingProxyType(
+    {
+        Registered: _registered,
+        AssignmentsReceived: _assigned,
+        LaunchRefused: _launch_refused,
+        StopOrdered: _stop_ordered,
+        RestartOrdered: _restart_ordered,
+        ReportRequested: _report_requested,
+        SupervisorReported: _supervisor_reported,
+        SeenInGraph: _seen,
+        TimePassed: _time_passed,
+    }
+)
+
+Event = (
+    Registered
+    | AssignmentsReceived
+    | LaunchRefused
+    | StopOrdered
+    | RestartOrdered
+    | ReportRequested
+    | SupervisorReported
+    | SeenInGraph
+    | TimePassed
+)
+
+
+def step(state: SlaveState, event: Event, now: float) -> Sequence[Command]:
+    """Take one event in.
+
+    Args:
+        state: changed in place.
+        event: what happened.
+        now: seconds by the slave's monotonic clock; never less than before.
+    """
+    return HANDLERS[type(event)](state, event, now)
+
+
+def step_all(state: SlaveState, events: Iterable[Event], now: float) -> list[Command]:
+    """Take several events in, in order."""
+    return [command for event in events for command in step(state, event, now)]

@@ -1,0 +1,1 @@
+"""The master's runtime: it carries out what the core decides."""

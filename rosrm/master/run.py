@@ -1,0 +1,55 @@
+"""Starts the master's runtime from settings that were checked before: `rosrm master` executes this.
+
+It imports neither pydantic nor typer nor rich: the memory of a master is budgeted.
+"""
+
+# ruff: noqa: E402 - Ctrl-C must end us without a traceback also while the rest is being imported
+from __future__ import annotations
+
+import signal
+
+signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+import argparse
+import logging
+import os
+import sys
+
+from rosrm.config.settings import ClusterConfig
+from rosrm.errors import RosrmError
+from rosrm.registry import Registry
+
+
+def main() -> int:
+    """Read the settings from an inherited file descriptor and serve; returns the exit code."""
+    parser = argparse.ArgumentParser(prog="rosrm master")
+    parser.add_argument("--settings-fd", type=int, required=True, help="holds ClusterConfig as JSON")
+    arguments = parser.parse_args()
+    logging.basicConfig(
+        level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(name)s: %(message)s",
+        datefmt="%H:%M:%S",
+    )  # fmt: skip
+    with os.fdopen(arguments.settings_fd) as settings:
+        config = ClusterConfig.from_json(settings.read())
+    try:
+        return _serve(config)
+    except RosrmError as error:
+        print(f"rosrm master: {error}", file=sys.stderr)
+        return error.exit_code
+
+
+def _serve(config: ClusterConfig) -> int:
+    from rosrm.master.policy_guard import GuardedPolicy
+    from rosrm.master.runtime import MasterRuntime
+
+    registry = Registry.discover()
+    name = config.scoring.policy or "weighted"
+    policy = GuardedPolicy(name, registry.scoring(name, config.scoring.options))
+    strategies = registry.migrations(config.migration.strategies)
+    registry.checkpoint(config.checkpoint.policy, config.checkpoint.options)
+    rows = registry.rows("scoring", "migration", "checkpoint")
+    return MasterRuntime(config, policy, strategies, rows).run()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

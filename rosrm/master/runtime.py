@@ -1,0 +1,271 @@
+"""The master's loop: take events in, let the core decide, make intent durable, carry it out."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import logging
+import os
+import secrets
+import signal
+import socket
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from rosrm.config.settings import ClusterConfig
+from rosrm.core import events as happened
+from rosrm.core import listing, restore
+from rosrm.core.commands import Assign, Command, Order, Reply, Withdraw
+from rosrm.core.master import step
+from rosrm.core.state import MasterState
+from rosrm.core.views import EventRow, PluginRow, Snapshot
+from rosrm.errors import Refused
+from rosrm.journal import SqliteJournal
+from rosrm.ports import Intent, MigrationStrategy, Record, ScoringPolicy, StoredRecord
+from rosrm.ros.client import find_master
+from rosrm.ros.master_endpoint import Identity, MasterEndpoint
+from rosrm.ros.participant import Participant
+
+_log = logging.getLogger("rosrm.master")
+
+#: Seconds between two looks at readings and deadlines.
+_TICK: Final = 0.02
+#: Seconds in which a master that runs already would be discovered.
+_DISCOVERY: Final = 1.0
+_DEFAULT_EVENTS: Final = 1000
+
+
+def monotonic_ns() -> int:
+    """The master's beat."""
+    return time.monotonic_ns()
+
+
+class MasterRuntime:
+    """One master.
+
+    Args:
+        config: as checked.
+        policy: the scoring policy that the configuration names.
+        strategies: the migration strategies that it names.
+        plugins: what `rosrm plugins` shows of the master.
+
+    Raises:
+        Refused: another master runs on this domain, or on this state directory.
+        JournalError: the journal cannot be used.
+    """
+
+    def __init__(
+        self,
+        config: ClusterConfig,
+        policy: ScoringPolicy,
+        strategies: dict[str, MigrationStrategy],
+        plugins: Sequence[PluginRow] = (),
+    ) -> None:
+        self._config = config
+        self._plugins = list(plugins)
+        self._started = time.monotonic()
+        self._stopping = ""
+        self._closing = contextlib.ExitStack()
+        with contextlib.ExitStack() as opened:
+            opened.enter_context(_only_one(config.state))
+            self._journal = SqliteJournal(
+                config.state / "journal.sqlite",
+                sync=config.journal.sync, keep_events=config.journal.keep_events,
+            )  # fmt: skip
+            opened.callback(self._journal.close)
+            self._participant = Participant(config.ros, "rosrm_master")
+            opened.callback(self._participant.close)
+            self._refuse_second()
+            self._state = self._restored(policy, strategies)
+            self._endpoint = self._new_endpoint()
+            self._closing = opened.pop_all()
+
+    def _refuse_second(self) -> None:
+        first = find_master(self._participant, f"master {self._config.name}", _DISCOVERY)
+        if first is not None:
+            raise Refused(
+                f"a master runs already on {self._config.ros.describe()}: {first.master!r}, pid "
+                f"{first.pid} on {first.hostname}. Stop it first, or give this one another domain",
+                "second_master",
+            )
+
+    def _restored(
+        self, policy: ScoringPolicy, strategies: dict[str, MigrationStrategy]
+    ) -> MasterState:
+        known = self._journal.intents("cluster").get("epoch", {"epoch": 0})
+        epoch = int(known["epoch"]) + 1
+        self._journal.write(
+            [Record("master_started", message=f"master {self._config.name} started, epoch {epoch}")],
+            [Intent("cluster", "epoch", {"epoch": epoch})],
+            0.0,
+        )
+        state = MasterState(
+            self._config.core(), self._config.scoring.policy or "", policy, strategies, epoch
+        )
+        restore.restore(state, self._journal.intents, self._now())
+        return state
+
+    def _new_endpoint(self) -> MasterEndpoint:
+        identity = Identity(
+            self._config.name, socket.gethostname(), os.getpid(), self._state.epoch,
+            secrets.randbits(63) | 1,
+        )  # fmt: skip
+        control = self._config.control
+        return MasterEndpoint(
+            self._participant, identity, self, monotonic_ns, control.max_age, control.order_retry,
+            control.beat_period,
+        )  # fmt: skip
+
+    def _now(self) -> float:
+        return time.monotonic()
+
+    # --- the loop ------------------------------------------------------------------------
+
+    def run(self) -> int:
+        """Serve until SIGINT or SIGTERM; returns the exit code."""
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._stop)
+        next_tick = next_beat = self._now()
+        with self._closing:
+            while not self._stopping:
+                self._participant.spin(max(0.0, next_tick - self._now()))
+                now = self._now()
+                if now >= next_tick:
+                    next_tick = now + _TICK
+                    self._tick(now)
+                if now >= next_beat:
+                    next_beat = now + self._config.control.beat_period
+                    self._endpoint.beat(now - self._started)
+                self._take_in(now)
+            self._write([Record("master_stopped", message=f"master stopped: {self._stopping}")], [])
+        return 1 if self._stopping.startswith("refused") else 0
+
+    def _stop(self, number: int, _frame: Any) -> None:
+        self._stopping = self._stopping or signal.Signals(number).name
+
+    def _tick(self, now: float) -> None:
+        self._endpoint.poll_readings()
+        self._endpoint.expire(now)
+        self._endpoint.events.append(happened.TimePassed())
+        rival = self._endpoint.rival
+        if rival is not None:
+            self._endpoint.rival = None
+            self._judge_rival(rival, now)
+
+    def _judge_rival(self, rival: Any, now: float) -> None:
+        """Two masters that came up at once: the younger gives way."""
+        if rival.uptime <= now - self._started:
+            return
+        reason = (
+            f"refused: a master runs already: {rival.name!r}, pid {rival.pid} on {rival.hostname}"
+        )
+        _log.error(reason)
+        self._stopping = reason
+
+    def _take_in(self, now: float) -> None:
+        """Everything that happened goes to the core, in order, as one durable group."""
+        self._state.wall = time.time()
+        while events := self._endpoint.take_events():
+            commands: list[Command] = []
+            for event in events:
+                commands += step(self._state, event, now)
+            if commands:
+                self._carry_out(commands, now)
+
+    def _carry_out(self, commands: Sequence[Command], now: float) -> None:
+        records = [command for command in commands if isinstance(command, Record)]
+        intents = [command for command in commands if isinstance(command, Intent)]
+        if records or intents:
+            self._write(records, intents)
+        endpoint = self._endpoint
+        for command in commands:
+            if isinstance(command, Assign):
+                endpoint.assign(command)
+            elif isinstance(command, Order):
+                endpoint.order(command, now)
+            elif isinstance(command, Reply):
+                endpoint.reply(command)
+            elif isinstance(command, Withdraw):
+                endpoint.withdraw(command, now)
+        endpoint.flush()
+
+    def _write(self, records: Sequence[Record], intents: Sequence[Intent]) -> None:
+        for stored in self._journal.write(records, intents, self._now() - self._started):
+            _log.info("%s", stored.record.message)
+
+    # --- what may be read ----------------------------------------------------------------
+
+    def snapshot(self, request: Any) -> Snapshot:
+        """The listings that were asked for."""
+        now = self._now()
+        state = self._state
+        return Snapshot(
+            master=self._config.name,
+            uptime=now - self._started,
+            last_sequence=self._journal.last_sequence,
+            hosts=listing.host_rows(state, now) if request.hosts else (),
+            processes=self._processes(request.process, now) if request.processes else (),
+            plugins=self._all_plugins() if request.plugins else (),
+            events=self._events(request) if request.events else (),
+        )
+
+    def _processes(self, name: str, now: float) -> Sequence[Any]:
+        rows = listing.process_rows(self._state, now)
+        return [row for row in rows if row.name == name] if name else rows
+
+    def _events(self, request: Any) -> list[EventRow]:
+        stored = self._journal.records(
+            after=request.after_sequence, process=request.process, host=request.host,
+            newest=request.max_events or _DEFAULT_EVENTS,
+        )  # fmt: skip
+        return [_event_row(one) for one in stored]
+
+    def _all_plugins(self) -> list[PluginRow]:
+        rows = list(self._plugins)
+        for host in self._state.hosts.hosts:
+            described = host.description
+            rows += [
+                PluginRow("probe", resource.name, "", "selected", f"scope {resource.scope}", host.name)
+                for resource in described.resources
+            ]
+            rows += [
+                PluginRow("probe", name, "", "absent", reason, host.name)
+                for name, reason in described.absent.items()
+            ]
+        return rows
+
+    def explain(self, name: str) -> str | None:
+        """The story of a process as JSON."""
+        story = listing.explanation(self._state, name, self._now())
+        return None if story is None else json.dumps(story, default=dict)
+
+
+def _event_row(stored: StoredRecord) -> EventRow:
+    record = stored.record
+    return EventRow(
+        stored.sequence, stored.wall_time, stored.elapsed, record.kind, record.process,
+        record.host, record.message, record.facts,
+    )  # fmt: skip
+
+
+@contextlib.contextmanager
+def _only_one(directory: Path) -> Iterator[None]:
+    """Hold the state directory for one master of this machine."""
+    directory.mkdir(parents=True, exist_ok=True, mode=0o700)
+    with (directory / "master.lock").open("a+") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            lock.seek(0)
+            raise Refused(
+                f"a master runs already on {directory}: pid {lock.read().strip() or 'unknown'}. "
+                f"Stop it first, or give this one another `state:`",
+                "second_master",
+            ) from error
+        lock.truncate(0)
+        lock.write(str(os.getpid()))
+        lock.flush()
+        yield

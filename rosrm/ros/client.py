@@ -1,0 +1,280 @@
+"""The master as its clients see it: what the command line, the demo and the benchmarks use."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, Final
+
+from rosrm_msgs import srv
+
+from rosrm.core.model import ProcessSpec
+from rosrm.core.views import Snapshot
+from rosrm.errors import NoMaster, Refused, RosrmError
+from rosrm.ros import convert, names, qos
+from rosrm.ros.control import ControlClient, check_answer
+from rosrm.ros.participant import Participant
+from rosrm.ros.settings import RosSettings
+from rosrm.version import PROTOCOL_VERSION, __version__
+
+#: Seconds between two looks whether a service was discovered: rclpy has no event for it.
+_LOOK: Final = 0.005
+
+
+@dataclass(frozen=True, slots=True)
+class LogPart:
+    """A part of a log.
+
+    Attributes:
+        content: bytes of the log file.
+        next_offset: where to read on.
+        generation: changes when the log was rotated; then read from 0.
+        ended: the instance has ended and nothing more will come.
+    """
+
+    content: bytes
+    next_offset: int
+    generation: int
+    ended: bool
+
+
+def wait_for_service(participant: Participant, client: Any, deadline: float) -> bool:
+    """Whether a service is there before `deadline` (monotonic seconds)."""
+    while not client.service_is_ready():
+        if time.monotonic() >= deadline:
+            return False
+        participant.spin(_LOOK)
+    return True
+
+
+def wait_for(participant: Participant, future: Any, deadline: float) -> Any:
+    """The result of a call; None when `deadline` (monotonic seconds) has passed."""
+    while not future.done():
+        left = deadline - time.monotonic()
+        if left <= 0.0:
+            return None
+        participant.spin(min(left, 0.1))
+    return future.result()
+
+
+def find_master(
+    participant: Participant, who: str, timeout: float
+) -> srv.Handshake.Response | None:
+    """Look for a master and shake hands.
+
+    Args:
+        who: role and name of the asking side.
+        timeout: seconds.
+
+    Returns:
+        What the master says of itself, or None: nobody answered in time.
+    """
+    deadline = time.monotonic() + timeout
+    path = names.Names(participant.settings.namespace)(names.HANDSHAKE)
+    client = participant.node.create_client(srv.Handshake, path, qos_profile=qos.SERVICE)
+    try:
+        if not wait_for_service(participant, client, deadline):
+            return None
+        role, _, name = who.partition(" ")
+        request = srv.Handshake.Request(
+            protocol_version=PROTOCOL_VERSION, software_version=__version__, role=role, name=name
+        )
+        return wait_for(participant, client.call_async(request), deadline)
+    finally:
+        participant.node.destroy_client(client)
+
+
+class MasterClient:
+    """A connection to the master; a context manager.
+
+    Use `connect`. Every request raises `Refused` with the master's message when it is turned down,
+    and `NoMaster` when no answer comes in time.
+    """
+
+    def __init__(
+        self, participant: Participant, hello: srv.Handshake.Response, name: str, timeout: float
+    ) -> None:
+        self._participant = participant
+        self._master = hello
+        self._heard = time.monotonic()
+        self._timeout = timeout
+        self._names = names.Names(participant.settings.namespace)
+        self._control = ControlClient(participant, f"client {name}")
+        self._clients: dict[str, Any] = {}
+
+    @classmethod
+    def connect(
+        cls, settings: RosSettings, *, name: str, timeout: float = 3.0
+    ) -> MasterClient:
+        """Find the master.
+
+        Args:
+            name: of this client, for the master's messages.
+            timeout: seconds, for finding it and for each request.
+
+        Raises:
+            NoMaster: none answered; the message says what was looked for.
+            Refused: it is of another version.
+        """
+        participant = Participant(settings, f"rosrm_client_{os.getpid()}")
+        try:
+            hello = find_master(participant, f"client {name}", timeout)
+            if hello is None:
+                raise NoMaster(
+                    f"no master answered within {timeout:g} s ({settings.describe()}, namespace "
+                    f"{settings.namespace}). Is `rosrm master` running there, with the same domain?"
+                )
+            if not hello.accepted:
+                raise Refused(hello.message, "version")
+        except BaseException:
+            participant.close()
+            raise
+        return cls(participant, hello, name, timeout)
+
+    # --- requests ------------------------------------------------------------------------
+
+    def submit(self, specs: Sequence[ProcessSpec]) -> str:
+        """Queue processes, all or none; returns the master's message."""
+        request = srv.Submit.Request(processes=[convert.spec_to_msg(spec) for spec in specs])
+        return str(self._ask(srv.Submit, names.SUBMIT, request).answer.message)
+
+    def submit_soon(self, specs: Sequence[ProcessSpec], done: Callable[[str], None]) -> None:
+        """Queue processes without waiting for the answer; `spin` until `done` is called.
+
+        Args:
+            done: called with "" or with why the processes were refused.
+        """
+        request = srv.Submit.Request(processes=[convert.spec_to_msg(spec) for spec in specs])
+        request.envelope = self._envelope()
+        client = self._client(srv.Submit, names.SUBMIT)
+
+        def finish(response: Any) -> None:
+            refused = response is None or not response.answer.accepted
+            done((response.answer.message if response else "no answer in time") if refused else "")
+
+        self._control.call(client, request, time.monotonic() + self._timeout, finish)
+
+    def spin(self, timeout: float) -> None:
+        """Take in what comes, at most `timeout` seconds."""
+        self._participant.spin(timeout)
+        self._control.expire(time.monotonic())
+
+    def cancel(self, processes: Sequence[str]) -> str:
+        """Take processes out of the queue, or stop them."""
+        request = srv.Cancel.Request(processes=list(processes))
+        return str(self._ask(srv.Cancel, names.CANCEL, request).answer.message)
+
+    def restart(self, processes: Sequence[str]) -> str:
+        """Restart processes where they run; queue anew those that have ended."""
+        request = srv.Restart.Request(processes=list(processes))
+        return str(self._ask(srv.Restart, names.RESTART, request).answer.message)
+
+    def migrate(self, name: str, host: str | None = None) -> str:
+        """Begin to move a process; without a host the core chooses one."""
+        request = srv.Migrate.Request(process=name, host=host or "")
+        return str(self._ask(srv.Migrate, names.MIGRATE, request).answer.message)
+
+    def set_host_state(self, host: str, action: str) -> str:
+        """Cordon, uncordon or drain a host."""
+        request = srv.SetHostState.Request(host=host, action=action)
+        return str(self._ask(srv.SetHostState, names.SET_HOST_STATE, request).answer.message)
+
+    # --- what can be read ----------------------------------------------------------------
+
+    def list(
+        self, *, hosts: bool = False, processes: bool = False, plugins: bool = False,
+        events: bool = False, process: str = "", host: str = "", after: int = 0, newest: int = 0,
+    ) -> Snapshot:  # fmt: skip
+        """The listings that are asked for; the other arguments narrow the events."""
+        request = srv.List.Request(
+            protocol_version=PROTOCOL_VERSION, hosts=hosts, processes=processes, plugins=plugins,
+            events=events, process=process, host=host, after_sequence=after, max_events=newest,
+        )  # fmt: skip
+        answer = self._call(srv.List, self._names(names.LIST), request, "the master")
+        return Snapshot(
+            master=answer.master, uptime=answer.uptime, last_sequence=answer.last_sequence,
+            hosts=[convert.host_row_from_msg(row) for row in answer.host_list],
+            processes=[convert.process_row_from_msg(row) for row in answer.process_list],
+            plugins=[convert.plugin_row_from_msg(row) for row in answer.plugin_list],
+            events=[convert.event_from_msg(row) for row in answer.event_list],
+        )  # fmt: skip
+
+    def explain(self, name: str) -> Mapping[str, Any]:
+        """Why a process is where it is, or why it waits."""
+        request = srv.Explain.Request(protocol_version=PROTOCOL_VERSION, process=name)
+        answer = self._call(srv.Explain, self._names(names.EXPLAIN), request, "the master")
+        story: Mapping[str, Any] = json.loads(answer.explanation)
+        return story
+
+    def read_log(
+        self, host: str, process: str, number: int, offset: int, max_bytes: int
+    ) -> LogPart:
+        """A part of a log, from the slave that holds it."""
+        request = srv.ReadLog.Request(
+            protocol_version=PROTOCOL_VERSION, process=process, number=number, offset=offset,
+            max_bytes=max_bytes,
+        )  # fmt: skip
+        path = self._names.of_host(host, names.READ_LOG)
+        answer = self._call(srv.ReadLog, path, request, f"the slave of {host}")
+        return LogPart(
+            bytes(answer.content), answer.next_offset, answer.generation, answer.ended
+        )
+
+    # --- how -----------------------------------------------------------------------------
+
+    def _envelope(self) -> Any:
+        """Heads a request; the beat is renewed while it is still young for the master."""
+        if time.monotonic() - self._heard > 1.0:
+            hello = find_master(self._participant, self._control.sender, self._timeout)
+            if hello is None:
+                raise NoMaster(f"the master is gone ({self._participant.settings.describe()})")
+            self._master, self._heard = hello, time.monotonic()
+        return self._control.envelope(self._master.beat, self._master.epoch)
+
+    def _ask(self, kind: Any, name: str, request: Any) -> Any:
+        request.envelope = self._envelope()
+        return self._call(kind, self._names(name), request, "the master")
+
+    def _client(self, kind: Any, name: str) -> Any:
+        path = name if name.startswith("/") else self._names(name)
+        client = self._clients.get(path)
+        if client is None:
+            client = self._participant.node.create_client(kind, path, qos_profile=qos.SERVICE)
+            self._clients[path] = client
+            if not wait_for_service(self._participant, client, time.monotonic() + self._timeout):
+                raise NoMaster(f"{path} does not answer ({self._participant.settings.describe()})")
+        return client
+
+    def _call(self, kind: Any, path: str, request: Any, who: str) -> Any:
+        client = self._client(kind, path)
+        deadline = time.monotonic() + self._timeout
+        response = wait_for(self._participant, client.call_async(request), deadline)
+        if response is None:
+            raise NoMaster(
+                f"{who} did not answer {path} within {self._timeout:g} s "
+                f"({self._participant.settings.describe()})"
+            )
+        check_answer(response.answer, who)
+        return response
+
+    def close(self) -> None:
+        """Leave ROS."""
+        self._participant.close()
+
+    def __enter__(self) -> MasterClient:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+__all__ = ["LogPart", "MasterClient", "RosrmError", "find_master", "wait_for", "wait_for_service"]

@@ -1,0 +1,223 @@
+"""Every control request goes through here, in both directions.
+
+A request carries an id, the epoch and the newest monotonic beat *of its receiver* that the sender
+has heard. The receiver alone judges its age, by its own clock: robots' clocks differ, and DDS
+delivers requests seconds late after a cut. Repeated ids are answered again, not carried out again.
+"""
+
+from __future__ import annotations
+
+import uuid
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from rosrm_msgs.msg import Answer, Envelope
+
+from rosrm.errors import Refused
+from rosrm.ros.participant import OpenRequest, Participant
+from rosrm.version import PROTOCOL_VERSION
+
+#: Ids remembered: more than can arrive within the greatest age of a request.
+_REMEMBERED: Final = 10_000
+_NS: Final = 1e-9
+
+
+def version_refusal(version: int, who: str) -> str:
+    """Why a peer of another protocol version is refused; "" for our own."""
+    if version == PROTOCOL_VERSION:
+        return ""
+    return (
+        f"{who} speaks version {version} of rosrm's protocol and this side {PROTOCOL_VERSION}: "
+        f"install the same version of rosrm on every host"
+    )
+
+
+def accepted(message: str = "", epoch: int = 0) -> Answer:
+    """The answer to a request that was carried out."""
+    return Answer(
+        protocol_version=PROTOCOL_VERSION, accepted=True, message=message, epoch=epoch
+    )
+
+
+def refused(code: str, message: str, epoch: int = 0) -> Answer:
+    """The answer to a request that changed nothing."""
+    return Answer(
+        protocol_version=PROTOCOL_VERSION, accepted=False, code=code, message=message, epoch=epoch
+    )
+
+
+def check_answer(answer: Answer, who: str) -> None:
+    """Raise `Refused` where an answer says so, or is of another protocol version."""
+    fault = version_refusal(answer.protocol_version, who)
+    if fault:
+        raise Refused(fault, "version")
+    if not answer.accepted:
+        raise Refused(answer.message, answer.code)
+
+
+class Gate:
+    """Judges requests at their receiver.
+
+    Args:
+        beat: the receiver's monotonic clock, ns.
+        max_age: seconds after which a request is stale.
+    """
+
+    def __init__(self, beat: Callable[[], int], max_age: float) -> None:
+        self._beat = beat
+        self._max_age = max_age
+        self._answers: OrderedDict[str, Any] = OrderedDict()
+
+    def refusal(self, envelope: Envelope, epoch: int | None = None) -> Answer | None:
+        """Why a request is refused, or None.
+
+        Args:
+            epoch: older epochs than this are refused; None: the sender need not know it.
+        """
+        fault = version_refusal(envelope.protocol_version, envelope.sender or "the sender")
+        if fault:
+            return refused("version", fault)
+        age = (self._beat() - envelope.receiver_beat) * _NS
+        if envelope.receiver_beat == 0 or not 0.0 <= age <= self._max_age:
+            return refused(
+                "stale",
+                f"the request of {envelope.sender} is {age:.1f} s old by this side's clock "
+                f"(allowed: {self._max_age:g} s), or not meant for this run; nothing was done",
+            )
+        if epoch is not None and envelope.epoch < epoch:
+            return refused(
+                "stale", f"the request comes from epoch {envelope.epoch}, this is epoch {epoch}"
+            )
+        return None
+
+    def repeated(self, envelope: Envelope, request: OpenRequest) -> bool:
+        """True for a request that came before: it gets the same answer, or the one in the making."""
+        known = self._answers.get(envelope.request_id)
+        if known is None:
+            self._answers[envelope.request_id] = _PENDING
+            if len(self._answers) > _REMEMBERED:
+                self._answers.popitem(last=False)
+            return False
+        if known is not _PENDING:
+            request.answer(known)
+        return True
+
+    def remember(self, envelope: Envelope, response: Any) -> None:
+        """Keep an answer for a repetition of its request."""
+        self._answers[envelope.request_id] = response
+
+
+_PENDING: Final = object()
+
+
+class ControlServer:
+    """Offers services behind a gate.
+
+    Args:
+        participant: where they are offered.
+        gate: judges every request.
+        epoch: the current one, where older ones are to be refused.
+    """
+
+    def __init__(
+        self, participant: Participant, gate: Gate, epoch: Callable[[], int | None] = lambda: None
+    ) -> None:
+        self._participant = participant
+        self._gate = gate
+        self._epoch = epoch
+
+    def offer(
+        self,
+        service_type: Any,
+        name: str,
+        handle: Callable[[Any, Callable[[Any], None]], None],
+        *,
+        remember: bool = True,
+    ) -> None:
+        """Offer a service.
+
+        Args:
+            handle: called with a request that was let through and the means to answer it.
+            remember: keep the answer for repetitions (not for long polls).
+        """
+        gate = self._gate
+
+        def take(request: Any, open_request: OpenRequest) -> None:
+            answer = gate.refusal(request.envelope, self._epoch())
+            if answer is not None:
+                open_request.answer(service_type.Response(answer=answer))
+                return
+            if gate.repeated(request.envelope, open_request):
+                return
+
+            def respond(response: Any) -> None:
+                if remember:
+                    gate.remember(request.envelope, response)
+                open_request.answer(response)
+
+            handle(request, respond)
+
+        self._participant.serve(service_type, name, take)
+
+
+@dataclass(slots=True)
+class _Call:
+    future: Any
+    client: Any
+    deadline: float
+    done: Callable[[Any], None]
+
+
+@dataclass(slots=True)
+class ControlClient:
+    """Sends requests; each ends by its answer or by its deadline.
+
+    Attributes:
+        participant: from which they are sent.
+        sender: role and name, for people.
+    """
+
+    participant: Participant
+    sender: str
+    _calls: list[_Call] = field(default_factory=list)
+
+    def envelope(self, receiver_beat: int, epoch: int = 0) -> Envelope:
+        """The head of a new request."""
+        return Envelope(
+            protocol_version=PROTOCOL_VERSION, request_id=uuid.uuid4().hex, sender=self.sender,
+            epoch=epoch, receiver_beat=receiver_beat,
+        )  # fmt: skip
+
+    def call(
+        self, client: Any, request: Any, deadline: float, done: Callable[[Any], None]
+    ) -> None:
+        """Send a request.
+
+        Args:
+            client: an rclpy service client.
+            deadline: monotonic seconds, compared with `expire`'s argument.
+            done: called once: with the response, or with None when the deadline has passed.
+        """
+        call = _Call(client.call_async(request), client, deadline, done)
+        self._calls.append(call)
+        call.future.add_done_callback(self.participant.counted(lambda _: self._finish(call)))
+
+    def _finish(self, call: _Call) -> None:
+        if call in self._calls:
+            self._calls.remove(call)
+            call.done(call.future.result())
+
+    def expire(self, now: float) -> None:
+        """End the calls whose deadline has passed."""
+        for call in [call for call in self._calls if now >= call.deadline]:
+            self._calls.remove(call)
+            call.client.remove_pending_request(call.future)
+            call.done(None)
+
+    def forget(self) -> None:
+        """Drop every call without an answer: the other side is another run by now."""
+        for call in self._calls:
+            call.client.remove_pending_request(call.future)
+        self._calls.clear()

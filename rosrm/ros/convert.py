@@ -1,0 +1,303 @@
+"""Message <-> value. Nothing received is ever unpickled; free-form values travel as JSON."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from rosrm_msgs import msg
+
+from rosrm.core import model
+from rosrm.core.views import EventRow, HostRow, PluginRow, ProcessRow, ResourceRow
+from rosrm.errors import Refused
+
+# --- small things -----------------------------------------------------------------------------
+
+
+def pairs(values: Mapping[str, Any]) -> list[msg.KeyValue]:
+    """A mapping of strings as messages."""
+    return [msg.KeyValue(key=key, value=str(value)) for key, value in values.items()]
+
+
+def mapping(values: Iterable[msg.KeyValue]) -> dict[str, str]:
+    """The inverse of `pairs`."""
+    return {pair.key: pair.value for pair in values}
+
+
+def instance_to_msg(instance: model.InstanceId) -> msg.InstanceId:
+    """One run of a process."""
+    return msg.InstanceId(process=instance.process, number=instance.number)
+
+
+def instance_from_msg(message: msg.InstanceId) -> model.InstanceId:
+    """The inverse of `instance_to_msg`."""
+    return model.InstanceId(message.process, message.number)
+
+
+def json_object(text: str, what: str) -> dict[str, Any]:
+    """A JSON object that came as text; raises `Refused` naming `what`."""
+    if not text:
+        return {}
+    try:
+        value = json.loads(text)
+    except ValueError as error:
+        raise Refused(f"{what} is no JSON: {error}") from error
+    if not isinstance(value, dict):
+        raise Refused(f"{what} is a JSON {type(value).__name__}, not an object")
+    return value
+
+
+# --- specs and assignments --------------------------------------------------------------------
+
+
+def spec_to_msg(spec: model.ProcessSpec) -> msg.ProcessSpec:
+    """A process spec."""
+    restart, readiness, stop = spec.restart, spec.readiness, spec.stop
+    return msg.ProcessSpec(
+        name=spec.name, ros_namespace=spec.namespace, package=spec.package or "",
+        executable=spec.executable or "", module=spec.module or "", command=list(spec.command),
+        arguments=list(spec.arguments),
+        parameters=[
+            msg.KeyValue(key=key, value=json.dumps(value)) for key, value in spec.parameters.items()
+        ],
+        remappings=pairs(spec.remappings), environment=pairs(spec.environment),
+        working_directory=spec.working_directory or "", ros=spec.ros, kind=spec.kind.value,
+        restart=msg.RestartPolicy(
+            when=restart.when, delay=float(restart.delay), max_delay=float(restart.max_delay),
+            factor=float(restart.factor), attempts=restart.attempts, window=float(restart.window),
+        ),
+        needs=[
+            msg.ResourceAmount(resource=name, amount=float(amount))
+            for name, amount in spec.needs.items()
+        ],
+        required_labels=pairs(spec.required_labels), preferred_labels=pairs(spec.preferred_labels),
+        avoided_labels=pairs(spec.avoided_labels), priority=spec.priority,
+        migration=msg.MigrationPolicy(
+            strategy=spec.migration.strategy or "", overlap=spec.migration.overlap,
+            options=json.dumps(dict(spec.migration.options)),
+        ),
+        readiness=msg.Readiness(kind=readiness.kind, timeout=float(readiness.timeout)),
+        stop=msg.StopPolicy(
+            interrupt_grace=float(stop.interrupt_grace), terminate_grace=float(stop.terminate_grace)
+        ),
+    )  # fmt: skip
+
+
+def spec_from_msg(message: msg.ProcessSpec) -> model.ProcessSpec:
+    """The inverse of `spec_to_msg`; raises `Refused` for what makes no process."""
+    fault = _spec_fault(message)
+    if fault:
+        raise Refused(f"process {message.name!r}: {fault}")
+    restart, migration = message.restart, message.migration
+    return model.ProcessSpec(
+        name=message.name, namespace=message.ros_namespace, package=message.package or None,
+        executable=message.executable or None, module=message.module or None,
+        command=tuple(message.command), arguments=tuple(message.arguments),
+        parameters={
+            pair.key: _json_value(pair.value, f"parameter {pair.key}")
+            for pair in message.parameters
+        },
+        remappings=mapping(message.remappings), environment=mapping(message.environment),
+        working_directory=message.working_directory or None, ros=message.ros,
+        kind=model.Kind(message.kind),
+        restart=model.RestartPolicy(
+            restart.when, restart.delay, restart.max_delay, restart.factor, restart.attempts,
+            restart.window,
+        ),
+        needs={need.resource: need.amount for need in message.needs},
+        required_labels=mapping(message.required_labels),
+        preferred_labels=mapping(message.preferred_labels),
+        avoided_labels=mapping(message.avoided_labels), priority=message.priority,
+        migration=model.MigrationPolicy(
+            migration.strategy or None, migration.overlap,
+            json_object(migration.options, "migration options"),
+        ),
+        readiness=model.Readiness(message.readiness.kind, message.readiness.timeout),
+        stop=model.StopPolicy(message.stop.interrupt_grace, message.stop.terminate_grace),
+    )  # fmt: skip
+
+
+def _spec_fault(message: msg.ProcessSpec) -> str:
+    """What a client of ours would never send: somebody else's might."""
+    forms = [bool(message.package), bool(message.module), bool(message.command)]
+    if not message.name:
+        return "it has no name"
+    if sum(forms) != 1:
+        return "give exactly one of package + executable, module, command"
+    if bool(message.package) != bool(message.executable):
+        return "package and executable go together"
+    if message.kind not in {kind.value for kind in model.Kind}:
+        return f"kind {message.kind!r}; allowed: service, job"
+    if message.restart.when not in ("never", "on-failure", "always"):
+        return f"restart {message.restart.when!r}; allowed: never, on-failure, always"
+    if message.readiness.kind not in ("auto", "graph", "running"):
+        return f"readiness {message.readiness.kind!r}; allowed: auto, graph, running"
+    for need in message.needs:
+        if not 0.0 <= need.amount < float("inf"):
+            return f"it needs {need.amount} of {need.resource}; allowed: 0 and more"
+    return ""
+
+
+def _json_value(text: str, what: str) -> Any:
+    try:
+        return json.loads(text)
+    except ValueError as error:
+        raise Refused(f"{what} is no JSON: {error}") from error
+
+
+def assignment_to_msg(assignment: model.Assignment) -> msg.Assignment:
+    """An order to run an instance."""
+    return msg.Assignment(
+        instance=instance_to_msg(assignment.instance), epoch=assignment.epoch,
+        node_name=assignment.node_name, spec=spec_to_msg(assignment.spec),
+    )  # fmt: skip
+
+
+def assignment_from_msg(message: msg.Assignment) -> model.Assignment:
+    """The inverse of `assignment_to_msg`; raises `Refused`."""
+    return model.Assignment(
+        instance_from_msg(message.instance), spec_from_msg(message.spec), message.epoch,
+        message.node_name,
+    )  # fmt: skip
+
+
+# --- hosts and statuses -----------------------------------------------------------------------
+
+
+def host_to_msg(host: model.HostDescription) -> msg.HostDescription:
+    """A host."""
+    return msg.HostDescription(
+        name=host.name, hostname=host.hostname, incarnation=host.incarnation, pid=host.pid,
+        software_version=host.software_version, labels=pairs(host.labels),
+        resources=[
+            msg.ResourceDescription(
+                slot=slot, name=resource.name, unit=resource.unit, capacity=resource.capacity,
+                scope=resource.scope,
+            )
+            for slot, resource in enumerate(host.resources)
+        ],
+        max_processes=host.max_processes, period=host.period, executors=list(host.executors),
+        absent=pairs(host.absent),
+    )  # fmt: skip
+
+
+def host_from_msg(message: msg.HostDescription) -> model.HostDescription:
+    """The inverse of `host_to_msg`; raises `Refused` for what makes no host."""
+    resources = sorted(message.resources, key=lambda resource: int(resource.slot))
+    if [resource.slot for resource in resources] != list(range(len(resources))):
+        raise Refused(f"host {message.name!r}: its resources do not fill the slots 0, 1, 2, …")
+    if len(resources) > model.RESOURCE_SLOTS or not message.name or not message.incarnation:
+        raise Refused(f"host {message.name!r}: no name, no incarnation or too many resources")
+    for resource in resources:
+        if not 0.0 < resource.capacity < float("inf"):
+            raise Refused(f"host {message.name!r}: {resource.name} has capacity {resource.capacity}")
+    return model.HostDescription(
+        name=message.name, incarnation=message.incarnation, hostname=message.hostname,
+        pid=message.pid, software_version=message.software_version, labels=mapping(message.labels),
+        resources=tuple(
+            model.ResourceDescription(r.name, r.unit, r.capacity, r.scope) for r in resources
+        ),
+        max_processes=message.max_processes, period=message.period,
+        executors=tuple(message.executors), absent=mapping(message.absent),
+    )  # fmt: skip
+
+
+def status_to_msg(status: model.InstanceStatus) -> msg.ProcessStatus:
+    """What became of an instance."""
+    return msg.ProcessStatus(
+        instance=instance_to_msg(status.instance), state=status.state.value, pid=status.pid,
+        exit_code=status.exit_code, exit_signal=status.exit_signal, restarts=status.restarts,
+        peak_memory=float(status.peak_memory), cpu_time=float(status.cpu_time),
+        run_time=float(status.run_time), message=status.message,
+    )  # fmt: skip
+
+
+def status_from_msg(message: msg.ProcessStatus) -> model.InstanceStatus:
+    """The inverse of `status_to_msg`; raises `Refused` for an unknown state."""
+    try:
+        state = model.InstanceState(message.state)
+    except ValueError as error:
+        raise Refused(f"unknown state {message.state!r} of {message.instance.process}") from error
+    return model.InstanceStatus(
+        instance_from_msg(message.instance), state, message.pid, message.exit_code,
+        message.exit_signal, message.restarts, message.peak_memory, message.cpu_time,
+        message.run_time, message.message,
+    )  # fmt: skip
+
+
+# --- rows -------------------------------------------------------------------------------------
+
+
+def host_row_to_msg(row: HostRow) -> msg.HostState:
+    """A row of `rosrm hosts`."""
+    return msg.HostState(
+        description=host_to_msg(row.description), host_id=row.host_id, state=row.state,
+        cordoned=row.cordoned, draining=row.draining, accepting=row.accepting,
+        reading_age=row.reading_age, usage=[r.usage for r in row.resources],
+        in_flight=[r.in_flight for r in row.resources], limit=[r.limit for r in row.resources],
+        stale=[r.stale for r in row.resources], processes=row.processes,
+    )  # fmt: skip
+
+
+def host_row_from_msg(message: msg.HostState) -> HostRow:
+    """The inverse of `host_row_to_msg`."""
+    resources = tuple(
+        ResourceRow(
+            resource.name, resource.unit, resource.capacity, resource.scope, float(usage),
+            float(in_flight), float(limit), bool(stale),
+        )
+        for resource, usage, in_flight, limit, stale in zip(
+            message.description.resources, message.usage, message.in_flight, message.limit,
+            message.stale, strict=True,
+        )
+    )  # fmt: skip
+    description = message.description
+    return HostRow(
+        model.HostDescription(
+            description.name, description.incarnation, description.hostname, description.pid,
+            description.software_version, mapping(description.labels),
+            tuple(model.ResourceDescription(r.name, r.unit, r.capacity, r.scope)
+                  for r in description.resources),
+            description.max_processes, description.period, tuple(description.executors),
+            mapping(description.absent),
+        ),
+        message.host_id, message.state, message.cordoned, message.draining, message.accepting,
+        message.reading_age, resources, message.processes,
+    )  # fmt: skip
+
+
+def process_row_to_msg(row: ProcessRow) -> msg.ProcessState:
+    """A row of `rosrm ps`."""
+    return msg.ProcessState(**{name: getattr(row, name) for name in ProcessRow.__slots__})
+
+
+def process_row_from_msg(message: msg.ProcessState) -> ProcessRow:
+    """The inverse of `process_row_to_msg`."""
+    return ProcessRow(**{name: getattr(message, name) for name in ProcessRow.__slots__})
+
+
+def plugin_row_to_msg(row: PluginRow) -> msg.PluginState:
+    """A row of `rosrm plugins`."""
+    return msg.PluginState(**{name: getattr(row, name) for name in PluginRow.__slots__})
+
+
+def plugin_row_from_msg(message: msg.PluginState) -> PluginRow:
+    """The inverse of `plugin_row_to_msg`."""
+    return PluginRow(**{name: getattr(message, name) for name in PluginRow.__slots__})
+
+
+def event_to_msg(row: EventRow) -> msg.Event:
+    """A line of the event record."""
+    return msg.Event(
+        sequence=row.sequence, wall_time=row.wall_time, elapsed=row.elapsed, kind=row.kind,
+        process=row.process, host=row.host, message=row.message, data=json.dumps(dict(row.facts)),
+    )  # fmt: skip
+
+
+def event_from_msg(message: msg.Event) -> EventRow:
+    """The inverse of `event_to_msg`."""
+    return EventRow(
+        message.sequence, message.wall_time, message.elapsed, message.kind, message.process,
+        message.host, message.message, json_object(message.data, "an event"),
+    )  # fmt: skip

@@ -1,0 +1,67 @@
+"""Whether one very instance is in the ROS graph: a node's name alone does not tell namesakes apart.
+
+Every rclcpp and rclpy node publishes `/parameter_events`; the endpoint's GID tells its participant.
+Fast DDS writes the machine and the process id into the GID, so there an instance is recognised by
+its own pids; with another vendor an endpoint counts that was not there when the instance started.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from typing import Any, Final
+
+from rclpy.node import Node
+
+_TOPIC: Final = "/parameter_events"
+_FAST_DDS: Final = b"\x01\x0f"
+#: Vendor, host, process: the rest of a GID's prefix is chance and counters.
+_HOST: Final = slice(2, 4)
+_PID: Final = slice(4, 6)
+
+
+class GraphWatch:
+    """Looks for instances in the graph, from one node.
+
+    Args:
+        node: any node of this participant.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._host = b""
+
+    def endpoints(self, name: str) -> frozenset[bytes]:
+        """GIDs of the endpoints of all nodes of a fully qualified name, as known now."""
+        return frozenset(gid for owner, gid in self._all() if owner == name)
+
+    def sees(self, name: str, pids: Iterable[int], before: frozenset[bytes]) -> bool:
+        """Whether the instance that runs as one of `pids` has a node of this name.
+
+        Args:
+            name: fully qualified.
+            before: endpoints of that name when the instance was started.
+        """
+        own = {pid & 0xFFFF for pid in pids}
+        return any(self._belongs(gid, own, before) for gid in self.endpoints(name))
+
+    def _belongs(self, gid: bytes, own: set[int], before: frozenset[bytes]) -> bool:
+        if gid[:2] != _FAST_DDS:
+            return gid not in before
+        return gid[_HOST] == self._own_host() and int.from_bytes(gid[_PID], "little") in own
+
+    def _own_host(self) -> bytes:
+        if not self._host:
+            own = {os.getpid() & 0xFFFF}
+            for _, gid in self._all():
+                if gid[:2] == _FAST_DDS and int.from_bytes(gid[_PID], "little") in own:
+                    self._host = gid[_HOST]
+        return self._host
+
+    def _all(self) -> list[tuple[str, bytes]]:
+        infos: list[Any] = self._node.get_publishers_info_by_topic(_TOPIC)
+        return [(_qualified(info), bytes(info.endpoint_gid)) for info in infos]
+
+
+def _qualified(info: Any) -> str:
+    return f"{info.node_namespace.rstrip('/')}/{info.node_name}"

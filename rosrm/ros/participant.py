@@ -1,0 +1,145 @@
+"""One DDS participant with one node and one executor: all that a part of rosrm has of ROS.
+
+The EventsExecutor costs a third of the others' CPU a message, but its `spin()` does nothing in the
+Jazzy wheels: we loop over `spin_once`. It cannot await an asynchronous service callback; `serve`
+therefore defers every response, so that a request may stay open until there is an answer.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any
+
+import rclpy
+from rclpy.experimental import EventsExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.signals import SignalHandlerOptions
+
+from rosrm.ros import qos
+from rosrm.ros.settings import RosSettings
+
+
+@dataclass(slots=True)
+class OpenRequest:
+    """A request that waits for its response; `answer` may be called at any time, once."""
+
+    _send: Callable[[Any, Any], None]
+    _header: Any
+
+    def answer(self, response: Any) -> None:
+        """Send the response."""
+        self._send(response, self._header)
+
+
+class Participant:
+    """A context, a lean node and its executor.
+
+    Args:
+        settings: applied to the environment before the context is made.
+        name: of the node.
+    """
+
+    def __init__(self, settings: RosSettings, name: str) -> None:
+        os.environ.update(settings.environment())
+        self.settings = settings
+        self.context = rclpy.Context()
+        rclpy.init(
+            context=self.context,
+            domain_id=settings.domain,
+            signal_handler_options=SignalHandlerOptions.NO,
+        )
+        self.node = self._lean_node(name)
+        self.executor = EventsExecutor(context=self.context)
+        self.executor.add_node(self.node)
+        self._executed = 0
+        self._unwatched: list[Node] = []
+
+    def _lean_node(self, name: str) -> Node:
+        return Node(
+            name,
+            context=self.context,
+            namespace=self.settings.namespace,
+            use_global_arguments=False,
+            enable_rosout=False,
+            start_parameter_services=False,
+            parameter_overrides=[Parameter("start_type_description_service", value=False)],
+        )
+
+    def unwatched_node(self, name: str) -> Node:
+        """A node of the same participant outside the executor, whose messages are polled."""
+        node = self._lean_node(name)
+        self._unwatched.append(node)
+        return node
+
+    # --- the loop ------------------------------------------------------------------------
+
+    def counted(self, callback: Callable[..., None]) -> Callable[..., None]:
+        """Wrap a callback so that `spin` knows when nothing more is ready."""
+
+        def call(*arguments: Any) -> None:
+            self._executed += 1
+            callback(*arguments)
+
+        return call
+
+    def spin(self, timeout: float) -> None:
+        """Wait for something to do, at most `timeout` seconds, then do all that is ready."""
+        before = self._executed
+        self.executor.spin_once(timeout_sec=timeout)
+        while self._executed != before:
+            before = self._executed
+            self.executor.spin_once(timeout_sec=0.0)
+
+    def wake(self) -> None:
+        """End a `spin` that waits; may be called from any thread."""
+        self.executor.create_task(_nothing)
+
+    # --- services ------------------------------------------------------------------------
+
+    def serve(
+        self, service_type: Any, name: str, handle: Callable[[Any, OpenRequest], None]
+    ) -> None:
+        """Offer a service whose responses may come later.
+
+        Args:
+            handle: called with each request and the means to answer it.
+        """
+        # The executor passes what the callback returns to `send_response` with the header that is
+        # needed for the answer: the callback hands the request through, and the answer comes later.
+        service = self.node.create_service(
+            service_type, name, lambda request, _response: request, qos_profile=qos.SERVICE
+        )
+        send = service.send_response
+
+        def take(request: Any, header: Any) -> None:
+            self._executed += 1
+            handle(request, OpenRequest(send, header))
+
+        service.send_response = take
+
+    def close(self) -> None:
+        """Leave ROS."""
+        self.executor.remove_node(self.node)
+        self.executor.shutdown()
+        for node in (*self._unwatched, self.node):
+            node.destroy_node()
+        self.context.try_shutdown()
+
+    def __enter__(self) -> Participant:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+def _nothing() -> None:
+    """What a wake-up does: the executor's own `wake` does not end a waiting `spin_once`."""

@@ -1,0 +1,33 @@
+"""The quality of service of every topic and service, in one place."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+#: Requests of a thousand slaves at once; the default keeps the last 10 and drops silently.
+SERVICE: Final = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST, depth=2000, reliability=ReliabilityPolicy.RELIABLE
+)
+
+#: Newest counts: a reading that is lost is followed by the next. The depth is for all hosts.
+READINGS: Final = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST, depth=4000, reliability=ReliabilityPolicy.BEST_EFFORT
+)
+
+#: The sender keeps no more readings than the newest.
+READING_OUT: Final = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.BEST_EFFORT
+)
+
+#: What must arrive, in order; a gap is noticed by sequence and asked for.
+STATUSES: Final = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST, depth=2000, reliability=ReliabilityPolicy.RELIABLE
+)
+
+#: One for all: who comes late hears the newest at once.
+BEAT: Final = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)  # fmt: skip

@@ -1,0 +1,392 @@
+"""The slave's side of the wire: it finds the master, registers, asks, reports."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any, Final, Protocol
+
+import numpy as np
+import numpy.typing as npt
+from rosrm_msgs import msg, srv
+
+from rosrm.core import slave as core
+from rosrm.core.model import HostDescription, InstanceStatus
+from rosrm.errors import Refused
+from rosrm.ros import convert, names, qos
+from rosrm.ros.control import (
+    ControlClient,
+    ControlServer,
+    Gate,
+    accepted,
+    refused,
+    version_refusal,
+)
+from rosrm.ros.participant import OpenRequest, Participant
+from rosrm.ros.readings import ACCEPTING, LAYOUT, encode
+from rosrm.version import PROTOCOL_VERSION, __version__
+
+#: Seconds for one request to the master.
+_PATIENCE: Final = 3.0
+#: A long poll is asked anew after this, so that one that was lost does not last, seconds.
+_POLL_ANEW: Final = 30.0
+#: Seconds for which a name that is taken is asked for again: the former run of this slave may
+#: have been killed a moment ago.
+_NAME_TAKEN: Final = 5.0
+#: Beats of a master in its silence before it counts as gone.
+_MISSED_BEATS: Final = 10
+
+
+class Link(Enum):
+    """How far this slave is with its master."""
+
+    SEARCHING = "searching"
+    GREETING = "greeting"
+    REGISTERING = "registering"
+    REGISTERED = "registered"
+
+
+@dataclass(frozen=True, slots=True)
+class LogSlice:
+    """A part of a log file, as `ReadLog` answers it."""
+
+    content: bytes
+    next_offset: int
+    generation: int
+    ended: bool
+
+
+class Host(Protocol):
+    """What the endpoint asks of the slave's runtime."""
+
+    def take(self, event: core.Event) -> None:
+        """Something happened."""
+
+    def statuses(self) -> Sequence[InstanceStatus]:
+        """All that this host holds."""
+
+    def read_log(self, process: str, number: int, offset: int, max_bytes: int) -> LogSlice:
+        """A part of a log; raises `Refused`."""
+
+    def execute(
+        self, executor: str, arguments: dict[str, Any], done: Callable[[bool, str, str], None]
+    ) -> None:
+        """Run an executor; `done(accepted, message, result JSON)` is called in the loop's thread."""
+
+    def say(self, message: str) -> None:
+        """Tell the user."""
+
+
+class SlaveEndpoint:
+    """Everything that a slave says and hears.
+
+    Attributes:
+        link: how far it is with its master.
+        failure: why it must give up; "" while it need not.
+    """
+
+    def __init__(
+        self, participant: Participant, host: Host, description: HostDescription, max_age: float
+    ) -> None:
+        self._participant = participant
+        self._host = host
+        self._description = description
+        self.link = Link.SEARCHING
+        self.failure = ""
+        self.host_id = 0
+        self._epoch = 0
+        self._master_beat = 0
+        self._beat_at = 0.0
+        self._beat_period = 1.0
+        self._master: tuple[str, int] = ("", 0)
+        self._taken_since: float | None = None
+        self._told = ""
+        self._poll_open = False
+        self._sequence = 0
+        self._status_sequence = 0
+        self._row = np.zeros((), LAYOUT)
+        self._row["protocol_version"] = PROTOCOL_VERSION
+        self._row["incarnation"] = description.incarnation
+        self._control = ControlClient(participant, f"slave {description.name}")
+        self._names = names.Names(participant.settings.namespace)
+        self._join(max_age)
+
+    def _join(self, max_age: float) -> None:
+        node, path = self._participant.node, self._names
+        self._clients = {
+            kind: node.create_client(kind, path(name), qos_profile=qos.SERVICE)
+            for kind, name in (
+                (srv.Handshake, names.HANDSHAKE),
+                (srv.RegisterHost, names.REGISTER_HOST),
+                (srv.RequestProcess, names.REQUEST_PROCESS),
+                (srv.Leave, names.LEAVE),
+            )
+        }
+        self._readings = node.create_publisher(
+            msg.ResourceInfo, path(names.RESOURCE_INFO), qos.READING_OUT
+        )
+        self._statuses = node.create_publisher(
+            msg.ProcessStatusBatch, path(names.PROCESS_STATUS), qos.STATUSES
+        )
+        self._usages = node.create_publisher(
+            msg.ProcessUsage, path(names.PROCESS_USAGE), qos.STATUSES
+        )
+        node.create_subscription(
+            msg.MasterBeat, path(names.MASTER_BEAT),
+            self._participant.counted(self._take_beat), qos.BEAT,
+        )  # fmt: skip
+        host = self._description.name
+        server = ControlServer(
+            self._participant, Gate(time.monotonic_ns, max_age), lambda: self._epoch
+        )
+        server.offer(srv.ControlHost, path.of_host(host, names.CONTROL), self._take_order)
+        self._participant.serve(srv.ReadLog, path.of_host(host, names.READ_LOG), self._take_log)
+
+    # --- finding the master --------------------------------------------------------------
+
+    def go_on(self, now: float) -> None:
+        """Take the next step towards a registration; called in every cycle."""
+        self._control.expire(now)
+        if self.link is Link.SEARCHING and self._clients[srv.Handshake].service_is_ready():
+            self._greet(now)
+        silence = now - self._beat_at
+        if self.link is Link.REGISTERED and silence > _MISSED_BEATS * self._beat_period:
+            self._lose_master(f"the master has been silent for {silence:.1f} s; processes go on")
+
+    def _greet(self, now: float) -> None:
+        self.link = Link.GREETING
+        request = srv.Handshake.Request(
+            protocol_version=PROTOCOL_VERSION, software_version=__version__, role="slave",
+            name=self._description.name,
+        )  # fmt: skip
+        self._control.call(
+            self._clients[srv.Handshake], request, now + _PATIENCE, self._take_greeting
+        )
+
+    def _take_greeting(self, answer: srv.Handshake.Response | None) -> None:
+        if answer is None:
+            self.link = Link.SEARCHING
+            return
+        fault = version_refusal(answer.protocol_version, f"the master on {answer.hostname}")
+        if fault or not answer.accepted:
+            self.failure = fault or answer.message
+            return
+        self._note_beat(answer.beat, time.monotonic())
+        self._master = (f"{answer.master} (pid {answer.pid} on {answer.hostname})", answer.epoch)
+        self._register()
+
+    def _register(self) -> None:
+        self.link = Link.REGISTERING
+        self._poll_open = False
+        request = srv.RegisterHost.Request(
+            envelope=self._control.envelope(self._master_beat, self._master[1]),
+            host=convert.host_to_msg(self._description),
+            instances=[convert.status_to_msg(status) for status in self._host.statuses()],
+        )
+        self._control.call(
+            self._clients[srv.RegisterHost], request, time.monotonic() + _PATIENCE,
+            self._take_registration,
+        )  # fmt: skip
+
+    def _take_registration(self, response: srv.RegisterHost.Response | None) -> None:
+        now = time.monotonic()
+        if response is None or response.answer.code == "stale":
+            self.link = Link.SEARCHING
+            return
+        answer = response.answer
+        if not answer.accepted:
+            self._turned_down(answer, now)
+            return
+        self._taken_since = None
+        self.host_id = response.host_id
+        self._epoch = answer.epoch
+        self._beat_period = response.beat_period
+        self._beat_at = now
+        self._row["host_id"] = self.host_id
+        self._status_sequence = 0
+        self.link = Link.REGISTERED
+        self._host.take(core.Registered(answer.epoch))
+        self._host.say(f"registered with master {self._master[0]} as host {self.host_id}")
+
+    def _turned_down(self, answer: msg.Answer, now: float) -> None:
+        """A name may still be held by a former run of this very slave: ask again for a moment."""
+        if self._taken_since is None:
+            self._taken_since = now
+        if answer.code != "name_taken" or now - self._taken_since >= _NAME_TAKEN:
+            self.failure = answer.message
+            return
+        self.link = Link.SEARCHING
+
+    def _lose_master(self, reason: str) -> None:
+        self.link = Link.SEARCHING
+        self._poll_open = False
+        self._control.forget()
+        self._host.say(reason)
+
+    def _take_beat(self, beat: msg.MasterBeat) -> None:
+        if version_refusal(beat.protocol_version, "the master"):
+            return  # the handshake says it clearly
+        if self.link is Link.REGISTERED and beat.epoch != self._epoch:
+            if beat.epoch < self._epoch:
+                return
+            self._lose_master(f"the master has started again (epoch {beat.epoch})")
+        self._note_beat(beat.beat, time.monotonic())
+
+    def _note_beat(self, beat: int, now: float) -> None:
+        self._master_beat, self._beat_at = beat, now
+        self._row["master_beat"] = beat
+
+    # --- asking for work -----------------------------------------------------------------
+
+    def ask(self, now: float) -> None:
+        """Ask for work, unless a request is open already."""
+        if self._poll_open or self.link is not Link.REGISTERED:
+            return
+        self._poll_open = True
+        request = srv.RequestProcess.Request(
+            envelope=self._control.envelope(self._master_beat, self._epoch),
+            host_id=self.host_id, incarnation=self._description.incarnation,
+        )  # fmt: skip
+        self._control.call(
+            self._clients[srv.RequestProcess], request, now + _POLL_ANEW, self._take_work
+        )
+
+    def _take_work(self, response: srv.RequestProcess.Response | None) -> None:
+        self._poll_open = False
+        if response is None:
+            return
+        answer = response.answer
+        if not answer.accepted:
+            if answer.code in ("unknown", "stale"):
+                self._lose_master(f"the master does not know this host any more: {answer.message}")
+            return
+        try:
+            work = tuple(convert.assignment_from_msg(one) for one in response.assignments)
+        except Refused as refusal:
+            self._host.say(f"an assignment that makes no sense was refused: {refusal}")
+            return
+        self._host.take(core.AssignmentsReceived(work))
+        self.ask(time.monotonic())
+
+    # --- orders --------------------------------------------------------------------------
+
+    def _take_order(
+        self, request: srv.ControlHost.Request, respond: Callable[[Any], None]
+    ) -> None:
+        kind = srv.ControlHost.Request
+        instance = convert.instance_from_msg(request.instance)
+        try:
+            if request.action == kind.EXECUTE:
+                self._execute(request, respond)
+                return
+            if request.action == kind.START:
+                assignment = convert.assignment_from_msg(request.assignment)
+                self._host.take(core.AssignmentsReceived((assignment,)))
+            elif request.action == kind.STOP:
+                self._host.take(core.StopOrdered(instance))
+            elif request.action == kind.RESTART:
+                self._host.take(core.RestartOrdered(instance))
+            elif request.action == kind.REPORT:
+                self._host.take(core.ReportRequested())
+            else:
+                raise Refused(f"unknown action {request.action}")
+        except Refused as refusal:
+            respond(srv.ControlHost.Response(answer=refused(refusal.code, str(refusal))))
+            return
+        respond(srv.ControlHost.Response(answer=accepted()))
+
+    def _execute(
+        self, request: srv.ControlHost.Request, respond: Callable[[Any], None]
+    ) -> None:
+        def done(good: bool, message: str, result: str) -> None:
+            answer = accepted(message) if good else refused("failed", message)
+            respond(srv.ControlHost.Response(answer=answer, result=result))
+
+        arguments = convert.json_object(request.arguments, "the arguments of an executor")
+        self._host.execute(request.executor, arguments, done)
+
+    def _take_log(self, request: srv.ReadLog.Request, open_request: OpenRequest) -> None:
+        fault = version_refusal(request.protocol_version, "a reader of logs")
+        try:
+            if fault:
+                raise Refused(fault, "version")
+            part = self._host.read_log(
+                request.process, request.number, request.offset, request.max_bytes
+            )
+        except Refused as refusal:
+            answer = refused(refusal.code, str(refusal))
+            open_request.answer(srv.ReadLog.Response(answer=answer))
+            return
+        open_request.answer(
+            srv.ReadLog.Response(
+                answer=accepted(), content=part.content, next_offset=part.next_offset,
+                generation=part.generation, ended=part.ended,
+            )
+        )  # fmt: skip
+
+    # --- what is said --------------------------------------------------------------------
+
+    def publish_reading(
+        self, usage: npt.NDArray[np.float32], limit: npt.NDArray[np.float32], present: int,
+        stale: int, *, accepting: bool, processes: int,
+    ) -> None:  # fmt: skip
+        """Say the utilisation and limits of this host; (slots,) fractions."""
+        if self.link is not Link.REGISTERED:
+            return
+        self._sequence += 1
+        row = self._row
+        row["flags"] = ACCEPTING if accepting else 0
+        row["sequence"] = self._sequence
+        row["beat"] = time.monotonic_ns()
+        row["status_sequence"] = self._status_sequence
+        row["processes"] = processes
+        row["present"], row["stale"] = present, stale
+        row["usage"], row["limit"] = usage, limit
+        self._readings.publish(encode(row))
+
+    def publish_statuses(self, statuses: Sequence[InstanceStatus], *, complete: bool) -> None:
+        """Say what became of instances."""
+        if self.link is not Link.REGISTERED:
+            return  # all of it goes with the registration
+        self._status_sequence += 1
+        self._statuses.publish(
+            msg.ProcessStatusBatch(
+                protocol_version=PROTOCOL_VERSION, host_id=self.host_id,
+                incarnation=self._description.incarnation, sequence=self._status_sequence,
+                complete=complete, statuses=[convert.status_to_msg(one) for one in statuses],
+            )
+        )  # fmt: skip
+
+    def publish_usage(
+        self, numbers: Sequence[int], cpu: Sequence[float], memory: Sequence[int]
+    ) -> None:
+        """Say what each instance uses: cores and bytes, in parallel."""
+        if self.link is Link.REGISTERED:
+            self._usages.publish(
+                msg.ProcessUsage(
+                    protocol_version=PROTOCOL_VERSION, host_id=self.host_id,
+                    incarnation=self._description.incarnation, numbers=numbers, cpu=cpu,
+                    memory=memory,
+                )
+            )  # fmt: skip
+
+    def leave(self, done: Callable[[], None]) -> None:
+        """Say that this host stops in good order; `done` when the master knows, or did not answer."""
+        if self.link is not Link.REGISTERED:
+            done()
+            return
+        request = srv.Leave.Request(
+            envelope=self._control.envelope(self._master_beat, self._epoch),
+            host_id=self.host_id, incarnation=self._description.incarnation,
+        )  # fmt: skip
+        self._control.call(
+            self._clients[srv.Leave], request, time.monotonic() + 1.0, lambda _: done()
+        )
+
+
+def result_json(result: Any) -> str:
+    """What an executor returned, as JSON text."""
+    return json.dumps(result, default=dict)

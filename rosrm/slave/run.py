@@ -1,0 +1,48 @@
+"""Starts the slave's runtime from settings that were checked before: `rosrm slave` executes this.
+
+It imports neither pydantic nor typer nor rich: the memory of a slave is budgeted.
+"""
+
+# ruff: noqa: E402 - Ctrl-C must end us without a traceback also while the rest is being imported
+from __future__ import annotations
+
+import signal
+
+signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+import argparse
+import logging
+import os
+import sys
+
+from rosrm.config.settings import HostConfig
+from rosrm.errors import RosrmError
+from rosrm.registry import Registry
+
+
+def main() -> int:
+    """Read the settings from an inherited file descriptor and serve; returns the exit code."""
+    parser = argparse.ArgumentParser(prog="rosrm slave")
+    parser.add_argument("--settings-fd", type=int, required=True, help="holds HostConfig as JSON")
+    arguments = parser.parse_args()
+    logging.basicConfig(
+        level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(name)s: %(message)s",
+        datefmt="%H:%M:%S",
+    )  # fmt: skip
+    with os.fdopen(arguments.settings_fd) as settings:
+        config = HostConfig.from_json(settings.read())
+    try:
+        return _serve(config)
+    except RosrmError as error:
+        print(f"rosrm slave: {error}", file=sys.stderr)
+        return error.exit_code
+
+
+def _serve(config: HostConfig) -> int:
+    from rosrm.slave.runtime import SlaveRuntime
+
+    return SlaveRuntime(config, Registry.discover()).run()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,404 @@
+"""The slave's loop: sample, report, ask for work, launch it, watch it."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import logging
+import os
+import secrets
+import signal
+import socket
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from rosrm.config.settings import HostConfig
+from rosrm.core import slave as core
+from rosrm.core.model import (
+    RESOURCE_SLOTS,
+    Assignment,
+    HostDescription,
+    InstanceId,
+    InstanceState,
+    InstanceStatus,
+)
+from rosrm.errors import LaunchError, Refused, SupervisorError
+from rosrm.ports import ProbeContext
+from rosrm.registry import Registry
+from rosrm.ros.graph import GraphWatch
+from rosrm.ros.names import token
+from rosrm.ros.participant import Participant
+from rosrm.ros.slave_endpoint import Link, LogSlice, SlaveEndpoint, result_json
+from rosrm.slave.launch import launch_order
+from rosrm.slave.log_reading import newest_instance, read_log
+from rosrm.slave.sampling import Sampler
+from rosrm.slave.sessions import SessionTable
+from rosrm.supervisor.client import LogLimits, SupervisorClient, SupervisorEnded
+from rosrm.version import __version__
+
+_log = logging.getLogger("rosrm.slave")
+
+#: Seconds between two looks at the ROS graph while an instance is awaited in it.
+_LOOK_AT_GRAPH: Final = 0.05
+#: Seconds between two reports of what each instance uses.
+_USAGE_PERIOD: Final = 1.0
+#: Seconds between two words to the user that there is no master yet.
+_PATIENCE_TOLD: Final = 10.0
+#: Seconds beyond the processes' own grace that a stop may take before it is said.
+_STOP_MARGIN: Final = 5.0
+_MAX_AGE: Final = 5.0
+
+Executor = Callable[[Mapping[str, Any]], Mapping[str, Any]]
+
+
+class SlaveRuntime:
+    """One slave.
+
+    Args:
+        config: as checked.
+        registry: the installed plugins.
+
+    Raises:
+        Refused: another slave runs on this state directory.
+        SupervisorError: the supervisor cannot be started or reached.
+    """
+
+    def __init__(self, config: HostConfig, registry: Registry) -> None:
+        self._config = config
+        self._stopping = ""
+        self._left = False
+        self._state = core.SlaveState()
+        self._events: deque[core.Event] = deque()
+        self._from_threads: deque[Callable[[], None]] = deque()
+        self._graph_before: dict[InstanceId, frozenset[bytes]] = {}
+        self._executors: Mapping[str, Executor] = registry.executors()
+        self._leaders: dict[int, InstanceId] = {}
+        self._supervisor_state = config.state / "supervisor"
+        self._closing = contextlib.ExitStack()
+        with contextlib.ExitStack() as opened:
+            opened.enter_context(_only_one(config.state, config.host))
+            self._sessions = SessionTable()
+            context = ProbeContext(config.scope, config.budget, config.state, self._sessions)
+            probes = registry.probes(config.probes, context)
+            self._sampler = Sampler(probes.made)
+            opened.callback(self._sampler.close)
+            self._sampler.first()
+            self._supervisor = SupervisorClient.connect(
+                self._supervisor_state,
+                log=LogLimits(config.logs.max_bytes, config.logs.keep),
+            )
+            opened.callback(self._supervisor.close)
+            self._participant = Participant(config.ros, f"rosrm_slave_{token(config.host)}")
+            opened.callback(self._participant.close)
+            self._graph = GraphWatch(self._participant.node)
+            self._limit = self._limits()
+            self._environment = {**os.environ, **config.ros.environment()}
+            self._endpoint = SlaveEndpoint(
+                self._participant, self, self._description(probes.absent), _MAX_AGE
+            )
+            self._closing = opened.pop_all()
+        self._adopt()
+
+    def _limits(self) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
+        limit = np.ones(RESOURCE_SLOTS, np.float32)
+        for slot, resource in enumerate(self._sampler.resources):
+            limit[slot] = self._config.limits.get(resource.name, 1.0)
+        return limit
+
+    def _description(self, absent: Mapping[str, str]) -> HostDescription:
+        config = self._config
+        return HostDescription(
+            name=config.host, incarnation=secrets.randbits(63) | 1, hostname=socket.gethostname(),
+            pid=os.getpid(), software_version=__version__, labels=config.labels,
+            resources=tuple(self._sampler.resources), max_processes=config.max_processes,
+            period=config.period, executors=tuple(self._executors), absent=absent,
+        )  # fmt: skip
+
+    def _adopt(self) -> None:
+        """Take over what a former run of this slave left with the supervisor."""
+        for note in self._supervisor.notes:
+            self.say(note)
+        if self._supervisor.instances:
+            self.say(f"{len(self._supervisor.instances)} processes were found with the supervisor")
+            self._take_statuses(self._supervisor.instances)
+            self._work(time.monotonic())
+
+    # --- the loop ------------------------------------------------------------------------
+
+    def run(self) -> int:
+        """Serve until SIGINT or SIGTERM; returns the exit code."""
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._stop)
+        reader = threading.Thread(target=self._read_supervisor, name="supervisor", daemon=True)
+        reader.start()
+        with self._closing:
+            self._serve(lambda: not self._stopping and not self._endpoint.failure)
+            return self._end()
+
+    def _serve(self, goes_on: Callable[[], bool]) -> None:
+        now = time.monotonic()
+        next_sample = next_usage = next_graph = now
+        told = now - _PATIENCE_TOLD
+        while goes_on():
+            if now >= next_sample:
+                next_sample = max(next_sample + self._config.period, now)
+                self._cycle(now)
+            if now >= next_usage:
+                next_usage = now + _USAGE_PERIOD
+                self._report_usage(now)
+            awaited = self._state.awaited_in_graph()
+            if awaited and now >= next_graph:
+                next_graph = now + _LOOK_AT_GRAPH
+                self._look_at_graph(awaited)
+            if self._endpoint.link is Link.SEARCHING and now - told >= _PATIENCE_TOLD:
+                told = now
+                self.say(f"looking for a master on {self._config.ros.describe()}")
+            self._work(now)
+            wake = min(next_sample, next_usage, next_graph if awaited else next_sample)
+            self._participant.spin(max(0.0, wake - time.monotonic()))
+            now = time.monotonic()
+            self._work(now)
+
+    def _stop(self, number: int, _frame: Any) -> None:
+        self._stopping = self._stopping or signal.Signals(number).name
+
+    def _cycle(self, now: float) -> None:
+        """What is done at the rate of `resource_info`."""
+        self._endpoint.go_on(now)
+        sample = self._sampler.latest(now)
+        for report in sample.reports:
+            self.say(str(report))
+        present = self._sampler.present
+        under = core.under_limits(sample.usage, self._limit, present, sample.stale)
+        accepting = under and not self._stopping
+        self._endpoint.publish_reading(
+            sample.usage, self._limit, present, sample.stale, accepting=accepting,
+            processes=self._state.live(),
+        )  # fmt: skip
+        if accepting:
+            self._endpoint.ask(now)
+        self.take(core.TimePassed())
+
+    def _report_usage(self, now: float) -> None:
+        if not self._leaders:
+            return
+        self._sessions.refresh(now)
+        usage = self._sessions.usage()
+        known = [leader for leader in self._leaders if leader in usage]
+        self._endpoint.publish_usage(
+            [self._leaders[leader].number for leader in known],
+            [usage[leader].cpu for leader in known],
+            [usage[leader].memory for leader in known],
+        )
+
+    def _look_at_graph(self, awaited: Mapping[InstanceId, core.Held]) -> None:
+        for instance, held in awaited.items():
+            before = self._graph_before.get(instance, frozenset())
+            if self._graph.sees(held.node_name, self._pids_of(held.status.pid), before):
+                self.take(core.SeenInGraph(instance))
+
+    def _pids_of(self, leader: int) -> list[int]:
+        """The leader and the other members of its session, as far as they are known."""
+        members = [leader]
+        for pid in self._sessions.pids():
+            with contextlib.suppress(ProcessLookupError):
+                if pid != leader and os.getsid(pid) == leader:
+                    members.append(pid)
+        return members
+
+    # --- core and supervisor -------------------------------------------------------------
+
+    def take(self, event: core.Event) -> None:
+        """Something happened."""
+        self._events.append(event)
+
+    def _work(self, now: float) -> None:
+        """Let the core decide about everything that happened, and carry it out."""
+        while self._from_threads:
+            self._from_threads.popleft()()
+        while self._events:
+            events = list(self._events)
+            self._events.clear()
+            reported: list[InstanceStatus] = []
+            for command in core.step_all(self._state, events, now):
+                if isinstance(command, core.Report) and not command.complete:
+                    reported += command.statuses
+                else:
+                    self._carry_out(command)
+            if reported:
+                self._endpoint.publish_statuses(reported, complete=False)
+
+    def _carry_out(self, command: core.Command) -> None:
+        if isinstance(command, core.Launch):
+            self._launch(command.assignments)
+        elif isinstance(command, core.Stop):
+            self._supervisor.stop(command.instance)
+        elif isinstance(command, core.Restart):
+            self._supervisor.restart(command.instance)
+        elif isinstance(command, core.Forget):
+            self._supervisor.forget(command.instances)
+        else:
+            self._endpoint.publish_statuses(command.statuses, complete=command.complete)
+
+    def _launch(self, assignments: Sequence[Assignment]) -> None:
+        orders = []
+        for assignment in assignments:
+            held = self._state.held[assignment.instance]
+            if held.node_name:
+                self._graph_before[assignment.instance] = self._graph.endpoints(held.node_name)
+            try:
+                orders.append(
+                    launch_order(
+                        assignment, self._environment, sys.executable, host=self._config.host,
+                        state_directory=self._supervisor_state,
+                    )
+                )  # fmt: skip
+            except LaunchError as error:
+                self.say(f"{assignment.instance} cannot be started here: {error}")
+                self.take(core.LaunchRefused(assignment.instance, str(error)))
+        if orders:
+            self._supervisor.start(orders)
+
+    def _read_supervisor(self) -> None:
+        """Runs in a thread of its own: the supervisor's words, into the loop."""
+        while True:
+            try:
+                statuses = self._supervisor.receive(None)
+            except SupervisorError as error:
+                ended = isinstance(error, SupervisorEnded)
+                reason = "" if ended else str(error)
+                self._from_threads.append(partial(self._supervisor_gone, reason))
+                self._wake()
+                return
+            self._from_threads.append(partial(self._take_statuses, statuses))
+            self._wake()
+
+    def _wake(self) -> None:
+        # The participant may be closed already, when the last words come.
+        with contextlib.suppress(Exception):
+            self._participant.wake()
+
+    def _supervisor_gone(self, reason: str) -> None:
+        self._left = True
+        if reason:
+            self._endpoint.failure = f"the supervisor of this host is gone: {reason}"
+
+    def _take_statuses(self, statuses: Sequence[InstanceStatus]) -> None:
+        for status in statuses:
+            self._follow_session(status)
+        self.take(core.SupervisorReported(tuple(statuses)))
+
+    def _follow_session(self, status: InstanceStatus) -> None:
+        """Keep the table of sessions, for probes and usage."""
+        leader = next((pid for pid, one in self._leaders.items() if one == status.instance), 0)
+        runs = status.state in (InstanceState.RUNNING, InstanceState.STOPPING) and status.pid
+        if leader and leader != status.pid or leader and not runs:
+            self._sessions.remove(leader, status.cpu_time)
+            del self._leaders[leader]
+        if runs and status.pid not in self._leaders:
+            self._sessions.add(status.pid)
+            self._leaders[status.pid] = status.instance
+        if status.state.ended:
+            self._graph_before.pop(status.instance, None)
+
+    # --- what the endpoint asks ----------------------------------------------------------
+
+    def statuses(self) -> Sequence[InstanceStatus]:
+        """All that this host holds."""
+        return self._state.statuses()
+
+    def say(self, message: str) -> None:
+        """Tell the user."""
+        _log.info("%s", message)
+
+    def read_log(self, process: str, number: int, offset: int, max_bytes: int) -> LogSlice:
+        """A part of a log; raises `Refused`."""
+        instance = (
+            InstanceId(process, number)
+            if number
+            else newest_instance(self._supervisor_state, process)
+        )
+        held = self._state.held.get(instance)
+        ended = held is None or held.status.state.ended
+        return read_log(self._supervisor_state, instance, offset, max_bytes, ended=ended)
+
+    def execute(
+        self, executor: str, arguments: dict[str, Any], done: Callable[[bool, str, str], None]
+    ) -> None:
+        """Run an executor in a thread of its own."""
+        function = self._executors.get(executor)
+        if function is None:
+            there = ", ".join(sorted(self._executors)) or "none"
+            raise Refused(f"no executor {executor!r} on {self._config.host}; there are: {there}")
+
+        def work() -> None:
+            try:
+                result = result_json(function(arguments))
+                outcome = (True, "", result)
+            except Exception as error:  # noqa: BLE001 - a third party's code: anything may come
+                outcome = (False, f"{executor} raised {type(error).__name__}: {error}", "")
+            self._from_threads.append(partial(done, *outcome))
+            self._wake()
+
+        threading.Thread(target=work, name=f"executor {executor}", daemon=True).start()
+
+    # --- the end -------------------------------------------------------------------------
+
+    def _end(self) -> int:
+        """Leave in good order: the master knows, the processes are stopped, or kept."""
+        failure = self._endpoint.failure
+        if failure:
+            _log.error("%s", failure)
+        if self._left or self._config.on_stop == "keep":
+            return 1 if failure else 0
+        live = self._state.live()
+        if live:
+            self.say(f"stopping {live} processes ({self._stopping or 'refused'})")
+        self._endpoint.leave(self._supervisor.shutdown)
+        deadline = time.monotonic() + self._longest_stop() + _STOP_MARGIN
+        self._serve(lambda: not self._left and time.monotonic() < deadline)
+        return self._ended(failure)
+
+    def _ended(self, failure: str) -> int:
+        if not self._left:
+            _log.error("the supervisor did not end in time; it goes on stopping the processes")
+            return 1
+        self._work(time.monotonic())
+        return 1 if failure else 0
+
+    def _longest_stop(self) -> float:
+        graces = [
+            held.spec.stop.interrupt_grace + held.spec.stop.terminate_grace
+            for held in self._state.held.values()
+            if held.spec is not None and not held.status.state.ended
+        ]
+        return max(graces, default=10.0)
+
+
+@contextlib.contextmanager
+def _only_one(directory: Path, host: str) -> Iterator[None]:
+    """Hold the state directory for one slave of this machine."""
+    directory.mkdir(parents=True, exist_ok=True, mode=0o700)
+    with (directory / "slave.lock").open("a+") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            lock.seek(0)
+            raise Refused(
+                f"a slave of host {host!r} runs already on {directory}: pid "
+                f"{lock.read().strip() or 'unknown'}. Stop it first, or give this one another "
+                f"`host:` and `state:`",
+                "name_taken",
+            ) from None
+        lock.truncate(0)
+        lock.write(str(os.getpid()))
+        lock.flush()
+        yield
