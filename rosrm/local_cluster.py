@@ -1,0 +1,223 @@
+"""A whole cluster on this machine: real master, slaves and processes, for demos, tests, benchmarks.
+
+Every part is a process of its own, started as `rosrm master` and `rosrm slave` start it, in a ROS
+domain of its own on loopback. Whatever happens, the parts that were started are ended, by pid.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import TracebackType
+from typing import Final
+
+from rosrm.config.settings import ClusterConfig, HostConfig
+from rosrm.core.views import HostRow, ProcessRow, Snapshot
+from rosrm.errors import RosrmError
+from rosrm.ros.client import MasterClient
+from rosrm.ros.settings import RosSettings
+
+#: Seconds in which a part must have ended after SIGINT; its processes have their own grace.
+_END: Final = 30.0
+#: Domains that DDS maps to ports below the ephemeral range.
+_DOMAINS: Final = range(1, 101)
+_LOOK: Final = 0.02
+
+
+def free_domain() -> int:
+    """A ROS domain in which nobody on this machine listens now."""
+    for domain in sorted(_DOMAINS, key=lambda number: (number * 37 + os.getpid()) % 101):
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            try:
+                probe.bind(("127.0.0.1", 7410 + 250 * domain))
+            except OSError:
+                continue
+            return domain
+    raise RosrmError("every ROS domain from 1 to 100 is in use on this machine")
+
+
+@dataclass
+class Part:
+    """A master or a slave that was started.
+
+    Attributes:
+        log: what it writes to its standard error.
+    """
+
+    name: str
+    process: subprocess.Popen[bytes]
+    log: Path
+
+    def end(self, number: int = signal.SIGINT) -> None:
+        """Send a signal, if it lives."""
+        if self.process.poll() is None:
+            self.process.send_signal(number)
+
+
+@dataclass
+class LocalCluster:
+    """A master and slaves on this machine; a context manager that ends them.
+
+    Attributes:
+        directory: for states and logs.
+        cluster: the master's settings; its `ros` and `state` are set here.
+        hosts: the slaves' settings; likewise.
+        domain: ROS domain; None: a free one.
+    """
+
+    directory: Path
+    cluster: ClusterConfig = field(default_factory=ClusterConfig)
+    hosts: Sequence[HostConfig] = ()
+    domain: int | None = None
+    master: Part | None = None
+    slaves: dict[str, Part] = field(default_factory=dict)
+    _client: MasterClient | None = None
+
+    def __post_init__(self) -> None:
+        """Choose the domain."""
+        if self.domain is None:
+            self.domain = free_domain()
+        self.ros = RosSettings(domain=self.domain, discovery_range="localhost")
+
+    # --- parts ---------------------------------------------------------------------------
+
+    def start_master(self) -> Part:
+        """Start the master, or start it again."""
+        settings = replace(self.cluster, ros=self.ros, state=self.directory / "master")
+        self.master = self._start("master", "rosrm.master.run", settings.to_json())
+        return self.master
+
+    def start_slave(self, host: HostConfig) -> Part:
+        """Start a slave, or start it again."""
+        state = self.directory / "hosts" / host.host
+        settings = replace(host, ros=self.ros, state=state)
+        part = self._start(host.host, "rosrm.slave.run", settings.to_json())
+        self.slaves[host.host] = part
+        return part
+
+    def _start(self, name: str, module: str, settings: str) -> Part:
+        self.directory.mkdir(parents=True, exist_ok=True)
+        log = self.directory / f"{name}.log"
+        holder = os.memfd_create(f"rosrm-{name}")
+        try:
+            os.write(holder, settings.encode())
+            os.lseek(holder, 0, os.SEEK_SET)
+            with log.open("ab") as sink:
+                process = subprocess.Popen(
+                    [sys.executable, "-m", module, "--settings-fd", str(holder)],
+                    pass_fds=[holder], stdin=subprocess.DEVNULL, stdout=sink, stderr=sink,
+                    start_new_session=True,
+                )  # fmt: skip
+        finally:
+            os.close(holder)
+        return Part(name, process, log)
+
+    # --- looking -------------------------------------------------------------------------
+
+    @property
+    def client(self) -> MasterClient:
+        """A connection to the master."""
+        if self._client is None:
+            self._client = MasterClient.connect(self.ros, name="local cluster", timeout=15.0)
+        return self._client
+
+    def wait_until(
+        self, what: str, condition: Callable[[Snapshot], bool], timeout: float = 30.0
+    ) -> Snapshot:
+        """Look at hosts and processes until a condition holds.
+
+        Raises:
+            TimeoutError: it did not hold in time; the message says what was waited for, and what
+                there was instead.
+        """
+        deadline = time.monotonic() + timeout
+        while True:
+            view = self.client.list(hosts=True, processes=True)
+            if condition(view):
+                return view
+            if time.monotonic() >= deadline:
+                raise TimeoutError(f"{what} did not come about in {timeout:g} s: {_brief(view)}")
+            self._check_parts()
+            self.client.spin(_LOOK)
+
+    def wait_for_hosts(self, timeout: float = 30.0) -> None:
+        """Wait until every slave has registered and asks for work."""
+
+        def all_accept(view: Snapshot) -> bool:
+            accepting = {row.description.name for row in view.hosts if row.accepting}
+            return accepting >= set(self.slaves)
+
+        self.wait_until(f"hosts {', '.join(self.slaves)} accepting", all_accept, timeout)
+
+    def host(self, name: str) -> HostRow:
+        """A host's row now."""
+        rows = self.client.list(hosts=True).hosts
+        return next(row for row in rows if row.description.name == name)
+
+    def process(self, name: str) -> ProcessRow:
+        """A process's row now."""
+        rows = self.client.list(processes=True).processes
+        return next(row for row in rows if row.name == name)
+
+    def _check_parts(self) -> None:
+        for part in (self.master, *self.slaves.values()):
+            if part is not None and part.process.poll() not in (None, 0):
+                tail = part.log.read_text(errors="replace")[-2000:]
+                raise RosrmError(f"{part.name} ended with {part.process.returncode}:\n{tail}")
+
+    # --- begin and end -------------------------------------------------------------------
+
+    def __enter__(self) -> LocalCluster:
+        """Start everything and wait until every host asks for work."""
+        try:
+            self.start_master()
+            for host in self.hosts:
+                self.start_slave(host)
+            if self.hosts:
+                self.wait_for_hosts()
+        except BaseException:
+            self.close()
+            raise
+        return self
+
+    def close(self) -> None:
+        """End the slaves with their processes, then the master."""
+        if self._client is not None:
+            self._client.close()
+            self._client = None
+        _end_all(list(self.slaves.values()))
+        if self.master is not None:
+            _end_all([self.master])
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+def _end_all(parts: Sequence[Part]) -> None:
+    for part in parts:
+        part.end()
+    deadline = time.monotonic() + _END
+    for part in parts:
+        try:
+            part.process.wait(max(0.1, deadline - time.monotonic()))
+        except subprocess.TimeoutExpired:
+            part.end(signal.SIGKILL)
+            part.process.wait(5.0)
+
+
+def _brief(view: Snapshot) -> str:
+    hosts = ", ".join(f"{row.description.name} {row.state}" for row in view.hosts) or "no host"
+    processes = ", ".join(f"{row.name} {row.state}" for row in view.processes[:20])
+    return f"{hosts}; {processes or 'no process'}"
