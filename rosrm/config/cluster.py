@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from rosrm.config.checking import validated
-from rosrm.config.documents import Node, Problems, read
+from rosrm.config.documents import Node, Problems, parse, read
 from rosrm.config.options import PluginCheck
 from rosrm.config.rules import check_amounts, check_name, settled
 from rosrm.config.settings import ClusterConfig
@@ -23,7 +23,16 @@ def load_cluster(path: str | Path, registry: Registry | None = None) -> ClusterC
         registry: the installed plugins; without it the names of plugins and their options are taken
             as they are.
     """
-    root, problems = read(path), Problems()
+    return _checked(read(path), path, registry)
+
+
+def default_cluster(registry: Registry | None = None) -> ClusterConfig:
+    """The settings of a master without a file, its plugins checked as those of one."""
+    return _checked(parse("", "the default settings"), "", registry)
+
+
+def _checked(root: Node, path: str | Path, registry: Registry | None) -> ClusterConfig:
+    problems = Problems()
     config = validated(ClusterConfig, root, problems)
     _check_rules(root, config, problems)
     config = _with_options(root, config or ClusterConfig(), PluginCheck(registry, problems))

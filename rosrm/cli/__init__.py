@@ -1,0 +1,1 @@
+"""The `rosrm` command. Only `rosrm.cli.live` is of use to other programs."""

@@ -1,0 +1,102 @@
+"""Commands that change something: submit, cancel, restart, migrate, cordon, uncordon, drain."""
+
+# Each command imports what it needs when it runs, so that `rosrm --help` is quick.
+# ruff: noqa: PLC0415
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+
+from rosrm.cli import connection
+from rosrm.cli.options import Domain, Host, Name, Names
+
+
+def submit(
+    ctx: typer.Context,
+    file: Annotated[Path, typer.Argument(metavar="WORK", help="work.yaml: the processes to run.")],
+    wait: Annotated[
+        bool,
+        typer.Option(
+            "--wait",
+            help="Wait until each job has ended and each service runs; exit 1 if one failed.",
+        ),
+    ] = False,
+    timeout: Annotated[
+        str,
+        typer.Option(
+            "--timeout", metavar="TIME", help="With --wait: the longest to wait, such as 5min."
+        ),
+    ] = "",
+    domain: Domain = None,
+) -> None:
+    """Queue the processes of a work file.
+
+    All of them are taken, or none.
+    """
+    from rosrm.cli.waiting import longest, wait_for
+    from rosrm.config import load_work
+
+    limit = longest(timeout)
+    specs = load_work(file)
+    with connection.master(ctx, domain) as client:
+        typer.echo(client.submit(specs))
+        if wait and not wait_for(client, [spec.name for spec in specs], limit):
+            raise typer.Exit(1)
+
+
+def cancel(ctx: typer.Context, names: Names, domain: Domain = None) -> None:
+    """Take out of the queue, or stop for good."""
+    with connection.master(ctx, domain) as client:
+        typer.echo(client.cancel(names))
+
+
+def restart(ctx: typer.Context, names: Names, domain: Domain = None) -> None:
+    """Restart processes.
+
+    One that runs is restarted on its host; one that has ended is queued anew.
+    """
+    with connection.master(ctx, domain) as client:
+        typer.echo(client.restart(names))
+
+
+def migrate(
+    ctx: typer.Context,
+    name: Name,
+    to: Annotated[
+        str | None,
+        typer.Option("--to", metavar="HOST", help="Where to; by default the master chooses."),
+    ] = None,
+    domain: Domain = None,
+) -> None:
+    """Move a process to another host.
+
+    It is moved by the migration strategy that its work file names.
+    """
+    with connection.master(ctx, domain) as client:
+        typer.echo(client.migrate(name, to))
+
+
+def cordon(ctx: typer.Context, host: Host, domain: Domain = None) -> None:
+    """Give a host no new work."""
+    _set_host(ctx, host, "cordon", domain)
+
+
+def uncordon(ctx: typer.Context, host: Host, domain: Domain = None) -> None:
+    """Give a host work again."""
+    _set_host(ctx, host, "uncordon", domain)
+
+
+def drain(ctx: typer.Context, host: Host, domain: Domain = None) -> None:
+    """Cordon a host and move away what can be."""
+    _set_host(ctx, host, "drain", domain)
+
+
+def _set_host(ctx: typer.Context, host: str, action: str, domain: int | None) -> None:
+    with connection.master(ctx, domain) as client:
+        typer.echo(client.set_host_state(host, action))
+
+
+COMMANDS: Final = (submit, cancel, restart, migrate, cordon, uncordon, drain)

@@ -1,0 +1,57 @@
+"""How a command reaches the master. ROS is imported here, and not before a command needs it."""
+
+from __future__ import annotations
+
+import getpass
+import os
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import TYPE_CHECKING, Final
+
+import typer
+
+from rosrm.cli.options import Common
+from rosrm.errors import RosrmError
+from rosrm.ros.settings import RosSettings
+
+if TYPE_CHECKING:
+    from rosrm.ros.client import MasterClient
+
+#: Seconds to look for a master: with the imports, less than 3 s to the message that there is none.
+LOOK_FOR: Final = 2.4
+
+
+def ros_settings(ctx: typer.Context, domain: int | None) -> RosSettings:
+    """How to join ROS: the command's own option, before the common ones, before the file."""
+    common = ctx.obj if isinstance(ctx.obj, Common) else Common()
+    settings = RosSettings()
+    if common.cluster is not None:
+        from rosrm.config import load_cluster  # noqa: PLC0415 - pydantic only where a file is read
+
+        settings = load_cluster(common.cluster).ros
+    chosen = common.domain if domain is None else domain
+    return settings if chosen is None else replace(settings, domain=chosen)
+
+
+@contextmanager
+def master(ctx: typer.Context, domain: int | None) -> Iterator[MasterClient]:
+    """A connection to the master for one command."""
+    with connect(ros_settings(ctx, domain)) as client:
+        yield client
+
+
+def connect(settings: RosSettings) -> MasterClient:
+    """Find the master; raises `NoMaster`, or `RosrmError` where there is no ROS 2."""
+    try:
+        from rosrm.ros.client import MasterClient  # noqa: PLC0415 - the first import of ROS
+    except ImportError as error:
+        if (error.name or "").split(".")[0] == "rosrm":
+            raise
+        raise RosrmError(
+            f"ROS 2 cannot be imported ({str(error).splitlines()[0]}). Source your ROS 2 (and the workspace with "
+            "rosrm_msgs), or install the wheels: pip install 'rosrm[ros]'"
+        ) from None
+    who = f"{getpass.getuser()}@{socket.gethostname()}:{os.getpid()}"
+    return MasterClient.connect(settings, name=who, timeout=LOOK_FOR)

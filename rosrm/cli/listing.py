@@ -1,0 +1,120 @@
+"""Commands that show something once: status, ps, hosts, plugins, explain."""
+
+# Each command imports what it needs when it runs, so that `rosrm --help` is quick.
+# ruff: noqa: PLC0415
+
+from __future__ import annotations
+
+from typing import Annotated, Final
+
+import typer
+
+from rosrm.cli import connection
+from rosrm.cli.options import AsJson, Domain, Name
+
+
+def status(ctx: typer.Context, as_json: AsJson = False, domain: Domain = None) -> None:
+    """Show the cluster on half a page."""
+    from rosrm.cli import json_forms
+    from rosrm.cli import status as overview
+    from rosrm.cli.tables import console
+
+    with connection.master(ctx, domain) as client:
+        snapshot = client.list(hosts=True, processes=True, events=True, newest=5)
+    if as_json:
+        json_forms.show(json_forms.status_form(snapshot))
+    else:
+        console().print(overview.render(snapshot))
+
+
+def ps(
+    ctx: typer.Context,
+    everything: Annotated[
+        bool, typer.Option("--all", "-a", help="Also those that finished or were cancelled.")
+    ] = False,
+    host: Annotated[
+        str, typer.Option("--host", metavar="HOST", help="Only those on one host.")
+    ] = "",
+    as_json: AsJson = False,
+    domain: Domain = None,
+) -> None:
+    """List the processes."""
+    from rosrm.cli import json_forms, tables
+
+    with connection.master(ctx, domain) as client:
+        rows = client.list(processes=True).processes
+    shown = [row for row in rows if not host or row.host == host]
+    if as_json:
+        json_forms.show(json_forms.forms(shown))
+        return
+    listed = [row for row in shown if everything or row.state not in ("finished", "cancelled")]
+    if listed:
+        tables.console().print(tables.processes(listed))
+    if len(listed) < len(shown):
+        typer.echo(f"{len(shown) - len(listed)} finished or cancelled (--all shows them)")
+    elif not listed:
+        typer.echo("no process")
+
+
+def hosts(ctx: typer.Context, as_json: AsJson = False, domain: Domain = None) -> None:
+    """List the hosts and what they use.
+
+    Usage and limit are percent of the capacity; `?` stands before a reading that is stale.
+    """
+    from rosrm.cli import json_forms, tables
+
+    with connection.master(ctx, domain) as client:
+        rows = client.list(hosts=True).hosts
+    if as_json:
+        json_forms.show(json_forms.forms(rows))
+    elif rows:
+        tables.console().print(tables.hosts(rows))
+    else:
+        typer.echo("no host; start `rosrm slave` on each")
+
+
+def plugins(
+    ctx: typer.Context,
+    local: Annotated[
+        bool,
+        typer.Option("--local", help="What is installed here, without asking a master."),
+    ] = False,
+    as_json: AsJson = False,
+    domain: Domain = None,
+) -> None:
+    """List the plugins and how they fare.
+
+    One is selected, available, absent on a host, or broken, and the reason is said.
+    """
+    from rosrm.cli import json_forms, tables
+    from rosrm.registry import Registry
+
+    if local:
+        rows = list(Registry.discover().rows())
+    else:
+        with connection.master(ctx, domain) as client:
+            rows = list(client.list(plugins=True).plugins)
+    if as_json:
+        json_forms.show(json_forms.forms(rows))
+    elif rows:
+        tables.console().print(tables.plugins(rows))
+    else:
+        typer.echo("no plugin is installed; rosrm's own are in rosrm-scoring and its siblings")
+
+
+def explain(ctx: typer.Context, name: Name, as_json: AsJson = False, domain: Domain = None) -> None:
+    """Say why a process is where it is.
+
+    Or why it waits: each host with its score, its veto or what it lacks, and what happened.
+    """
+    from rosrm.cli import explaining, json_forms, tables
+
+    with connection.master(ctx, domain) as client:
+        story = client.explain(name)
+    if as_json:
+        json_forms.show(dict(story))
+    else:
+        tables.console().print(explaining.render(story))
+
+
+COMMANDS: Final = (status, ps, hosts, plugins, explain)

@@ -1,0 +1,33 @@
+"""Options that several commands have."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+@dataclass(frozen=True)
+class Common:
+    """What was said before the command's name."""
+
+    domain: int | None = None
+    cluster: Path | None = None
+
+
+Domain = Annotated[
+    int | None,
+    typer.Option(
+        "--domain",
+        metavar="N",
+        min=0,
+        max=232,
+        help="The ROS domain, instead of ROS_DOMAIN_ID.",
+    ),
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")]
+Name = Annotated[str, typer.Argument(metavar="NAME", help="Name of a process.")]
+Names = Annotated[list[str], typer.Argument(metavar="NAME...", help="Names of processes.")]
+Host = Annotated[str, typer.Argument(metavar="HOST", help="Name of a host.")]

@@ -1,0 +1,113 @@
+"""`rosrm master` and `rosrm slave`: check everything, say what starts, and become the runtime.
+
+The runtime takes this process's place and starts without pydantic, typer and rich, which it has no
+use for; it reads the settings that were checked from an inherited file.
+"""
+
+# Each command imports what it needs when it runs, so that `rosrm --help` is quick.
+# ruff: noqa: PLC0415
+
+from __future__ import annotations
+
+import os
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final
+
+import typer
+
+from rosrm.cli.options import Common, Domain
+
+if TYPE_CHECKING:
+    from rosrm.config.settings import ClusterConfig, HostConfig
+    from rosrm.ros.settings import RosSettings
+
+
+def master(
+    ctx: typer.Context,
+    config: Annotated[
+        Path | None,
+        typer.Option("--config", metavar="FILE", help="cluster.yaml; without it, the defaults."),
+    ] = None,
+    domain: Domain = None,
+) -> None:
+    """Start the master of a cluster.
+
+    It runs until Ctrl-C, which touches no process; started again it goes on where it was.
+    """
+    from rosrm.config.cluster import default_cluster, load_cluster
+    from rosrm.registry import Registry
+
+    registry = Registry.discover()
+    file = config or ctx.ensure_object(Common).cluster
+    settings = load_cluster(file, registry) if file else default_cluster(registry)
+    settings = replace(settings, ros=_with_domain(settings.ros, ctx, domain))
+    typer.echo(_says(settings), err=True)
+    become("rosrm.master.run", settings.to_json())
+
+
+def slave(
+    ctx: typer.Context,
+    config: Annotated[
+        Path | None,
+        typer.Option("--config", metavar="FILE", help="host.yaml; without it, the defaults."),
+    ] = None,
+    domain: Domain = None,
+) -> None:
+    """Start the slave of this host.
+
+    It runs until Ctrl-C, which stops its processes too, unless the file says `on_stop: keep`.
+    """
+    from rosrm.config import HostConfig, load_host
+    from rosrm.registry import Registry
+
+    registry = Registry.discover()
+    settings = load_host(config, registry) if config else HostConfig()
+    if settings.probes is None:
+        registry.default_probes()  # raises where there is none
+    settings = replace(settings, ros=_with_domain(settings.ros, ctx, domain))
+    typer.echo(_says_of_host(settings), err=True)
+    become("rosrm.slave.run", settings.to_json())
+
+
+def become(module: str, settings: str) -> None:
+    """Put a runtime in this process's place."""
+    descriptor = os.memfd_create("rosrm-settings", 0)
+    os.write(descriptor, settings.encode())
+    os.lseek(descriptor, 0, os.SEEK_SET)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    interpreter = [sys.executable, *_without_this_folder()]
+    os.execv(  # noqa: S606 - no shell is wanted
+        sys.executable, [*interpreter, "-m", module, "--settings-fd", str(descriptor)]
+    )
+
+
+def _without_this_folder() -> list[str]:
+    """`-m` looks for modules in the working directory first: not wanted, save in a checkout."""
+    in_checkout = Path(__file__).is_relative_to(Path.cwd())
+    return ["-P"] if sys.version_info >= (3, 11) and not in_checkout else []
+
+
+def _with_domain(settings: RosSettings, ctx: typer.Context, domain: int | None) -> RosSettings:
+    chosen = ctx.ensure_object(Common).domain if domain is None else domain
+    return settings if chosen is None else replace(settings, domain=chosen)
+
+
+def _says(settings: ClusterConfig) -> str:
+    return (
+        f"master {settings.name!r}: {settings.ros.describe()}; scoring {settings.scoring.policy}; "
+        f"migration {', '.join(settings.migration.strategies) or 'none'}; state in {settings.state}"
+    )
+
+
+def _says_of_host(settings: HostConfig) -> str:
+    limits = ", ".join(f"{name} {limit:.0%}" for name, limit in settings.limits.items())
+    return (
+        f"slave of {settings.host!r}: {settings.ros.describe()}; scope {settings.scope}; "
+        f"limits {limits}; state in {settings.state}"
+    )
+
+
+COMMANDS: Final = (master, slave)

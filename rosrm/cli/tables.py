@@ -1,0 +1,134 @@
+"""Listings as tables that read at 80 columns."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Final
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from rosrm.cli import formats
+from rosrm.core.views import EventRow, HostRow, PluginRow, ProcessRow, ResourceRow
+
+#: Width of tables that go into a file or pipe, where nobody minds a long line.
+_PIPE_WIDTH: Final = 160
+
+#: How a state looks; others are plain.
+STYLES: Final = {
+    "running": "green",
+    "finished": "green",
+    "up": "green",
+    "selected": "green",
+    "queued": "yellow",
+    "set_aside": "yellow",
+    "backoff": "yellow",
+    "migrating": "cyan",
+    "suspect": "yellow",
+    "absent": "yellow",
+    "failed": "red",
+    "stuck": "bold red",
+    "unreachable": "red",
+    "lost": "red",
+    "broken": "red",
+}
+
+
+def console() -> Console:
+    """Where tables go: as wide as the terminal, else wide enough not to be cut."""
+    output = Console(highlight=False)
+    return output if output.is_terminal else Console(highlight=False, width=_PIPE_WIDTH)
+
+
+def table(*columns: str, right: Sequence[str] = ()) -> Table:
+    """An empty table; the columns named in `right` hold numbers."""
+    made = Table(box=box.SIMPLE_HEAD, pad_edge=False, header_style="bold", show_edge=False)
+    for column in columns:
+        number = column in right
+        made.add_column(
+            column, justify="right" if number else "left", no_wrap=number, overflow="fold"
+        )
+    return made
+
+
+def state(word: str) -> Text:
+    """A state in its colour."""
+    return Text(formats.words(word), style=STYLES.get(word, ""))
+
+
+def processes(rows: Iterable[ProcessRow]) -> Table:
+    """For `rosrm ps`."""
+    numbers = ("SINCE", "CPU", "MEMORY")
+    made = table("NAME", "STATE", "HOST", *numbers, "WHY", right=numbers)
+    for row in rows:
+        runs = row.pid != 0
+        made.add_row(
+            Text(row.name),
+            state(row.state),
+            Text(row.host),
+            formats.duration(row.since),
+            f"{row.cpu:.2f}" if runs else "",
+            formats.size(row.memory) if runs else "",
+            Text(_why(row)),
+        )
+    return made
+
+
+def _why(row: ProcessRow) -> str:
+    parts = [f"no. {row.queue_position} in the queue"] if row.queue_position else []
+    if row.reason:
+        parts.append(row.reason)
+    elif row.state == "failed":
+        parts.append(f"exit code {row.exit_code}")
+    if row.restarts:
+        parts.append(f"{row.restarts} restarts")
+    if row.migrations:
+        parts.append(f"moved {row.migrations}x")
+    return "; ".join(parts)
+
+
+def hosts(rows: Sequence[HostRow]) -> Table:
+    """For `rosrm hosts`: usage against limit, in percent of the capacity."""
+    resources = list(dict.fromkeys(r.name for row in rows for r in row.resources))
+    numbers = ("RUNS", *(f"{name} %" for name in resources))
+    made = table("HOST", "STATE", *numbers, right=numbers)
+    for row in rows:
+        by_name = {resource.name: resource for resource in row.resources}
+        cells = [usage(by_name[name]) if name in by_name else Text("-") for name in resources]
+        made.add_row(Text(row.description.name), host_state(row), str(row.processes), *cells)
+    return made
+
+
+def host_state(row: HostRow) -> Text:
+    """The state of a host and what an operator did to it."""
+    text = state(row.state)
+    if row.draining:
+        text.append(", draining", "yellow")
+    elif row.cordoned:
+        text.append(", cordoned", "yellow")
+    return text
+
+
+def usage(resource: ResourceRow) -> Text:
+    """`34/80`: used and limit, percent."""
+    text = f"{formats.percent(resource.usage)}/{formats.percent(resource.limit)}"
+    if resource.stale:
+        return Text(f"?{text}", "dim")
+    return Text(text, "red" if resource.usage > resource.limit else "")
+
+
+def plugins(rows: Iterable[PluginRow]) -> Table:
+    """For `rosrm plugins`."""
+    made = table("KIND", "NAME", "STATE", "HOST", "FROM", "ABOUT")
+    for row in rows:
+        cells = (row.kind, row.name, row.host, row.distribution, row.reason)
+        kind, name, host, distribution, reason = map(Text, cells)
+        made.add_row(kind, name, state(row.state), host, distribution, reason)
+    return made
+
+
+def event_line(row: EventRow) -> str:
+    """One line of the event record."""
+    return f"{formats.clock(row.wall_time)}  {formats.words(row.kind):<18} {row.message}"
