@@ -38,12 +38,23 @@ from rosrm.supervisor.logs import LogLimits
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-__all__ = ["LaunchOrder", "LogLimits", "SupervisorClient", "SupervisorEnded", "log_path"]
+__all__ = [
+    "LaunchOrder",
+    "LogLimits",
+    "SupervisorClient",
+    "SupervisorEnded",
+    "SupervisorGone",
+    "log_path",
+]
 
 #: Seconds for the supervisor to take what it is sent.
 SEND_TIMEOUT: Final = 5.0
 DEFAULT_LOG_LIMITS: Final = LogLimits()
 _CHUNK: Final = 1 << 16
+
+
+class SupervisorGone(SupervisorError):
+    """The connection was lost: the supervisor was killed. Connect again: a new one takes over."""
 
 
 class SupervisorEnded(SupervisorError):
@@ -115,14 +126,20 @@ class SupervisorClient:
         """
         state = Path(os.path.abspath(state_directory))
         deadline = time.monotonic() + timeout
-        peer = _connect_or_start(state, start, log, deadline)
-        client = cls(peer, state)
-        try:
-            client._introduce(log, deadline)
-        except BaseException:
-            client.close()
-            raise
-        return client
+        while True:
+            client = cls(_connect_or_start(state, start, log, deadline), state)
+            try:
+                client._introduce(log, deadline)
+            except SupervisorGone:
+                # A supervisor that is just dying still takes connections for an instant.
+                client.close()
+                if time.monotonic() > deadline:
+                    raise
+            except BaseException:
+                client.close()
+                raise
+            else:
+                return client
 
     # --- orders -------------------------------------------------------------------------------
 
@@ -164,7 +181,8 @@ class SupervisorClient:
 
         Raises:
             SupervisorEnded: the shutdown is complete.
-            SupervisorError: the supervisor is gone, or turned us down.
+            SupervisorGone: it was killed; its processes go on.
+            SupervisorError: it turned us down, or cannot be understood.
         """
         deadline = None if timeout is None else time.monotonic() + timeout
         while not self._received:
@@ -230,7 +248,7 @@ class SupervisorClient:
                     message = f"{self._name()} took no order within {SEND_TIMEOUT:g} s"
                     raise SupervisorError(message) from None
             except OSError as error:
-                raise SupervisorError(f"{self._name()} is gone: {error.strerror}") from None
+                raise SupervisorGone(f"{self._name()} is gone: {error.strerror}") from None
 
     # --- receiving ----------------------------------------------------------------------------
 
@@ -249,12 +267,12 @@ class SupervisorClient:
         except BlockingIOError:
             return
         except OSError as error:
-            self._fail(SupervisorError(f"{self._name()} is gone: {error.strerror}"))
+            self._fail(SupervisorGone(f"{self._name()} is gone: {error.strerror}"))
             return
         if not data and self._ending:
             self._fail(SupervisorEnded(f"{self._name()} has ended, and all its processes"))
         elif not data:
-            self._fail(SupervisorError(f"{self._name()} is gone; its processes go on"))
+            self._fail(SupervisorGone(f"{self._name()} is gone; its processes go on"))
         try:
             for line in self._lines.feed(data):
                 self._take(protocol.parse(line))

@@ -42,11 +42,10 @@ class Family:
 
     # --- a leader's life ----------------------------------------------------------------------
 
-    def add_child(self, key: Key, pid: int) -> None:
-        """A session leader that was spawned here."""
-        stat = members.read_stat(pid)
+    def add_child(self, key: Key, pid: int, birth: int) -> None:
+        """A session leader that was spawned here, at `birth` in clock ticks or a little later."""
         self._children[pid] = key
-        self._add(key, pid, stat.start if stat else 0)
+        self._add(key, pid, birth)
 
     def take_over(self, key: Key, leader: Stat) -> None:
         """A session leader that an earlier supervisor spawned."""

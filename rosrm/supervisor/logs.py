@@ -17,6 +17,8 @@ from rosrm.supervisor import own_log, paths
 #: Seconds between two looks while logs grow, and while they do not.
 BUSY: Final = 0.2
 QUIET: Final = 1.0
+#: New processes between two looks for logs of old ones.
+PRUNE_EVERY: Final = 100
 
 
 class LogLimits(NamedTuple):
@@ -43,17 +45,25 @@ class LogKeeper:
         self._state = state
         self._sizes: dict[Key, int] = {}
         self._due: float | None = None
-        self._started = 0
+        self._new_processes = 0
 
-    def open(self, instance: Key) -> int:
-        """The descriptor that an instance is to write to."""
+    def open(self, instance: Key, known: Iterable[Key]) -> int:
+        """The descriptor that an instance is to write to; makes room by removing old logs.
+
+        Args:
+            instance: that is about to start.
+            known: instances whose logs stay.
+        """
         process, number = instance
         path = paths.log_file(self._state, process, number)
         try:
-            return _open(path)
+            log = _open(path)
         except FileNotFoundError:
-            os.makedirs(os.path.dirname(path), mode=0o700, exist_ok=True)
+            self._prune_processes(known)
+            os.mkdir(os.path.dirname(path), mode=0o700)
             return _open(path)
+        self._prune_instances(process, known)
+        return log
 
     def watch(self, instance: Key, now: float) -> None:
         """The instance runs."""
@@ -96,17 +106,35 @@ class LogKeeper:
             own_log.say(f"{path} was cut, but not kept: {error}")
         return 0
 
-    def prune(self, process: str, live: Iterable[Key]) -> None:
-        """Remove the logs of a process's oldest instances, and now and then of old processes."""
-        _prune_instances(
-            paths.log_directory(self._state, process),
-            self.limits.instances,
-            (number for name, number in live if name == process),
-        )
-        if self._started % 100 == 0:
-            names = {paths.safe_name(name) for name, _ in live}
-            _prune_processes(os.path.join(self._state, "logs"), self.limits.processes, names)
-        self._started += 1
+    def _prune_instances(self, process: str, known: Iterable[Key]) -> None:
+        """Remove the logs of all but the newest instances of a process."""
+        directory = paths.log_directory(self._state, process)
+        files: dict[int, list[str]] = {}
+        for name in os.listdir(directory):
+            number = name.partition(".")[0]
+            if number.isdigit():
+                files.setdefault(int(number), []).append(name)
+        excess = len(files) - self.limits.instances
+        if excess <= 0:
+            return
+        stay = {number for name, number in known if name == process}
+        for old in set(sorted(files)[:excess]) - stay:
+            for name in files[old]:
+                os.unlink(os.path.join(directory, name))
+
+    def _prune_processes(self, known: Iterable[Key]) -> None:
+        """Once in many new processes, remove the logs of those that wrote longest ago."""
+        self._new_processes += 1
+        if self._new_processes % PRUNE_EVERY:
+            return
+        directory = paths.log_root(self._state)
+        stay = {paths.safe_name(name) for name, _ in known}
+        old = [os.path.join(directory, name) for name in os.listdir(directory) if name not in stay]
+        old.sort(key=lambda path: os.stat(path).st_mtime)
+        for path in old[: max(0, len(old) - self.limits.processes)]:
+            for name in os.listdir(path):
+                os.unlink(os.path.join(path, name))
+            os.rmdir(path)
 
 
 def rotate(path: str, size: int, limits: LogLimits) -> None:
@@ -136,36 +164,3 @@ def _copy_end(log: int, target: str, size: int, most: int) -> None:
 
 def _open(path: str) -> int:
     return os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o600)
-
-
-def _prune_instances(directory: str, keep: int, live: Iterable[int]) -> None:
-    """Remove all files NUMBER.* but those of the `keep` highest numbers and of what runs."""
-    files: dict[int, list[str]] = {}
-    for name in _listed(directory):
-        number = name.partition(".")[0]
-        if number.isdigit():
-            files.setdefault(int(number), []).append(name)
-    if len(files) <= keep:
-        return
-    for old in set(sorted(files)[: len(files) - keep]).difference(live):
-        for name in files[old]:
-            os.unlink(os.path.join(directory, name))
-
-
-def _prune_processes(directory: str, keep: int, running: set[str]) -> None:
-    """Remove the logs of all processes but the `keep` that wrote last, and of what runs."""
-    old = [name for name in _listed(directory) if name not in running]
-    if len(old) <= keep:
-        return
-    old.sort(key=lambda name: os.stat(os.path.join(directory, name)).st_mtime)
-    for name in old[: len(old) - keep]:
-        for file in _listed(os.path.join(directory, name)):
-            os.unlink(os.path.join(directory, name, file))
-        os.rmdir(os.path.join(directory, name))
-
-
-def _listed(directory: str) -> list[str]:
-    try:
-        return os.listdir(directory)
-    except FileNotFoundError:
-        return []

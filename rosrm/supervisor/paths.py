@@ -1,12 +1,14 @@
 """Where the supervisor keeps its files, below the state directory of its host.
 
-supervisor.sock                the slave connects here
-supervisor.lock                held by the one live supervisor; holds its pid
-supervisor.log                 its own troubles
-instances.jsonl                the durable record
-logs/PROCESS/NUMBER.log        what an instance writes; NUMBER.log.1 is older, and so on
-logs/PROCESS/NUMBER.*          further files of that instance (its parameters)
-work/PROCESS/                  working directory of a process that names none
+One folder holds all of one host::
+
+    supervisor.sock                the slave connects here
+    supervisor.lock                held by the one live supervisor; holds its pid
+    supervisor.log                 its own troubles
+    instances.jsonl                the durable record
+    logs/PROCESS/NUMBER.log        what an instance writes; NUMBER.log.1 is older, and so on
+    logs/PROCESS/NUMBER.*          further files of that instance (its parameters)
+    work/                          working directory of the processes that name none
 """
 
 from __future__ import annotations
@@ -29,9 +31,14 @@ def safe_name(process: str) -> str:
     return "%2E" + safe[1:] if safe.startswith(".") else safe
 
 
+def log_root(state: str) -> str:
+    """Where the logs of all processes are."""
+    return os.path.join(state, "logs")
+
+
 def log_directory(state: str, process: str) -> str:
     """Where the logs of all instances of a process are."""
-    return os.path.join(state, "logs", safe_name(process))
+    return os.path.join(log_root(state), safe_name(process))
 
 
 def log_file(state: str, process: str, number: int) -> str:
@@ -39,6 +46,6 @@ def log_file(state: str, process: str, number: int) -> str:
     return os.path.join(log_directory(state, process), f"{number}.log")
 
 
-def work_directory(state: str, process: str) -> str:
-    """Where a process runs that names no working directory."""
-    return os.path.join(state, "work", safe_name(process))
+def work_directory(state: str) -> str:
+    """Where the processes run that name no working directory."""
+    return os.path.join(state, "work")

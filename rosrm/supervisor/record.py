@@ -154,7 +154,7 @@ class Record:
         self._add({"record": "spawning", "instances": list(keys)})
 
     def state(self, instance: Instance, birth: int) -> None:
-        """All that is known of an instance; `birth`: start time of its leader in clock ticks."""
+        """All that is known of an instance; `birth`: see `members.was_born`."""
         self._add(_state(instance, birth))
 
     def dead(self, key: Key, number: int) -> None:

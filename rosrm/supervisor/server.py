@@ -17,7 +17,7 @@ from typing import Final
 
 from rosrm.core import supervision
 from rosrm.core.supervision import Event, Key, Spawned, SpawnFailed
-from rosrm.supervisor import children, own_log, paths, protocol, takeover
+from rosrm.supervisor import children, members, own_log, paths, protocol, takeover
 from rosrm.supervisor.connection import Connection
 from rosrm.supervisor.family import Family, mark
 from rosrm.supervisor.logs import LogKeeper, LogLimits
@@ -115,7 +115,7 @@ class Server:
         elif isinstance(command, supervision.Unspawn):
             self._unspawn(command.instance)
         elif isinstance(command, supervision.Drop):
-            self._drop(command.instance)
+            self._record.dead(command.instance, self._core.dead[command.instance[0]])
         else:
             self._leaving = True
 
@@ -133,13 +133,6 @@ class Server:
         if key in self._spawns:
             self._spawns.remove(key)
             self._happened(SpawnFailed(key, ""))
-
-    def _drop(self, key: Key) -> None:
-        self._record.dead(key, self._core.dead[key[0]])
-        try:
-            os.rmdir(paths.work_directory(self._state, key[0]))
-        except OSError:
-            return  # what a process left there is its user's
 
     def _tell(self) -> None:
         telling = b"".join(self._telling)
@@ -163,12 +156,13 @@ class Server:
                 self._happened(SpawnFailed(key, failed, transient=True))
 
     def _spawn(self, key: Key) -> None:
+        birth = members.ticks_now()
         try:
             pid = self._spawn_process(key)
         except children.SpawnError as error:
             self._happened(SpawnFailed(key, str(error), error.transient))
             return
-        self._family.add_child(key, pid)
+        self._family.add_child(key, pid, birth)
         self._logs.watch(key, time.monotonic())
         self._happened(Spawned(key, pid))
 
@@ -176,16 +170,13 @@ class Server:
         launch = self._launches.get(key)
         if launch is None:
             raise children.SpawnError("its order was lost with a part of the record")
-        directory = launch.directory or paths.work_directory(self._state, key[0])
         try:
-            if launch.directory is None:
-                os.makedirs(directory, mode=0o700, exist_ok=True)
-            self._logs.prune(key[0], self._core.instances)
-            log = self._logs.open(key)
+            log = self._logs.open(key, self._core.instances)
         except OSError as error:
-            message = f"{error.filename or directory} cannot be made: {error.strerror}"
+            message = f"its log {error.filename} cannot be opened: {error.strerror}"
             raise children.SpawnError(message, transient=True) from None
         try:
+            directory = launch.directory or paths.work_directory(self._state)
             return children.spawn(
                 launch.argv, self._environment(launch), directory, self._null, log
             )

@@ -37,7 +37,7 @@ def restore(state: str, core: Supervision, family: Family) -> Recorded:
         core.restore(instance)
         leader = members.read_stat(instance.pid) if instance.pid and recorded.same_boot else None
         birth = recorded.births[instance.key]
-        if leader is not None and leader.alive and leader.start == birth:
+        if leader is not None and leader.alive and members.was_born(leader, birth):
             family.take_over(instance.key, leader)
     return recorded
 

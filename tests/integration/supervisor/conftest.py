@@ -1,0 +1,132 @@
+"""A supervisor in a folder of the test's own; whatever the test does, no process outlives it."""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from rosrm.core.model import InstanceId, InstanceState, StopPolicy
+from rosrm.supervisor import members
+from rosrm.supervisor.client import LaunchOrder, SupervisorClient, log_path
+
+QUICK = StopPolicy(interrupt_grace=0.3, terminate_grace=0.3)
+TIMEOUT = 15.0
+
+
+class Host:
+    """One state directory, its supervisor, and what a test does with them."""
+
+    def __init__(self, state: Path):
+        self.state = state
+        self.clients: list[SupervisorClient] = []
+        self.pids: set[int] = set()
+
+    def connect(self, **options) -> SupervisorClient:
+        client = SupervisorClient.connect(self.state, **options)
+        self.clients.append(client)
+        self.pids.add(client.pid)
+        return client
+
+    def order(self, name: str, *argv: str, number: int = 1, **options) -> LaunchOrder:
+        options.setdefault("environment", dict(os.environ))
+        options.setdefault("stop", QUICK)
+        return LaunchOrder(InstanceId(name, number), argv, **options)
+
+    def python(self, name: str, code: str, **options) -> LaunchOrder:
+        return self.order(name, sys.executable, "-I", "-S", "-c", code, **options)
+
+    def log(self, name: str, number: int = 1) -> Path:
+        return log_path(self.state, InstanceId(name, number))
+
+    def wait(self, client, name: str, *states: InstanceState, number: int = 1):
+        """The first status of an instance in one of the states."""
+        instance, deadline = InstanceId(name, number), time.monotonic() + TIMEOUT
+        seen = []
+        while time.monotonic() < deadline:
+            for status in client.receive(deadline - time.monotonic()):
+                seen.append(status)
+                if status.instance == instance and status.state in states:
+                    return status
+        pytest.fail(f"{instance} was in none of {states} within {TIMEOUT} s; told: {seen}")
+
+    def run(self, client, order: LaunchOrder):
+        """Start it and return its final status."""
+        client.start([order])
+        return self.ended(client, order.instance.process, number=order.instance.number)
+
+    def running(self, client, name: str, number: int = 1):
+        return self.wait(client, name, InstanceState.RUNNING, number=number)
+
+    def ended(self, client, name: str, number: int = 1):
+        final = (InstanceState.EXITED, InstanceState.FAILED, InstanceState.REFUSED)
+        return self.wait(client, name, *final, number=number)
+
+    def kill_supervisor(self, client) -> None:
+        os.kill(client.pid, signal.SIGKILL)
+        wait_gone(client.pid)
+        client.close()
+
+    def alive(self) -> list[int]:
+        """Every process that the supervisor started, and what came of it."""
+        found = members.find_marked(str(self.state))
+        return [stat.pid for stats in found.values() for stat in stats]
+
+    def clean_up(self) -> None:
+        for client in self.clients:
+            client.close()
+        lock = self.state / "supervisor.lock"
+        if lock.exists():
+            self.pids.add(int(lock.read_text() or 0))
+        for pid in self.pids:
+            if str(self.state) in command_line(pid):
+                os.kill(pid, signal.SIGKILL)
+                wait_gone(pid)
+        for pid in self.alive():
+            os.kill(pid, signal.SIGKILL)
+
+
+def command_line(pid: int) -> str:
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode()
+    except OSError:
+        return ""
+
+
+def wait_gone(pid: int, timeout: float = TIMEOUT) -> None:
+    """Until a process has ended."""
+    try:
+        pidfd = os.pidfd_open(pid)
+    except ProcessLookupError:
+        return
+    poll = select.poll()
+    poll.register(pidfd, select.POLLIN)
+    ended = poll.poll(timeout * 1000)
+    os.close(pidfd)
+    assert ended, f"process {pid} did not end within {timeout} s: {command_line(pid)}"
+
+
+def wait_until(condition, what: str, timeout: float = TIMEOUT):
+    """For what cannot be awaited: a file of another process."""
+    deadline = time.monotonic() + timeout
+    while not (result := condition()):
+        assert time.monotonic() < deadline, f"not within {timeout} s: {what}"
+        time.sleep(0.01)
+    return result
+
+
+@pytest.fixture
+def host(tmp_path):
+    host = Host(tmp_path / "state")
+    yield host
+    host.clean_up()
+
+
+@pytest.fixture
+def client(host):
+    return host.connect()

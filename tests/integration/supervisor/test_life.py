@@ -1,0 +1,373 @@
+"""The supervisor itself: it outlives its slave, is taken over, refuses a second one, ends clean."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+import rosrm
+from rosrm.core.model import InstanceId, InstanceState, RestartPolicy
+from rosrm.errors import SupervisorError
+from rosrm.supervisor import members
+from rosrm.supervisor.client import SupervisorClient, SupervisorEnded
+
+from .conftest import Host, command_line, wait_gone, wait_until
+
+SLAVE = """
+    import os, sys
+    from pathlib import Path
+    from rosrm.core.model import InstanceId
+    from rosrm.supervisor.client import LaunchOrder, SupervisorClient
+    client = SupervisorClient.connect(Path(sys.argv[1]))
+    order = LaunchOrder(InstanceId("kept", 1), ("sleep", "1000"), dict(os.environ))
+    client.start([order])
+    while not any(status.pid for status in client.receive(10)): pass
+    print(client.pid, flush=True)
+    client.receive()
+"""
+
+
+def start_slave(host: Host) -> subprocess.Popen:
+    """A process of its own that is connected and has started `kept`."""
+    root = str(Path(rosrm.__file__).parent.parent)
+    slave = subprocess.Popen(
+        [sys.executable, "-c", textwrap.dedent(SLAVE), str(host.state)],
+        stdout=subprocess.PIPE,
+        env={**os.environ, "PYTHONPATH": root},
+    )
+    host.pids.add(int(slave.stdout.readline()))
+    return slave
+
+
+@pytest.fixture
+def slave(host):
+    slave = start_slave(host)
+    yield slave
+    slave.kill()
+    slave.wait()
+    slave.stdout.close()
+
+
+def test_processes_survive_a_killed_slave(host, slave):
+    """SIGKILL the slave: the next one finds the process running, and the same supervisor."""
+    slave.kill()
+    slave.wait()
+    client = host.connect(start=False)
+    (status,) = client.instances
+    assert status.instance == InstanceId("kept", 1)
+    assert status.state is InstanceState.RUNNING
+    assert command_line(status.pid).startswith("sleep")
+
+
+def test_nothing_of_a_slaves_terminal_reaches_it(host, slave):
+    """Supervisor and process have sessions of their own, so Ctrl-C reaches neither."""
+    supervisor = next(iter(host.pids))
+    (process,) = host.alive()
+    sessions = {os.getsid(slave.pid), os.getsid(supervisor), os.getsid(process)}
+    assert len(sessions) == 3
+    stat = members.read_stat(supervisor)
+    assert stat.parent != slave.pid
+
+
+def test_a_second_live_slave_is_refused(host, slave):
+    """While one is connected another is turned down, and is told which one is there."""
+    with pytest.raises(SupervisorError, match=f"another slave .pid {slave.pid}. is connected"):
+        host.connect()
+
+
+def test_final_statuses_are_kept_until_forgotten(host):
+    """They are told at each connection until the client has acknowledged them."""
+    client = host.connect()
+    final = host.run(client, host.order("job", "sh", "-c", "exit 5"))
+    client.close()
+    client = host.connect()
+    assert client.instances == (final,)
+    client.forget([InstanceId("job", 1)])
+    client.close()
+    client = host.connect()
+    assert client.instances == ()
+
+
+def test_a_killed_supervisor_is_taken_over(host):
+    """SIGKILL the supervisor: the next one has the same processes, and can stop them."""
+    client = host.connect()
+    client.start([host.order("kept", "sh", "-c", "echo ran; sleep 1000 & wait")])
+    before = host.running(client, "kept")
+    wait_until(lambda: len(host.alive()) == 2, "the shell has started its sleep")
+    host.kill_supervisor(client)
+    client = host.connect()
+    (status,) = client.instances
+    assert (status.state, status.pid) == (InstanceState.RUNNING, before.pid)
+    client.stop(InstanceId("kept", 1))
+    assert host.ended(client, "kept").state is InstanceState.EXITED
+    assert host.alive() == []
+    assert host.log("kept").read_text() == "ran\n"
+
+
+def test_an_end_that_nobody_saw_is_said_to_be_unknown(host):
+    """It ended while no supervisor ran: failed, with an unknown exit code, not started again."""
+    client = host.connect()
+    client.start([host.order("gone", "sleep", "1000")])
+    pid = host.running(client, "gone").pid
+    host.kill_supervisor(client)
+    os.kill(pid, signal.SIGKILL)
+    wait_gone(pid)
+    client = host.connect()
+    (status,) = client.instances
+    assert (status.state, status.exit_code) == (InstanceState.FAILED, -1)
+    assert "not known" in status.message
+
+
+def test_an_unseen_end_follows_the_restart_policy(host):
+    """For a process that is to be restarted, an unknown exit is a failure."""
+    client = host.connect()
+    restart = RestartPolicy(when="on-failure", delay=0.05)
+    client.start([host.order("again", "sleep", "1000", restart=restart)])
+    pid = host.running(client, "again").pid
+    host.kill_supervisor(client)
+    os.kill(pid, signal.SIGKILL)
+    wait_gone(pid)
+    client = host.connect()
+    (status,) = client.instances
+    assert status.state is InstanceState.BACKOFF
+    assert host.running(client, "again").restarts == 1
+
+
+def test_what_a_dead_leader_left_is_stopped_after_a_take_over(host):
+    """Leader and supervisor are gone, a child lives on: the next supervisor finds and stops it."""
+    client = host.connect()
+    client.start([host.order("leaver", "sh", "-c", "sleep 1000 & wait")])
+    pid = host.running(client, "leaver").pid
+    wait_until(lambda: len(host.alive()) == 2, "the shell has started its sleep")
+    host.kill_supervisor(client)
+    os.kill(pid, signal.SIGKILL)
+    wait_gone(pid)
+    client = host.connect()
+    host.ended(client, "leaver")
+    assert host.alive() == []
+
+
+def test_a_taken_over_process_that_ends_is_noticed(host):
+    """It is nobody's child here; its pidfd tells."""
+    client = host.connect()
+    client.start([host.order("kept", "sleep", "1000")])
+    pid = host.running(client, "kept").pid
+    host.kill_supervisor(client)
+    client = host.connect()
+    os.kill(pid, signal.SIGKILL)
+    assert host.ended(client, "kept").exit_code == -1
+
+
+def test_a_spawn_without_an_outcome_is_not_tried_again(host):
+    """Killed between the spawn and its record: it may have run, so it does not run again."""
+    client = host.connect()
+    host.run(client, host.order("model", "touch", "ran"))
+    host.kill_supervisor(client)
+    record = host.state / "instances.jsonl"
+    lines = [json.loads(line) for line in record.read_text().splitlines()]
+    last = max(i for i, line in enumerate(lines) if line["record"] == "spawning")
+    record.write_text("".join(json.dumps(line) + "\n" for line in lines[: last + 1]))
+    (host.state / "work" / "ran").unlink()
+    client = host.connect()
+    (status,) = client.instances
+    assert status.state is InstanceState.FAILED
+    assert "how that went is not known" in status.message
+    assert not (host.state / "work" / "ran").exists()
+
+
+def test_a_start_that_was_never_tried_is_carried_out(host):
+    """Killed between the order's record and the spawn: the next supervisor spawns it, once."""
+    client = host.connect()
+    host.run(client, host.order("model", "sh", "-c", "echo ran"))
+    host.kill_supervisor(client)
+    record = host.state / "instances.jsonl"
+    lines = [json.loads(line) for line in record.read_text().splitlines()]
+    last = max(i for i, line in enumerate(lines) if line["record"] == "spawning")
+    record.write_text("".join(json.dumps(line) + "\n" for line in lines[:last]))
+    host.log("model").unlink()
+    client = host.connect()
+    if not any(status.state.ended for status in client.instances):
+        host.ended(client, "model")
+    assert host.log("model").read_text() == "ran\n"
+
+
+def test_a_spawn_without_a_record_is_found_by_its_marks(host):
+    """Killed right after a spawn: the process runs, its pid was not recorded; it is found."""
+    client = host.connect()
+    client.start([host.order("found", "sleep", "1000")])
+    pid = host.running(client, "found").pid
+    host.kill_supervisor(client)
+    record = host.state / "instances.jsonl"
+    lines = record.read_text().splitlines(keepends=True)
+    last = max(i for i, line in enumerate(lines) if '"record":"spawning"' in line)
+    record.write_text("".join(lines[: last + 1]))
+    client = host.connect()
+    (status,) = client.instances
+    assert (status.state, status.pid) == (InstanceState.RUNNING, pid)
+
+
+def test_a_torn_tail_is_left_out_and_said(host):
+    """The record ends in half a line: the rest counts, and the client hears of it."""
+    client = host.connect()
+    client.start([host.order("kept", "sleep", "1000")])
+    host.running(client, "kept")
+    host.kill_supervisor(client)
+    with (host.state / "instances.jsonl").open("a") as record:
+        record.write('{"record":"state","key":["ke')
+    client = host.connect()
+    assert client.instances[0].state is InstanceState.RUNNING
+    assert any("torn line" in note for note in client.notes)
+
+
+def test_a_damaged_line_is_left_out_and_said(host):
+    """A line in the middle cannot be read: its place is said, everything else counts."""
+    client = host.connect()
+    host.run(client, host.order("job", "true"))
+    host.kill_supervisor(client)
+    record = host.state / "instances.jsonl"
+    lines = record.read_text().splitlines(keepends=True)
+    record.write_text("".join([*lines[:1], "\0\0 not JSON\n", *lines[1:]]))
+    client = host.connect()
+    assert client.instances[0].state is InstanceState.EXITED
+    assert any("instances.jsonl:2" in note for note in client.notes)
+
+
+def test_a_second_supervisor_is_refused(host, client):
+    """One state directory, one supervisor; the second says which one is there."""
+    command = [sys.executable, "-m", "rosrm.supervisor", "--state", str(host.state)]
+    root = str(Path(rosrm.__file__).parent.parent)
+    result = subprocess.run(
+        [*command, "--foreground"],
+        capture_output=True,
+        text=True,
+        timeout=20,
+        env={**os.environ, "PYTHONPATH": root},
+        check=False,
+    )
+    assert result.returncode == 1
+    assert f"another supervisor (pid {client.pid}) serves" in result.stderr
+
+
+def test_two_slaves_that_start_at_once_get_one_supervisor(host):
+    """Both try to start it; one supervisor serves, one slave is refused as the second."""
+    outcomes: list[object] = []
+
+    def connect() -> None:
+        try:
+            outcomes.append(host.connect())
+        except SupervisorError as error:
+            outcomes.append(error)
+
+    threads = [threading.Thread(target=connect) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    (error,) = [outcome for outcome in outcomes if isinstance(outcome, SupervisorError)]
+    assert "another slave" in str(error)
+    assert len(host.pids) == 1
+
+
+def test_a_long_path_is_no_trouble(tmp_path):
+    """A Unix socket's path holds 108 bytes; a state directory may be deeper."""
+    host = Host(tmp_path / ("deep" * 20) / ("deeper" * 20))
+    try:
+        client = host.connect()
+        assert host.run(client, host.order("job", "true")).state is InstanceState.EXITED
+    finally:
+        host.clean_up()
+
+
+def test_no_supervisor_is_started_unless_asked(host):
+    """`start=False` only looks."""
+    with pytest.raises(SupervisorError, match="no supervisor serves"):
+        host.connect(start=False)
+    assert not host.state.exists()
+
+
+def test_an_unusable_state_directory_is_said(tmp_path):
+    """What cannot be made is named, at once."""
+    (tmp_path / "file").write_text("")
+    with pytest.raises(SupervisorError, match="file/state cannot be used"):
+        SupervisorClient.connect(tmp_path / "file" / "state")
+
+
+def test_shutdown_ends_everything_and_leaves_nothing(host, client):
+    """Every process is stopped, the socket is gone, and so is the supervisor."""
+    client.start([host.order("a", "sleep", "1000"), host.order("b", "sleep", "1000")])
+    host.running(client, "b")
+    client.shutdown()
+    with pytest.raises(SupervisorEnded):
+        list(iter(lambda: client.receive(10), []))
+    wait_gone(client.pid)
+    assert host.alive() == []
+    assert not (host.state / "supervisor.sock").exists()
+
+
+def test_sigterm_is_a_shutdown(host, client):
+    """A plain `kill` of the supervisor stops everything too."""
+    client.start([host.order("a", "sleep", "1000")])
+    host.running(client, "a")
+    os.kill(client.pid, signal.SIGTERM)
+    wait_gone(client.pid)
+    assert host.alive() == []
+
+
+def test_a_lost_supervisor_is_told(host, client):
+    """A slave that waits hears at once that its supervisor is gone."""
+    os.kill(client.pid, signal.SIGKILL)
+    with pytest.raises(SupervisorError, match="is gone; its processes go on"):
+        client.receive(10)
+
+
+def test_orders_pass_while_another_thread_waits(host, client):
+    """One thread blocks in `receive`; another one's order wakes it by its answer."""
+    received = []
+    thread = threading.Thread(target=lambda: received.extend(client.receive(10)))
+    thread.start()
+    client.start([host.order("job", "true")])
+    thread.join(10)
+    assert received
+
+
+def test_it_sleeps_while_nothing_happens(host, client):
+    """No process, no order: it is not scheduled once."""
+    host.run(client, host.order("job", "true"))
+    time.sleep(0.1)  # let it go to sleep
+
+    def switches() -> str:
+        status = Path(f"/proc/{client.pid}/status").read_text()
+        return status[status.index("voluntary_ctxt_switches") :]
+
+    before = switches()
+    time.sleep(1.0)
+    assert switches() == before
+
+
+def test_it_imports_nothing_heavy():
+    """The supervisor's modules import the standard library only, and little of it."""
+    root = str(Path(rosrm.__file__).parent.parent)
+    code = f"import sys; sys.path.append({root!r}); import rosrm.supervisor.server"
+    code += "; print(*sys.modules)"
+    command = [sys.executable, "-I", "-S", "-c", code]
+    loaded = subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
+    roots = {name.partition(".")[0] for name in loaded}
+    assert roots - {"rosrm"} <= set(sys.stdlib_module_names) | {"__main__"}
+    heavy = {"asyncio", "ctypes", "dataclasses", "inspect", "logging", "pathlib", "subprocess"}
+    assert roots & heavy == set()
+    assert "rosrm.core.model" not in loaded
+
+
+def test_it_is_small(client):
+    """At most 12 MiB by itself, alone on the machine (about 8 beside other Pythons)."""
+    rollup = Path(f"/proc/{client.pid}/smaps_rollup").read_text().split()
+    assert int(rollup[rollup.index("Pss:") + 1]) < 12 * 1024

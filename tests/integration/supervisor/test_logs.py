@@ -1,0 +1,65 @@
+"""The logs of real processes: rotated, bounded, pruned."""
+
+from __future__ import annotations
+
+from rosrm.core.model import InstanceId
+from rosrm.supervisor.client import LogLimits
+
+from .conftest import wait_until
+
+KIB = 1024
+FLOOD = """
+import time
+line = b"x" * 1023 + b"\\n"
+with open("/dev/stdout", "ab", buffering=0) as out:
+    while True:
+        out.write(line * 64)
+        time.sleep(0.01)
+"""
+
+
+def test_a_flood_is_bounded(host):
+    """Files of the limit's size, as many as are kept, however much is written."""
+    limits = LogLimits(max_bytes=256 * KIB, keep=2)
+    client = host.connect(log=limits)
+    client.start([host.python("flood", FLOOD)])
+    log = host.log("flood")
+    oldest = log.with_name(log.name + ".2")
+    wait_until(oldest.exists, "two rotations")
+    first = oldest.stat().st_ino
+    wait_until(lambda: oldest.stat().st_ino != first, "a third rotation")
+    client.stop(InstanceId("flood", 1))
+    host.ended(client, "flood")
+    files = list(log.parent.iterdir())
+    assert sorted(file.name for file in files) == ["1.log", "1.log.1", "1.log.2"]
+    assert all(file.stat().st_size <= limits.max_bytes + 100 for file in files)
+
+
+def test_a_rotated_log_keeps_its_newest_lines(host):
+    """What is dropped is the oldest, and the file says that something was."""
+    client = host.connect(log=LogLimits(max_bytes=10 * KIB, keep=1))
+    host.run(client, host.order("count", "seq", "1", "10000"))
+    kept = host.log("count").with_name("1.log.1").read_text().splitlines()
+    assert kept[0].startswith("[rosrm: ")
+    assert kept[-1] == "10000"
+
+
+def test_logs_of_old_instances_are_pruned(host):
+    """Of one process only the newest instances' logs stay, with the files beside them."""
+    client = host.connect(log=LogLimits(instances=3))
+    for number in range(1, 6):
+        host.log("many", number).parent.mkdir(parents=True, exist_ok=True)
+        host.log("many", number).with_suffix(".parameters.yaml").write_text("{}")
+        host.run(client, host.order("many", "true", number=number))
+        client.forget([InstanceId("many", number)])
+    numbers = {file.name.partition(".")[0] for file in host.log("many").parent.iterdir()}
+    assert numbers == {"3", "4", "5"}
+
+
+def test_any_process_name_is_a_safe_file_name(host):
+    """A name with slashes and dots stays below the folder of logs."""
+    client = host.connect()
+    name = "../../ns/talker é"
+    host.run(client, host.order(name, "echo", "hello"))
+    assert host.log(name).read_text() == "hello\n"
+    assert host.state / "logs" in host.log(name).resolve().parents

@@ -1,0 +1,237 @@
+"""Real processes under a real supervisor: how they start, run and end."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import signal
+import time
+
+import pytest
+
+from rosrm.core.model import InstanceId, InstanceState, RestartPolicy
+
+from .conftest import wait_gone, wait_until
+
+IGNORES_ALL = """
+import signal, time
+signal.signal(signal.SIGINT, signal.SIG_IGN)
+signal.signal(signal.SIGTERM, signal.SIG_IGN)
+print("deaf", flush=True)
+time.sleep(1000)
+"""
+DAEMON = """
+import os, time
+if os.fork() == 0:
+    os.setsid()
+    if os.fork() == 0:
+        open("daemon.pid", "w").write(str(os.getpid()))
+        time.sleep(1000)
+    os._exit(0)
+os.wait()
+while not os.path.exists("daemon.pid"): time.sleep(0.01)
+"""
+
+
+def test_exit_status_usage_and_output_are_kept(host, client):
+    """A process that exits at once: its code, its times, its memory and its last words."""
+    status = host.run(client, host.order("short", "sh", "-c", "echo out; echo err >&2; exit 3"))
+    assert (status.state, status.exit_code) == (InstanceState.FAILED, 3)
+    assert status.message == "exit code 3"
+    assert 0 < status.run_time < 10
+    assert status.peak_memory > 0
+    assert host.log("short").read_text() == "out\nerr\n"
+
+
+def test_a_crash_is_told_by_its_signal(host, client):
+    """Killed by a signal that nobody here sent: failed, with the signal's name."""
+    status = host.run(client, host.order("crash", "sh", "-c", "kill -SEGV $$"))
+    assert (status.state, status.exit_signal) == (InstanceState.FAILED, signal.SIGSEGV)
+    assert status.message == "killed by SIGSEGV"
+
+
+def test_a_process_is_alone_in_its_session(host, client):
+    """A session leader with nothing inherited but a log, and nothing on its standard input."""
+    code = """
+import os
+print(os.getsid(0) == os.getpid() == os.getpgrp(), os.readlink("/proc/self/fd/0"))
+print(sorted(int(fd) for fd in os.listdir("/proc/self/fd"))[:-1], os.getcwd())
+"""
+    host.run(client, host.python("alone", code))
+    lines = host.log("alone").read_text().splitlines()
+    assert lines == ["True /dev/null", f"[0, 1, 2] {host.state}/work"]
+
+
+def test_a_process_starts_with_every_signal_at_its_default(host, client):
+    """Nothing is blocked, and nothing ignored that the supervisor or its Python ignores."""
+    host.run(client, host.order("signals", "grep", "-E", "SigBlk|SigIgn", "/proc/self/status"))
+    _, blocked, _, ignored = host.log("signals").read_text().split()
+    own_to_glibc = 1 << 31 | 1 << 32  # signals 32 and 33, which its posix_spawn ignores
+    assert int(blocked, 16) == 0
+    assert int(ignored, 16) & ~own_to_glibc == 0
+
+
+def test_it_runs_in_its_environment_and_directory_alone(host, client, tmp_path):
+    """The environment is the order's, plus the supervisor's two marks; so is the directory."""
+    order = host.order(
+        "env", "/usr/bin/env", environment={"A": "1"}, working_directory=str(tmp_path)
+    )
+    host.run(client, order)
+    lines = sorted(host.log("env").read_text().splitlines())
+    assert lines == ["A=1", "ROSRM_INSTANCE=env#1", f"ROSRM_SUPERVISOR={host.state}"]
+
+
+def test_environments_of_one_batch_stay_apart(host, client):
+    """Variables that are added, changed or left out against the first order's arrive so."""
+    first = {"PATH": os.environ["PATH"], "A": "1", "B": "2"}
+    second = {"PATH": os.environ["PATH"], "A": "3", "C": "4"}
+    command = ("sh", "-c", "echo $A,$B,$C")
+    client.start(
+        [
+            host.order("first", *command, environment=first),
+            host.order("second", *command, environment=second),
+        ]
+    )
+    host.ended(client, "second")
+    assert host.log("first").read_text() == "1,2,\n"
+    assert host.log("second").read_text() == "3,,4\n"
+
+
+def test_a_process_that_ignores_everything_is_killed(host, client):
+    """SIGINT, SIGTERM, SIGKILL, each step told as it is taken and kept in the last message."""
+    client.start([host.python("deaf", IGNORES_ALL)])
+    pid = host.running(client, "deaf").pid
+    wait_until(lambda: host.log("deaf").read_text(), "it said that it is deaf")
+    client.stop(InstanceId("deaf", 1))
+    told = []
+    while not told or not told[-1].state.ended:
+        told += client.receive(10)
+    steps = [status.message for status in told if status.state is InstanceState.STOPPING]
+    assert [step.split(", ")[-1].split()[0] for step in steps] == ["SIGINT", "SIGTERM", "SIGKILL"]
+    assert told[-1].state is InstanceState.EXITED
+    assert told[-1].message.startswith("stopped by SIGINT, SIGTERM after 0.3 s, SIGKILL after 0.6")
+    wait_gone(pid)
+
+
+def test_a_stop_reaches_the_whole_group(host, client):
+    """What a process has started is stopped with it."""
+    client.start([host.order("group", "sh", "-c", "sleep 1000 & sleep 1000 & wait")])
+    host.running(client, "group")
+    wait_until(lambda: len(host.alive()) == 3, "a shell and two sleeps run")
+    client.stop(InstanceId("group", 1))
+    host.ended(client, "group")
+    assert host.alive() == []
+
+
+def test_children_that_survive_their_leader_are_stopped(host, client):
+    """The leader exits and leaves a child: it ends before the instance does; its code is kept."""
+    status = host.run(client, host.order("leaver", "sh", "-c", "sleep 1000 & exit 4"))
+    assert (status.state, status.exit_code) == (InstanceState.FAILED, 4)
+    assert host.alive() == []
+
+
+def test_a_daemon_that_left_the_session_is_found(host, client):
+    """Two forks and a setsid do not make an orphan."""
+    status = host.run(client, host.python("daemon", DAEMON))
+    assert status.state is InstanceState.EXITED
+    wait_gone(int((host.state / "work" / "daemon.pid").read_text()))
+    assert host.alive() == []
+
+
+def test_a_deaf_child_that_is_left_over_is_killed(host, client):
+    """The escalation goes on for what the leader left."""
+    code = f"""
+import os, time
+if os.fork() == 0:
+    exec({IGNORES_ALL!r})
+time.sleep(0.3)
+"""
+    status = host.run(client, host.python("deaf", code))
+    assert status.state is InstanceState.EXITED
+    assert status.exit_code == 0
+    assert host.alive() == []
+
+
+@pytest.mark.parametrize(
+    ("argv", "directory", "said"),
+    [
+        (("no-such-program",), None, "no executable 'no-such-program' was found in PATH, /"),
+        (("/no/such/program",), None, "no executable '/no/such/program' exists"),
+        (("/etc/passwd",), None, "/etc/passwd cannot be started: it is not executable"),
+        (("true",), "/no/such/folder", "the working directory '/no/such/folder' cannot be"),
+        (("{tmp}/orphaned-script",), None, "the interpreter in its first line does not exist"),
+        (("{tmp}/nonsense",), None, "neither a program nor a script"),
+    ],
+)
+def test_what_cannot_be_started_says_why(host, client, tmp_path, argv, directory, said):
+    """A clear message, at once, whatever the restart policy."""
+    for name, text in (("orphaned-script", "#!/no/such/interpreter\n"), ("nonsense", "x\n")):
+        (tmp_path / name).write_text(text)
+        (tmp_path / name).chmod(0o700)
+    argv = tuple(word.replace("{tmp}", str(tmp_path)) for word in argv)
+    restart = RestartPolicy(when="always")
+    order = host.order("broken", *argv, working_directory=directory, restart=restart)
+    status = host.run(client, order)
+    assert status.state is InstanceState.FAILED
+    assert said in status.message
+
+
+def test_restarts_back_off_and_run_out(host, client):
+    """On failure it is started again, after growing waits, and at last it has failed."""
+    policy = RestartPolicy(when="on-failure", delay=0.05, factor=2.0, attempts=3)
+    order = host.order("flaky", "sh", "-c", "date +%s.%N; exit 1", restart=policy)
+    status = host.run(client, order)
+    assert status.state is InstanceState.FAILED
+    assert status.restarts == 3
+    times = [float(line) for line in host.log("flaky").read_text().split()]
+    assert len(times) == 4
+    waits = [later - earlier for earlier, later in itertools.pairwise(times)]
+    assert all(wait >= least for wait, least in zip(waits, (0.05, 0.1, 0.2), strict=True))
+
+
+def test_a_forced_restart_is_a_new_process(host, client):
+    """Stop, then start: another pid, the same instance, no restart counted."""
+    client.start([host.order("again", "sleep", "1000")])
+    before = host.running(client, "again").pid
+    client.restart(InstanceId("again", 1))
+    after = host.running(client, "again")
+    assert after.pid != before
+    assert after.restarts == 0
+    wait_gone(before)
+
+
+def test_a_late_start_is_refused(host, client):
+    """A stop that arrives before its start leaves a tombstone."""
+    client.stop(InstanceId("late", 1))
+    assert host.ended(client, "late").state is InstanceState.REFUSED
+    status = host.run(client, host.order("late", "touch", "ran"))
+    assert status.state is InstanceState.REFUSED
+    assert not (host.state / "work" / "ran").exists()
+
+
+def test_a_repeated_start_starts_once(host, client):
+    """DDS repeats; the process does not."""
+    order = host.order("once", "sh", "-c", "echo ran; sleep 1000")
+    client.start([order, order])
+    client.start([order])
+    host.running(client, "once")
+    wait_until(lambda: host.log("once").read_text(), "it ran")
+    client.stop(InstanceId("once", 1))
+    host.ended(client, "once")
+    assert host.log("once").read_text() == "ran\n"
+
+
+def test_three_hundred_at_once(host, client):
+    """A burst of short jobs: each ends once, with its own status."""
+    began = time.monotonic()
+    client.start([host.order(f"job{number}", "true", number=number) for number in range(300)])
+    final = {}
+    while len(final) < 300:
+        statuses = client.receive(10)
+        assert statuses, f"nothing told for 10 s, {len(final)} of 300 ended"
+        for status in statuses:
+            if status.state.ended:
+                assert status.instance not in final
+                final[status.instance] = status
+    assert all(status.state is InstanceState.EXITED for status in final.values())
+    assert time.monotonic() - began < 30

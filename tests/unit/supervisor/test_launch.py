@@ -1,0 +1,289 @@
+"""From an assignment to a launch order, and what the process's environment holds."""
+
+from __future__ import annotations
+
+import math
+import sys
+
+import hypothesis.strategies as st
+import pytest
+import yaml
+from hypothesis import given
+
+from rosrm.core.model import Assignment, InstanceId, ProcessSpec, RestartPolicy, StopPolicy
+from rosrm.errors import LaunchError
+from rosrm.slave.environment import process_environment, without_bootstrapper
+from rosrm.slave.launch import launch_order
+from rosrm.slave.ros_arguments import join_arguments, parameters_text
+
+VENV = "/home/robot/venv"
+SITE = f"{VENV}/lib/python3.12/site-packages"
+
+
+def assignment(**fields) -> Assignment:
+    spec = ProcessSpec(**{"name": "talker", **fields})
+    return Assignment(InstanceId("talker", 7), spec, 1, "talker")
+
+
+def order(tmp_path, environment=None, **fields):
+    return launch_order(
+        assignment(**fields),
+        {"PATH": "/usr/bin", **(environment or {})},
+        sys.executable,
+        host="robot1",
+        state_directory=tmp_path,
+    )
+
+
+@pytest.fixture
+def prefix(tmp_path):
+    """An ament prefix with one package that has two executables and a file that is none."""
+    prefix = tmp_path / "install"
+    index = prefix / "share" / "ament_index" / "resource_index" / "packages"
+    index.mkdir(parents=True)
+    (index / "demo_nodes").write_text("")
+    folder = prefix / "lib" / "demo_nodes"
+    folder.mkdir(parents=True)
+    for name, mode in (("talker", 0o755), ("listener", 0o755), ("notes", 0o644)):
+        (folder / name).write_text("#!/bin/sh\n")
+        (folder / name).chmod(mode)
+    return prefix
+
+
+# --- command lines ----------------------------------------------------------------------------
+
+
+def test_a_plain_command_gets_nothing_added(tmp_path):
+    """What is no ROS node is run as it was written."""
+    assert order(tmp_path, command=("sleep", "3"), arguments=("x",)).argv == ("sleep", "3", "x")
+
+
+def test_a_module_is_run_by_the_given_python(tmp_path):
+    """`module` is `python -m`."""
+    assert order(tmp_path, module="a.b", arguments=("x",)).argv == (
+        sys.executable,
+        "-m",
+        "a.b",
+        "x",
+    )
+
+
+def test_a_ros_node_gets_its_name_namespace_and_remappings(tmp_path):
+    """The user's arguments go first, the ROS arguments behind them."""
+    argv = order(
+        tmp_path,
+        command=("node",),
+        ros=True,
+        arguments=("--fast",),
+        namespace="/ns",
+        remappings={"chatter": "/other/chatter"},
+    ).argv
+    assert argv == (
+        *("node", "--fast", "--ros-args", "-r", "__node:=talker", "-r", "__ns:=/ns"),
+        *("-r", "chatter:=/other/chatter"),
+    )
+
+
+def test_an_alias_names_the_node(tmp_path):
+    """In a handoff the node's name is the assignment's, not the spec's."""
+    spec = ProcessSpec(name="talker", command=("node",), ros=True)
+    alias = Assignment(InstanceId("talker", 8), spec, 1, "talker_1700000000")
+    made = launch_order(alias, {}, "python3", host="h", state_directory=tmp_path)
+    assert "__node:=talker_1700000000" in made.argv
+
+
+@pytest.mark.parametrize(
+    ("arguments", "joined"),
+    [
+        ((), ["--ros-args", "x"]),
+        (("--ros-args", "-p", "a:=1"), ["--ros-args", "-p", "a:=1", "--", "--ros-args", "x"]),
+        (("--ros-args", "--", "y"), ["--ros-args", "--", "y", "--ros-args", "x"]),
+        (("--", "y"), ["--", "y", "--ros-args", "x"]),
+    ],
+)
+def test_ros_arguments_of_the_user_are_closed_first(arguments, joined):
+    """What the user left open does not swallow ours."""
+    assert join_arguments(arguments, ["--ros-args", "x"]) == joined
+
+
+def test_policies_and_directory_are_carried_over(tmp_path):
+    """The order holds what the spec says about restarts, stops and the directory."""
+    made = order(
+        tmp_path,
+        command=("x",),
+        working_directory="/tmp",
+        restart=RestartPolicy(when="always"),
+        stop=StopPolicy(1.0, 2.0),
+    )
+    assert made.restart.when == "always"
+    assert made.stop == StopPolicy(1.0, 2.0)
+    assert made.working_directory == "/tmp"
+
+
+# --- packages ---------------------------------------------------------------------------------
+
+
+def test_an_executable_is_found_through_the_ament_index(tmp_path, prefix):
+    """PREFIX/lib/PACKAGE/EXECUTABLE, given its ROS arguments."""
+    environment = {"AMENT_PREFIX_PATH": f"/opt/none:{prefix}"}
+    made = order(tmp_path, environment, package="demo_nodes", executable="talker")
+    assert made.argv[:2] == (str(prefix / "lib" / "demo_nodes" / "talker"), "--ros-args")
+
+
+def test_packages_lie_in_the_prefix_of_python_too(tmp_path, prefix):
+    """The ROS wheels set no AMENT_PREFIX_PATH: their packages are in the virtual environment."""
+    made = launch_order(
+        assignment(package="demo_nodes", executable="talker"),
+        {},
+        str(prefix / "bin" / "python3"),
+        host="h",
+        state_directory=tmp_path,
+    )
+    assert made.argv[0] == str(prefix / "lib" / "demo_nodes" / "talker")
+
+
+@pytest.mark.parametrize(
+    ("package", "executable", "said"),
+    [
+        ("demo_node", "talker", ["'demo_node' was not found in", "did you mean demo_nodes?"]),
+        ("nothing", "talker", ["'nothing' was not found in", "it has demo_nodes"]),
+        ("demo_nodes", "talk", ["has no executable 'talk'", "did you mean talker"]),
+        ("demo_nodes", "notes", ["notes", "is not executable"]),
+    ],
+)
+def test_what_is_missing_is_named(tmp_path, prefix, package, executable, said):
+    """What was looked for, where, and what is there with a similar name."""
+    environment = {"AMENT_PREFIX_PATH": str(prefix)}
+    with pytest.raises(LaunchError) as caught:
+        order(tmp_path, environment, package=package, executable=executable)
+    for part in [*said, str(prefix)]:
+        assert part in str(caught.value)
+
+
+# --- parameters -------------------------------------------------------------------------------
+
+
+def test_parameters_go_to_a_file_beside_the_log(tmp_path):
+    """Whatever the node's name is, the file is for it."""
+    made = order(tmp_path, command=("node",), ros=True, parameters={"rate": 10})
+    path = tmp_path / "logs" / "talker" / "7.parameters.yaml"
+    assert made.argv[-2:] == ("--params-file", str(path))
+    assert yaml.safe_load(path.read_text()) == {"/**": {"ros__parameters": {"rate": 10}}}
+
+
+def test_no_parameters_no_file(tmp_path):
+    """An empty file of parameters is an error to ROS 2."""
+    made = order(tmp_path, command=("node",), ros=True, parameters={"nested": {}})
+    assert "--params-file" not in made.argv
+
+
+TEXTS = st.text(st.characters(exclude_categories=["Cs"]))
+SCALARS = st.one_of(
+    st.booleans(),
+    st.integers(-(2**63), 2**63 - 1),
+    st.floats(allow_nan=False),
+    TEXTS,
+)
+ARRAYS = st.one_of(
+    *(st.lists(kind, min_size=1) for kind in (st.booleans(), st.integers(-9, 9), TEXTS))
+)
+PARAMETERS = st.recursive(
+    st.dictionaries(TEXTS, st.one_of(SCALARS, ARRAYS), min_size=1),
+    lambda inner: st.dictionaries(TEXTS, st.one_of(inner, SCALARS), min_size=1),
+    max_leaves=5,
+)
+
+
+def typed(value):
+    """With types made visible: 1 == 1.0 == True."""
+    if isinstance(value, dict):
+        return {key: typed(inner) for key, inner in value.items()}
+    if isinstance(value, list):
+        return [typed(inner) for inner in value]
+    return type(value).__name__, value
+
+
+@given(PARAMETERS)
+def test_parameters_survive_with_their_types(parameters):
+    """Any JSON value reads back as what it was: text stays text, 1.0 stays a fraction."""
+    read = yaml.load(parameters_text(parameters), Loader=_Loader)
+    assert typed(read["/**"]["ros__parameters"]) == typed(parameters)
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML 1.2's numbers, as ROS 2 reads them: 1e-05 and 1e+22 are fractions."""
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    __import__("re").compile(r"^-?\d+(\.\d+)?(e[-+]?\d+)?$"),
+    list("-0123456789"),
+)
+_Loader.yaml_implicit_resolvers = {
+    first: sorted(rows, key=lambda row: "float" in row[0])
+    for first, rows in _Loader.yaml_implicit_resolvers.items()
+}
+
+
+def test_whole_numbers_among_fractions_become_fractions():
+    """A ROS array has one type."""
+    assert "[1.0, 2.5]" in parameters_text({"gains": [1, 2.5]})
+
+
+def test_what_is_no_number_is_written_as_yaml_does():
+    """NaN and the infinities."""
+    text = parameters_text({"a": math.nan, "b": -math.inf})
+    assert ".nan" in text
+    assert "-.inf" in text
+
+
+@pytest.mark.parametrize("value", [None, [], [1, "a"], [[1]], 2**63, [True, 1]])
+def test_what_no_parameter_can_hold_is_refused(value):
+    """By name, where it is nested too."""
+    with pytest.raises(LaunchError, match=r"'outer\.inner'"):
+        parameters_text({"outer": {"inner": value}})
+
+
+# --- environment ------------------------------------------------------------------------------
+
+
+def test_the_bootstrappers_variables_are_removed():
+    """Both variables go; what was in LD_LIBRARY_PATH before stays."""
+    polluted = {
+        "LD_LIBRARY_PATH": f"{SITE}/ros_rcl.libs:/opt/mine:{VENV}/lib:{SITE}/ros_rclpy.libs",
+        "_ROS_WHEELS_BOOTSTRAP_COMPLETE": "1",
+        "HOME": "/root",
+    }
+    assert without_bootstrapper(polluted) == {"LD_LIBRARY_PATH": "/opt/mine", "HOME": "/root"}
+
+
+def test_nothing_is_left_of_an_empty_library_path():
+    """Where nothing was there before, the variable goes altogether."""
+    polluted = {
+        "LD_LIBRARY_PATH": f"{sys.prefix}/lib:{SITE}/ros_rcl.libs",
+        "_ROS_WHEELS_BOOTSTRAP_COMPLETE": "1",
+    }
+    assert without_bootstrapper(polluted) == {}
+
+
+def test_without_the_bootstrapper_nothing_is_touched():
+    """Apt's ROS 2 needs its own LD_LIBRARY_PATH."""
+    environment = {"LD_LIBRARY_PATH": "/opt/ros/jazzy/lib"}
+    assert without_bootstrapper(environment) == environment
+
+
+def test_the_spec_has_the_last_word():
+    """A process can find out what it is, and its own variables win."""
+    made = process_environment(
+        assignment(command=("x",), environment={"ROS_DOMAIN_ID": "9", "PYTHONUNBUFFERED": ""}),
+        {"ROS_DOMAIN_ID": "5", "RMW_IMPLEMENTATION": "rmw_fastrtps_cpp"},
+        "robot1",
+    )
+    assert made == {
+        "ROS_DOMAIN_ID": "9",
+        "RMW_IMPLEMENTATION": "rmw_fastrtps_cpp",
+        "ROSRM_PROCESS": "talker",
+        "ROSRM_INSTANCE": "talker#7",
+        "ROSRM_HOST": "robot1",
+        "PYTHONUNBUFFERED": "",
+    }

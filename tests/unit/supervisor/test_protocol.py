@@ -1,0 +1,93 @@
+"""What travels to the supervisor and back: it survives the way, and nothing else is accepted."""
+
+from __future__ import annotations
+
+import hypothesis.strategies as st
+import pytest
+from hypothesis import given
+
+from rosrm.core.supervision import (
+    Forgotten,
+    RestartOrdered,
+    RestartRule,
+    ShutdownOrdered,
+    StopOrdered,
+    StopRule,
+)
+from rosrm.supervisor import protocol
+from rosrm.supervisor.logs import LogLimits
+
+SECONDS = st.floats(0, 1e6)
+KEYS = st.tuples(st.text(), st.integers(0, 2**53))
+# What Linux gives as a word: any bytes, those that are no UTF-8 as surrogates.
+WORDS = st.binary().map(lambda data: data.decode("utf-8", "surrogateescape"))
+ORDERS = st.one_of(
+    st.builds(protocol.Hello, st.integers(), st.integers(), st.just(LogLimits(1, 2, 3, 4))),
+    st.builds(protocol.Environment, st.text(), st.dictionaries(WORDS, WORDS)),
+    st.builds(
+        protocol.Launch,
+        KEYS,
+        st.lists(WORDS, min_size=1).map(tuple),
+        st.text(),
+        st.dictionaries(WORDS, st.none() | WORDS),
+        st.none() | WORDS,
+        st.builds(
+            RestartRule,
+            st.sampled_from(["never", "on-failure", "always"]),
+            SECONDS,
+            SECONDS,
+            SECONDS,
+            st.integers(0, 99),
+            SECONDS,
+        ),
+        st.builds(StopRule, SECONDS, SECONDS),
+    ),
+    st.builds(StopOrdered, KEYS),
+    st.builds(RestartOrdered, KEYS),
+    st.builds(protocol.Forget, st.lists(st.builds(Forgotten, KEYS)).map(tuple)),
+    st.just(ShutdownOrdered()),
+)
+
+
+@given(ORDERS)
+def test_orders_survive_the_way(order):
+    """Any order reads back as what it was, of the same type, from one line."""
+    line = protocol.encode_order(order)
+    assert line.count(b"\n") == 1
+    read = protocol.decode_order(line)
+    assert read == order
+    assert type(read) is type(order)
+
+
+@given(st.lists(st.binary().map(lambda data: data.replace(b"\n", b"")), max_size=5), st.data())
+def test_lines_are_cut_wherever_the_stream_is(lines, data):
+    """However the bytes come in, the lines are the same."""
+    stream = b"".join(line + b"\n" for line in lines)
+    cuts = sorted(data.draw(st.lists(st.integers(0, len(stream)), max_size=6)))
+    cutter, found = protocol.Lines(), []
+    for begin, end in zip([0, *cuts], [*cuts, len(stream)], strict=True):
+        found += cutter.feed(stream[begin:end])
+    assert found == lines
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        (b"hello", "not a line of JSON"),
+        (b"[1]", "not a JSON object"),
+        (b'{"do": "dance"}', "unknown order 'dance'; known: hello,"),
+        (b'{"do": "stop"}', "'stop' cannot be read: KeyError"),
+        (b'{"do": "stop", "instance": ["a"]}', "'stop' cannot be read: ValueError"),
+        (b'{"do": "stop", "instance": [1, 2]}', "'stop' cannot be read: TypeError"),
+    ],
+)
+def test_what_is_not_understood_is_refused(line, said):
+    """Never guessed at: the answer says what was wrong."""
+    with pytest.raises(protocol.ProtocolError, match=said):
+        protocol.decode_order(line)
+
+
+def test_a_line_without_end_is_refused():
+    """A peer cannot fill the memory."""
+    with pytest.raises(protocol.ProtocolError, match="longer than"):
+        protocol.Lines().feed(b"x" * (protocol.LONGEST_LINE + 1))

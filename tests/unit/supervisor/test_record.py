@@ -1,0 +1,135 @@
+"""The durable record: what it keeps, and what it does while the disk is full."""
+
+from __future__ import annotations
+
+import errno
+import os
+
+import pytest
+
+from rosrm.core import supervision as sv
+from rosrm.supervisor import record as rc
+from rosrm.supervisor.protocol import Launch
+
+TALKER = ("talker", 7)
+LAUNCH = Launch(TALKER, ("sleep", "1"), "base", {}, None, sv.RestartRule(), sv.StopRule())
+
+
+@pytest.fixture
+def core():
+    core = sv.Supervision()
+    core.handle(sv.StartOrdered(TALKER, sv.RestartRule("always"), sv.StopRule(1.0, 2.0)), 0.0)
+    core.handle(sv.Spawned(TALKER, 100), 0.0)
+    return core
+
+
+@pytest.fixture
+def record(tmp_path, core):
+    record = rc.Record(str(tmp_path))
+    record.rewrite(core, {TALKER: LAUNCH}, {"base": {"A": "1"}}, lambda key: 55)
+    return record
+
+
+def test_an_instance_comes_back_as_it_was(tmp_path, core, record):
+    """Every field of its state, its launch, its environment and its leader's birth."""
+    recorded = rc.read(str(tmp_path))
+    back, instance = recorded.instances[TALKER], core.instances[TALKER]
+    assert {name: getattr(back, name) for name in sv.Instance.__slots__} == {
+        name: getattr(instance, name) for name in sv.Instance.__slots__
+    }
+    assert recorded.launches == {TALKER: LAUNCH}
+    assert recorded.environments == {"base": {"A": "1"}}
+    assert recorded.births == {TALKER: 55}
+    assert recorded.same_boot
+    assert not recorded.notes
+
+
+def test_the_last_line_counts(tmp_path, core, record):
+    """Later states replace earlier ones; an ended instance needs its launch no more."""
+    core.handle(sv.StopOrdered(TALKER), 1.0)
+    core.handle(sv.Exited(TALKER, signal=2), 2.0)
+    record.state(core.instances[TALKER], 0)
+    record.flush()
+    recorded = rc.read(str(tmp_path))
+    assert recorded.instances[TALKER].phase == sv.EXITED
+    assert recorded.launches == {}
+
+
+def test_the_forgotten_are_gone_but_stay_dead(tmp_path, record):
+    """A forgotten instance leaves its number behind, through a compaction too."""
+    record.dead(TALKER, 7)
+    record.flush()
+    recorded = rc.read(str(tmp_path))
+    assert recorded.instances == {}
+    assert recorded.dead == {"talker": 7}
+    core = sv.Supervision()
+    core.dead.update(recorded.dead)
+    record.rewrite(core, {}, {}, lambda key: 0)
+    assert rc.read(str(tmp_path)).dead == {"talker": 7}
+
+
+def test_another_boot_is_noticed(tmp_path, record, monkeypatch):
+    """After a restart of the machine none of the pids means anything."""
+    monkeypatch.setattr(rc.members, "boot_id", lambda: "another")
+    assert not rc.read(str(tmp_path)).same_boot
+
+
+def test_no_record_is_an_empty_one(tmp_path):
+    """The first start of a host."""
+    recorded = rc.read(str(tmp_path))
+    assert not recorded.instances
+    assert not recorded.notes
+
+
+def full(*_):
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def test_a_full_disk_delays_and_says_so(tmp_path, core, record, monkeypatch):
+    """What cannot be written waits, and is written when there is room again."""
+    core.handle(sv.Exited(TALKER, 3), 2.0)
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "write", full)
+        record.state(core.instances[TALKER], 0)
+        assert not record.flush()
+        assert "instances.jsonl cannot be written: No space left" in record.trouble
+    assert record.flush()
+    assert record.trouble == ""
+    assert rc.read(str(tmp_path)).instances[TALKER].exit_code == 3
+
+
+def test_a_write_in_part_is_finished_later(tmp_path, core, record, monkeypatch):
+    """The disk took half a line: the other half follows, and the line is whole."""
+    core.handle(sv.Exited(TALKER, 3), 2.0)
+    write = os.write
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "write", lambda file, data: write(file, data[:10]))
+        record.state(core.instances[TALKER], 0)
+        assert not record.flush()
+    assert record.flush()
+    recorded = rc.read(str(tmp_path))
+    assert recorded.instances[TALKER].exit_code == 3
+    assert not recorded.notes
+
+
+def test_a_compaction_without_room_keeps_the_old_record(tmp_path, core, record, monkeypatch):
+    """The old file stays, and what was waiting still gets into it."""
+    core.handle(sv.Exited(TALKER, 3), 2.0)
+    record.state(core.instances[TALKER], 0)
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "write", full)
+        record.rewrite(core, {}, {}, lambda key: 0)
+        assert record.trouble
+    assert record.flush()
+    assert rc.read(str(tmp_path)).instances[TALKER].exit_code == 3
+
+
+def test_it_is_compacted_when_it_has_grown(tmp_path, core, record):
+    """Thousands of changes of one instance leave one line of it."""
+    while not record.is_large():
+        record.state(core.instances[TALKER], 55)
+        record.flush()
+    record.rewrite(core, {}, {}, lambda key: 55)
+    assert not record.is_large()
+    assert (tmp_path / "instances.jsonl").stat().st_size < 2000
+    assert TALKER in rc.read(str(tmp_path)).instances

@@ -1,0 +1,449 @@
+"""The supervisor's state machine: its table row by row, and what holds in every order of events."""
+
+from __future__ import annotations
+
+import dataclasses
+import signal
+
+import hypothesis.strategies as st
+import pytest
+from hypothesis import given, settings
+from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
+
+from rosrm.core import model
+from rosrm.core import supervision as sv
+from rosrm.supervisor import protocol
+
+TALKER = ("talker", 7)
+
+
+def kinds(commands):
+    """The commands by their type alone: named tuples of different types may be equal."""
+    return [type(command).__name__ for command in commands]
+
+
+def started(**policies):
+    """A state machine with one running instance, started at time 0."""
+    core = sv.Supervision()
+    core.handle(
+        sv.StartOrdered(
+            TALKER, policies.get("restart", sv.RestartRule()), policies.get("stop", sv.StopRule())
+        ),
+        0.0,
+    )
+    core.handle(sv.Spawned(TALKER, 100), 0.0)
+    return core, core.instances[TALKER]
+
+
+def test_policies_are_those_of_the_model():
+    """The supervisor's light policies have the fields and defaults of the model's."""
+    for light, heavy in (
+        (sv.RestartRule, model.RestartPolicy),
+        (sv.StopRule, model.StopPolicy),
+    ):
+        assert light._fields == tuple(field.name for field in dataclasses.fields(heavy))
+        assert tuple(light()) == dataclasses.astuple(heavy())
+
+
+def test_status_is_that_of_the_model():
+    """What is told has the fields of the model's status, and its words for the states."""
+    assert protocol.Status._fields == tuple(
+        field.name for field in dataclasses.fields(model.InstanceStatus)
+    )
+    ours = {sv.STARTING, sv.RUNNING, sv.BACKOFF, sv.STOPPING, *sv.ENDED}
+    theirs = {state.value for state in model.InstanceState} - {"ready"}  # the slave decides that
+    assert ours == theirs
+    assert {state.value for state in model.InstanceState if state.ended} == sv.ENDED
+
+
+def test_rules_stand_in_the_table_of_the_module():
+    """Each row of the table of transitions stands in the docstring, under its phase."""
+    documented: dict[str, str] = {}
+    phase = ""
+    for line in sv.__doc__.split("\n\n")[1].splitlines()[1:]:
+        phase = line[4:14].strip() or phase
+        documented[phase] = documented.get(phase, "") + line[14:31]
+    for row, event in sv.TRANSITIONS:
+        assert event.__name__ in documented[row], f"{event.__name__} in {row}"
+
+
+def test_start_is_recorded_before_it_is_tried():
+    """A start is told (so recorded) first and spawned second."""
+    core = sv.Supervision()
+    commands = core.handle(sv.StartOrdered(TALKER, sv.RestartRule(), sv.StopRule()), 0.0)
+    assert kinds(commands) == ["Tell", "Spawn"]
+
+
+def test_repeated_start_only_tells_again():
+    """DDS repeats: a start of a known instance spawns nothing."""
+    core, _ = started()
+    commands = core.handle(sv.StartOrdered(TALKER, sv.RestartRule(), sv.StopRule()), 1.0)
+    assert kinds(commands) == ["Tell"]
+
+
+def test_late_start_of_a_stopped_stranger_is_refused():
+    """A stop that overtakes its start wins."""
+    core = sv.Supervision()
+    core.handle(sv.StopOrdered(TALKER), 0.0)
+    core.handle(sv.StartOrdered(TALKER, sv.RestartRule(), sv.StopRule()), 1.0)
+    assert core.instances[TALKER].phase == sv.REFUSED
+
+
+@pytest.mark.parametrize(("number", "starts"), [(6, False), (7, False), (8, True)])
+def test_forgotten_numbers_never_start(number, starts):
+    """Once an instance is forgotten, it and the older ones of its process are refused."""
+    core, _ = started()
+    core.handle(sv.Exited(TALKER), 1.0)
+    core.handle(sv.Forgotten(TALKER), 2.0)
+    order = sv.StartOrdered(("talker", number), sv.RestartRule(), sv.StopRule())
+    commands = core.handle(order, 3.0)
+    assert ("Spawn" in kinds(commands)) is starts
+
+
+def test_what_runs_is_not_forgotten():
+    """Only a final status can be forgotten."""
+    core, instance = started()
+    assert kinds(core.handle(sv.Forgotten(TALKER), 1.0)) == ["Tell"]
+    assert instance.phase == sv.RUNNING
+
+
+@pytest.mark.parametrize(
+    ("when", "code", "phase"),
+    [
+        ("never", 0, sv.EXITED),
+        ("never", 3, sv.FAILED),
+        ("on-failure", 0, sv.EXITED),
+        ("on-failure", 3, sv.BACKOFF),
+        ("always", 0, sv.BACKOFF),
+        ("always", 3, sv.BACKOFF),
+    ],
+)
+def test_restart_policy(when, code, phase):
+    """What follows an exit is the policy's."""
+    core, instance = started(restart=sv.RestartRule(when=when))
+    core.handle(sv.Exited(TALKER, code), 1.0)
+    assert instance.phase == phase
+
+
+def test_backoff_grows_to_its_bound_and_restarts_run_out():
+    """1, 2, 4 s and so on up to the bound; after the last attempt it has failed, and says why."""
+    policy = sv.RestartRule("on-failure", 1.0, 5.0, 2.0, attempts=5, window=300.0)
+    core, instance = started(restart=policy)
+    now, waits = 0.0, []
+    for _ in range(6):
+        core.handle(sv.Exited(TALKER, 1), now)
+        if instance.phase == sv.FAILED:
+            break
+        waits.append(core.deadline() - now)
+        now = core.deadline()
+        assert kinds(core.handle(sv.TimePassed(), now)) == ["Tell", "Spawn"]
+        core.handle(sv.Spawned(TALKER, 100), now)
+    assert waits == [1.0, 2.0, 4.0, 5.0, 5.0]
+    assert instance.message == "exit code 1; 5 restarts within 300 s are the most allowed"
+    assert instance.restarts == 5
+
+
+def test_a_long_run_starts_the_backoff_afresh():
+    """Restarts that lie further back than the window do not count."""
+    core, instance = started(restart=sv.RestartRule("always", 1.0, 30.0, 2.0, 1, window=10.0))
+    core.handle(sv.Exited(TALKER, 1), 0.0)
+    core.handle(sv.TimePassed(), 1.0)
+    core.handle(sv.Spawned(TALKER, 101), 1.0)
+    core.handle(sv.Exited(TALKER, 1), 12.0)
+    assert instance.phase == sv.BACKOFF
+    assert core.deadline() == 13.0
+
+
+@given(st.integers(0, 2000), st.floats(0, 1e6), st.floats(0, 1e6), st.floats(0.5, 1e3))
+def test_backoff_is_bounded(done, delay, most, factor):
+    """No policy and no number of restarts gives a wait beyond its bound, or an overflow."""
+    assert 0.0 <= sv.backoff(sv.RestartRule("always", delay, most, factor), done) <= most
+
+
+def test_stop_escalates_and_says_each_step():
+    """SIGINT at once, SIGTERM and SIGKILL after their graces; the last message holds all three."""
+    core, instance = started(stop=sv.StopRule(2.0, 3.0))
+    sent = []
+    commands = core.handle(sv.StopOrdered(TALKER), 10.0)
+    while len(sent) < 3:
+        sent += [(command.number, core.deadline()) for command in commands[1:]]
+        commands = core.handle(sv.TimePassed(), core.deadline())
+    assert sent == [(signal.SIGINT, 12.0), (signal.SIGTERM, 15.0), (signal.SIGKILL, 16.0)]
+    core.handle(sv.Exited(TALKER, signal=signal.SIGKILL), 16.1)
+    assert instance.phase == sv.EXITED
+    assert instance.message == "stopped by SIGINT, SIGTERM after 2.0 s, SIGKILL after 5.0 s"
+
+
+def test_stopped_process_is_not_restarted():
+    """The user's stop is stronger than `always`."""
+    core, instance = started(restart=sv.RestartRule("always"))
+    core.handle(sv.StopOrdered(TALKER), 1.0)
+    core.handle(sv.Exited(TALKER, signal=signal.SIGINT), 2.0)
+    assert instance.phase == sv.EXITED
+
+
+def test_forced_restart_stops_then_starts():
+    """A forced restart spawns when nothing is left, and the policy does not count it."""
+    core, instance = started()
+    assert kinds(core.handle(sv.RestartOrdered(TALKER), 1.0)) == ["Tell", "Signal"]
+    assert kinds(core.handle(sv.Exited(TALKER, signal=2), 2.0)) == ["Tell", "Spawn"]
+    assert instance.restarts == 0
+
+
+def test_stop_during_a_forced_restart_wins():
+    """Who was to be started again ends, if a stop comes before that."""
+    core, instance = started()
+    core.handle(sv.RestartOrdered(TALKER), 1.0)
+    core.handle(sv.StopOrdered(TALKER), 1.5)
+    core.handle(sv.Exited(TALKER, signal=2), 2.0)
+    assert instance.phase == sv.EXITED
+
+
+def test_leftovers_are_stopped_before_it_counts_as_ended():
+    """Its leader exits by itself and leaves others: they are stopped, then its exit code counts."""
+    core, instance = started()
+    commands = core.handle(sv.Exited(TALKER, 3, leftovers=True), 1.0)
+    assert kinds(commands) == ["Tell", "Signal"]
+    assert instance.phase == sv.STOPPING
+    core.handle(sv.Cleared(TALKER), 2.0)
+    assert (instance.phase, instance.exit_code) == (sv.FAILED, 3)
+
+
+def test_leftovers_of_a_killed_leader_are_killed_at_once():
+    """Behind SIGKILL there is no milder step: what the leader leaves gets it as well."""
+    core, _ = started(stop=sv.StopRule(0.0, 0.0))
+    core.handle(sv.StopOrdered(TALKER), 0.0)
+    core.handle(sv.TimePassed(), 0.0)
+    core.handle(sv.TimePassed(), 0.0)
+    commands = core.handle(sv.Exited(TALKER, signal=9, leftovers=True), 0.1)
+    assert commands[-1] == sv.Signal(TALKER, signal.SIGKILL)
+
+
+def test_final_spawn_failure_is_not_repeated():
+    """A missing executable does not come by waiting: no restart, whatever the policy."""
+    core = sv.Supervision()
+    core.handle(sv.StartOrdered(TALKER, sv.RestartRule("always"), sv.StopRule()), 0.0)
+    core.handle(sv.SpawnFailed(TALKER, "no executable"), 0.0)
+    assert core.instances[TALKER].phase == sv.FAILED
+
+
+def test_transient_spawn_failure_follows_the_policy():
+    """A lack of memory may pass."""
+    core = sv.Supervision()
+    core.handle(sv.StartOrdered(TALKER, sv.RestartRule("on-failure"), sv.StopRule()), 0.0)
+    core.handle(sv.SpawnFailed(TALKER, "no memory", transient=True), 0.0)
+    assert core.instances[TALKER].phase == sv.BACKOFF
+
+
+def test_stop_before_the_spawn_gives_it_up():
+    """A start that still waits its turn is taken back."""
+    core = sv.Supervision()
+    core.handle(sv.StartOrdered(TALKER, sv.RestartRule(), sv.StopRule()), 0.0)
+    assert kinds(core.handle(sv.StopOrdered(TALKER), 0.0)) == ["Tell", "Unspawn"]
+    core.handle(sv.SpawnFailed(TALKER, ""), 0.0)
+    assert core.instances[TALKER].phase == sv.EXITED
+
+
+def test_shutdown_leaves_when_all_have_ended():
+    """Everything is stopped, nothing is started any more, and then the supervisor leaves."""
+    core, _ = started()
+    assert "Leave" not in kinds(core.handle(sv.ShutdownOrdered(), 1.0))
+    core.handle(sv.StartOrdered(("late", 1), sv.RestartRule(), sv.StopRule()), 1.0)
+    assert core.instances["late", 1].phase == sv.REFUSED
+    assert kinds(core.handle(sv.Exited(TALKER, signal=2), 2.0)) == ["Tell", "Leave"]
+
+
+def test_a_lost_client_changes_nothing():
+    """The processes of a slave that died keep running."""
+    core, instance = started()
+    assert core.handle(sv.ClientLost(), 1.0) == []
+    assert instance.phase == sv.RUNNING
+
+
+def test_dead_numbers_are_bounded():
+    """Thousands of jobs with names of their own leave a bounded memory."""
+    core = sv.Supervision()
+    for number in range(sv.MOST_TOMBSTONES + 10):
+        key = (f"job{number}", number)
+        core.handle(sv.StopOrdered(key), 0.0)
+        core.handle(sv.Forgotten(key), 0.0)
+    assert len(core.dead) == sv.MOST_TOMBSTONES
+
+
+# --- what holds in every order of events ------------------------------------------------------
+
+KEYS = st.sampled_from([("a", 1), ("a", 2), ("b", 3)])
+POLICIES = st.builds(
+    sv.RestartRule,
+    st.sampled_from(["never", "on-failure", "always"]),
+    st.sampled_from([0.0, 0.5, 1.0]),
+    st.just(2.0),
+    st.just(2.0),
+    st.integers(0, 3),
+    st.sampled_from([5.0, 50.0]),
+)
+GRACES = st.builds(sv.StopRule, st.sampled_from([0.0, 1.0]), st.sampled_from([0.0, 1.0]))
+
+
+class Host(RuleBasedStateMachine):
+    """A host whose processes do as they like, and the machine that supervises them.
+
+    `leaders` and `strays` are the truth about what lives; the machine only hears of it.
+    """
+
+    def __init__(self):
+        super().__init__()
+        self.core = sv.Supervision()
+        self.now = 0.0
+        self.queue: list[sv.Key] = []
+        self.leaders: set[sv.Key] = set()
+        self.strays: set[sv.Key] = set()
+        self.killed: set[sv.Key] = set()
+        self.final: dict[sv.Key, protocol.Status] = {}
+        self.policy_restarts: dict[sv.Key, list[float]] = {}
+        self.left = False
+
+    def happens(self, event):
+        before = {key: instance.phase for key, instance in self.core.instances.items()}
+        for command in self.core.handle(event, self.now):
+            self.carry_out(command, event, before)
+
+    def carry_out(self, command, event, before):
+        if isinstance(command, sv.Leave):
+            assert not self.leaders, "it leaves while something runs"
+            assert not self.strays, "it leaves while something is left over"
+            self.left = True
+            return
+        key = command.instance
+        if isinstance(command, sv.Spawn):
+            assert key not in self.leaders | self.strays, "started twice"
+            assert key not in self.queue, "ordered twice"
+            assert key not in self.final, "started after its end"
+            self.queue.append(key)
+            if isinstance(event, sv.TimePassed) and before[key] == sv.BACKOFF:
+                self.policy_restarts.setdefault(key, []).append(self.now)
+        elif isinstance(command, sv.Unspawn):
+            assert key in self.queue
+            self.queue.remove(key)
+            self.happens(sv.SpawnFailed(key, ""))
+        elif isinstance(command, sv.Signal):
+            assert key in self.leaders | self.strays, "a signal after the end"
+            if command.number == signal.SIGKILL:
+                self.killed.add(key)
+        elif isinstance(command, sv.Tell):
+            self.hear(key)
+        else:
+            assert key in self.final, "forgotten before its end"
+            del self.final[key]
+
+    def hear(self, key):
+        status = protocol.Status.of(self.core.instances[key])
+        if key in self.final:
+            assert status == self.final[key], "a second final status"
+        elif status.state in sv.ENDED:
+            self.final[key] = status
+
+    @rule(key=KEYS, restart=POLICIES, stop=GRACES)
+    def start(self, key, restart, stop):
+        self.happens(sv.StartOrdered(key, restart, stop))
+
+    @rule(key=KEYS)
+    def stop(self, key):
+        self.happens(sv.StopOrdered(key))
+
+    @rule(key=KEYS)
+    def restart(self, key):
+        self.policy_restarts.pop(key, None)
+        self.happens(sv.RestartOrdered(key))
+
+    @rule(key=KEYS)
+    def forget(self, key):
+        self.happens(sv.Forgotten(key))
+
+    @rule()
+    def client_dies(self):
+        self.happens(sv.ClientLost())
+
+    @rule()
+    def shut_down(self):
+        self.happens(sv.ShutdownOrdered())
+
+    @precondition(lambda self: self.queue)
+    @rule(data=st.data())
+    def spawn_succeeds(self, data):
+        key = data.draw(st.sampled_from(self.queue))
+        self.queue.remove(key)
+        self.leaders.add(key)
+        self.killed.discard(key)
+        self.happens(sv.Spawned(key, 100))
+
+    @precondition(lambda self: self.queue)
+    @rule(data=st.data(), transient=st.booleans())
+    def spawn_fails(self, data, transient):
+        key = data.draw(st.sampled_from(self.queue))
+        self.queue.remove(key)
+        self.happens(sv.SpawnFailed(key, "no memory", transient))
+
+    @precondition(lambda self: self.leaders)
+    @rule(data=st.data(), code=st.sampled_from([0, 1]), leaves=st.booleans())
+    def leader_exits(self, data, code, leaves):
+        key = data.draw(st.sampled_from(sorted(self.leaders)))
+        self.leaders.discard(key)
+        if leaves:
+            self.strays.add(key)
+        self.happens(sv.Exited(key, code, leftovers=leaves))
+
+    @precondition(lambda self: self.strays)
+    @rule(data=st.data())
+    def strays_end(self, data):
+        key = data.draw(st.sampled_from(sorted(self.strays)))
+        self.strays.discard(key)
+        self.happens(sv.Cleared(key))
+
+    @rule(seconds=st.sampled_from([0.0, 0.5, 1.0, 6.0, 60.0]))
+    def time_passes(self, seconds):
+        self.now += seconds
+        self.happens(sv.TimePassed())
+
+    @invariant()
+    def books_agree_with_the_host(self):
+        for key, instance in self.core.instances.items():
+            alive = key in self.leaders or key in self.strays
+            assert alive == (instance.phase in (sv.RUNNING, sv.STOPPING)), key
+            assert (key in self.leaders) == (instance.pid > 0), key
+            assert (key in self.queue) == (instance.phase == sv.STARTING), key
+            assert instance.ended == (key in self.final), key
+            waits = instance.phase in (sv.STOPPING, sv.BACKOFF)
+            assert (instance.deadline is not None) == waits, key
+        assert self.leaders | self.strays | set(self.queue) <= set(self.core.instances)
+
+    @invariant()
+    def restarts_stay_within_the_policy(self):
+        for key, times in self.policy_restarts.items():
+            rule_ = self.core.instances[key].restart if key in self.core.instances else None
+            if rule_ is not None:
+                recent = [at for at in times if times[-1] - at < rule_.window]
+                assert len(recent) <= rule_.attempts
+
+    def teardown(self):
+        """From wherever it stands, a shutdown ends: what gets SIGKILL dies, in bounded time."""
+        self.shut_down()
+        for _ in range(100):
+            if self.left:
+                break
+            for key in list(self.queue):
+                self.queue.remove(key)
+                self.happens(sv.SpawnFailed(key, "no memory", transient=True))
+            for key in sorted(self.leaders & self.killed):
+                self.leaders.discard(key)
+                self.happens(sv.Exited(key, signal=signal.SIGKILL))
+            for key in sorted(self.strays & self.killed):
+                self.strays.discard(key)
+                self.happens(sv.Cleared(key))
+            self.now = self.core.deadline() or self.now
+            self.happens(sv.TimePassed())
+        assert self.left
+
+
+Host.TestCase.settings = settings(max_examples=150, stateful_step_count=40, deadline=None)
+TestHost = Host.TestCase
