@@ -49,8 +49,9 @@ def connect(settings: RosSettings) -> MasterClient:
     except ImportError as error:
         if (error.name or "").split(".")[0] == "rosrm":
             raise
+        reason = str(error).splitlines()[0]
         raise RosrmError(
-            f"ROS 2 cannot be imported ({str(error).splitlines()[0]}). Source your ROS 2 (and the workspace with "
+            f"ROS 2 cannot be imported ({reason}). Source your ROS 2 (and the workspace with "
             "rosrm_msgs), or install the wheels: pip install 'rosrm[ros]'"
         ) from None
     who = f"{getpass.getuser()}@{socket.gethostname()}:{os.getpid()}"

@@ -1,0 +1,181 @@
+"""The command line against a client that only pretends to be connected."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+
+import pytest
+from typer.testing import CliRunner
+
+from rosrm.cli import connection
+from rosrm.cli.commands import app
+from rosrm.core.model import HostDescription
+from rosrm.core.views import (
+    EventRow,
+    HostRow,
+    PluginRow,
+    ProcessRow,
+    ResourceRow,
+    Snapshot,
+)
+
+NAN = float("nan")
+
+
+def resource(name, usage=0.4, in_flight=0.1, limit=0.8, stale=False):
+    return ResourceRow(name, "B", 2e9, "machine", usage, in_flight, limit, stale)
+
+
+def host(name, state="up", *, cordoned=False, draining=False, resources=None, processes=2):
+    rows = (resource("memory"), resource("cpu", 0.95, 0.0, 0.9)) if resources is None else resources
+    description = HostDescription(name, 7, labels={"gpu": "true"})
+    return HostRow(description, 3, state, cordoned, draining, True, 0.05, tuple(rows), processes)
+
+
+def process(name, state="running", host="alpha", *, number=1, kind="service", **more):
+    values = {
+        "pid": 99 if state == "running" else 0,
+        "restarts": 0,
+        "migrations": 0,
+        "exit_code": 0,
+        "priority": 0,
+        "queue_position": 0,
+        "since": 12.0,
+        "cpu": 0.5,
+        "memory": 64_000_000,
+        "reason": "",
+        **more,
+    }
+    return ProcessRow(name=name, kind=kind, state=state, host=host, number=number, **values)
+
+
+def event(sequence, kind="assigned", process="talker", host="alpha", message=""):
+    text = message or f"{process} goes to {host}"
+    return EventRow(sequence, 1_700_000_000.0, 1.5, kind, process, host, text, {"score": 0.4})
+
+
+HOSTS = [host("alpha"), host("beta", "suspect", cordoned=True), host("gamma", draining=True)]
+PROCESSES = [
+    process("talker", restarts=2, migrations=1),
+    process("next", "queued", "", queue_position=1, reason="no host has room: memory"),
+    process("crashed", "failed", kind="job", exit_code=3),
+    process("done", "finished", kind="job"),
+]
+PLUGINS = [
+    PluginRow("scoring", "weighted", "rosrm-scoring 0.1.0", "selected", "Eq. 1 of the paper"),
+    PluginRow("probe", "gpu", "rosrm-resources 0.1.0", "absent", "no NVIDIA driver", "alpha"),
+]
+EVENTS = [event(1, "submitted", host=""), event(2)]
+STORY = {
+    "process": "talker",
+    "state": "running",
+    "host": "alpha",
+    "reason": "",
+    "decision": {
+        "kind": "assigned",
+        "elapsed": 61.0,
+        "policy": "weighted",
+        "chosen": "alpha",
+        "need": {"memory": 64e6, "cpu": 0.5},
+        "hosts": [
+            {"name": "alpha", "verdict": "chosen", "score": 0.41234, "reason": "memory 0.41"},
+            {"name": "beta", "verdict": "full", "score": None, "reason": "memory 0.79 of 0.8"},
+            {"name": "gamma", "verdict": "vetoed", "score": None, "reason": "too near its limit"},
+        ],
+        "omitted": {"does not fit now": 5, "fits with a higher score": 0},
+    },
+    "history": [{"elapsed": 62.0, "kind": "submitted", "message": "talker was submitted"}],
+}
+
+
+@dataclass
+class FakeClient:
+    """Answers like a master and notes what it was asked."""
+
+    hosts: list = field(default_factory=lambda: list(HOSTS))
+    processes: list = field(default_factory=lambda: list(PROCESSES))
+    plugins: list = field(default_factory=lambda: list(PLUGINS))
+    events: list = field(default_factory=lambda: list(EVENTS))
+    asked: list = field(default_factory=list)
+    fails: BaseException | None = None
+    settings: object = None
+    closed: bool = False
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *exception):
+        self.closed = True
+
+    def _note(self, *what):
+        self.asked.append(what)
+        if self.fails is not None:
+            raise self.fails
+
+    def submit(self, specs):
+        self._note("submit", [spec.name for spec in specs])
+        return f"{len(specs)} processes were queued"
+
+    def cancel(self, names):
+        self._note("cancel", list(names))
+        return "cancelled"
+
+    def restart(self, names):
+        self._note("restart", list(names))
+        return "restarted"
+
+    def migrate(self, name, host):
+        self._note("migrate", name, host)
+        return "moving"
+
+    def set_host_state(self, host, action):
+        self._note(action, host)
+        return f"{host}: {action}"
+
+    def explain(self, name):
+        self._note("explain", name)
+        return STORY
+
+    def list(self, *, hosts=False, processes=False, plugins=False, events=False, process="",
+             host="", after=0, newest=0):  # fmt: skip
+        self._note("list", {"process": process, "host": host, "after": after, "newest": newest})
+        chosen = [
+            row
+            for row in self.events
+            if row.sequence > after and process in ("", row.process) and host in ("", row.host)
+        ]
+        return Snapshot(
+            master="lab",
+            uptime=125.0,
+            last_sequence=max((row.sequence for row in self.events), default=0),
+            hosts=self.hosts if hosts else (),
+            processes=self.processes if processes else (),
+            plugins=self.plugins if plugins else (),
+            events=chosen[-newest:] if events and newest else chosen if events else (),
+        )
+
+
+@pytest.fixture
+def client(monkeypatch):
+    """The client that every command gets; it keeps the settings that it was reached with."""
+    fake = FakeClient()
+
+    def connect(settings):
+        fake.settings = settings
+        return fake
+
+    monkeypatch.setattr(connection, "connect", connect)
+    return fake
+
+
+@pytest.fixture
+def rosrm():
+    """Run one command line; both streams and the exit code come back."""
+
+    def run(*words, columns="80"):
+        runner = CliRunner(env={"COLUMNS": columns, "NO_COLOR": "1", "TERM": "dumb"})
+        result = runner.invoke(app, [str(word) for word in words], prog_name="rosrm")
+        return SimpleNamespace(code=result.exit_code, out=result.stdout, err=result.stderr)
+
+    return run

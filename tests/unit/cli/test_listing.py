@@ -1,0 +1,225 @@
+"""Commands that show something: tables that read at 80 columns, and stable JSON."""
+
+from __future__ import annotations
+
+import json
+import time
+
+import pytest
+
+from rosrm.errors import NoMaster
+
+from .conftest import EVENTS, NAN, PLUGINS, STORY, event, host, process, resource
+
+
+def test_status_shows_the_cluster_on_half_a_page(rosrm, client):
+    result = rosrm("status")
+    assert result.code == 0
+    lines = result.out.splitlines()
+    assert lines[0] == "master     lab, up 2 min"
+    assert lines[1] == "hosts      2 up, 1 suspect (1 cordoned, 1 draining)"
+    assert lines[2] == "processes  1 running, 1 queued, 1 failed, 1 finished"
+    assert "crashed is failed" in result.out
+    assert "talker goes to alpha" in result.out
+
+
+def test_status_json_counts_states(rosrm, client):
+    assert json.loads(rosrm("status", "--json").out) == {
+        "master": "lab",
+        "uptime": 125.0,
+        "last_sequence": 2,
+        "hosts": {"up": 2, "suspect": 1},
+        "processes": {"running": 1, "queued": 1, "failed": 1, "finished": 1},
+    }
+
+
+def test_status_of_an_empty_cluster(rosrm, client):
+    client.hosts, client.processes, client.events = [], [], []
+    assert rosrm("status").out.splitlines()[1:3] == ["hosts      none", "processes  none"]
+
+
+def test_ps_lists_what_is_not_over_and_says_what_it_leaves_out(rosrm, client):
+    out = rosrm("ps").out
+    assert "done" not in out
+    assert "1 finished or cancelled (--all shows them)" in out
+    assert "done" in rosrm("ps", "--all").out
+
+
+def test_ps_says_why(rosrm, client):
+    out = rosrm("ps").out
+    for expected in (
+        "64.0 MB",
+        "2 restarts; moved 1x",
+        "no. 1 in the queue; no host has room: memory",
+        "exit code 3",
+    ):
+        assert expected in out
+
+
+def test_ps_of_one_host_and_of_nothing(rosrm, client):
+    out = rosrm("ps", "--host", "alpha").out
+    assert "talker" in out
+    assert "next" not in out
+    client.processes = []
+    assert rosrm("ps").out == "no process\n"
+
+
+def test_ps_json_has_every_process_with_every_field(rosrm, client):
+    rows = json.loads(rosrm("ps", "--json").out)
+    assert [row["name"] for row in rows] == ["talker", "next", "crashed", "done"]
+    assert rows[0] == {
+        "name": "talker", "kind": "service", "state": "running", "host": "alpha", "number": 1,
+        "pid": 99, "restarts": 2, "migrations": 1, "exit_code": 0, "priority": 0,
+        "queue_position": 0, "since": 12.0, "cpu": 0.5, "memory": 64_000_000, "reason": "",
+    }  # fmt: skip
+
+
+def test_hosts_shows_usage_against_limits(rosrm, client):
+    out = rosrm("hosts").out
+    assert "memory %" in out
+    assert "40/80" in out
+    assert "95/90" in out
+    assert "suspect, cordoned" in out
+    assert "up, draining" in out
+    client.hosts = []
+    assert rosrm("hosts").out == "no host; start `rosrm slave` on each\n"
+
+
+def test_a_stale_or_missing_reading_is_marked(rosrm, client):
+    client.hosts = [
+        host("a", resources=[resource("memory", stale=True)]),
+        host("b", resources=[resource("cpu", usage=NAN)]),
+    ]
+    out = rosrm("hosts").out
+    assert "?40/80" in out
+    assert "?/80" in out
+
+
+def test_hosts_json_joins_host_and_description_and_has_no_nan(rosrm, client):
+    client.hosts = [host("a", resources=[resource("memory", usage=NAN)])]
+    (row,) = json.loads(rosrm("hosts", "--json").out)
+    assert (row["name"], row["state"], row["labels"]) == ("a", "up", {"gpu": "true"})
+    assert row["resources"] == [
+        {
+            "name": "memory", "unit": "B", "capacity": 2e9, "scope": "machine", "usage": None,
+            "in_flight": 0.1, "limit": 0.8, "stale": False,
+        }
+    ]  # fmt: skip
+
+
+def test_plugins_come_from_the_master(rosrm, client):
+    out = rosrm("plugins").out
+    assert "no NVIDIA driver" in out
+    assert "rosrm-scoring 0.1.0" in out
+    rows = json.loads(rosrm("plugins", "--json").out)
+    assert rows[1] == {
+        "kind": "probe", "name": "gpu", "distribution": "rosrm-resources 0.1.0",
+        "state": "absent", "reason": "no NVIDIA driver", "host": "alpha",
+    }  # fmt: skip
+    assert len(rows) == len(PLUGINS)
+
+
+def test_plugins_local_asks_no_master(rosrm, client):
+    client.fails = NoMaster("none")
+    assert rosrm("plugins", "--local").code == 0
+    assert client.asked == []
+
+
+def test_events_are_shown_oldest_first(rosrm, client):
+    result = rosrm("events", "--process", "talker", "--newest", 10)
+    clock = time.strftime("%H:%M:%S", time.localtime(1_700_000_000))
+    assert result.out.splitlines()[1] == f"{clock}  assigned           talker goes to alpha"
+    assert client.asked == [("list", {"process": "talker", "host": "", "after": 0, "newest": 10})]
+
+
+def test_events_json_is_one_list(rosrm, client):
+    rows = json.loads(rosrm("events", "--json").out)
+    assert [row["sequence"] for row in rows] == [1, 2]
+    assert rows[0] == {
+        "sequence": 1, "wall_time": 1_700_000_000.0, "elapsed": 1.5, "kind": "submitted",
+        "process": "talker", "host": "", "message": EVENTS[0].message, "facts": {"score": 0.4},
+    }  # fmt: skip
+
+
+def test_events_follow_shows_each_event_once_until_ctrl_c(rosrm, client, monkeypatch):
+    rounds = iter([[event(3, message="third")], [], [event(4, message="fourth")]])
+
+    def later(seconds):
+        try:
+            client.events = client.events + next(rounds)
+        except StopIteration:
+            raise KeyboardInterrupt from None
+
+    monkeypatch.setattr("time.sleep", later)
+    result = rosrm("events", "-f", "--json")
+    assert result.code == 130
+    assert [json.loads(line)["sequence"] for line in result.out.splitlines()] == [1, 2, 3, 4]
+
+
+def test_explain_shows_every_host_with_its_score_or_veto(rosrm, client):
+    out = rosrm("explain", "talker").out
+    lines = out.splitlines()
+    assert lines[0] == "talker is running on alpha"
+    assert lines[2].startswith("It was given to alpha, 61 s ago (scoring policy weighted;")
+    assert "Counted for it: memory 64.0 MB, cpu 0.5 cores." in out
+    for expected in ("0.4123", "memory 0.79 of 0.8", "too near its limit", "vetoed"):
+        assert expected in out
+    assert "and 5 more: does not fit now" in out
+    assert "fits with a higher score" not in out
+    assert "62 s ago  submitted          talker was submitted" in out
+
+
+def test_explain_json_is_the_masters_own(rosrm, client):
+    assert json.loads(rosrm("explain", "talker", "--json").out) == STORY
+
+
+def test_explain_of_a_process_without_a_decision(rosrm, client, monkeypatch):
+    story = {**STORY, "decision": None, "history": [], "host": "", "state": "queued"}
+    monkeypatch.setattr(client, "explain", lambda name: {**story, "reason": "2 before it"})
+    assert rosrm("explain", "talker").out == "talker is queued: 2 before it\n"
+
+
+@pytest.mark.parametrize("command", ["status", "ps", "hosts", "plugins"])
+def test_tables_keep_to_80_columns_on_a_terminal(client, command, monkeypatch):
+    from io import StringIO
+
+    from rich.console import Console
+
+    from rosrm.cli import tables
+
+    client.processes = [process("a_process_with_quite_a_long_name", reason="because " * 12)]
+    client.hosts = [
+        host("robot-with-a-long-name", resources=[resource(n) for n in ("memory", "cpu", "disk")])
+    ]
+    output = StringIO()
+    monkeypatch.setattr(
+        tables, "console", lambda: Console(file=output, width=80, force_terminal=False)
+    )
+    from typer.testing import CliRunner
+
+    from rosrm.cli.commands import app
+
+    CliRunner().invoke(app, [command])
+    lines = output.getvalue().splitlines()
+    assert lines
+    assert all(len(line.rstrip()) <= 80 for line in lines)
+    text = "".join(line.strip() for line in lines)
+    assert "…" not in text
+
+
+def test_top_shows_pictures_and_ends(rosrm, client, monkeypatch):
+    monkeypatch.setattr("time.sleep", lambda seconds: None)
+    result = rosrm("top", "--count", 2)
+    assert result.code == 0
+    assert "alpha" in result.out
+    assert len(client.asked) == 2
+
+
+def test_top_outlives_a_master_that_is_away_for_a_while(rosrm, client, monkeypatch):
+    def later(seconds):
+        client.fails = NoMaster("gone")
+
+    monkeypatch.setattr("time.sleep", later)
+    result = rosrm("top", "--count", 2)
+    assert result.code == 0
+    assert "the master does not answer" in result.out

@@ -1,0 +1,48 @@
+"""Where a command looks for the master, and what it says where there is no ROS."""
+
+from __future__ import annotations
+
+import builtins
+
+import pytest
+
+from rosrm.cli import connection
+from rosrm.errors import RosrmError
+from rosrm.ros.settings import RosSettings
+
+
+def test_the_domain_comes_from_before_or_after_the_command(rosrm, client):
+    rosrm("--domain", 7, "ps")
+    assert client.settings.domain == 7
+    rosrm("--domain", 7, "ps", "--domain", 9)
+    assert client.settings.domain == 9
+    rosrm("ps")
+    assert client.settings == RosSettings()
+
+
+def test_a_cluster_file_says_how_to_join_ros(rosrm, client, tmp_path, monkeypatch):
+    (tmp_path / "c.yaml").write_text("ros: {domain: 5, transports: UDPv4}", encoding="utf-8")
+    rosrm("--cluster", tmp_path / "c.yaml", "ps")
+    assert client.settings == RosSettings(domain=5, transports="UDPv4")
+    monkeypatch.setenv("ROSRM_CLUSTER", str(tmp_path / "c.yaml"))
+    rosrm("ps", "--domain", 6)
+    assert client.settings == RosSettings(domain=6, transports="UDPv4")
+
+
+def test_a_domain_outside_0_to_232_is_refused(rosrm, client):
+    result = rosrm("ps", "--domain", 233)
+    assert result.code == 2
+    assert "Invalid value for '--domain'" in result.err
+
+
+def test_without_ros_a_command_says_how_to_get_it(monkeypatch):
+    real = builtins.__import__
+
+    def no_ros(name, *more):
+        if name == "rosrm.ros.client":
+            raise ModuleNotFoundError("No module named 'rclpy'", name="rclpy")
+        return real(name, *more)
+
+    monkeypatch.setattr(builtins, "__import__", no_ros)
+    with pytest.raises(RosrmError, match=r"ROS 2 cannot be imported.*pip install 'rosrm\[ros\]'"):
+        connection.connect(RosSettings())

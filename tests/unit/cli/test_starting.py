@@ -1,0 +1,103 @@
+"""`rosrm master` and `rosrm slave` check everything, say what starts, and become the runtime."""
+
+from __future__ import annotations
+
+import os
+from types import SimpleNamespace
+
+import pytest
+
+from rosrm.cli import starting
+from rosrm.config import ClusterConfig, HostConfig
+from rosrm.hookspecs import hookimpl
+from rosrm.ports import MigrationOffer, ProbeOffer, ScoringOffer
+from rosrm.registry import Registry
+
+
+@hookimpl
+def register_probes():
+    return [ProbeOffer("cpu", lambda options, context: None, default=True)]
+
+
+@hookimpl
+def register_scoring_policies():
+    return [ScoringOffer("weighted", lambda options: None)]
+
+
+@hookimpl
+def register_migration_strategies():
+    return [MigrationOffer("relaunch", lambda options: None)]
+
+
+OURS = SimpleNamespace(
+    register_probes=register_probes,
+    register_scoring_policies=register_scoring_policies,
+    register_migration_strategies=register_migration_strategies,
+)
+
+
+@pytest.fixture
+def becomes(monkeypatch):
+    """What this process would have become, instead of becoming it."""
+    seen = []
+    monkeypatch.setattr(Registry, "discover", lambda: Registry.of(ours=OURS))
+    monkeypatch.setattr(
+        starting, "become", lambda module, settings: seen.append((module, settings))
+    )
+    return seen
+
+
+def test_a_master_starts_with_the_settings_of_its_file(rosrm, becomes, tmp_path):
+    (tmp_path / "c.yaml").write_text("name: lab\nstate: s\n", encoding="utf-8")
+    result = rosrm("master", "--config", tmp_path / "c.yaml", "--domain", 7)
+    assert result.code == 0
+    assert result.err.startswith("master 'lab': domain 7, ")
+    assert f"scoring weighted; migration relaunch; state in {tmp_path / 's'}" in result.err
+    ((module, settings),) = becomes
+    assert module == "rosrm.master.run"
+    config = ClusterConfig.from_json(settings)
+    assert (config.name, config.ros.domain) == ("lab", 7)
+
+
+def test_a_slave_starts_with_the_settings_of_its_file(rosrm, becomes, tmp_path):
+    (tmp_path / "h.yaml").write_text("host: h1\nlimits: {memory: 0.7}\n", encoding="utf-8")
+    result = rosrm("slave", "--config", tmp_path / "h.yaml")
+    assert result.code == 0
+    assert "slave of 'h1': domain " in result.err
+    assert "limits memory 70%, cpu 90%, disk 90%" in result.err
+    ((module, settings),) = becomes
+    assert module == "rosrm.slave.run"
+    assert HostConfig.from_json(settings).host == "h1"
+
+
+def test_both_start_with_the_defaults_too(rosrm, becomes):
+    assert rosrm("master").code == 0
+    assert rosrm("slave").code == 0
+    assert [module for module, _ in becomes] == ["rosrm.master.run", "rosrm.slave.run"]
+
+
+def test_a_wrong_file_or_unknown_plugin_starts_nothing(rosrm, becomes, tmp_path):
+    (tmp_path / "c.yaml").write_text("scoring: {policy: weihgted}\n", encoding="utf-8")
+    result = rosrm("master", "--config", tmp_path / "c.yaml")
+    assert result.code == 2
+    assert "c.yaml:1:11: unknown scoring policy 'weihgted'; did you mean 'weighted'?" in result.err
+    result = rosrm("slave", "--config", tmp_path / "none.yaml")
+    assert result.code == 2
+    assert "none.yaml: cannot be read: No such file or directory" in result.err
+    assert becomes == []
+
+
+def test_the_runtime_inherits_the_settings_in_a_file(monkeypatch):
+    seen = {}
+
+    def execv(program, words):
+        descriptor = int(words[-1])
+        seen["words"] = words
+        seen["inherited"] = os.get_inheritable(descriptor)
+        seen["text"] = os.read(descriptor, 10_000).decode()
+        os.close(descriptor)
+
+    monkeypatch.setattr(os, "execv", execv)
+    starting.become("rosrm.slave.run", '{"host": "h"}')
+    assert seen["words"][-4:-1] == ["-m", "rosrm.slave.run", "--settings-fd"]
+    assert (seen["inherited"], seen["text"]) == (True, '{"host": "h"}')
