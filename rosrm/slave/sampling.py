@@ -54,7 +54,7 @@ class ProbeReport:
 
     Attributes:
         resources: names of the readings concerned.
-        reason: why they are stale; "" on recovery.
+        reason: why they are stale; on recovery "", or a remark.
     """
 
     probe: str
@@ -67,7 +67,7 @@ class ProbeReport:
         names = ", ".join(self.resources)
         if self.stale:
             return f"probe {self.probe}: {names} stale: {self.reason}"
-        return f"probe {self.probe}: {names} read again"
+        return f"probe {self.probe}: {names} read again" + (self.reason and f"; {self.reason}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,11 +87,17 @@ class Sample:
 
 @dataclass(frozen=True, slots=True)
 class _Outcome:
-    """What a read brought: values in the order of the probe's resources, or why there are none."""
+    """What a read brought: values in the order of the probe's resources, or why there are none.
+
+    Attributes:
+        seconds: that the read took.
+        age: seconds since it was asked for, which a busy machine can make much longer.
+    """
 
     values: tuple[float, ...]
     reason: str
     seconds: float
+    age: float
 
 
 class Sampler:
@@ -112,13 +118,13 @@ class Sampler:
         self._shared = _Lane("rosrm-probes")
         self._left: list[_Lane] = []
         self._watched: list[_Watched] = []
-        self._usage = np.zeros(RESOURCE_SLOTS, np.float32)
+        self._usage = [0.0] * RESOURCE_SLOTS
         first = 0
         for made in probes:
             watched = _Watched(made, first, clock, self._progress)
             self._watched.append(watched)
             first += len(watched.names)
-        self._usage[:first] = 1.0
+        self._usage[:first] = [1.0] * first
         self._stale = self.present
 
     @property
@@ -136,14 +142,13 @@ class Sampler:
         for watched in self._watched:
             if watched.busy:
                 self._mind_running(watched, now)
-            else:
-                self._take_outcome(watched)
-            report = watched.report(now)
-            if report is not None:
-                reports.append(report)
-            if not watched.busy and watched.is_due(now):
+            elif watched.outcome is not None:
+                self._take_outcome(watched, watched.outcome)
+            if bool(watched.reason) != watched.reported_stale:
+                reports += watched.report(now)
+            if now >= watched.due and not watched.busy:
                 watched.lane.put(watched.prepare(now))
-        return Sample(self._usage.copy(), self._stale, tuple(reports))
+        return Sample(np.array(self._usage, np.float32), self._stale, tuple(reports))
 
     def settle(self, timeout: float) -> bool:
         """Wait until no read is under way.
@@ -182,7 +187,9 @@ class Sampler:
             Names of the probes that hang or raised, and so were left unclosed.
         """
         for watched in self._watched:
-            watched.lane.put(watched.close)
+            # One that hangs in a thread it took with it must not be closed under its own read.
+            if watched.lane.alive() or not watched.busy:
+                watched.lane.put(watched.close)
         lanes = {id(lane): lane for lane in [*(w.lane for w in self._watched), self._shared]}
         end = time.monotonic() + timeout
         for lane in lanes.values():
@@ -193,26 +200,22 @@ class Sampler:
 
     def _mind_running(self, watched: _Watched, now: float) -> None:
         """A read is under way: free those behind it when it is slow, mark it when it is late."""
-        running = watched.running(now)
-        if running > QUICK and watched.lane is self._shared:
-            self._shared = self._shared.succeed()
+        if watched.running(now) > QUICK and watched.lane is self._shared:
+            stuck, self._shared = self._shared, self._shared.succeed()
             for other in self._watched:
-                if other.lane is not watched.lane or other is watched:
-                    continue
-                other.lane = self._shared
+                if other.lane is stuck:
+                    other.lane = self._shared
             watched.lane = _Lane(f"rosrm-probe-{watched.name}")
-        if running > watched.deadline:
+        if now - watched.asked > watched.deadline:
             self._mark(watched, f"no answer within {watched.deadline:g} s")
 
-    def _take_outcome(self, watched: _Watched) -> None:
+    def _take_outcome(self, watched: _Watched, outcome: _Outcome) -> None:
         """A read has ended: publish its values, and choose the thread of the next."""
-        outcome, watched.outcome = watched.outcome, None
-        if outcome is None:
-            return
+        watched.outcome = None
         if outcome.values:
             self._usage[watched.slots] = outcome.values
-        if outcome.seconds > watched.deadline:
-            self._mark(watched, f"answered after {outcome.seconds:.3g} s")
+        if outcome.age > watched.deadline:
+            self._mark(watched, f"answered after {outcome.age:.3g} s")
         else:
             self._mark(watched, outcome.reason)
         self._choose_lane(watched, outcome.seconds)
@@ -281,8 +284,12 @@ class _Lane:
 
     def _serve(self) -> None:
         # Without a time-out, as it waits for orders alone: `end` is always among them.
-        while not self._dismissed and (call := self._queue.get()) is not None:
+        while (call := self._queue.get()) is not None:
             call()
+            if self._dismissed:
+                return
+        if self._dismissed:  # it was free after all, and has taken the end meant for its successor
+            self._queue.put(None)
 
 
 class _Watched:
@@ -308,6 +315,7 @@ class _Watched:
         self.quick_reads = 0
         self.reason = ""
         self.busy = False
+        self.asked = -math.inf
         self.closed = False
         self.outcome: _Outcome | None = None
         self._started: float | None = None
@@ -315,19 +323,18 @@ class _Watched:
         self._period = made.period
         self._clock = clock
         self._progress = progress
-        self._due = -math.inf
-        self._reported = ""
+        self.due = self._nominal = -math.inf
+        self.reported_stale = False
         self._report_times: list[float] = []
-
-    def is_due(self, now: float) -> bool:
-        """A quarter of a period early counts as due, so that jitter skips no cycle."""
-        return now + self._period / 4 >= self._due
 
     def prepare(self, now: float) -> Callable[[], None]:
         """The read to carry out, counted as under way from now on."""
-        following = self._due + self._period
-        self._due = following if following > now else now + self._period
+        following = self._nominal + self._period
+        self._nominal = following if following > now else now + self._period
+        # A quarter of a period early is due as well, so that jitter skips no cycle.
+        self.due = self._nominal - self._period / 4
         self._started = None
+        self.asked = now
         self.busy = True
         return self._read
 
@@ -335,19 +342,18 @@ class _Watched:
         """Seconds since the read under way began; 0 while it is queued."""
         return 0.0 if self._started is None else now - self._started
 
-    def report(self, now: float) -> ProbeReport | None:
-        """What there is to say anew, bounded in number."""
-        if bool(self.reason) == bool(self._reported):
-            return None
+    def report(self, now: float) -> list[ProbeReport]:
+        """The readings went stale or came back: what there is to say, bounded in number."""
         self._report_times = [t for t in self._report_times if now - t < REPORT_WINDOW]
         if len(self._report_times) >= REPORTS:
-            return None
+            return []
         self._report_times.append(now)
-        self._reported = self.reason
+        self.reported_stale = bool(self.reason)
         reason = self.reason
         if len(self._report_times) == REPORTS:
-            reason += f" (it changes often: silent for up to {REPORT_WINDOW:g} s)"
-        return ProbeReport(self.name, self.names, bool(self.reason), reason)
+            remark = f"it changes often, so this is the last report for up to {REPORT_WINDOW:g} s"
+            reason = f"{reason}; {remark}" if reason else remark
+        return [ProbeReport(self.name, self.names, self.reported_stale, reason)]
 
     def close(self) -> None:
         """Close the probe, in the thread that reads it."""
@@ -369,7 +375,8 @@ class _Watched:
         except BaseException as error:  # noqa: BLE001 - the guard: whatever a plugin raises, even
             # SystemExit, makes its readings stale and harms nothing else.
             reason = f"read() raised {type(error).__name__}: {error}"
-        self.outcome = _Outcome(values, reason, self._clock() - started)
+        ended = self._clock()
+        self.outcome = _Outcome(values, reason, ended - started, ended - self.asked)
         self.busy = False
         self._progress.set()
 

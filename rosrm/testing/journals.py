@@ -7,7 +7,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 from unittest import SkipTest
 
 from rosrm.ports import Intent, Journal, Record, StoredRecord
@@ -72,7 +72,7 @@ class JournalContract:
         durable: what was written is there again when the journal is opened anew.
     """
 
-    durable = True
+    durable: ClassVar[bool] = True
 
     def open(self, directory: Path) -> Journal:
         """The journal in a directory, made where it is not there yet."""

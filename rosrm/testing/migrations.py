@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, ClassVar
 
 from rosrm.core.migration import Commit, Execute, Move, Plan, Start, Step, Stop
 from rosrm.core.migration import plan_fault as fault_of
@@ -22,9 +22,9 @@ class MigrationContract:
         spec: of a process that the strategy can move.
     """
 
-    offer: MigrationOffer
-    options: Mapping[str, Any] = EMPTY
-    spec: ProcessSpec = ProcessSpec("p", command=("true",))
+    offer: ClassVar[MigrationOffer]
+    options: ClassVar[Mapping[str, Any]] = EMPTY
+    spec: ClassVar[ProcessSpec] = ProcessSpec("p", command=("true",))
 
     def make(self) -> MigrationStrategy:
         """A new strategy; override it where more is needed."""

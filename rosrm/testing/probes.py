@@ -8,7 +8,7 @@ import threading
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 from unittest import SkipTest
 
 from rosrm.core.model import EMPTY, Reading, ResourceDescription
@@ -117,9 +117,9 @@ class ProbeContract:
         context: what the probe is made with.
     """
 
-    offer: ProbeOffer
-    options: Mapping[str, Any] = EMPTY
-    context: ProbeContext = probe_context()
+    offer: ClassVar[ProbeOffer]
+    options: ClassVar[Mapping[str, Any]] = EMPTY
+    context: ClassVar[ProbeContext] = probe_context()
 
     def make(self) -> Probe:
         """A new probe; override it where more is needed."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -72,8 +72,8 @@ class ScoringContract:
         options: settings by name; the others have their defaults.
     """
 
-    offer: ScoringOffer
-    options: Mapping[str, Any] = EMPTY
+    offer: ClassVar[ScoringOffer]
+    options: ClassVar[Mapping[str, Any]] = EMPTY
 
     def make(self) -> ScoringPolicy:
         """A new policy; override it where more is needed."""

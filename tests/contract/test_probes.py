@@ -1,6 +1,7 @@
 """Every shipped probe holds the contract that a third party's holds, in every scope."""
 
 from pathlib import Path
+from typing import ClassVar
 
 import pytest
 
@@ -58,7 +59,7 @@ class TestGpu(ProbeContract):
 
 class TestNetwork(ProbeContract):
     offer = OFFERS["network"]
-    options = {"interfaces": ("lo",), "capacity": 1e9}
+    options: ClassVar = {"interfaces": ("lo",), "capacity": 1e9}
 
 
 def test_each_shipped_probe_is_here():
@@ -76,7 +77,7 @@ class TestFake(ProbeContract):
 class _Leaking(FakeProbe):
     def __init__(self):
         super().__init__(a=0.5)
-        self.file = open(__file__)  # noqa: SIM115 - the leak is the point
+        self.file = Path(__file__).open()  # noqa: SIM115 - the leak is the point
         _LEAKED.append(self.file)
 
 

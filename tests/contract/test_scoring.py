@@ -1,5 +1,7 @@
 """Every shipped scoring policy holds the contract that a third party's holds."""
 
+from typing import ClassVar
+
 import numpy as np
 import pytest
 
@@ -15,7 +17,7 @@ class TestWeighted(ScoringContract):
 
 
 class TestWeightedByGpu(TestWeighted):
-    options = {"weights": {"gpu": 1.0, "gpu_memory": 0.3, "cpu": 0.1}}
+    options: ClassVar = {"weights": {"gpu": 1.0, "gpu_memory": 0.3, "cpu": 0.1}}
 
 
 class TestThreshold(ScoringContract):
@@ -23,7 +25,7 @@ class TestThreshold(ScoringContract):
 
 
 class TestNarrowThreshold(TestThreshold):
-    options = {"enter": 0.5, "leave": 0.4, "watch": ("gpu",), "weights": {}}
+    options: ClassVar = {"enter": 0.5, "leave": 0.4, "watch": ("gpu",), "weights": {}}
 
 
 def test_each_shipped_policy_is_here():

@@ -187,7 +187,7 @@ def test_counts_cpus(text, count):
 
 @pytest.mark.parametrize(("text", "number"), [("max", None), ("-1", None), ("", None), ("5 9", 5)])
 def test_reads_limits(tmp_path, text, number):
-    """ "max" and -1 are no limit, nor is an empty or missing file."""
+    """The word max and -1 are no limit, nor is an empty or missing file."""
     (tmp_path / "limit").write_text(text)
     assert read_number(tmp_path / "limit") == number
     assert read_number(tmp_path / "missing") is None

@@ -19,9 +19,8 @@ def hosts(draw):
     return host_view({name: draw(columns) for name in names or ["memory"]})
 
 
-weights = st.dictionaries(
-    st.sampled_from(["memory", "cpu", "disk", "gpu", "absent"]), st.floats(0, 1)
-)
+weighable = st.sampled_from(["memory", "cpu", "disk", "gpu", "absent"])
+weights = st.dictionaries(weighable, st.floats(0, 1))
 
 
 def score(view, **given_weights):
