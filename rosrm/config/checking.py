@@ -46,6 +46,15 @@ _WANTED: Final = {
 }
 
 
+#: What a bound of annotated_types asks for.
+_BOUNDS: Final = {
+    "greater_than": "greater than",
+    "greater_than_equal": "at least",
+    "less_than": "less than",
+    "less_than_equal": "at most",
+}
+
+
 def validated(wanted: type[T], node: Node, problems: Problems, where: str = "") -> T | None:
     """The value of a document, or None with every problem noted.
 
@@ -97,21 +106,21 @@ def _note(
     path = tuple(step for step in error["loc"][1:] if step != "[key]")
     target = node.deepest(path)
     if error["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
-        inside = dotted(path[:-1], where)
+        inside = _named(path[:-1], where)
         note = f"unknown key {path[-1]!r}" + (f" in {inside}" if inside else "")
         allowed = list(_allowed(wanted, path[:-1]))
         problems.add(target.key_place or target.place, note + near(str(path[-1]), allowed))
         return
-    prefix = dotted(path, where)
+    prefix = _named(path, where)
     problems.add(target.place, (f"{prefix}: " if prefix else "") + _said(error))
 
 
-def dotted(path: tuple[str | int, ...], where: str = "") -> str:
-    """A path as people write it: `processes[2].restart.delay`."""
-    text = where
+def _named(path: tuple[str | int, ...], where: str) -> str:
+    """A path as people write it, after what it is a part of: `options of X: many[2].delay`."""
+    text = ""
     for step in path:
         text += f"[{step}]" if isinstance(step, int) else f".{step}" if text else step
-    return text
+    return ": ".join(part for part in (where, text) if part)
 
 
 def _said(error: Mapping[str, Any]) -> str:
@@ -122,6 +131,9 @@ def _said(error: Mapping[str, Any]) -> str:
         return "is missing"
     if kind == "literal_error":
         return _not_one_of(given, error["ctx"]["expected"])
+    if kind in _BOUNDS:
+        bound = next(iter(error["ctx"].values()))
+        return f"{described(given)} is not {_BOUNDS[kind]} {bound}"
     if kind in _WANTED:
         return f"{_WANTED[kind]} is wanted, not {described(given)}"
     return f"{error['msg'][:1].lower()}{error['msg'][1:]}, and {described(given)} is given"

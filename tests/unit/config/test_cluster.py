@@ -171,8 +171,8 @@ def test_options_are_checked_against_the_plugin_and_kept_in_base_units(file, reg
 def test_a_wrong_option_names_plugin_option_allowed_ones_and_place(refusal, registry):
     said = refusal(load_cluster, "scoring: {options: {mem: 1.5, cpu: 0.6, memory: 1}}", registry)
     title = "options of scoring policy 'weighted'"
-    assert f"f.yaml:1:26: {title}.mem: 1.5 is not within 0..1" in said
-    assert f"f.yaml:1:36: {title}.cpu: input should be less than or equal to 0.5" in said
+    assert f"f.yaml:1:26: {title}: mem: 1.5 is not within 0..1" in said
+    assert f"f.yaml:1:36: {title}: cpu: 0.6 is not at most 0.5" in said
     assert f"f.yaml:1:41: unknown key 'memory' in {title}; did you mean 'mem'?" in said
     assert "Allowed: mem, cpu, window, order" in said
 
