@@ -1,0 +1,81 @@
+"""A mapped piece of a drive, as `map_piece` leaves it on disk and `merge` joins it."""
+
+from __future__ import annotations
+
+import os
+import zipfile
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+
+from rosrm_examples.arrays import Arrays, Floats, Keys, Points
+from rosrm_examples.errors import PieceError
+
+
+@dataclass(frozen=True)
+class MapPiece:
+    """What mapping one piece gave, in the frame of the piece's first scan.
+
+    Attributes:
+        number: Which piece this is, from 1.
+        of: How many pieces the drive was cut into.
+        indices: (S,) numbers of its scans in the whole drive.
+        times: (S,) seconds.
+        poses: (S, 4, 4).
+        points: (P, 3) float32 metres, the map.
+    """
+
+    number: int
+    of: int
+    indices: Keys
+    times: Floats
+    poses: Floats
+    points: Points
+
+
+def piece_path(folder: Path, number: int) -> Path:
+    """Returns where a piece lies in the folder of pieces."""
+    return folder / f"piece_{number:02d}.npz"
+
+
+def save_piece(folder: Path, piece: MapPiece) -> Path:
+    """Writes a piece into a folder so that a reader finds either nothing or all of it."""
+    path = piece_path(folder, piece.number)
+    unfinished = path.with_suffix(f".{os.getpid()}.tmp")
+    try:
+        with unfinished.open("wb") as file:
+            np.savez(file, **{field.name: getattr(piece, field.name) for field in fields(piece)})
+        unfinished.replace(path)
+    finally:
+        unfinished.unlink(missing_ok=True)
+    return path
+
+
+def load_piece(path: Path) -> MapPiece:
+    """Reads a piece; raises PieceError where there is none or it is damaged."""
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            arrays: Arrays = {field.name: archive[field.name] for field in fields(MapPiece)}
+    except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
+        raise PieceError(f"{path}: not a piece of a map: {error}") from error
+    return MapPiece(
+        number=int(arrays["number"]),
+        of=int(arrays["of"]),
+        indices=arrays["indices"],
+        times=arrays["times"],
+        poses=arrays["poses"],
+        points=arrays["points"],
+    )
+
+
+def load_pieces(folder: Path) -> list[MapPiece]:
+    """Reads all pieces of a drive from a folder; raises PieceError where one is missing."""
+    paths = sorted(folder.glob("piece_*.npz"))
+    if not paths:
+        raise PieceError(f"{folder}: no pieces (piece_01.npz, ...) are here")
+    pieces = sorted((load_piece(path) for path in paths), key=lambda piece: piece.number)
+    numbers, of = [piece.number for piece in pieces], pieces[0].of
+    if numbers != list(range(1, of + 1)):
+        raise PieceError(f"{folder}: pieces 1 to {of} are needed, found are {numbers}")
+    return pieces
