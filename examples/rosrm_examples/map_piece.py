@@ -1,0 +1,143 @@
+"""A ROS 2 node that maps one piece of a LiDAR drive and exits.
+
+    python -m rosrm_examples.map_piece --drive kitti0001 --piece 2 --of 6 --out out/pieces
+
+It publishes the pose of every scan on `odometry` (nav_msgs/Odometry) and writes piece_02.npz at its
+end. Exit status: 0 when the piece is written, 2 when the arguments cannot be used, and 128 + signal
+number when SIGINT or SIGTERM stopped it first; then nothing is written.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy: one process is one core's work
+if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # ends the imports below without a traceback
+
+import argparse
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from types import FrameType
+
+import numpy as np
+from geometry_msgs.msg import Point, Quaternion, Vector3
+from nav_msgs.msg import Odometry
+from rclpy.node import Node
+from rclpy.utilities import remove_ros_args
+
+from rosrm_examples.drives import DEFAULT_OVERLAP, Drive, load_drive
+from rosrm_examples.errors import ExampleError
+from rosrm_examples.lean_node import lean_node
+from rosrm_examples.pieces import MapPiece, save_piece
+from rosrm_examples.poses import quaternion
+from rosrm_examples.slam import Slam
+
+PROGRESS_SCANS = 10
+
+
+class StopSignals:
+    """Notes SIGINT and SIGTERM, so that the node stops between two scans and never within one.
+
+    Attributes:
+        came: The number of the signal that came last, or None.
+    """
+
+    def __init__(self) -> None:
+        """Takes both signals over."""
+        self.came: int | None = None
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._note)
+
+    def _note(self, number: int, _: FrameType | None) -> None:
+        self.came = number
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Maps a piece; returns the exit status."""
+    raw = list(sys.argv if arguments is None else ["map_piece", *arguments])
+    options = _parse(remove_ros_args(raw)[1:])
+    stop = StopSignals()
+    try:
+        piece = load_drive(options.drive).piece(options.piece, options.of, options.overlap)
+        options.out.mkdir(parents=True, exist_ok=True)  # if that fails, then before the work
+        with lean_node("map_piece", raw) as node:
+            slam = _map(piece, node, options.rate, stop)
+        if stop.came is not None:
+            print(f"stopped by {signal.Signals(stop.came).name}, nothing written", flush=True)
+            return 128 + stop.came
+        path = save_piece(options.out, _result(options.piece, options.of, piece, slam))
+    except (ExampleError, OSError) as error:
+        print(f"map_piece: {error}", file=sys.stderr)
+        return 2
+    print(f"wrote {path}: {len(slam.poses)} scans", flush=True)
+    return 0
+
+
+def _parse(arguments: Sequence[str]) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="python -m rosrm_examples.map_piece")
+    parser.add_argument("--drive", required=True, help="name or path of the drive")
+    parser.add_argument("--piece", required=True, type=int, help="which piece, from 1")
+    parser.add_argument("--of", required=True, type=int, help="number of pieces")
+    parser.add_argument("--out", required=True, type=Path, help="folder for piece_KK.npz")
+    parser.add_argument(
+        "--overlap", type=int, default=DEFAULT_OVERLAP, help="scans shared with the next piece"
+    )
+    parser.add_argument(
+        "--rate", type=float, default=0.0, help="scans a second at most; 0: as fast as it can"
+    )
+    return parser.parse_args(arguments)
+
+
+def _map(piece: Drive, node: Node, rate: float, stop: StopSignals) -> Slam:
+    """Runs SLAM over a piece and publishes each pose, up to the end or a signal."""
+    publisher = node.create_publisher(Odometry, "odometry", 10)
+    slam = Slam()
+    started, cpu_before = time.monotonic(), time.process_time()
+    for done, (points, t) in enumerate(zip(piece.scans(), piece.times, strict=True), start=1):
+        if stop.came is not None:
+            break
+        slam.add_scan(points, float(t))
+        publisher.publish(_odometry(slam))
+        if done % PROGRESS_SCANS == 0 or done == len(piece):
+            cpu = (time.process_time() - cpu_before) / done
+            print(f"{done}/{len(piece)} scans, {cpu:.3f} s of CPU a scan", flush=True)
+        if rate > 0:
+            time.sleep(max(0.0, started + done / rate - time.monotonic()))
+    return slam
+
+
+def _result(number: int, of: int, piece: Drive, slam: Slam) -> MapPiece:
+    return MapPiece(
+        number=number,
+        of=of,
+        indices=piece.indices,
+        times=piece.times,
+        poses=np.array(slam.poses),
+        points=slam.map_points(),
+    )
+
+
+def _odometry(slam: Slam) -> Odometry:
+    """Turns the present pose and velocity into a message."""
+    pose, t = slam.poses[-1], slam.times[-1]
+    x, y, z = (float(value) for value in pose[:3, 3])
+    qx, qy, qz, qw = quaternion(pose[:3, :3])
+    velocity = [float(value) for value in slam.velocity]
+    message = Odometry()
+    message.header.stamp.sec = int(t)
+    message.header.stamp.nanosec = int((t - int(t)) * 1e9)
+    message.header.frame_id = "map"
+    message.child_frame_id = "lidar"
+    message.pose.pose.position = Point(x=x, y=y, z=z)
+    message.pose.pose.orientation = Quaternion(x=qx, y=qy, z=qz, w=qw)
+    message.twist.twist.linear = Vector3(x=velocity[0], y=velocity[1], z=velocity[2])
+    message.twist.twist.angular = Vector3(x=velocity[3], y=velocity[4], z=velocity[5])
+    return message
+
+
+if __name__ == "__main__":
+    sys.exit(main())

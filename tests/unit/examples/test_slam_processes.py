@@ -1,0 +1,153 @@
+"""The examples as real processes: the ROS 2 node that maps, and the process that holds memory."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from rosrm_examples.pieces import load_piece
+
+Start = Callable[..., subprocess.Popen[str]]
+
+
+@pytest.fixture
+def start() -> Iterator[Start]:
+    """Starts modules of the examples; whatever is left at the end is killed."""
+    started: list[subprocess.Popen[str]] = []
+    environment = {
+        **os.environ,
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "ROS_DOMAIN_ID": str(os.getpid() % 100 + 1),
+    }
+
+    def start_module(module: str, *arguments: str) -> subprocess.Popen[str]:
+        process = subprocess.Popen(
+            [sys.executable, "-m", f"rosrm_examples.{module}", *arguments],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=environment,
+        )
+        started.append(process)
+        return process
+
+    yield start_module
+    for process in started:
+        process.kill()
+        process.communicate()
+
+
+def resident_mb(process: subprocess.Popen[str]) -> float:
+    """The private memory that a process really has, MB."""
+    pages = Path(f"/proc/{process.pid}/statm").read_text().split()
+    return (int(pages[1]) - int(pages[2])) * os.sysconf("SC_PAGESIZE") / 1e6
+
+
+def wait_until(condition: Callable[[], bool], seconds: float = 10.0) -> None:
+    """Waits for a condition; fails when it does not come true in time."""
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "it did not come true in time"
+        time.sleep(0.02)
+
+
+def test_map_piece_maps_its_piece(start: Start, tmp_path: Path) -> None:
+    """The node writes its piece, tells how far it is, and exits with 0."""
+    pytest.importorskip("rclpy")
+    arguments = ["--drive", "street:30", "--piece", "2", "--of", "2", "--out", str(tmp_path)]
+    node = start("map_piece", *arguments, "--ros-args", "-r", "__node:=mapper")
+    output, errors = node.communicate(timeout=30)
+    assert (node.returncode, errors) == (0, "")
+    assert "10/15 scans" in output
+    assert "15/15 scans" in output
+    assert load_piece(tmp_path / "piece_02.npz").indices.tolist() == list(range(15, 30))
+
+
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
+def test_map_piece_stops_cleanly(start: Start, tmp_path: Path, stop: signal.Signals) -> None:
+    """A signal ends the node without a traceback, without a file, and not as a success."""
+    pytest.importorskip("rclpy")
+    arguments = ["--drive", "street:100", "--piece", "1", "--of", "1", "--out", str(tmp_path)]
+    node = start("map_piece", *arguments, "--rate", "20")
+    assert node.stdout is not None
+    node.stdout.readline()
+    node.send_signal(stop)
+    output, errors = node.communicate(timeout=10)
+    assert (node.returncode, errors) == (128 + stop, "")
+    assert f"stopped by {stop.name}" in output
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_map_piece_says_what_it_cannot_use(start: Start, tmp_path: Path) -> None:
+    """A piece that is not there ends in one line and exit status 2."""
+    pytest.importorskip("rclpy")
+    arguments = ["--drive", "street:30", "--piece", "3", "--of", "2", "--out", str(tmp_path)]
+    node = start("map_piece", *arguments)
+    _, errors = node.communicate(timeout=30)
+    assert node.returncode == 2
+    assert errors == "map_piece: piece 3 of 2: pieces are numbered from 1 to 2\n"
+
+
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
+def test_holder_holds_what_it_is_told_until_a_signal(start: Start, stop: signal.Signals) -> None:
+    """The memory is really there, beyond the process's own, and a signal ends it with 0."""
+    empty, full = start("holder", "--mb", "0"), start("holder", "--mb", "60")
+    wait_until(lambda: resident_mb(full) > 60)
+    wait_until(lambda: resident_mb(empty) > 3)
+    time.sleep(0.2)
+    assert resident_mb(full) - resident_mb(empty) == pytest.approx(60, abs=3)
+    full.send_signal(stop)
+    assert (full.wait(timeout=5), full.communicate()) == (0, ("", ""))
+
+
+def test_holder_grows_and_ends_by_itself(start: Start) -> None:
+    """Memory grows at the rate asked for, and the process ends with 0 when its time is over."""
+    holder = start("holder", "--mb", "10", "--grow", "40", "--seconds", "1.5")
+    wait_until(lambda: resident_mb(holder) > 45)
+    assert (holder.wait(timeout=5), holder.communicate()) == (0, ("", ""))
+
+
+def test_holder_is_small_without_ros() -> None:
+    """Neither numpy nor rclpy is loaded for a plain holder."""
+    code = (
+        "import sys, rosrm_examples.holder as holder\n"
+        "assert holder.main(['--mb', '1', '--seconds', '0']) == 0\n"
+        "assert not {'numpy', 'rclpy'} & set(sys.modules), 'too much is loaded'\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=20)
+
+
+def test_holder_can_be_a_ros_node(start: Start) -> None:
+    """With --ros it is in the ROS graph, takes remappings, and still stops by a signal with 0."""
+    pytest.importorskip("rclpy")
+    holder = start("holder", "--mb", "5", "--ros", "--ros-args", "-r", "__node:=h1")
+    wait_until(lambda: resident_mb(holder) > 15)
+    time.sleep(0.3)
+    holder.send_signal(signal.SIGTERM)
+    output, errors = holder.communicate(timeout=5)
+    assert (holder.returncode, output, errors) == (0, "", "")
+
+
+@pytest.mark.parametrize("size", ["-5", "much", "nan", "inf"])
+def test_holder_refuses_what_is_no_size(start: Start, size: str) -> None:
+    """The error names the option and what is allowed."""
+    holder = start("holder", "--mb", size)
+    _, errors = holder.communicate(timeout=5)
+    assert holder.returncode == 2
+    assert f"argument --mb: {size} is not a number from 0" in errors
+
+
+def test_holder_says_when_there_is_no_more_memory(start: Start) -> None:
+    """More than the machine can ever give ends in one line, not in a traceback."""
+    holder = start("holder", "--mb", "1e12")
+    _, errors = holder.communicate(timeout=5)
+    assert holder.returncode == 1
+    assert errors.startswith("holder: no more memory to be had: ")
+    assert errors.count("\n") == 1
