@@ -7,7 +7,6 @@ import fcntl
 import json
 import logging
 import os
-import secrets
 import signal
 import socket
 import time
@@ -111,7 +110,7 @@ class MasterRuntime:
     def _new_endpoint(self) -> MasterEndpoint:
         identity = Identity(
             self._config.name, socket.gethostname(), os.getpid(), self._state.epoch,
-            secrets.randbits(63) | 1,
+            int.from_bytes(os.urandom(7), "big") | 1,
         )  # fmt: skip
         control = self._config.control
         return MasterEndpoint(

@@ -7,7 +7,7 @@ delivers requests seconds late after a cut. Repeated ids are answered again, not
 
 from __future__ import annotations
 
-import uuid
+import os
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -186,7 +186,7 @@ class ControlClient:
     def envelope(self, receiver_beat: int, epoch: int = 0) -> Envelope:
         """The head of a new request."""
         return Envelope(
-            protocol_version=PROTOCOL_VERSION, request_id=uuid.uuid4().hex, sender=self.sender,
+            protocol_version=PROTOCOL_VERSION, request_id=os.urandom(16).hex(), sender=self.sender,
             epoch=epoch, receiver_beat=receiver_beat,
         )  # fmt: skip
 

@@ -6,7 +6,6 @@ import contextlib
 import fcntl
 import logging
 import os
-import secrets
 import signal
 import socket
 import sys
@@ -116,7 +115,7 @@ class SlaveRuntime:
     def _description(self, absent: Mapping[str, str]) -> HostDescription:
         config = self._config
         return HostDescription(
-            name=config.host, incarnation=secrets.randbits(63) | 1, hostname=socket.gethostname(),
+            name=config.host, incarnation=int.from_bytes(os.urandom(7), "big") | 1, hostname=socket.gethostname(),
             pid=os.getpid(), software_version=__version__, labels=config.labels,
             resources=tuple(self._sampler.resources), max_processes=config.max_processes,
             period=config.period, executors=tuple(self._executors), absent=absent,
