@@ -1,0 +1,97 @@
+"""From `submit` called to the process running, one process at a time, beside a bare spawn.
+
+The process is `date`, which stamps the time itself as its first act; the bare spawn in the same run
+starts the same program with Python's subprocess.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.hosts import three_hosts
+from benchmarks.machine import print_report
+from rosrm.core.model import InstanceId, Kind, ProcessSpec
+from rosrm.local_cluster import LocalCluster
+from rosrm.supervisor.client import log_path
+
+_STAMP = ("date", "+%s%N")
+_NS_PER_MS = 1e6
+
+
+def bare_spawn_ms(folder: Path) -> float:
+    """Milliseconds from the call to the stamp of a process without rosrm."""
+    out = folder / "bare"
+    with out.open("wb") as sink:
+        called = time.time_ns()
+        process = subprocess.Popen(
+            _STAMP, stdin=subprocess.DEVNULL, stdout=sink, stderr=sink, start_new_session=True
+        )
+    process.wait(10.0)
+    return (int(out.read_text()) - called) / _NS_PER_MS
+
+
+def submitted_ms(cluster: LocalCluster, number: int) -> float:
+    """Milliseconds from `submit` called to the stamp of the process."""
+    name = f"stamp{number}"
+    called = time.time_ns()
+    cluster.client.submit([ProcessSpec(name, command=_STAMP, kind=Kind.JOB)])
+    _wait_for_end(cluster, name)
+    return (_stamp_of(cluster, name) - called) / _NS_PER_MS
+
+
+def _wait_for_end(cluster: LocalCluster, name: str, timeout: float = 10.0) -> None:
+    """Look seldom, so that looking is no part of what is measured."""
+    deadline = time.monotonic() + timeout
+    while True:
+        cluster.client.spin(0.02)
+        (row,) = cluster.client.list(processes=True, process=name).processes
+        if row.state == "finished":
+            return
+        if time.monotonic() >= deadline:
+            raise TimeoutError(f"{name} did not finish in {timeout:g} s: it is {row.state}")
+
+
+def _stamp_of(cluster: LocalCluster, name: str) -> int:
+    for host in cluster.slaves:
+        state = cluster.directory / "hosts" / host / "supervisor"
+        for log in log_path(state, InstanceId(name, 0)).parent.glob("*.log"):
+            return int(log.read_text())
+    raise FileNotFoundError(f"no slave has a log of {name}")
+
+
+def main() -> None:
+    """Measure and print one JSON object."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--runs", type=int, default=300)
+    parser.add_argument("--warm-up", type=int, default=20)
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="rosrm-latency-") as folder:
+        directory = Path(folder)
+        with LocalCluster(directory, hosts=three_hosts()) as cluster:
+            spawns, totals = [], []
+            for number in range(arguments.warm_up + arguments.runs):
+                # Interleaved: what the machine does meanwhile hits both alike.
+                spawns.append(bare_spawn_ms(directory))
+                totals.append(submitted_ms(cluster, number))
+    spawns, totals = spawns[arguments.warm_up :], totals[arguments.warm_up :]
+    print_report(
+        "latency",
+        {
+            "p50_ms": float(np.percentile(totals, 50)),
+            "p99_ms": float(np.percentile(totals, 99)),
+            "spawn_p50_ms": float(np.percentile(spawns, 50)),
+            "spawn_p99_ms": float(np.percentile(spawns, 99)),
+            "beyond_spawn_p50_ms": float(np.percentile(totals, 50) - np.percentile(spawns, 50)),
+        },
+        runs=arguments.runs,
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,106 @@
+"""What a slave costs that has nothing to do, beside a bare rclpy node.
+
+A registered slave at 10 Hz with no process, its supervisor included, and in the same run a bare
+rclpy node that publishes the same message at 10 Hz from a timer. CPU is that of all threads over
+the measured time; memory is PSS, so that pages shared by several processes count once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import psutil
+
+from benchmarks.machine import print_report
+from rosrm.config.settings import HostConfig
+from rosrm.local_cluster import LocalCluster
+
+_BARE = """
+import rclpy
+from rclpy.node import Node
+from rosrm_msgs.msg import ResourceInfo
+
+rclpy.init()
+node = Node("bare")
+publisher = node.create_publisher(ResourceInfo, "bare_resource_info", 1)
+message = ResourceInfo(protocol_version=1)
+node.create_timer(0.1, lambda: publisher.publish(message))
+print("ready", flush=True)
+rclpy.spin(node)
+"""
+_MIB = 2.0**20
+
+
+def cpu_seconds(processes: Sequence[psutil.Process]) -> float:
+    """User and system time of these processes so far."""
+    return sum(sum(process.cpu_times()[:2]) for process in processes)
+
+
+def pss_mib(processes: Sequence[psutil.Process]) -> float:
+    """Proportional set size, summed."""
+    return float(sum(process.memory_full_info().pss for process in processes)) / _MIB
+
+
+def supervisor_of(slave: psutil.Process, directory: Path) -> psutil.Process:
+    """The supervisor that serves the slave's state directory."""
+    for process in psutil.process_iter(["cmdline"]):
+        line = process.info["cmdline"] or []
+        if any("supervisor" in word for word in line) and any(str(directory) in w for w in line):
+            return process
+    raise LookupError(f"no supervisor for {directory} (slave pid {slave.pid})")
+
+
+def main() -> None:
+    """Measure and print one JSON object."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seconds", type=float, default=30.0)
+    seconds = parser.parse_args().seconds
+    with (
+        tempfile.TemporaryDirectory(prefix="rosrm-slave-cost-") as folder,
+        LocalCluster(Path(folder), hosts=[HostConfig(host="host0")]) as cluster,
+    ):
+        bare = subprocess.Popen(
+            [sys.executable, "-c", _BARE], stdout=subprocess.PIPE, stdin=subprocess.DEVNULL
+        )
+        try:
+            assert bare.stdout is not None
+            if bare.stdout.readline() != b"ready\n":
+                raise RuntimeError("the bare node did not come up")
+            result = _measure(cluster, psutil.Process(bare.pid), Path(folder), seconds)
+        finally:
+            bare.terminate()
+            bare.wait(10.0)
+    print_report("slave_cost", result, runs=1)
+
+
+def _measure(
+    cluster: LocalCluster, bare: psutil.Process, folder: Path, seconds: float
+) -> dict[str, float]:
+    slave = psutil.Process(cluster.slaves["host0"].process.pid)
+    supervisor = supervisor_of(slave, folder)
+    ours = [slave, supervisor]
+    cluster.client.spin(3.0)
+    slave_before, bare_before, begun = cpu_seconds(ours), cpu_seconds([bare]), time.monotonic()
+    supervisor_before = cpu_seconds([supervisor])
+    while time.monotonic() - begun < seconds:
+        cluster.client.spin(0.5)
+    elapsed = time.monotonic() - begun
+    return {
+        "slave_cpu": (cpu_seconds(ours) - slave_before) / elapsed,
+        "bare_cpu": (cpu_seconds([bare]) - bare_before) / elapsed,
+        "supervisor_cpu": (cpu_seconds([supervisor]) - supervisor_before) / elapsed,
+        "slave_pss_mib": pss_mib(ours),
+        "bare_pss_mib": pss_mib([bare]),
+        "supervisor_pss_mib": pss_mib([supervisor]),
+        "seconds": elapsed,
+    }
+
+
+if __name__ == "__main__":
+    main()

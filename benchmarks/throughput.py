@@ -1,0 +1,86 @@
+"""Many short jobs at once, and how well slots are kept busy.
+
+Two measurements on three hosts: 300 times `true` submitted at once (jobs a second, from `submit`
+called to the last one known as finished), and 150 times `sleep 0.1` with one slot a host (makespan
+over the ideal of 50 sleeps in a row).
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from benchmarks.hosts import three_hosts
+from benchmarks.machine import print_report
+from rosrm.config.settings import HostConfig
+from rosrm.core.model import Kind, ProcessSpec
+from rosrm.local_cluster import LocalCluster
+
+_TRUE = 300
+_SLEEPS, _SLEEP_S = 150, 0.1
+
+
+def makespan(cluster: LocalCluster, specs: Sequence[ProcessSpec]) -> float:
+    """Seconds from `submit` called to the last process finished, by the master's record."""
+    before = cluster.client.list().last_sequence
+    started = time.time()
+    cluster.client.submit(specs)
+    names = {spec.name for spec in specs}
+
+    def all_finished(view: object) -> bool:
+        events = cluster.client.list(events=True, after=before, newest=1).events
+        return bool(events) and _finished(cluster, names)
+
+    cluster.wait_until(f"{len(specs)} processes finished", all_finished, timeout=120.0)
+    events = cluster.client.list(events=True, after=before, newest=10_000).events
+    last = max(event.wall_time for event in events if event.kind == "finished")
+    return last - started
+
+
+def _finished(cluster: LocalCluster, names: set[str]) -> bool:
+    rows = cluster.client.list(processes=True).processes
+    return all(row.state == "finished" for row in rows if row.name in names)
+
+
+def measure(hosts: Sequence[HostConfig], specs: Sequence[ProcessSpec]) -> float:
+    """The makespan on a fresh cluster that has warmed up with one job a host."""
+    with (
+        tempfile.TemporaryDirectory(prefix="rosrm-throughput-") as folder,
+        LocalCluster(Path(folder), hosts=hosts) as cluster,
+    ):
+        makespan(cluster, [_job(f"warm{i}", "true") for i in range(30)])
+        return makespan(cluster, specs)
+
+
+def _job(name: str, *command: str) -> ProcessSpec:
+    return ProcessSpec(name, command=command, kind=Kind.JOB)
+
+
+def main() -> None:
+    """Measure and print one JSON object."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--runs", type=int, default=5)
+    runs = parser.parse_args().runs
+    jobs = [_job(f"true{i}", "true") for i in range(_TRUE)]
+    sleeps = [_job(f"sleep{i}", "sleep", str(_SLEEP_S)) for i in range(_SLEEPS)]
+    ideal = _SLEEPS / 3 * _SLEEP_S
+    rates, ratios = [], []
+    for _ in range(runs):
+        rates.append(_TRUE / measure(three_hosts(), jobs))
+        ratios.append(measure(three_hosts(max_processes=1), sleeps) / ideal)
+    print_report(
+        "throughput",
+        {
+            "jobs_per_s": statistics.median(rates), "jobs_per_s_all": rates,
+            "makespan_over_ideal": statistics.median(ratios), "makespan_over_ideal_all": ratios,
+        },
+        runs=runs,
+    )  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()
