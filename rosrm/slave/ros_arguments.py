@@ -13,7 +13,9 @@ from rosrm.errors import LaunchError
 _BEGIN: Final = "--ros-args"
 _END: Final = "--"
 #: Characters that YAML wants escaped and JSON leaves as they are.
-_UNPRINTABLE: Final = {code: f"\\x{code:02x}" for code in range(0x7F, 0xA0)}
+_UNPRINTABLE: Final = {
+    code: f"\\u{code:04x}" for code in (*range(0x7F, 0xA0), 0x2028, 0x2029, 0xFEFF, 0xFFFE, 0xFFFF)
+}
 _LARGEST: Final = 2**63
 
 

@@ -146,11 +146,9 @@ class SupervisorClient:
     def start(self, orders: Sequence[LaunchOrder]) -> None:
         """Have instances started; repeating an order starts nothing twice."""
         with self._sending:
-            lines = [protocol.encode_order(launch) for launch in map(self._launch, orders)]
             if orders and self._base is None:
                 self._choose_base(orders[0].environment)
-                lines = [protocol.encode_order(launch) for launch in map(self._launch, orders)]
-            self._send(b"".join(lines))
+            self._send(b"".join(protocol.encode_order(self._launch(order)) for order in orders))
 
     def stop(self, instance: InstanceId) -> None:
         """SIGINT, SIGTERM, SIGKILL to all of it; never heard of: it will never be started."""

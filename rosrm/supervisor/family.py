@@ -72,7 +72,7 @@ class Family:
 
     def _taken_over_ended(self, key: Key, pid: int) -> None:
         self._unwatch(self._taken_over.pop(pid))
-        left = members.find_marked(self._state).get(mark(key), [])
+        left = members.find_members(pid, mark(key), self._state)
         self.watch_strays(key, left)
         self._happened(Exited(key, UNKNOWN_EXIT, leftovers=bool(left)))
 
@@ -165,8 +165,8 @@ class Family:
             self._happened(Cleared(key))
 
     def _find(self, key: Key) -> list[Stat]:
-        session = self._sessions.get(key, 0)
-        if session in self._taken_over or session == 0:
+        session = self._sessions.get(key)
+        if session is None:  # its leader ended before this supervisor began
             return members.find_marked(self._state).get(mark(key), [])
         return members.find_members(session, mark(key), self._state)
 

@@ -89,11 +89,18 @@ def everyone() -> Iterator[Stat]:
 
 
 def find_members(leader: int, mark: str, supervisor: str) -> list[Stat]:
-    """Who is alive of the instance whose session leader is, or just was, `leader`."""
+    """Who is alive of the instance whose session leader was `leader` and has ended.
+
+    A pid is not used again while it names a session or group. So where a process has it now, nobody
+    of the old session is left, and its new one is a stranger's.
+    """
+    stats = list(everyone())
+    is_reused = any(stat.pid == leader for stat in stats)
     return [
         stat
-        for stat in everyone()
-        if leader in (stat.session, stat.group) or read_marks(stat.pid) == (mark, supervisor)
+        for stat in stats
+        if (not is_reused and leader in (stat.session, stat.group))
+        or read_marks(stat.pid) == (mark, supervisor)
     ]
 
 

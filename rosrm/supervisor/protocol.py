@@ -184,7 +184,7 @@ def _order(kind: object, fields: Mapping[str, Any]) -> Order:
     if kind == "environment":
         return Environment(_text(fields["id"]), _texts(fields["variables"]))
     if kind == "hello":
-        return Hello(int(fields["protocol"]), int(fields["pid"]), LogLimits(*fields["log"]))
+        return Hello(int(fields["protocol"]), int(fields["pid"]), _limits(fields["log"]))
     if kind == "shutdown":
         return ShutdownOrdered()
     known = "hello, environment, start, stop, restart, forget, shutdown"
@@ -235,6 +235,11 @@ def read_stop(value: Sequence[Any]) -> StopRule:
     """A stop policy from its JSON list."""
     interrupt_grace, terminate_grace = value
     return StopRule(float(interrupt_grace), float(terminate_grace))
+
+
+def _limits(value: Any) -> LogLimits:
+    max_bytes, keep, instances, processes = value
+    return LogLimits(int(max_bytes), int(keep), int(instances), int(processes))
 
 
 def _text(value: Any) -> str:

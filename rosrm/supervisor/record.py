@@ -225,7 +225,6 @@ class Record:
             view = memoryview(text)
             while view:
                 view = view[os.write(file, view) :]
-            os.fsync(file)
             os.replace(new, self._path)
         except OSError:
             os.close(file)

@@ -225,6 +225,7 @@ class Server:
         self._watch(connection, lambda: self._heard(connection))
         if connection.uid not in (0, os.geteuid()):
             self._refuse(connection, "this supervisor belongs to another user")
+            self._send(connection, b"")
 
     def _heard(self, connection: Connection) -> None:
         try:

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from rosrm.core.model import InstanceId, InstanceState, StopPolicy
-from rosrm.supervisor import members
+from rosrm.supervisor import members, record
 from rosrm.supervisor.client import LaunchOrder, SupervisorClient, log_path
 
 QUICK = StopPolicy(interrupt_grace=0.3, terminate_grace=0.3)
@@ -87,8 +87,18 @@ class Host:
             if str(self.state) in command_line(pid):
                 os.kill(pid, signal.SIGKILL)
                 wait_gone(pid)
-        for pid in self.alive():
+        for pid in {*self.recorded(), *self.alive()}:
             os.kill(pid, signal.SIGKILL)
+
+    def recorded(self) -> list[int]:
+        """Leaders that live, by the record: one that is just being executed shows no marks yet."""
+        recorded = record.read(str(self.state))
+        leaders = []
+        for key, instance in recorded.instances.items():
+            stat = members.read_stat(instance.pid) if instance.pid else None
+            if stat is not None and members.was_born(stat, recorded.births[key]):
+                leaders.append(instance.pid)
+        return leaders
 
 
 def command_line(pid: int) -> str:

@@ -65,13 +65,13 @@ def test_processes_survive_a_killed_slave(host, slave):
     (status,) = client.instances
     assert status.instance == InstanceId("kept", 1)
     assert status.state is InstanceState.RUNNING
-    assert command_line(status.pid).startswith("sleep")
+    wait_until(lambda: command_line(status.pid).startswith("sleep"), "the process is executed")
 
 
 def test_nothing_of_a_slaves_terminal_reaches_it(host, slave):
     """Supervisor and process have sessions of their own, so Ctrl-C reaches neither."""
     supervisor = next(iter(host.pids))
-    (process,) = host.alive()
+    (process,) = wait_until(host.alive, "the process is executed")
     sessions = {os.getsid(slave.pid), os.getsid(supervisor), os.getsid(process)}
     assert len(sessions) == 3
     stat = members.read_stat(supervisor)
