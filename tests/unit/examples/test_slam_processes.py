@@ -16,6 +16,8 @@ from rosrm_examples.pieces import load_piece
 
 Start = Callable[..., subprocess.Popen[str]]
 
+DOMAIN = os.getpid() % 100 + 1  # a ROS domain of this test run's own
+
 
 @pytest.fixture
 def start() -> Iterator[Start]:
@@ -24,7 +26,7 @@ def start() -> Iterator[Start]:
     environment = {
         **os.environ,
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-        "ROS_DOMAIN_ID": str(os.getpid() % 100 + 1),
+        "ROS_DOMAIN_ID": str(DOMAIN),
     }
 
     def start_module(module: str, *arguments: str) -> subprocess.Popen[str]:
@@ -68,6 +70,35 @@ def test_map_piece_maps_its_piece(start: Start, tmp_path: Path) -> None:
     assert "10/15 scans" in output
     assert "15/15 scans" in output
     assert load_piece(tmp_path / "piece_02.npz").indices.tolist() == list(range(15, 30))
+
+
+def test_map_piece_publishes_the_pose_of_every_scan(start: Start, tmp_path: Path) -> None:
+    """A subscriber gets the scans' odometry in order, with the pose and a plausible velocity."""
+    rclpy = pytest.importorskip("rclpy")
+    from nav_msgs.msg import Odometry
+
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=DOMAIN)
+    listener = rclpy.create_node("listener", context=context)
+    executor = rclpy.executors.SingleThreadedExecutor(context=context)
+    executor.add_node(listener)
+    heard: list[Odometry] = []
+    listener.create_subscription(Odometry, "/car/odometry", heard.append, 10)
+    arguments = ["--drive", "street:30", "--piece", "1", "--of", "1", "--out", str(tmp_path)]
+    start("map_piece", *arguments, "--rate", "10", "--ros-args", "-r", "__ns:=/car")
+    try:
+        deadline = time.monotonic() + 15
+        while len(heard) < 5 and time.monotonic() < deadline:
+            executor.spin_once(timeout_sec=0.2)
+    finally:
+        executor.shutdown()
+        context.shutdown()
+    assert len(heard) >= 5
+    tenths = [round(m.header.stamp.sec * 10 + m.header.stamp.nanosec / 1e8) for m in heard]
+    assert tenths == list(range(tenths[0], tenths[0] + len(heard)))
+    travelled = [message.pose.pose.position.x for message in heard]
+    assert travelled == sorted(travelled)
+    assert 8 < heard[-1].twist.twist.linear.x < 14
 
 
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
