@@ -60,6 +60,10 @@ class SessionTable:
         """Seconds of CPU that ended sessions used; never falls."""
         return self._ended_cpu_time
 
+    def members(self, leader: int) -> tuple[int, ...]:
+        """The known processes of one session, its leader first; () where it is not known."""
+        return self._members.get(leader, ())
+
     def add(self, leader: int) -> None:
         """A session has begun; its leader counts at once.
 
@@ -73,7 +77,7 @@ class SessionTable:
         """A session has ended (its leader was reaped).
 
         Args:
-            leader: pid; an unknown one is ignored save for its time.
+            leader: pid; of one that ended before it was added, the time counts all the same.
             cpu_time: seconds that it and its reaped children used, as `wait4` reports them.
         """
         self._members.pop(leader, None)

@@ -3,12 +3,12 @@
 from dataclasses import replace
 
 import pytest
+from rosrm_migration import plugin
 
 from rosrm.core.migration import AwaitReady, Commit, Execute, Plan, Start, Stop
 from rosrm.ports import MigrationOffer
 from rosrm.testing import MigrationContract
 
-plugin = pytest.importorskip("rosrm_migration.plugin")
 OFFERS = {offer.name: offer for offer in plugin.register_migration_strategies()}
 
 

@@ -1,0 +1,265 @@
+"""The probes on real processes, and on the control groups of this machine."""
+
+import contextlib
+import os
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+
+import rosrm_resources.plugin
+from rosrm.registry import Registry
+from rosrm.slave.sampling import Sampler
+from rosrm.slave.sessions import SessionTable
+from rosrm.testing import probe_context
+from rosrm_resources.cgroups import find_group
+from rosrm_resources.cpu import CgroupCpu, GroupTime, MachineCpu, SliceCpu
+from rosrm_resources.memory import CgroupMemory, SliceMemory
+from rosrm_resources.plugin import register_probes
+
+BURN = "while True: pass"
+HOLD = "import sys; block = bytearray(int(sys.argv[1])); print('ready', flush=True); input()"
+MIB = 2**20
+
+
+@pytest.fixture
+def start():
+    """Starts Python programs as session leaders and ends them with their children."""
+    started = []
+
+    def run(code, *arguments, ready=False):
+        process = subprocess.Popen(
+            [sys.executable, "-S", "-c", code, *arguments],
+            start_new_session=True,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+        )
+        started.append(process)
+        if ready:
+            assert process.stdout.readline() == b"ready\n"
+        return process
+
+    yield run
+    for process in started:
+        with contextlib.suppress(ProcessLookupError):  # it may have ended already
+            os.killpg(process.pid, 9)
+        process.wait(10)
+        process.stdin.close()
+        process.stdout.close()
+
+
+def watch(seconds, read):
+    """Call `read` ten times a second; its last answer."""
+    tick = threading.Event()
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        answer = read()
+        tick.wait(0.1)
+    return answer
+
+
+def burnt(pid):
+    """CPU seconds of a process, by another way."""
+    times = psutil.Process(pid).cpu_times()
+    return times.user + times.system
+
+
+def test_slice_cpu_is_what_the_process_burns(start):
+    """Over two seconds the reading is the CPU time that the process was given."""
+    sessions = SessionTable()
+    gauge = SliceCpu(1.0, sessions, 2.0)
+    burner = start(BURN)
+    sessions.add(burner.pid)
+    gauge.usage()
+    before, begun = burnt(burner.pid), time.monotonic()
+    usage = watch(2.0, gauge.usage)
+    share = (burnt(burner.pid) - before) / (time.monotonic() - begun)
+    assert usage == pytest.approx(share, abs=0.15)
+    gauge.close()
+
+
+def test_slice_cpu_of_an_ended_session_neither_jumps_nor_lasts(start):
+    """Killed, reaped and only then told of: no reading exceeds the cores of the machine."""
+    sessions = SessionTable()
+    gauge = SliceCpu(1.0, sessions, 1.0)
+    burner = start(BURN)
+    sessions.add(burner.pid)
+    watch(1.0, gauge.usage)
+    used = burnt(burner.pid)
+    burner.kill()
+    burner.wait(10)
+    highest = watch(0.3, gauge.usage)
+    sessions.remove(burner.pid, used)
+    for _ in range(12):
+        highest = max(highest, watch(0.1, gauge.usage))
+    assert highest <= os.cpu_count() + 0.3
+    assert gauge.usage() < 0.1
+    gauge.close()
+
+
+def test_slice_memory_is_what_the_processes_hold(start):
+    """Two holders of 30 and 50 MiB raise the reading by as much."""
+    sessions = SessionTable()
+    gauge = SliceMemory(1000.0 * MIB, sessions)
+    bare = start(HOLD, "0", ready=True)
+    sessions.add(bare.pid)
+    own = gauge.usage()
+    for size in (30, 50):
+        sessions.add(start(HOLD, str(size * MIB), ready=True).pid)
+    assert gauge.usage() == pytest.approx(3 * own + 0.080, abs=0.005)
+    gauge.close()
+
+
+def test_sessions_find_the_children(start):
+    """A child of a child is known after a walk, and gone after the next when it has ended."""
+    shell = subprocess.Popen(
+        ["sh", "-c", "sleep 300 & sleep 300 & read line; kill $!; wait $!; read line"],
+        start_new_session=True, stdin=subprocess.PIPE, bufsize=0,
+    )  # fmt: skip
+    try:
+        table = SessionTable()
+        table.add(shell.pid)
+        _until(lambda: table.refresh(time.monotonic()) or len(table.pids()) == 3)
+        assert table.usage()[shell.pid].memory > 0
+        shell.stdin.write(b"\n")
+        _until(lambda: table.refresh(time.monotonic()) or len(table.pids()) == 2)
+    finally:
+        os.killpg(shell.pid, 9)
+        shell.wait(10)
+        shell.stdin.close()
+
+
+def test_machine_cpu_is_what_psutil_reads(start):
+    """The same two seconds, read by both, while a process burns."""
+    start(BURN)
+    gauge = MachineCpu(2.0)
+    psutil.cpu_percent(None)
+    usage = watch(2.0, gauge.usage)
+    assert usage == pytest.approx(psutil.cpu_percent(None) / 100, abs=0.15)
+    assert usage > 0.1
+    gauge.close()
+
+
+def test_default_probes_are_quick_and_sane():
+    """A whole cycle of the default set takes far less than a hundredth of 0.1 s."""
+    probes = Registry.of(resources=rosrm_resources.plugin).probes(None, probe_context())
+    assert {"cpu", "memory", "disk"} <= {probe.name for probe in probes.made}
+    assert set(probes.absent) <= {"gpu"}
+    sampler = Sampler(probes.made)
+    sample = sampler.first()
+    assert sample.stale == 0
+    assert all(0.0 <= usage <= 1.0 for usage in sample.usage)
+    sampler.close()
+
+
+# --- control groups of this machine -----------------------------------------------------------
+
+
+@pytest.fixture
+def memory_group():
+    group = find_group("memory")
+    if group is None or not any(group.directory.glob("memory.*")):
+        pytest.skip("no control group with the memory controller is mounted here")
+    return group
+
+
+def test_memory_of_the_own_group(memory_group):
+    """The kernel's figure less the inactive cache, whatever the version is."""
+    v1 = memory_group.version == 1
+    current = memory_group.directory / ("memory.usage_in_bytes" if v1 else "memory.current")
+    if not current.exists():
+        pytest.skip("this process is in the root group")
+    gauge = CgroupMemory([(memory_group.directory, 2.0**40)], memory_group.version)
+    usage = gauge.usage() * 2.0**40
+    assert 0 < usage <= int(current.read_text()) * 1.05 + 16 * MIB
+    gauge.close()
+
+
+def test_cpu_time_of_the_own_group():
+    """It grows, and by no more than the cores of the machine allow."""
+    group = find_group("cpu")
+    if group is None:
+        pytest.skip("no control group with the cpu controller is mounted here")
+    used = GroupTime(group, group.directory, Path("/"))
+    before, begun = used.seconds(), time.monotonic()
+    while time.process_time() % 0.1 < 0.09:  # burn a little
+        pass
+    grown, passed = used.seconds() - before, time.monotonic() - begun
+    assert 0 < grown <= os.cpu_count() * (passed + 0.1)
+    used.close()
+
+
+INSIDE = """
+import sys, time
+from rosrm_resources.memory import CgroupMemory
+from rosrm_resources.cpu import CgroupCpu
+memory, cpu = CgroupMemory.find(), CgroupCpu.find(1.0)
+before = memory.usage()
+block = bytearray(20 * 2**20)
+end = time.monotonic() + 1.5
+while time.monotonic() < end:
+    usage = cpu.usage()
+print(memory.capacity, memory.usage() - before, cpu.capacity, usage)
+"""
+
+
+def test_limited_group_of_version_1(tmp_path):
+    """A real group of 256 MiB and half a core: both are the capacity, and both are felt."""
+    groups = {name: find_group(name) for name in ("memory", "cpu", "cpuacct")}
+    if any(group is None or group.version != 1 for group in groups.values()):
+        pytest.skip("this machine has no control groups of version 1")
+    name = f"rosrm-test-{os.getpid()}"
+    made = []
+    try:
+        try:
+            for directory in dict.fromkeys(group.directory / name for group in groups.values()):
+                directory.mkdir()
+                made.append(directory)
+            (groups["memory"].directory / name / "memory.limit_in_bytes").write_text("256M")
+            (groups["cpu"].directory / name / "cpu.cfs_quota_us").write_text("50000")
+        except OSError as error:
+            pytest.skip(f"control groups cannot be made here: {error}")
+        enter = "".join(f"echo $$ > {directory}/cgroup.procs; " for directory in made)
+        done = subprocess.run(
+            ["sh", "-ec", f'{enter} exec "$0" -c "$1"', sys.executable, INSIDE],
+            capture_output=True, text=True, timeout=60, check=False,
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        capacity, grown, cores, busy = map(float, done.stdout.split())
+    finally:
+        for directory in made:
+            _until(lambda: _removed(directory))  # noqa: B023 - called at once
+    assert (capacity, cores) == (256 * MIB, 0.5)
+    assert grown == pytest.approx(20 / 256, abs=0.02)
+    assert 0.3 < busy < 1.35  # on a busy machine it may get less than its quota
+
+
+def test_group_of_this_process_is_read_or_is_the_machine():
+    """Whatever this machine is, the scope `cgroup` gives readings."""
+    for offer in register_probes()[:2]:
+        probe = offer.create(offer.options(), probe_context("cgroup"))
+        assert probe.resources[0].scope in ("cgroup", "machine")
+        assert probe.read()[0].usage >= 0
+        probe.close()
+    assert CgroupCpu.find(1.0) is None or CgroupCpu.find(1.0).capacity > 0
+
+
+def _removed(directory):
+    try:
+        directory.rmdir()
+    except OSError:  # its last process is still on its way out
+        return False
+    return True
+
+
+def _until(condition, timeout=10.0):
+    tick = threading.Event()
+    end = time.monotonic() + timeout
+    while not condition():
+        assert time.monotonic() < end, "it did not happen in time"
+        tick.wait(0.02)

@@ -1,0 +1,156 @@
+"""The table of a slave's sessions, on a written process tree."""
+
+import os
+import shutil
+
+import pytest
+
+from rosrm.slave.sessions import SessionTable, SessionUsage
+
+TICKS = os.sysconf("SC_CLK_TCK")
+PAGE = os.sysconf("SC_PAGE_SIZE")
+
+
+class Tree:
+    """A /proc with the processes that a test puts there."""
+
+    def __init__(self, path):
+        self.path = path
+        self.session = {}
+
+    def put(self, pid, session, *, own=0.0, children=0.0, pages=0, name="sleep"):
+        """A process: its CPU seconds, those of its reaped children, its resident pages."""
+        self.session[pid] = session
+        fields = [
+            "S", 1, pid, session, 0, -1, 0, 0, 0, 0, 0,
+            int(own * TICKS), 0, int(children * TICKS), 0, 20, 0, 1, 0, 77, 4096, pages, 0,
+        ]  # fmt: skip
+        folder = self.path / str(pid)
+        folder.mkdir(exist_ok=True)
+        (folder / "stat").write_text(f"{pid} ({name}) {' '.join(map(str, fields))}\n")
+
+    def end(self, pid):
+        """The process has been reaped."""
+        del self.session[pid]
+        shutil.rmtree(self.path / str(pid))
+
+    def session_of(self, pid):
+        try:
+            return self.session[pid]
+        except KeyError:
+            raise ProcessLookupError(pid) from None
+
+
+@pytest.fixture
+def tree(tmp_path):
+    return Tree(tmp_path)
+
+
+@pytest.fixture
+def table(tree):
+    return SessionTable(tree.path, tree.session_of)
+
+
+def test_leader_counts_at_once_members_at_the_walk(tree, table):
+    """A session is known when it is added; who joined it, one walk later."""
+    tree.put(10, 10)
+    tree.put(11, 10)
+    tree.put(12, 12)
+    table.add(10)
+    assert table.pids() == (10,)
+    table.refresh(0.0)
+    assert table.pids() == (10, 11)
+    assert table.members(10) == (10, 11)
+    assert table.members(12) == ()
+
+
+def test_usage_is_a_mean_between_walks(tree, table):
+    """Cores are CPU time over time passed, memory the sum of all members."""
+    tree.put(10, 10, own=5.0, pages=100)
+    tree.put(11, 10, own=1.0, pages=50)
+    table.add(10)
+    table.refresh(0.0)
+    assert table.usage() == {10: SessionUsage(0.0, 150 * PAGE)}
+    tree.put(10, 10, own=6.0, pages=100)
+    tree.put(11, 10, own=1.5, pages=70)
+    table.refresh(1.0)
+    assert table.usage() == {10: SessionUsage(pytest.approx(1.5), 170 * PAGE)}
+
+
+def test_child_that_was_waited_for_stays_counted(tree, table):
+    """The time of an ended child is its parent's: usage does not fall below zero, nor jump."""
+    tree.put(10, 10, own=1.0)
+    tree.put(11, 10, own=100.0)
+    table.add(10)
+    table.refresh(0.0)
+    tree.end(11)
+    tree.put(10, 10, own=1.5, children=100.0)
+    table.refresh(1.0)
+    assert table.usage()[10].cpu == pytest.approx(0.5)
+
+
+def test_lost_time_is_no_negative_usage(tree, table):
+    """A member that ended as an orphan takes its time with it."""
+    tree.put(10, 10, own=1.0)
+    tree.put(11, 10, own=100.0)
+    table.add(10)
+    table.refresh(0.0)
+    tree.end(11)
+    table.refresh(1.0)
+    assert table.usage()[10].cpu == 0.0
+
+
+def test_removed_session_is_gone_and_its_time_kept(tree, table):
+    """What an ended session used is kept for good; the others stay as they are."""
+    for leader in (10, 20):
+        tree.put(leader, leader, own=1.0)
+        table.add(leader)
+    table.refresh(0.0)
+    table.remove(10, cpu_time=1.25)
+    assert table.pids() == (20,)
+    assert set(table.usage()) == {20}
+    assert table.ended_cpu_time() == 1.25
+    table.remove(99, cpu_time=0.5)
+    assert table.ended_cpu_time() == 1.75
+
+
+def test_ended_time_never_falls(table):
+    """Nonsense from the kernel or the supervisor does not take time back."""
+    table.remove(10, cpu_time=2.0)
+    table.remove(11, cpu_time=-1.0)
+    assert table.ended_cpu_time() == 2.0
+
+
+def test_process_that_ends_during_the_walk_is_no_error(tree, table):
+    """Listed a moment ago, gone now."""
+    tree.put(10, 10, pages=10)
+    tree.put(11, 10, pages=10)
+    table.add(10)
+    (tree.path / "11" / "stat").unlink()
+    (tree.path / "12").mkdir()  # gone before its session could be asked for
+    table.refresh(0.0)
+    assert table.usage()[10].memory == 10 * PAGE
+
+
+def test_strange_names(tree, table):
+    """A program may call itself anything, also what looks like the end of its name."""
+    tree.put(10, 10, pages=10, name="a) S 1 (b c")
+    table.add(10)
+    table.refresh(0.0)
+    assert table.usage()[10].memory == 10 * PAGE
+
+
+def test_without_sessions_nothing_is_walked(table, tmp_path):
+    """A slave that runs nothing pays nothing."""
+    shutil.rmtree(tmp_path)
+    table.refresh(0.0)
+    assert (table.pids(), dict(table.usage())) == ((), {})
+
+
+def test_what_was_handed_out_does_not_change(tree, table):
+    """`pids` may be read in another thread while the loop adds and removes."""
+    table.add(10)
+    before = table.pids()
+    table.add(20)
+    table.remove(10, 0.0)
+    assert before == (10,)
