@@ -181,12 +181,13 @@ class MasterRuntime:
             self._write(records, intents)
         endpoint = self._endpoint
         for command in commands:
+            if isinstance(command, Reply):  # first: it opens the link to a host that registered
+                endpoint.reply(command)
+        for command in commands:
             if isinstance(command, Assign):
                 endpoint.assign(command)
             elif isinstance(command, Order):
                 endpoint.order(command, now)
-            elif isinstance(command, Reply):
-                endpoint.reply(command)
             elif isinstance(command, Withdraw):
                 endpoint.withdraw(command, now)
         endpoint.flush()

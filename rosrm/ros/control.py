@@ -69,6 +69,7 @@ class Gate:
         self._beat = beat
         self._max_age = max_age
         self._answers: OrderedDict[str, Any] = OrderedDict()
+        self._waiting: dict[str, list[OpenRequest]] = {}
 
     def refusal(self, envelope: Envelope, epoch: int | None = None) -> Answer | None:
         """Why a request is refused, or None.
@@ -79,6 +80,8 @@ class Gate:
         fault = version_refusal(envelope.protocol_version, envelope.sender or "the sender")
         if fault:
             return refused("version", fault)
+        if not envelope.request_id:
+            return refused("invalid", f"the request of {envelope.sender} has no id")
         age = (self._beat() - envelope.receiver_beat) * _NS
         if envelope.receiver_beat == 0 or not 0.0 <= age <= self._max_age:
             return refused(
@@ -98,15 +101,20 @@ class Gate:
         if known is None:
             self._answers[envelope.request_id] = _PENDING
             if len(self._answers) > _REMEMBERED:
-                self._answers.popitem(last=False)
+                oldest, _ = self._answers.popitem(last=False)
+                self._waiting.pop(oldest, None)
             return False
-        if known is not _PENDING:
+        if known is _PENDING:
+            self._waiting.setdefault(envelope.request_id, []).append(request)
+        else:
             request.answer(known)
         return True
 
     def remember(self, envelope: Envelope, response: Any) -> None:
-        """Keep an answer for a repetition of its request."""
+        """Keep an answer for a repetition of its request, and give it to those that came."""
         self._answers[envelope.request_id] = response
+        for request in self._waiting.pop(envelope.request_id, ()):
+            request.answer(response)
 
 
 _PENDING: Final = object()

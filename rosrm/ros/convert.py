@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, Final
 
 from rosrm_msgs import msg
 
 from rosrm.core import model
 from rosrm.core.views import EventRow, HostRow, PluginRow, ProcessRow, ResourceRow
 from rosrm.errors import Refused
+
+_INFINITE: Final = float("inf")
 
 # --- small things -----------------------------------------------------------------------------
 
@@ -39,10 +41,7 @@ def json_object(text: str, what: str) -> dict[str, Any]:
     """A JSON object that came as text; raises `Refused` naming `what`."""
     if not text:
         return {}
-    try:
-        value = json.loads(text)
-    except ValueError as error:
-        raise Refused(f"{what} is no JSON: {error}") from error
+    value = _json_value(text, what)
     if not isinstance(value, dict):
         raise Refused(f"{what} is a JSON {type(value).__name__}, not an object")
     return value
@@ -134,15 +133,34 @@ def _spec_fault(message: msg.ProcessSpec) -> str:
     if message.readiness.kind not in ("auto", "graph", "running"):
         return f"readiness {message.readiness.kind!r}; allowed: auto, graph, running"
     for need in message.needs:
-        if not 0.0 <= need.amount < float("inf"):
+        if not 0.0 <= need.amount < _INFINITE:
             return f"it needs {need.amount} of {need.resource}; allowed: 0 and more"
+    return _times_fault(message)
+
+
+def _times_fault(message: msg.ProcessSpec) -> str:
+    """A wait that is no number would never end, or never begin."""
+    restart = message.restart
+    if not 1.0 <= restart.factor < _INFINITE:
+        return f"the factor of its restarts is {restart.factor}; allowed: 1 and more"
+    times = {
+        "restart.delay": restart.delay,
+        "restart.max_delay": restart.max_delay,
+        "restart.window": restart.window,
+        "readiness.timeout": message.readiness.timeout,
+        "stop.interrupt_grace": message.stop.interrupt_grace,
+        "stop.terminate_grace": message.stop.terminate_grace,
+    }
+    for name, seconds in times.items():
+        if not 0.0 <= seconds < _INFINITE:
+            return f"{name} is {seconds} s; allowed: 0 and more"
     return ""
 
 
 def _json_value(text: str, what: str) -> Any:
     try:
         return json.loads(text)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise Refused(f"{what} is no JSON: {error}") from error
 
 
@@ -190,8 +208,10 @@ def host_from_msg(message: msg.HostDescription) -> model.HostDescription:
     if len(resources) > model.RESOURCE_SLOTS or not message.name or not message.incarnation:
         raise Refused(f"host {message.name!r}: no name, no incarnation or too many resources")
     for resource in resources:
-        if not 0.0 < resource.capacity < float("inf"):
+        if not 0.0 < resource.capacity < _INFINITE:
             raise Refused(f"host {message.name!r}: {resource.name} has capacity {resource.capacity}")
+    if not 0.0 < message.period < _INFINITE:
+        raise Refused(f"host {message.name!r}: it reports every {message.period} s")
     return model.HostDescription(
         name=message.name, incarnation=message.incarnation, hostname=message.hostname,
         pid=message.pid, software_version=message.software_version, labels=mapping(message.labels),
@@ -214,11 +234,14 @@ def status_to_msg(status: model.InstanceStatus) -> msg.ProcessStatus:
 
 
 def status_from_msg(message: msg.ProcessStatus) -> model.InstanceStatus:
-    """The inverse of `status_to_msg`; raises `Refused` for an unknown state."""
+    """The inverse of `status_to_msg`; raises `Refused` for what makes no sense."""
     try:
         state = model.InstanceState(message.state)
     except ValueError as error:
         raise Refused(f"unknown state {message.state!r} of {message.instance.process}") from error
+    for name in ("peak_memory", "cpu_time", "run_time"):
+        if not 0.0 <= getattr(message, name) < _INFINITE:
+            raise Refused(f"{message.instance.process}: {name} is {getattr(message, name)}")
     return model.InstanceStatus(
         instance_from_msg(message.instance), state, message.pid, message.exit_code,
         message.exit_signal, message.restarts, message.peak_memory, message.cpu_time,

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
 import numpy as np
 from rosrm_msgs import msg, srv
 
 from rosrm.core import events as happened
 from rosrm.core.commands import Assign, Order, Reply, Withdraw
-from rosrm.core.model import Assignment
+from rosrm.core.model import Assignment, HostDescription
 from rosrm.core.views import Snapshot
 from rosrm.errors import Refused
 from rosrm.ros import convert, names, qos
@@ -36,6 +37,10 @@ _ACTIONS = {
     "report": srv.ControlHost.Request.REPORT,
 }
 
+#: Seconds between two records of the same refusal, and refusals that are told apart.
+_REFUSED_EVERY: Final = 10.0
+_REFUSED_KEPT: Final = 1000
+
 
 @dataclass(frozen=True, slots=True)
 class Identity:
@@ -58,13 +63,30 @@ class Queries(Protocol):
         """The story of a process as JSON; None: there is none of that name."""
 
 
+@dataclass(frozen=True, slots=True)
+class _Unheard:
+    """An order for a slave whose first beat has not come."""
+
+    deadline: float
+    send: Callable[[], None]
+    done: Callable[[Any], None]
+
+
 @dataclass(slots=True)
 class _HostLink:
-    """What the endpoint keeps of one slave."""
+    """What the endpoint keeps of one slave.
+
+    Attributes:
+        incarnation: of the run that registered last; what a former run says is not heard.
+        beat: its newest; 0: none was heard yet, so that it would refuse every order.
+        unheard: orders that wait for its first beat.
+    """
 
     name: str
     control: Any
+    incarnation: int
     beat: int = 0
+    unheard: list[_Unheard] = field(default_factory=list)
     outbox: list[Assignment] = field(default_factory=list)
     poll: Callable[[Any], None] | None = None
     poll_token: int = 0
@@ -99,6 +121,7 @@ class MasterEndpoint:
         self._links: dict[int, _HostLink] = {}
         self._open: dict[int, Callable[[Reply], None]] = {}
         self._next_request = 1
+        self._refused: dict[tuple[str, str], float] = {}
         self._client = ControlClient(participant, f"master {identity.name}")
         self._server = ControlServer(participant, Gate(beat, max_age))
         self._subscribe()
@@ -136,16 +159,35 @@ class MasterEndpoint:
         if not taken:
             return
         batch = decode(taken)
-        for host_id, beat in batch.beats.items():
-            link = self._links.get(host_id)
+        for (host_id, incarnation), beat in batch.beats.items():
+            link = self._link(host_id, incarnation)
             if link is not None:
                 link.beat = beat
+                if link.unheard:
+                    self._send_unheard(link)
         for stranger in batch.strangers:
             self._refuse_peer("resource_info", stranger)
         if batch.readings is not None:
             self.events.append(batch.readings)
 
+    def _send_unheard(self, link: _HostLink) -> None:
+        waiting, link.unheard = link.unheard, []
+        for order in waiting:
+            order.send()
+
+    def _link(self, host_id: int, incarnation: int) -> _HostLink | None:
+        """The link of a host, if this is the run of it that registered last."""
+        link = self._links.get(host_id)
+        return link if link is not None and link.incarnation == incarnation else None
+
     def _refuse_peer(self, who: str, reason: str) -> None:
+        """Record it, but not ten times a second."""
+        now = time.monotonic()
+        if now - self._refused.get((who, reason), -_REFUSED_EVERY) < _REFUSED_EVERY:
+            return
+        if len(self._refused) >= _REFUSED_KEPT:
+            self._refused.clear()
+        self._refused[who, reason] = now
         self.events.append(happened.PeerRefused(who, reason))
 
     def _take_statuses(self, message: msg.ProcessStatusBatch) -> None:
@@ -254,7 +296,7 @@ class MasterEndpoint:
             response = self._response(srv.RegisterHost, reply)
             if reply.accepted:
                 response.host_id, response.beat_period = reply.host_id, self._beat_period
-                self._renew_link(reply.host_id, description.name)
+                self._renew_link(reply.host_id, description)
             respond(response)
 
         token = self._new_token()
@@ -262,7 +304,7 @@ class MasterEndpoint:
         self.events.append(happened.HostRegistered(token, description, statuses))
 
     def _left(self, request: srv.Leave.Request, token: int) -> happened.Event:
-        link = self._links.get(request.host_id)
+        link = self._link(request.host_id, request.incarnation)
         if link is not None:
             self._close_poll(link)
         return happened.HostLeft(token, request.host_id, request.incarnation)
@@ -329,7 +371,7 @@ class MasterEndpoint:
     def _take_poll(
         self, request: srv.RequestProcess.Request, respond: Callable[[Any], None]
     ) -> None:
-        link = self._links.get(request.host_id)
+        link = self._link(request.host_id, request.incarnation)
         if link is None:
             answer = refused("unknown", "register first", self._identity.epoch)
             respond(srv.RequestProcess.Response(answer=answer))
@@ -388,18 +430,23 @@ class MasterEndpoint:
         if answer is not None:
             answer(command)
 
-    def _renew_link(self, host_id: int, name: str) -> None:
+    def _renew_link(self, host_id: int, description: HostDescription) -> None:
         """A slave registered: what waited for its former run is void."""
         link = self._links.get(host_id)
         if link is None:
-            path = self._names.of_host(name, names.CONTROL)
+            path = self._names.of_host(description.name, names.CONTROL)
             control = self._participant.node.create_client(
                 srv.ControlHost, path, qos_profile=qos.SERVICE
             )
-            link = self._links[host_id] = _HostLink(name, control)
-        link.outbox.clear()
-        link.beat = 0
+            link = self._links[host_id] = _HostLink(description.name, control, 0)
         self._close_poll(link)
+        if link.incarnation == description.incarnation:
+            return  # the same run once more: what it has not fetched is still meant for it
+        link.incarnation, link.beat = description.incarnation, 0
+        link.outbox.clear()
+        waiting, link.unheard = link.unheard, []
+        for order in waiting:
+            order.done(None)
 
     def order(self, command: Order, now: float) -> None:
         """Ask a slave for something; the answer, or none in time, comes back as an event."""
@@ -410,7 +457,6 @@ class MasterEndpoint:
             )
             return
         request = srv.ControlHost.Request(
-            envelope=self._client.envelope(link.beat, self._identity.epoch),
             action=_ACTIONS[command.action], executor=command.executor,
             timeout=float(command.timeout),
         )  # fmt: skip
@@ -425,13 +471,27 @@ class MasterEndpoint:
             self.events.append(_order_answered(command.order, response))
 
         deadline = now + command.timeout + self._order_timeout
-        self._client.call(link.control, request, deadline, done)
+
+        def send() -> None:
+            request.envelope = self._client.envelope(link.beat, self._identity.epoch)
+            self._client.call(link.control, request, deadline, done)
+
+        if link.beat:
+            send()
+        else:
+            link.unheard.append(_Unheard(deadline, send, done))
 
     # --- with time -----------------------------------------------------------------------
 
     def expire(self, now: float) -> None:
         """End what was not answered in time."""
         self._client.expire(now)
+        for link in self._links.values():
+            if link.unheard:
+                late = [order for order in link.unheard if now >= order.deadline]
+                link.unheard = [order for order in link.unheard if now < order.deadline]
+                for order in late:
+                    order.done(None)
 
     def beat(self, uptime: float) -> None:
         """Say that the master lives."""

@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 from dataclasses import dataclass
 from typing import Final
 
-_UNFIT: Final = re.compile(r"[^A-Za-z0-9_]")
+_FIT: Final = re.compile(r"[A-Za-z](_?[A-Za-z0-9])*")
+_UNFIT: Final = re.compile(r"[^A-Za-z0-9]+")
+_LONGEST: Final = 64
 
 
 def token(name: str) -> str:
-    """A host's name as one token of a ROS name ("robot-1" -> "robot_1", "3d" -> "h3d")."""
-    fit = _UNFIT.sub("_", name)
-    return fit if fit[:1].isalpha() else f"h{fit}"
+    """A host's name as one token of a ROS name ("robot-1" -> "robot_1_8e1a36f3").
+
+    Different names stay different, by a digest where one must be changed: in DDS all servers of a
+    name execute a request, so that robot-1 would do what robot_1 is told.
+    """
+    if _FIT.fullmatch(name) and len(name) <= _LONGEST:
+        return name
+    digest = hashlib.sha256(name.encode("utf-8", "surrogatepass")).hexdigest()[:8]
+    fit = _UNFIT.sub("_", name)[:_LONGEST].strip("_")
+    return f"{fit}_{digest}" if fit[:1].isalpha() else f"host_{fit}_{digest}".replace("__", "_")
 
 
 @dataclass(frozen=True, slots=True)

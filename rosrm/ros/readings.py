@@ -39,14 +39,14 @@ class Decoded:
     """A batch of messages.
 
     Attributes:
-        readings: the newest of each host; None: there is none.
-        beats: host id to the slave's newest beat, ns.
+        readings: the newest of each run of a host; None: there is none.
+        beats: (host id, incarnation) to the newest beat of that run of a slave, ns.
         strangers: one line for each kind of message that was refused.
         received: messages of our version.
     """
 
     readings: ReadingsReceived | None = None
-    beats: dict[int, int] = field(default_factory=dict)
+    beats: dict[tuple[int, int], int] = field(default_factory=dict)
     strangers: tuple[str, ...] = ()
     received: int = 0
 
@@ -76,22 +76,31 @@ def decode(messages: Sequence[bytes]) -> Decoded:
         strangers.append(
             f"a resource_info of protocol version {version}; this side speaks {PROTOCOL_VERSION}"
         )
-    rows = _newest_of_each_host(rows[ours])
+    rows = _newest_of_each_run(rows[ours])
     if not len(rows):
         return Decoded(strangers=tuple(strangers))
     return Decoded(
         _event(rows),
-        dict(zip(rows["host_id"].tolist(), rows["beat"].tolist(), strict=True)),
+        dict(
+            zip(
+                zip(rows["host_id"].tolist(), rows["incarnation"].tolist(), strict=True),
+                rows["beat"].tolist(),
+                strict=True,
+            )
+        ),
         tuple(strangers),
         int(ours.sum()),
     )
 
 
-def _newest_of_each_host(rows: npt.NDArray[np.void]) -> npt.NDArray[np.void]:
+def _newest_of_each_run(rows: npt.NDArray[np.void]) -> npt.NDArray[np.void]:
+    """A former run that still speaks must not hide the readings of the present one."""
     if len(rows) < 2:
         return rows
     newest_first = rows[::-1]
-    _, index = np.unique(newest_first["host_id"], return_index=True)
+    run = newest_first["host_id"].astype(np.uint64) << np.uint64(32)
+    run |= newest_first["incarnation"] & np.uint64(0xFFFFFFFF)
+    _, index = np.unique(run, return_index=True)
     return newest_first[index]
 
 

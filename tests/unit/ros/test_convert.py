@@ -1,0 +1,260 @@
+"""Every value survives the way through a message; what makes no sense is refused, never misread."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rclpy.serialization import deserialize_message, serialize_message
+
+from rosrm.core import model
+from rosrm.core.views import EventRow, HostRow, PluginRow, ProcessRow, ResourceRow
+from rosrm.errors import Refused
+from rosrm.ros import convert
+from rosrm_msgs import msg
+
+WORDS = st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=12)
+NAMES = WORDS.filter(bool)
+SECONDS = st.floats(0.0, 1e6)
+PLAIN = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | WORDS,
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(WORDS, inner, max_size=3),
+    max_leaves=6,
+)
+TEXTS = st.dictionaries(NAMES, WORDS, max_size=3)
+UINT32 = st.integers(0, 2**32 - 1)
+UINT64 = st.integers(0, 2**64 - 1)
+INT32 = st.integers(-(2**31), 2**31 - 1)
+INSTANCES = st.builds(model.InstanceId, NAMES, UINT64)
+
+FORMS = st.one_of(
+    st.fixed_dictionaries({"package": NAMES, "executable": NAMES}),
+    st.fixed_dictionaries({"module": NAMES}),
+    st.fixed_dictionaries({"command": st.lists(WORDS, min_size=1, max_size=3).map(tuple)}),
+)
+
+
+@st.composite
+def specs(draw) -> model.ProcessSpec:
+    return model.ProcessSpec(
+        **draw(FORMS),
+        name=draw(NAMES),
+        namespace=draw(WORDS),
+        arguments=tuple(draw(st.lists(WORDS, max_size=3))),
+        parameters=draw(st.dictionaries(NAMES, PLAIN, max_size=3)),
+        remappings=draw(TEXTS),
+        environment=draw(TEXTS),
+        working_directory=draw(st.none() | NAMES),
+        ros=draw(st.booleans()),
+        kind=draw(st.sampled_from(model.Kind)),
+        restart=model.RestartPolicy(
+            draw(st.sampled_from(["never", "on-failure", "always"])),
+            draw(SECONDS),
+            draw(SECONDS),
+            draw(st.floats(1.0, 100.0)),
+            draw(UINT32),
+            draw(SECONDS),
+        ),
+        needs=draw(st.dictionaries(NAMES, st.floats(0.0, 1e18), max_size=3)),
+        required_labels=draw(TEXTS),
+        preferred_labels=draw(TEXTS),
+        avoided_labels=draw(TEXTS),
+        priority=draw(INT32),
+        migration=model.MigrationPolicy(
+            draw(st.none() | NAMES),
+            draw(st.booleans()),
+            draw(st.dictionaries(WORDS, PLAIN, max_size=2)),
+        ),
+        readiness=model.Readiness(
+            draw(st.sampled_from(["auto", "graph", "running"])), draw(SECONDS)
+        ),
+        stop=model.StopPolicy(draw(SECONDS), draw(SECONDS)),
+    )
+
+
+def over_the_wire(message):
+    """As the other side gets it."""
+    return deserialize_message(serialize_message(message), type(message))
+
+
+@given(specs())
+@settings(max_examples=150, deadline=None)
+def test_spec_survives(spec) -> None:
+    """What is submitted is what arrives, in every field."""
+    assert convert.spec_from_msg(over_the_wire(convert.spec_to_msg(spec))) == spec
+
+
+@given(specs(), INSTANCES, UINT64, WORDS)
+@settings(max_examples=30, deadline=None)
+def test_assignment_survives(spec, instance, epoch, node_name) -> None:
+    """An order to run an instance arrives as it was given."""
+    assignment = model.Assignment(instance, spec, epoch, node_name)
+    assert (
+        convert.assignment_from_msg(over_the_wire(convert.assignment_to_msg(assignment)))
+        == assignment
+    )
+
+
+@given(
+    st.builds(
+        model.InstanceStatus,
+        instance=INSTANCES,
+        state=st.sampled_from(model.InstanceState),
+        pid=UINT32,
+        exit_code=INT32,
+        exit_signal=INT32,
+        restarts=UINT32,
+        peak_memory=st.floats(0, 1e18),
+        cpu_time=st.floats(0, 1e9),
+        run_time=st.floats(0, 1e9),
+        message=WORDS,
+    )
+)
+@settings(max_examples=60, deadline=None)
+def test_status_survives(status) -> None:
+    """What a slave says of an instance is what the master hears."""
+    assert convert.status_from_msg(over_the_wire(convert.status_to_msg(status))) == status
+
+
+RESOURCES = st.lists(
+    st.builds(model.ResourceDescription, NAMES, WORDS, st.floats(1e-3, 1e18), WORDS), max_size=16
+).map(tuple)
+HOSTS = st.builds(
+    model.HostDescription,
+    name=NAMES,
+    incarnation=st.integers(1, 2**64 - 1),
+    hostname=WORDS,
+    pid=UINT32,
+    software_version=WORDS,
+    labels=TEXTS,
+    resources=RESOURCES,
+    max_processes=UINT32,
+    period=st.floats(1e-3, 10.0),
+    executors=st.lists(WORDS, max_size=3).map(tuple),
+    absent=TEXTS,
+)
+
+
+@given(HOSTS)
+@settings(max_examples=60, deadline=None)
+def test_host_survives(host) -> None:
+    """A host is what it says of itself; the place of a resource is its slot."""
+    assert convert.host_from_msg(over_the_wire(convert.host_to_msg(host))) == host
+
+
+@given(HOSTS, st.data())
+@settings(max_examples=30, deadline=None)
+def test_host_row_survives(host, data) -> None:
+    """A row of `rosrm hosts` arrives whole."""
+    fraction = st.floats(0, 2, width=32)
+    row = HostRow(
+        host, 7, "up", True, False, True, 0.25,
+        tuple(
+            ResourceRow(r.name, r.unit, r.capacity, r.scope, data.draw(fraction),
+                        data.draw(fraction), data.draw(fraction), data.draw(st.booleans()))
+            for r in host.resources
+        ),
+        3,
+    )  # fmt: skip
+    assert convert.host_row_from_msg(over_the_wire(convert.host_row_to_msg(row))) == row
+
+
+def test_rows_survive() -> None:
+    """Rows of `ps`, `plugins` and `events` arrive whole."""
+    process = ProcessRow(
+        "a", "job", "failed", "h", 2**40, 12, 3, 1, -9, -5, 0, 1.5, 0.25, 2**40, "why"
+    )
+    plugin = PluginRow("probe", "gpu", "rosrm-resources 0.1", "absent", "no driver", "h")
+    event = EventRow(2**40, 1.7e9, 12.5, "assigned", "a", "h", "a goes to h", {"n": [1, {"x": 2}]})
+    assert (
+        convert.process_row_from_msg(over_the_wire(convert.process_row_to_msg(process))) == process
+    )
+    assert convert.plugin_row_from_msg(over_the_wire(convert.plugin_row_to_msg(plugin))) == plugin
+    assert convert.event_from_msg(over_the_wire(convert.event_to_msg(event))) == event
+
+
+def good_spec() -> msg.ProcessSpec:
+    return convert.spec_to_msg(model.ProcessSpec("p", command=("true",)))
+
+
+NAN, INF = float("nan"), float("inf")
+NONSENSE_IN_SPECS = {
+    "no name": lambda m: setattr(m, "name", ""),
+    "two forms": lambda m: setattr(m, "module", "x"),
+    "no form": lambda m: setattr(m, "command", []),
+    "an executable without a package": lambda m: setattr(m, "executable", "x"),
+    "kind": lambda m: setattr(m, "kind", "daemon"),
+    "restart": lambda m: setattr(m.restart, "when", "sometimes"),
+    "a delay that is no time": lambda m: setattr(m.restart, "delay", NAN),
+    "an endless bound": lambda m: setattr(m.restart, "max_delay", INF),
+    "a falling back-off": lambda m: setattr(m.restart, "factor", 0.5),
+    "a negative window": lambda m: setattr(m.restart, "window", -1.0),
+    "readiness": lambda m: setattr(m.readiness, "kind", "soon"),
+    "a readiness without end": lambda m: setattr(m.readiness, "timeout", NAN),
+    "a grace without end": lambda m: setattr(m.stop, "interrupt_grace", INF),
+    "a negative grace": lambda m: setattr(m.stop, "terminate_grace", -1.0),
+    "needs": lambda m: setattr(m, "needs", [msg.ResourceAmount(resource="memory", amount=NAN)]),
+    "negative needs": lambda m: setattr(
+        m, "needs", [msg.ResourceAmount(resource="memory", amount=-1.0)]
+    ),
+    "a parameter": lambda m: setattr(m, "parameters", [msg.KeyValue(key="a", value="{")]),
+    "a parameter too deep": lambda m: setattr(
+        m, "parameters", [msg.KeyValue(key="a", value="[" * 100_000)]
+    ),
+    "migration options": lambda m: setattr(m.migration, "options", "[1]"),
+    "options too deep": lambda m: setattr(m.migration, "options", '{"a":' * 100_000),
+}
+
+
+@pytest.mark.parametrize("what", NONSENSE_IN_SPECS)
+def test_spec_that_makes_no_process_is_refused(what) -> None:
+    """Somebody else's client may send anything: it is refused with a reason, and nothing raises."""
+    message = good_spec()
+    convert.spec_from_msg(message)
+
+    NONSENSE_IN_SPECS[what](message)
+
+    with pytest.raises(Refused) as refusal:
+        convert.spec_from_msg(message)
+    assert len(str(refusal.value)) < 500
+
+
+NONSENSE_IN_HOSTS = {
+    "no name": lambda m: setattr(m, "name", ""),
+    "no incarnation": lambda m: setattr(m, "incarnation", 0),
+    "a slot twice": lambda m: setattr(m.resources[1], "slot", 0),
+    "a hole": lambda m: setattr(m.resources[1], "slot", 5),
+    "capacity": lambda m: setattr(m.resources[0], "capacity", NAN),
+    "no capacity": lambda m: setattr(m.resources[0], "capacity", 0.0),
+    "too many": lambda m: setattr(
+        m, "resources",
+        [msg.ResourceDescription(slot=n, name=str(n), capacity=1.0) for n in range(17)],
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", NONSENSE_IN_HOSTS)
+def test_host_that_makes_no_sense_is_refused(what) -> None:
+    """A slave that describes itself badly is not taken in."""
+    resources = tuple(model.ResourceDescription(name, "B", 1.0) for name in ("memory", "disk"))
+    message = convert.host_to_msg(model.HostDescription("h", 1, resources=resources))
+    convert.host_from_msg(message)
+
+    NONSENSE_IN_HOSTS[what](message)
+
+    with pytest.raises(Refused):
+        convert.host_from_msg(message)
+
+
+def test_unknown_state_is_refused() -> None:
+    """A status of a state that this version does not know is not guessed at."""
+    with pytest.raises(Refused, match="flying"):
+        convert.status_from_msg(msg.ProcessStatus(state="flying"))
+
+
+@pytest.mark.parametrize("text", ["[1]", "1", "nothing", "{", '"a"', "null"])
+def test_only_a_json_object_is_one(text) -> None:
+    """Free-form values are JSON objects; anything else is refused with what it was."""
+    with pytest.raises(Refused, match="the options"):
+        convert.json_object(text, "the options")
+    assert convert.json_object("", "the options") == {}

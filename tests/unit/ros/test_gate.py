@@ -1,0 +1,116 @@
+"""The gate: the receiver alone judges whether a request is still meant, and none counts twice."""
+
+from __future__ import annotations
+
+from rosrm.ros.control import Gate, check_answer, refused, version_refusal
+from rosrm.version import PROTOCOL_VERSION
+from rosrm_msgs.msg import Envelope
+
+S = 10**9
+
+
+class Requested:
+    """Stands for a request that waits for its answer."""
+
+    def __init__(self) -> None:
+        self.answers = []
+
+    def answer(self, response) -> None:
+        self.answers.append(response)
+
+
+def envelope(beat: int, **changes) -> Envelope:
+    fields = {
+        "protocol_version": PROTOCOL_VERSION, "request_id": "a", "sender": "client test",
+        "epoch": 3, "receiver_beat": beat,
+    }  # fmt: skip
+    return Envelope(**{**fields, **changes})
+
+
+def gate(now: float = 100.0, max_age: float = 5.0) -> Gate:
+    return Gate(lambda: int(now * S), max_age)
+
+
+def test_a_fresh_request_passes() -> None:
+    """Up to the greatest age, by the receiver's own clock."""
+    for age in (0, 1, 5):
+        assert gate().refusal(envelope((100 - age) * S)) is None
+
+
+def test_a_late_request_is_refused() -> None:
+    """DDS delivers requests seconds late after a cut: they are not carried out any more."""
+    answer = gate().refusal(envelope(94 * S))
+    assert (answer.accepted, answer.code) == (False, "stale")
+    assert "6.0 s" in answer.message
+    assert "client test" in answer.message
+
+
+def test_a_request_for_another_run_is_refused() -> None:
+    """No beat, or one that this receiver's clock has not reached: it was meant for another run."""
+    for beat in (0, 101 * S, 2**63):
+        assert gate().refusal(envelope(beat)).code == "stale"
+
+
+def test_an_older_epoch_is_refused() -> None:
+    """A master that was replaced gives no orders; a sender that knows a newer epoch may ask."""
+    assert gate().refusal(envelope(100 * S, epoch=2), epoch=3).code == "stale"
+    assert gate().refusal(envelope(100 * S, epoch=3), epoch=3) is None
+    assert gate().refusal(envelope(100 * S, epoch=4), epoch=3) is None
+
+
+def test_another_version_is_refused_first() -> None:
+    """Of a stranger's envelope no other field is believed."""
+    answer = gate().refusal(envelope(0, protocol_version=99))
+    assert answer.code == "version"
+    assert "99" in answer.message
+    assert str(PROTOCOL_VERSION) in answer.message
+
+
+def test_a_request_without_an_id_is_refused() -> None:
+    """Nobody could tell it from another one."""
+    assert gate().refusal(envelope(100 * S, request_id="")).code == "invalid"
+
+
+def test_a_repeated_request_gets_the_same_answer() -> None:
+    """It is not carried out again."""
+    judge, first, again = gate(), Requested(), Requested()
+    assert not judge.repeated(envelope(1), first)
+    judge.remember(envelope(1), "done")
+    assert judge.repeated(envelope(1), again)
+    assert again.answers == ["done"]
+
+
+def test_a_request_repeated_while_it_is_carried_out_gets_the_answer_too() -> None:
+    """The answer in the making goes to everybody who asks for it."""
+    judge, first, again = gate(), Requested(), Requested()
+    assert not judge.repeated(envelope(1), first)
+    assert judge.repeated(envelope(1), again)
+    assert again.answers == []
+    judge.remember(envelope(1), "done")
+    assert again.answers == ["done"]
+    assert first.answers == []  # it is answered by whoever carries it out
+
+
+def test_the_gate_forgets_only_the_oldest() -> None:
+    """Its memory is bounded, and holds far more than can come within the greatest age."""
+    judge = gate()
+    for number in range(10_001):
+        assert not judge.repeated(envelope(1, request_id=str(number)), Requested())
+    assert judge.repeated(envelope(1, request_id="1"), Requested())
+    assert judge.repeated(envelope(1, request_id="10000"), Requested())
+    assert not judge.repeated(envelope(1, request_id="0"), Requested())
+
+
+def test_check_answer_raises_what_was_said() -> None:
+    """A client raises the master's own words, or that it is of another version."""
+    import pytest
+
+    from rosrm.errors import Refused
+
+    with pytest.raises(Refused, match="no such host"):
+        check_answer(refused("unknown", "no such host"), "the master")
+    stranger = refused("unknown", "whatever")
+    stranger.protocol_version = 99
+    with pytest.raises(Refused, match="the master speaks version 99"):
+        check_answer(stranger, "the master")
+    assert version_refusal(PROTOCOL_VERSION, "x") == ""

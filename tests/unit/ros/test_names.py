@@ -1,0 +1,49 @@
+"""Names of topics and services: valid for ROS, and different for different hosts."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rclpy.validate_full_topic_name import validate_full_topic_name
+from rclpy.validate_node_name import validate_node_name
+
+from rosrm.ros.names import Names, token
+
+AWKWARD = [
+    "robot-1",
+    "robot_1",
+    "robot.1",
+    "robot--1",
+    "3d",
+    "h3d",
+    "-",
+    "_",
+    "a__b",
+    "a_",
+    "ö",
+    "Ω-1",
+    "x" * 100,
+]
+
+
+@pytest.mark.parametrize("host", AWKWARD)
+def test_names_are_valid(host) -> None:
+    """Whatever a host is called, ROS takes the names of its services and of its node."""
+    assert validate_full_topic_name(Names("/rosrm").of_host(host, "control"))
+    validate_node_name(f"rosrm_slave_{token(host)}")
+
+
+def test_a_plain_name_stays() -> None:
+    """What needs no change is easily recognised in `ros2 service list`."""
+    assert Names("/rosrm").of_host("robot_1", "control") == "/rosrm/host/robot_1/control"
+
+
+@given(
+    st.lists(st.sampled_from(AWKWARD) | st.text(min_size=1, max_size=8), min_size=2, unique=True)
+)
+def test_different_hosts_have_different_names(hosts) -> None:
+    """In DDS all servers of one name execute a request: robot-1 must not hear what robot_1 is told."""
+    assert len({token(host) for host in hosts}) == len(hosts)
+    for host in hosts:
+        validate_full_topic_name(Names("/rosrm").of_host(host, "control"))

@@ -1,0 +1,128 @@
+"""`resource_info` as bytes: field by field what rclpy's own serialisation says."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from rclpy.serialization import deserialize_message, serialize_message
+
+from rosrm.core.model import RESOURCE_SLOTS
+from rosrm.ros.readings import ACCEPTING, LAYOUT, decode, encode
+from rosrm.version import PROTOCOL_VERSION
+from rosrm_msgs import msg
+
+NUMBERS = {
+    "protocol_version": PROTOCOL_VERSION, "flags": ACCEPTING, "host_id": 0xFEDCBA98,
+    "incarnation": 0xFEDCBA9876543210, "sequence": 3, "beat": 2**63 + 5, "master_beat": 6,
+    "status_sequence": 2**40, "processes": 8, "present": 0xFFFF, "stale": 0b101, "reserved": 0,
+}  # fmt: skip
+USAGE = np.linspace(0.0, 1.5, RESOURCE_SLOTS, dtype=np.float32)
+LIMIT = np.linspace(1.0, 0.1, RESOURCE_SLOTS, dtype=np.float32)
+
+
+def info(**changes) -> msg.ResourceInfo:
+    return msg.ResourceInfo(**{**NUMBERS, "usage": USAGE, "limit": LIMIT, **changes})
+
+
+def row(**changes) -> np.ndarray:
+    record = np.zeros((), LAYOUT)
+    for name, value in {**NUMBERS, "usage": USAGE, "limit": LIMIT, **changes}.items():
+        record[name] = value
+    return record
+
+
+def test_encoding_is_what_rclpy_writes() -> None:
+    """A reader of any language gets the message that rclpy would have sent."""
+    assert encode(row()) == serialize_message(info())
+
+
+def test_every_byte_is_a_field() -> None:
+    """Each field of the layout stands where rclpy reads the field of that name."""
+    for name in LAYOUT.names[1:]:
+        record = row()
+        record[name] = 0
+        message = deserialize_message(encode(record), msg.ResourceInfo)
+        for other, value in {**NUMBERS, "usage": USAGE, "limit": LIMIT}.items():
+            expected = np.zeros_like(value) if other == name else value
+            np.testing.assert_array_equal(getattr(message, other), expected, err_msg=other)
+
+
+def test_zeros_at_the_end_are_kept() -> None:
+    """The header's last two bytes are zero, and so may be all others."""
+    raw = encode(np.zeros((), LAYOUT))
+    assert raw[:4] == b"\0\1\0\0"
+    assert len(raw) == LAYOUT.itemsize == len(serialize_message(msg.ResourceInfo()))
+
+
+def test_decoding_what_rclpy_writes() -> None:
+    """A reading that a slave in another language sends is read right."""
+    decoded = decode([serialize_message(info(host_id=5, incarnation=9, sequence=4))])
+
+    readings = decoded.readings
+    assert decoded.received == 1
+    assert decoded.strangers == ()
+    assert readings.host_id.tolist() == [5]
+    assert readings.incarnation.tolist() == [9]
+    assert readings.sequence.tolist() == [4]
+    assert readings.status_sequence.tolist() == [2**40]
+    assert readings.accepting.tolist() == [True]
+    assert readings.stale.tolist() == [0b101]
+    np.testing.assert_array_equal(readings.usage[0], USAGE)
+    np.testing.assert_array_equal(readings.limit[0], LIMIT)
+    assert decoded.beats == {(5, 9): 2**63 + 5}
+
+
+def test_newest_of_each_host_counts() -> None:
+    """Of several readings of one run of a host the last one counts."""
+    batch = [
+        serialize_message(info(host_id=host, sequence=sequence, beat=sequence))
+        for sequence, host in enumerate([1, 2, 1, 3, 2, 1])
+    ]
+
+    decoded = decode(batch)
+
+    newest = dict(
+        zip(decoded.readings.host_id.tolist(), decoded.readings.sequence.tolist(), strict=True)
+    )
+    assert newest == {1: 5, 2: 4, 3: 3}
+    assert decoded.received == 6
+
+
+def test_a_former_run_hides_no_reading() -> None:
+    """What a former run of a slave still sends neither replaces the new run's reading nor its beat."""
+    now = serialize_message(info(host_id=1, incarnation=20, sequence=1, beat=100))
+    late = serialize_message(info(host_id=1, incarnation=10, sequence=900, beat=5))
+
+    decoded = decode([now, late])
+
+    assert sorted(decoded.readings.incarnation.tolist()) == [10, 20]
+    assert decoded.beats == {(1, 20): 100, (1, 10): 5}
+
+
+@pytest.mark.parametrize(
+    ("raw", "said"),
+    [
+        (serialize_message(info(protocol_version=99)), "version 99"),
+        (serialize_message(info())[:-1], "another size"),
+        (serialize_message(info()) + b"\0", "another size"),
+        (b"\0\0" + serialize_message(info())[2:], "another size"),
+        (b"", "another size"),
+    ],
+    ids=["version", "short", "long", "big-endian", "empty"],
+)
+def test_strangers_are_refused(raw, said) -> None:
+    """Another version, size or byte order is refused and said, and never read as numbers."""
+    alone = decode([raw])
+    assert alone.readings is None
+    assert len(alone.strangers) == 1
+    assert said in alone.strangers[0]
+
+    among_ours = decode([raw, serialize_message(info(host_id=3)), raw])
+    assert among_ours.readings.host_id.tolist() == [3]
+    assert len(among_ours.strangers) == 1
+    assert among_ours.received == 1
+
+
+def test_nothing_is_nothing() -> None:
+    """No message, no event."""
+    assert decode([]).readings is None
