@@ -45,6 +45,7 @@ __all__ = [
     "SupervisorEnded",
     "SupervisorGone",
     "log_path",
+    "newest_log",
 ]
 
 #: Seconds for the supervisor to take what it is sent.
@@ -82,6 +83,15 @@ class LaunchOrder:
 def log_path(state_directory: Path, instance: InstanceId) -> Path:
     """The file that an instance writes its output to; older parts: `.1`, `.2`, ... behind it."""
     return Path(paths.log_file(str(state_directory), instance.process, instance.number))
+
+
+def newest_log(state_directory: Path, process: str) -> InstanceId | None:
+    """The newest instance of a process that has a log; None: there is none (any more)."""
+    wanted = paths.safe_name(process)
+    folder = Path(paths.log_folder(str(state_directory)))
+    found = [paths.log_number(path.name) for path in folder.glob("*.log")]
+    numbers = [log[1] for log in found if log is not None and log[0] == wanted]
+    return InstanceId(process, max(numbers)) if numbers else None
 
 
 class SupervisorClient:

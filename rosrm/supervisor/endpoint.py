@@ -22,7 +22,7 @@ def listen(state: str) -> socket.socket:
     try:
         os.makedirs(state, mode=0o700, exist_ok=True)
         os.chmod(state, 0o700)
-        for folder in (paths.log_root(state), paths.work_directory(state)):
+        for folder in (paths.log_folder(state), paths.work_directory(state)):
             os.makedirs(folder, mode=0o700, exist_ok=True)
         _lock(state)
         return _bind(state)

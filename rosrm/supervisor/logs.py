@@ -8,7 +8,7 @@ interval.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Collection, Container, Iterable
 from typing import Final, NamedTuple
 
 from rosrm.core.supervision import Key
@@ -17,8 +17,10 @@ from rosrm.supervisor import own_log, paths
 #: Seconds between two looks while logs grow, and while they do not.
 BUSY: Final = 0.2
 QUIET: Final = 1.0
-#: New processes between two looks for logs of old ones.
-PRUNE_EVERY: Final = 100
+#: As many processes too many are borne before the logs of the oldest are removed.
+PROCESSES_AT_ONCE: Final = 50
+#: What may lie beside a log and goes with it.
+FILES_BESIDE: Final = (".parameters.yaml",)
 
 
 class LogLimits(NamedTuple):
@@ -45,24 +47,22 @@ class LogKeeper:
         self._state = state
         self._sizes: dict[Key, int] = {}
         self._due: float | None = None
-        self._new_processes = 0
+        self._shelf = Shelf(state)
 
-    def open(self, instance: Key, known: Iterable[Key]) -> int:
+    def open(self, instance: Key, known: Collection[Key]) -> int:
         """The descriptor that an instance is to write to; makes room by removing old logs.
 
         Args:
             instance: that is about to start.
             known: instances whose logs stay.
         """
-        process, number = instance
-        path = paths.log_file(self._state, process, number)
-        try:
-            log = _open(path)
-        except FileNotFoundError:
-            self._prune_processes(known)
-            os.mkdir(os.path.dirname(path), mode=0o700)
-            return _open(path)
-        self._prune_instances(process, known)
+        log = os.open(
+            paths.log_file(self._state, *instance),
+            os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC,
+            0o600,
+        )
+        self._shelf.add(instance, known, self.limits)
+        self._shelf.remove_old_processes(known, self.limits)
         return log
 
     def watch(self, instance: Key, now: float) -> None:
@@ -106,35 +106,55 @@ class LogKeeper:
             own_log.say(f"{path} was cut, but not kept: {error}")
         return 0
 
-    def _prune_instances(self, process: str, known: Iterable[Key]) -> None:
-        """Remove the logs of all but the newest instances of a process."""
-        directory = paths.log_directory(self._state, process)
-        files: dict[int, list[str]] = {}
-        for name in os.listdir(directory):
-            number = name.partition(".")[0]
-            if number.isdigit():
-                files.setdefault(int(number), []).append(name)
-        excess = len(files) - self.limits.instances
-        if excess <= 0:
-            return
-        stay = {number for name, number in known if name == process}
-        for old in set(sorted(files)[:excess]) - stay:
-            for name in files[old]:
-                os.unlink(os.path.join(directory, name))
 
-    def _prune_processes(self, known: Iterable[Key]) -> None:
-        """Once in many new processes, remove the logs of those that wrote longest ago."""
-        self._new_processes += 1
-        if self._new_processes % PRUNE_EVERY:
+class Shelf:
+    """Which instances have files in the folder of logs; removes those of old ones.
+
+    The folder is read once; from then on the supervisor knows what it put there.
+    """
+
+    def __init__(self, state: str) -> None:
+        self._state = state
+        self._numbers: dict[str, list[int]] = {}
+        found = map(paths.log_number, os.listdir(paths.log_folder(state)))
+        for name, number in sorted(filter(None, found), key=lambda log: log[1]):
+            self._place(name, number)
+
+    def add(self, instance: Key, known: Container[Key], limits: LogLimits) -> None:
+        """A new log; makes room for it, but not with the logs of `known` instances."""
+        process, number = instance
+        numbers = self._place(paths.safe_name(process), number)
+        for old in numbers[: max(0, len(numbers) - limits.instances)]:
+            if (process, old) not in known:
+                numbers.remove(old)
+                self._remove(paths.safe_name(process), old)
+
+    def remove_old_processes(self, known: Iterable[Key], limits: LogLimits) -> None:
+        """Now and then: the logs of the processes that were started longest ago."""
+        excess = len(self._numbers) - limits.processes
+        if excess < PROCESSES_AT_ONCE:
             return
-        directory = paths.log_root(self._state)
-        stay = {paths.safe_name(name) for name, _ in known}
-        old = [os.path.join(directory, name) for name in os.listdir(directory) if name not in stay]
-        old.sort(key=lambda path: os.stat(path).st_mtime)
-        for path in old[: max(0, len(old) - self.limits.processes)]:
-            for name in os.listdir(path):
-                os.unlink(os.path.join(path, name))
-            os.rmdir(path)
+        stay = {paths.safe_name(process) for process, _ in known}
+        for name in [name for name in self._numbers if name not in stay][:excess]:
+            for number in self._numbers.pop(name):
+                self._remove(name, number)
+
+    def _place(self, name: str, number: int) -> list[int]:
+        """Note a log; its process is now the newest."""
+        numbers = self._numbers[name] = self._numbers.pop(name, [])
+        if number not in numbers:
+            numbers.append(number)
+            numbers.sort()
+        return numbers
+
+    def _remove(self, name: str, number: int) -> None:
+        log = os.path.join(paths.log_folder(self._state), f"{name}.{number}.log")
+        for extra in FILES_BESIDE:
+            _unlink(f"{log[: -len('.log')]}{extra}")
+        _unlink(log)
+        older = 1
+        while _unlink(f"{log}.{older}"):
+            older += 1
 
 
 def rotate(path: str, size: int, limits: LogLimits) -> None:
@@ -162,5 +182,10 @@ def _copy_end(log: int, target: str, size: int, most: int) -> None:
             offset += sent
 
 
-def _open(path: str) -> int:
-    return os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o600)
+def _unlink(path: str) -> bool:
+    """Remove a file; False: there is none."""
+    try:
+        os.unlink(path)
+    except FileNotFoundError:
+        return False
+    return True

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from rosrm.core.model import InstanceId
-from rosrm.supervisor.client import LogLimits
+from rosrm.supervisor.client import LogLimits, newest_log
+from rosrm.supervisor.logs import PROCESSES_AT_ONCE
 
 from .conftest import wait_until
 
@@ -31,7 +32,7 @@ def test_a_flood_is_bounded(host):
     client.stop(InstanceId("flood", 1))
     host.ended(client, "flood")
     files = list(log.parent.iterdir())
-    assert sorted(file.name for file in files) == ["1.log", "1.log.1", "1.log.2"]
+    assert sorted(file.name for file in files) == ["flood.1.log", "flood.1.log.1", "flood.1.log.2"]
     assert all(file.stat().st_size <= limits.max_bytes + 100 for file in files)
 
 
@@ -39,7 +40,7 @@ def test_a_rotated_log_keeps_its_newest_lines(host):
     """What is dropped is the oldest, and the file says that something was."""
     client = host.connect(log=LogLimits(max_bytes=10 * KIB, keep=1))
     host.run(client, host.order("count", "seq", "1", "10000"))
-    kept = host.log("count").with_name("1.log.1").read_text().splitlines()
+    kept = host.log("count").with_name("count.1.log.1").read_text().splitlines()
     assert kept[0].startswith("[rosrm: ")
     assert kept[-1] == "10000"
 
@@ -48,12 +49,48 @@ def test_logs_of_old_instances_are_pruned(host):
     """Of one process only the newest instances' logs stay, with the files beside them."""
     client = host.connect(log=LogLimits(instances=3))
     for number in range(1, 6):
-        host.log("many", number).parent.mkdir(parents=True, exist_ok=True)
         host.log("many", number).with_suffix(".parameters.yaml").write_text("{}")
         host.run(client, host.order("many", "true", number=number))
         client.forget([InstanceId("many", number)])
-    numbers = {file.name.partition(".")[0] for file in host.log("many").parent.iterdir()}
+    numbers = {file.name.split(".")[1] for file in host.log("many").parent.iterdir()}
     assert numbers == {"3", "4", "5"}
+    assert newest_log(host.state, "many") == InstanceId("many", 5)
+
+
+def test_the_index_of_logs_survives_the_supervisor(host):
+    """A new supervisor knows the logs that are there, and prunes them too."""
+    client = host.connect(log=LogLimits(instances=2))
+    for number in range(1, 3):
+        host.run(client, host.order("many", "true", number=number))
+        client.forget([InstanceId("many", number)])
+    host.kill_supervisor(client)
+    client = host.connect(log=LogLimits(instances=2))
+    host.run(client, host.order("many", "true", number=3))
+    assert sorted(file.name for file in host.log("many").parent.iterdir()) == [
+        "many.2.log",
+        "many.3.log",
+    ]
+
+
+def test_logs_of_old_processes_are_pruned(host):
+    """Jobs with names of their own leave a bounded number of logs."""
+    client = host.connect(log=LogLimits(processes=10))
+    for number in range(100):
+        host.run(client, host.order(f"job{number}", "true", number=number))
+        client.forget([InstanceId(f"job{number}", number)])
+    left = list(host.log("any").parent.iterdir())
+    assert len(left) < 10 + PROCESSES_AT_ONCE
+    assert newest_log(host.state, "job99") == InstanceId("job99", 99)
+    assert newest_log(host.state, "job0") is None
+
+
+def test_logs_with_numbers_in_the_name_stay_apart(host):
+    """`a` and `a.1` are two processes."""
+    client = host.connect()
+    host.run(client, host.order("a", "echo", "first", number=2))
+    host.run(client, host.order("a.1", "echo", "second", number=3))
+    assert newest_log(host.state, "a") == InstanceId("a", 2)
+    assert newest_log(host.state, "a.1") == InstanceId("a.1", 3)
 
 
 def test_any_process_name_is_a_safe_file_name(host):

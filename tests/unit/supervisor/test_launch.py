@@ -166,7 +166,7 @@ def test_what_is_missing_is_named(tmp_path, prefix, package, executable, said):
 def test_parameters_go_to_a_file_beside_the_log(tmp_path):
     """Whatever the node's name is, the file is for it."""
     made = order(tmp_path, command=("node",), ros=True, parameters={"rate": 10})
-    path = tmp_path / "logs" / "talker" / "7.parameters.yaml"
+    path = tmp_path / "logs" / "talker.7.parameters.yaml"
     assert made.argv[-2:] == ("--params-file", str(path))
     assert yaml.safe_load(path.read_text()) == {"/**": {"ros__parameters": {"rate": 10}}}
 
