@@ -49,9 +49,11 @@ def _check_rules(root: Node, config: ClusterConfig | None, problems: Problems) -
             f"liveness.suspect ({config.liveness.suspect:g} s) must be less than "
             f"liveness.lease ({config.liveness.lease:g} s)",
         )
-    if root.get("checkpoint", "options") is not None and not _given(root, "checkpoint"):
-        place = root.deepest(("checkpoint", "options")).place
-        problems.add(place, "checkpoint.options: options of no policy; name one in `policy`")
+    options = root.get("checkpoint", "options")
+    if options is not None and options.items and not _given(root, "checkpoint"):
+        problems.add(
+            options.place, "checkpoint.options: options of no policy; name one in `policy`"
+        )
 
 
 def _with_options(root: Node, config: ClusterConfig, plugins: PluginCheck) -> ClusterConfig:

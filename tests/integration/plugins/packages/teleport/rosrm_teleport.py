@@ -1,0 +1,64 @@
+"""A third party's migration strategy: announces the move on the destination, then moves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from rosrm.config.units import PositiveSeconds
+from rosrm.core.migration import AwaitReady, Commit, Execute, Move, Plan, Start, Stop
+from rosrm.hookspecs import hookimpl
+from rosrm.ports import MigrationOffer
+
+
+@dataclass(frozen=True)
+class TeleportOptions:
+    """What cluster.yaml may set.
+
+    Attributes:
+        patience: seconds for each step.
+    """
+
+    patience: PositiveSeconds = 10.0
+
+
+class Teleport:
+    """Stops the source first, after the destination was told."""
+
+    def __init__(self, options: TeleportOptions) -> None:
+        self._patience = options.patience
+
+    def propose(self, move: Move) -> Plan:
+        """Tell, stop here, start there, be ready there."""
+        wait = self._patience
+        back = Start(move.fallback, move.source_host, wait)
+        undo = Stop(move.destination, move.destination_host, wait)
+        return Plan(
+            (
+                Execute("teleport.announce", move.destination_host, {"who": move.spec.name}, wait),
+                Stop(move.source, move.source_host, wait, undo=back),
+                Start(move.destination, move.destination_host, wait, undo=undo),
+                AwaitReady(move.destination, move.destination_host, wait),
+                Commit(),
+            )
+        )
+
+
+def announce(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Runs on the destination's slave."""
+    return {"announced": arguments["who"]}
+
+
+@hookimpl
+def register_migration_strategies() -> Sequence[MigrationOffer]:
+    """Offer the strategy and its executor."""
+    return [
+        MigrationOffer(
+            "teleport",
+            Teleport,
+            TeleportOptions,
+            "says so, then moves",
+            executors={"teleport.announce": announce},
+        )
+    ]

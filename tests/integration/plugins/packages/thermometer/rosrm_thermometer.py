@@ -1,0 +1,57 @@
+"""A third party's probe: how hot the machine is, as a fraction of what it stands."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from annotated_types import Gt, Le
+
+from rosrm.core.model import Reading, ResourceDescription
+from rosrm.errors import SkipPlugin
+from rosrm.hookspecs import hookimpl
+from rosrm.ports import ProbeContext, ProbeOffer
+
+
+@dataclass(frozen=True)
+class ThermometerOptions:
+    """What host.yaml may set.
+
+    Attributes:
+        sensor: file that holds thousandths of a degree.
+        hottest: degrees that count as 1.0.
+    """
+
+    sensor: str = "/sys/class/thermal/thermal_zone0/temp"
+    hottest: Annotated[float, Gt(0), Le(150)] = 95.0
+
+
+class Thermometer:
+    """Reads one sensor."""
+
+    def __init__(self, options: ThermometerOptions, context: ProbeContext) -> None:
+        if not Path(options.sensor).is_file():
+            raise SkipPlugin(f"no sensor at {options.sensor}")
+        self._options = options
+        self._resource = ResourceDescription("heat", "K", options.hottest)
+
+    @property
+    def resources(self) -> Sequence[ResourceDescription]:
+        """One: heat."""
+        return [self._resource]
+
+    def read(self) -> Iterable[Reading]:
+        """The temperature now."""
+        degrees = int(Path(self._options.sensor).read_text(encoding="ascii")) / 1000.0
+        return [Reading("heat", max(0.0, degrees / self._options.hottest))]
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
+@hookimpl
+def register_probes() -> Sequence[ProbeOffer]:
+    """Offer the probe."""
+    return [ProbeOffer("heat", Thermometer, ThermometerOptions, "how hot it is", period=1.0)]

@@ -1,0 +1,82 @@
+"""The tutorial, done as it is written: files made, commands run, answers compared."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+TUTORIAL = Path(__file__).resolve().parents[3] / "docs/tutorials/your-own-scoring-plugin.md"
+
+_BLOCK = re.compile(
+    r"<!-- (?P<what>file|run)(: (?P<about>[^>]*?))? -->\n```\w+\n(?P<text>.*?)```", re.DOTALL
+)
+
+
+@dataclass(frozen=True)
+class Command:
+    """A line that a reader types, and what the page shows as the answer."""
+
+    line: str
+    answer: str
+    code: int
+
+
+def blocks() -> Iterator[tuple[str, str] | Command]:
+    """The files (name and text) and the commands of the tutorial, in its order."""
+    for block in _BLOCK.finditer(TUTORIAL.read_text(encoding="utf-8")):
+        about, text = block["about"] or "", block["text"]
+        if block["what"] == "file":
+            yield about, text
+            continue
+        code = int(about.removeprefix("exit ") or 0)
+        for shown in re.split(r"^\$ ", text, flags=re.MULTILINE)[1:]:
+            line, _, answer = shown.partition("\n")
+            yield Command(line, answer.strip(), code)
+
+
+def matches(shown: str, given: str) -> bool:
+    """`...` in the page stands for anything, and every run of spaces for any other."""
+    parts = [re.escape(part.strip()) for part in shown.split("...")]
+    pattern = ".*".join(part.replace(r"\ ", r"\s+").replace("\n", r"\s+") for part in parts)
+    return re.fullmatch(pattern, given.strip(), re.DOTALL) is not None
+
+
+def test_the_tutorial_does_what_it_says(environment):
+    """An empty folder becomes a policy that is pip-installed and selected by name."""
+    folder, done = environment.folder, []
+    for block in blocks():
+        if isinstance(block, Command):
+            if block.line.startswith("cd "):
+                folder /= block.line.removeprefix("cd ")
+                continue
+            result = environment.shell(block.line, folder)
+            said = result.stdout + result.stderr
+            assert result.returncode == block.code, f"$ {block.line}\n{said}"
+            assert matches(block.answer, said), f"$ {block.line}\n{said}"
+            done.append(block.line)
+        else:
+            name, text = block
+            (folder / name).write_text(text, encoding="utf-8")
+    assert "pip install --quiet ." in done
+    assert "rosrm config check cluster.yaml" in done
+    assert len(done) == 6
+
+    code = (
+        "from rosrm.registry import Registry\n"
+        "from rosrm.config import ClusterConfig, load_cluster\n"
+        "registry = Registry.discover()\n"
+        "config = load_cluster('rosrm-fewest/cluster.yaml', registry)\n"
+        "config = ClusterConfig.from_json(config.to_json())\n"
+        "policy = registry.scoring(config.scoring.policy, config.scoring.options)\n"
+        "print(type(policy).__module__, policy._most)\n"
+    )
+    assert environment.python(code).split() == ["rosrm_fewest", "20"]
+
+
+def test_every_marked_block_is_found():
+    """A block whose mark is misspelt would silently not be tested."""
+    text = TUTORIAL.read_text(encoding="utf-8")
+    assert text.count("<!--") == len(list(_BLOCK.finditer(text)))
+    assert text.count("```") == 2 * (text.count("<!--") + 1)  # one block is only shown

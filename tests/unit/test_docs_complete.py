@@ -1,0 +1,210 @@
+"""The reference pages name everything there is: hooks, offers, settings, commands, JSON fields."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Annotated, get_args, get_origin, get_type_hints
+
+import pytest
+import typer.main
+
+from rosrm import hookspecs, ports
+from rosrm.cli.commands import app
+from rosrm.config import ClusterConfig, HostConfig, load_cluster, load_host, load_work
+from rosrm.config.process import ProcessInFile
+from rosrm.core import migration, views
+from rosrm.core.model import HostDescription
+from rosrm.loading import HOOKS
+
+REFERENCE = Path(__file__).resolve().parents[2] / "docs" / "reference"
+
+
+def page(name: str) -> str:
+    return (REFERENCE / name).read_text(encoding="utf-8")
+
+
+def section(text: str, heading: str) -> str:
+    """What stands under a heading, up to the next of its level or above."""
+    found = re.search(rf"^(#+) {re.escape(heading)}$", text, re.MULTILINE)
+    assert found, f"no section {heading!r}"
+    rest = text[found.end() :]
+    end = re.search(rf"^#{{1,{len(found[1])}}} ", rest, re.MULTILINE)
+    return rest[: end.start()] if end else rest
+
+
+def keys(kind: type, before: str = "") -> Iterator[str]:
+    """The keys of a file by their dotted names, as the dataclasses have them."""
+    hints = get_type_hints(kind, include_extras=True)
+    for f in fields(kind):
+        hint = hints[f.name]
+        marks = get_args(hint)[1:] if get_origin(hint) is Annotated else ()
+        in_file = [mark.in_file() for mark in marks if hasattr(mark, "in_file")]
+        inner = in_file[0] if in_file else hint
+        if is_dataclass(inner):
+            yield from keys(inner, f"{before}{f.name}.")
+        else:
+            yield f"{before}{f.name}"
+
+
+def rows(text: str) -> set[str]:
+    """The first column of the tables of a text."""
+    return set(re.findall(r"^\| `([^`]+)` \|", text, re.MULTILINE))
+
+
+@pytest.mark.parametrize(
+    ("heading", "kind"), [("`cluster.yaml`", ClusterConfig), ("`host.yaml`", HostConfig)]
+)
+def test_every_setting_is_documented_and_nothing_else(heading, kind):
+    text = page("configuration.md")
+    wanted = set(keys(kind))
+    ros = {key for key in wanted if key.startswith("ros.")}
+    assert rows(section(text, heading)) == wanted - ros | {"ros"}
+    assert rows(section(text, "The section `ros`")) == ros
+
+
+def test_every_word_of_a_process_is_documented_and_nothing_else():
+    wanted = set(keys(ProcessInFile)) | {"foreach", "processes", "defaults"}
+    wanted |= {"restart", "migration", "readiness", "stop"}
+    assert rows(section(page("configuration.md"), "`work.yaml`")) == wanted
+
+
+@pytest.mark.parametrize(
+    ("mark", "load", "defaults"),
+    [
+        ("defaults: cluster", load_cluster, ClusterConfig()),
+        ("defaults: host", load_host, HostConfig()),
+    ],
+)
+def test_the_defaults_in_the_page_are_the_defaults(mark, load, defaults, tmp_path, monkeypatch):
+    """The example has every key but the host's name, which is the machine's."""
+    block = re.search(rf"<!-- {mark} -->\n```yaml\n(.*?)```", page("configuration.md"), re.DOTALL)
+    (tmp_path / "f.yaml").write_text(block[1], encoding="utf-8")
+    assert load(tmp_path / "f.yaml") == defaults
+    for key in keys(type(defaults)):
+        name = key.rsplit(".", 1)[-1]
+        assert key == "host" or re.search(rf"\b{name}:", block[1]), f"{key} is not in the example"
+
+
+def test_the_work_file_in_the_page_is_right(tmp_path):
+    block = re.search(r"<!-- work -->\n```yaml\n(.*?)```", page("configuration.md"), re.DOTALL)
+    (tmp_path / "work.yaml").write_text(block[1], encoding="utf-8")
+    assert len(load_work(tmp_path / "work.yaml")) == 22
+
+
+def hook_names() -> list[str]:
+    return [
+        name
+        for name, function in vars(hookspecs).items()
+        if callable(function) and hasattr(function, f"{hookspecs.GROUP}_spec")
+    ]
+
+
+def test_the_loader_knows_every_hook():
+    assert sorted(hook_names()) == sorted(HOOKS)
+
+
+@pytest.mark.parametrize("hook", hook_names())
+def test_every_hook_and_its_parameters_are_documented(hook):
+    text = page("plugins.md")
+    assert hook in rows(section(text, "Hooks"))
+    for parameter in inspect.signature(getattr(hookspecs, hook)).parameters:
+        assert f"`{parameter}`" in section(text, "Hooks")
+
+
+@pytest.mark.parametrize(
+    "offer",
+    [ports.ProbeOffer, ports.ScoringOffer, ports.MigrationOffer, ports.CheckpointOffer],
+    ids=lambda offer: offer.__name__,
+)
+def test_every_field_of_an_offer_is_documented(offer):
+    text = page("plugins.md")
+    common = section(text, "Offers").split("\n### ")[0]
+    own = section(text, f"`{offer.__name__}`")
+    for f in fields(offer):
+        assert f"- `{f.name}`" in common + own, f"{offer.__name__}.{f.name}"
+
+
+@pytest.mark.parametrize(
+    ("heading", "kinds"),
+    [
+        ("`ProbeOffer`", [ports.Probe, ports.ProbeContext, ports.Sessions]),
+        (
+            "`ScoringOffer`",
+            [ports.ScoringPolicy, ports.HostView, ports.ProcessView, ports.Scores],
+        ),
+        ("`MigrationOffer`", [ports.MigrationStrategy, migration.Move, migration.Plan]),
+        (
+            "`CheckpointOffer`",
+            [ports.CheckpointPolicy, ports.CheckpointView, ports.CheckpointChoice],
+        ),
+    ],
+)
+def test_all_that_a_plugin_meets_is_documented(heading, kinds):
+    text = section(page("plugins.md"), heading)
+    for kind in kinds:
+        assert kind.__name__ in text or kind is ports.Sessions
+        for name in set(vars(kind)) | set(getattr(kind, "__annotations__", ())):
+            if not name.startswith("_"):
+                assert re.search(rf"`{name}[`(]", text), f"{kind.__name__}.{name}"
+
+
+def test_every_step_of_a_plan_is_documented():
+    text = section(page("plugins.md"), "`MigrationOffer`")
+    for step in get_args(migration.Step):
+        assert f"`{step.__name__}`" in text
+
+
+def commands(group, before: str = "rosrm") -> Iterator[tuple[str, object]]:
+    for name, command in group.commands.items():
+        if hasattr(command, "commands"):
+            yield from commands(command, f"{before} {name}")
+        else:
+            yield f"{before} {name}", command
+
+
+TREE = typer.main.get_command(app)
+
+
+@pytest.mark.parametrize(("name", "command"), list(commands(TREE)), ids=str)
+def test_every_command_and_option_is_documented(name, command):
+    text = section(page("command-line.md"), f"`{name}`")
+    for parameter in command.params:
+        for word in parameter.opts if parameter.param_type_name == "option" else ():
+            assert re.search(rf"`{word}\b", text), f"{name} {word}"
+        if parameter.param_type_name == "argument":
+            assert str(parameter.metavar) in text, f"{name} {parameter.metavar}"
+
+
+def test_nothing_is_documented_that_is_no_command():
+    documented = set(re.findall(r"^### `(rosrm [^`]+)`$", page("command-line.md"), re.MULTILINE))
+    assert documented == {name for name, _ in commands(TREE)}
+
+
+def test_the_common_options_are_documented():
+    text = page("command-line.md").split("\n## ")[0]
+    for parameter in TREE.params:
+        for word in parameter.opts:
+            assert f"`{word}`" in text, word
+
+
+@pytest.mark.parametrize(
+    ("title", "kinds"),
+    [
+        ("A process", [views.ProcessRow]),
+        ("A host", [views.HostRow, HostDescription, views.ResourceRow]),
+        ("An event", [views.EventRow]),
+        ("A plugin", [views.PluginRow]),
+    ],
+)
+def test_every_field_of_the_json_is_documented(title, kinds):
+    found = re.search(
+        rf"^\*\*{title}\*\*.*?\n\n", page("command-line.md") + "\n", re.MULTILINE | re.DOTALL
+    )
+    for kind in kinds:
+        for f in fields(kind):
+            if f.name != "description":  # of a host: its fields stand beside the others
+                assert f"`{f.name}`" in found[0], f"{kind.__name__}.{f.name}"
