@@ -7,6 +7,7 @@ already is not done again: a stamp in `.venv` holds digests of what went into it
 from __future__ import annotations
 
 import argparse
+import contextlib
 import fcntl
 import hashlib
 import importlib.util
@@ -15,11 +16,13 @@ import os
 import platform
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import sysconfig
 import time
 from collections import deque
+from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -75,7 +78,11 @@ def wait_for(lock: int) -> None:
 
 def set_up(*, remake_other_version: bool) -> None:
     """Do the steps that are not done yet."""
-    wanted = {"interfaces": interfaces_digest(), "packages": packages_digest()}
+    wanted = {
+        "where": str(VENV),
+        "interfaces": interfaces_digest(),
+        "packages": packages_digest(),
+    }
     if not venv_usable(remake_other_version=remake_other_version):
         check_machine()
         make_venv()
@@ -99,7 +106,7 @@ def set_up(*, remake_other_version: bool) -> None:
                 INTERFACES,
             ),
         )
-        write_stamp({"interfaces": wanted["interfaces"]})
+        write_stamp({k: wanted[k] for k in ("where", "interfaces")})
     steps.run(
         "ROS 2 Jazzy, rosrm, its plugins and examples, the tools for the tests",
         *pip("install", "--no-build-isolation", *editables(extras="ros,plot,test")),
@@ -151,7 +158,8 @@ def venv_usable(*, remake_other_version: bool) -> bool:
     probe = "import sys; print(*sys.version_info[:2], sys.prefix)"
     answer = subprocess.run([PYTHON, "-c", probe], capture_output=True, text=True, check=False)
     major, minor, prefix = (*answer.stdout.strip().split(" ", 2), "", "", "")[:3]
-    if answer.returncode != 0 or Path(prefix) != VENV:
+    where = read_stamp().get("where", prefix)  # its commands name the place where it was made
+    if answer.returncode != 0 or not Path(prefix) == Path(where) == VENV:
         print("      .venv was made elsewhere or is broken: it is made anew")
         return False
     if remake_other_version and (major, minor) != tuple(map(str, sys.version_info[:2])):
@@ -225,6 +233,7 @@ def make_venv() -> None:
     )
     if made.returncode != 0:
         raise SetupError(f"python -m venv failed:\n{made.stdout}{made.stderr}")
+    write_stamp({"where": str(VENV)})
 
 
 #: Installed first, so that rosrm's own distributions install without a build environment each.
@@ -270,7 +279,9 @@ class Steps:
                 stderr=subprocess.STDOUT,
                 text=True,
                 errors="replace",
+                start_new_session=True,
             ) as process,
+            ended_with_us(process),
         ):
             progress = ProgressLine(began)
             for line in process.stdout or ():
@@ -284,6 +295,20 @@ class Steps:
                 f"{LOG.relative_to(ROOT)}):\n\n{''.join(last_lines)}"
             )
         print(f"      done in {time.monotonic() - began:.0f} s", flush=True)
+
+
+@contextlib.contextmanager
+def ended_with_us(process: subprocess.Popen[str]) -> Iterator[None]:
+    """End a command, its compilers too, where this run is interrupted."""
+    try:
+        yield
+    except BaseException:
+        for how, grace in ((signal.SIGINT, 5.0), (signal.SIGKILL, None)):
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, how)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(grace)
+        raise
 
 
 class ProgressLine:
