@@ -3,11 +3,11 @@
 from dataclasses import replace
 
 import pytest
-from rosrm_migration import plugin
 
 from rosrm.core.migration import AwaitReady, Commit, Execute, Plan, Start, Stop
 from rosrm.ports import MigrationOffer
 from rosrm.testing import MigrationContract
+from rosrm_migration import plugin
 
 OFFERS = {offer.name: offer for offer in plugin.register_migration_strategies()}
 

@@ -156,6 +156,21 @@ def test_default_probes_are_quick_and_sane():
     sampler.close()
 
 
+def test_default_probes_are_lean():
+    """The slave's memory is budgeted: what only some hosts need is not imported on all of them."""
+    code = (
+        "import sys; import rosrm_resources.plugin as plugin\n"
+        "from rosrm.registry import Registry; from rosrm.testing import probe_context\n"
+        "Registry.of(resources=plugin).probes(None, probe_context())\n"
+        "print(*sorted({'psutil', 'pydantic'} & set(sys.modules)))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    )  # fmt: skip
+    assert done.stdout.split() == []
+
+
 # --- control groups of this machine -----------------------------------------------------------
 
 

@@ -1,7 +1,7 @@
 """The rate of a counter over a sliding window."""
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rosrm_resources.rate import Rate
@@ -43,6 +43,7 @@ def test_nonsense_raises():
         Rate(1.0, 0.0, 0.0).update(1.0, float("nan"))
 
 
+@settings(deadline=None)
 @given(st.lists(st.tuples(st.floats(0, 5), st.floats(0, 1e6)), max_size=60))
 def test_never_negative_nor_above_the_fastest(steps):
     """Whatever the counter does and however unevenly it is read, the rate stays within its own."""

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rosrm.testing import host_view, one_row, process_view
@@ -95,6 +95,7 @@ def test_band_without_a_width_is_refused():
         ThresholdOptions(enter=0.5, leave=0.9)
 
 
+@settings(deadline=None)
 @given(hosts(), needs)
 def test_rows_are_independent(view, needed):
     """A host is judged alike alone and among others, to the last bit."""
@@ -110,17 +111,23 @@ def test_rows_are_independent(view, needed):
         assert alone.veto_reason(0) == together.veto_reason(row)
 
 
-@given(hosts())
-def test_hosts_below_the_band_go_before_hosts_within(view):
+fills = st.tuples(st.floats(0, 1), st.floats(0, 1))
+
+
+@settings(deadline=None)
+@given(st.lists(fills, min_size=1), st.lists(fills, min_size=1), st.floats(0.01, 1))
+def test_hosts_below_the_band_go_before_hosts_within(empty, full, limit):
     """No usage and no weight lets a host in the band go before one below it."""
-    scores = score(view)
-    fill = np.nan_to_num(view.usage[:, :2], nan=0.0) / np.maximum(view.limit[:, :2], 1e-9)
-    nearest = fill.max(axis=1)
-    below, within = nearest <= 0.8, (nearest > 0.8) & ~scores.veto
-    assume(below.any() and within.any())
-    assert scores.value[below].max() < scores.value[within].min()
+    below = [(0.79 * memory, 0.79 * cpu) for memory, cpu in empty]
+    within = [(0.81 + 0.13 * memory, 0.94 * cpu) for memory, cpu in full]
+    memory, cpu = zip(*(below + within), strict=True)
+    usage = {"memory": [m * limit for m in memory], "cpu": [c * limit for c in cpu]}
+    scores = score(host_view(usage, limit=limit))
+    assert not scores.veto.any()
+    assert scores.value[: len(below)].max() < scores.value[len(below) :].min()
 
 
+@settings(deadline=None)
 @given(hosts())
 def test_vetoes_exactly_what_is_above_enter(view):
     """No host at or below the threshold is vetoed, and none above it is not."""

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rosrm.testing import host_view, one_row, process_view
@@ -62,6 +62,7 @@ def test_reason_is_the_sum_written_out():
     assert "no resource" in score(view, network=1.0).reason(0)
 
 
+@settings(deadline=None)
 @given(hosts(), weights)
 def test_rows_are_independent(view, given_weights):
     """A host scores alike alone and among others, to the last bit."""
@@ -73,6 +74,7 @@ def test_rows_are_independent(view, given_weights):
         assert policy.score(*one_row(view, process, row)).value[0] == together[row]
 
 
+@settings(deadline=None)
 @given(hosts(), weights, st.floats(0, 1))
 def test_more_usage_never_scores_lower(view, given_weights, more):
     """A fuller host is never preferred for being fuller."""
