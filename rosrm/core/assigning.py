@@ -2,60 +2,74 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from rosrm.core.commands import Assign
-from rosrm.core.placement import Decision, Demand, Ranking, decide, why_never
-from rosrm.core.state import MasterState, Process, ProcessPhase
+from rosrm.core.model import EMPTY
+from rosrm.core.placement import Demand, Ranking
+from rosrm.core.state import MasterState, Process, ProcessPhase, larger
+from rosrm.core.verdicts import Decision, decide, refused_everywhere, why_never
 
 _PLUGIN_TOLD_EVERY = 10.0
 
 
-def demand_of(state: MasterState, process: Process, headroom: float = 0.0) -> Demand:
-    """What decides where a process may go."""
+def demand_of(state: MasterState, process: Process) -> Demand:
+    """What decides where a process may go; made anew only when something of it has changed."""
+    version = state.learned.version
+    if process.demand is None or process.demand[0] != version:
+        estimate = state.learned.estimate(process.spec, state.settings.default_needs)
+        demand = Demand(process.spec, estimate.amounts, estimate.estimated, dict(process.excluded))
+        process.demand = (version, demand)
+    return process.demand[1]
+
+
+def demand_to_move(
+    state: MasterState, process: Process, seen: Mapping[str, float], source: str, headroom: float
+) -> Demand:
+    """What decides where a running process may go on: what it was seen to use is no guess."""
     estimate = state.learned.estimate(process.spec, state.settings.default_needs)
-    return Demand(
-        process.spec,
-        tuple(sorted(estimate.amounts.items())),
-        tuple(sorted(process.excluded.items())),
-        headroom,
-    )
+    amounts = larger(estimate.amounts, seen)
+    guessed = {name for name in estimate.estimated if amounts[name] > seen.get(name, 0.0)}
+    excluded = {**process.excluded, source: "it is there already"}
+    return Demand(process.spec, amounts, frozenset(guessed), excluded, headroom)
 
 
 def ranking_of(state: MasterState, demand: Demand) -> Ranking:
-    """The judgement of all hosts for a demand, up to date; kept while only assignments change it."""
+    """All hosts judged for a demand, up to date; kept while only assignments change it."""
+    if state.rankings_version != state.hosts.version:
+        state.rankings.clear()
+        state.rankings_version = state.hosts.version
     ranking = state.rankings.get(demand.key)
-    if ranking is None or ranking.version != state.hosts.version:
-        if ranking is not None:
-            state.rankings.clear()
-        ranking = Ranking(state.hosts, state.policy, demand)
+    if ranking is None:
+        ranking = Ranking(state.hosts, state.policies, demand)
         state.rankings[demand.key] = ranking
     else:
         ranking.refresh()
     return ranking
 
 
-def policy_in(state: MasterState, ranking: Ranking) -> str:
-    """The name of the policy that decided, or that and why it was left out."""
-    if not ranking.failure:
-        return state.policy_name
-    return f"{state.policy_name} (left out: {ranking.failure})"
-
-
 def decide_now(state: MasterState, process: Process) -> Decision:
     """What would be decided about a waiting process at this moment."""
-    ranking = ranking_of(state, demand_of(state, process))
-    return decide(ranking, policy_in(state, ranking))
+    return decide(ranking_of(state, demand_of(state, process)))
 
 
 def place_waiting(state: MasterState, now: float) -> None:
     """Assign from the queue until its head fits nowhere (with `backfill`, until nobody fits)."""
-    if not len(state.queue):
+    if not len(state.queue) or state.placed_at == _versions(state):
         return
     if state.settings.backfill:
         _place_any(state, now)
-        return
-    while (name := state.queue.head()) is not None:
-        if not _place_or_set_aside(state, state.processes[name], now):
-            break
+    else:
+        while (name := state.queue.head()) is not None:
+            if not _place_or_set_aside(state, state.processes[name], now):
+                break
+    state.placed_at = _versions(state)
+
+
+def _versions(state: MasterState) -> tuple[int, ...]:
+    """As long as none of these grows, who did not fit does not fit."""
+    hosts = state.hosts
+    return (hosts.version, len(hosts.touched), state.queue.version, state.learned.version)
 
 
 def _place_any(state: MasterState, now: float) -> None:
@@ -72,7 +86,8 @@ def _place_or_set_aside(state: MasterState, process: Process, now: float) -> boo
     demand = demand_of(state, process)
     ranking = ranking_of(state, demand)
     column = ranking.best()
-    _tell_failure(state, ranking, now)
+    if ranking.failure:
+        _tell_failure(state, ranking, now)
     if column >= 0:
         _assign(state, process, ranking, column, now)
         return True
@@ -84,12 +99,16 @@ def _place_or_set_aside(state: MasterState, process: Process, now: float) -> boo
     return False
 
 
-def _assign(state: MasterState, process: Process, ranking: Ranking, column: int, now: float) -> None:
-    decision = decide(ranking, policy_in(state, ranking), chosen=column)
-    host = state.hosts.hosts[column]
+def _assign(
+    state: MasterState, process: Process, ranking: Ranking, column: int, now: float
+) -> None:
+    decision = decide(ranking, chosen=column)
+    host, demand = state.hosts.hosts[column], ranking.demand
     instance = state.new_instance_id(process)
     state.queue.remove(process.name)
-    state.add_instance(instance, process.spec, host, now)
+    state.charge_instance(
+        instance, host, now, demand.amounts, demand.estimated, ranking.need[:, column]
+    )
     process.owner = instance.number
     state.set_phase(process, ProcessPhase.ASSIGNED, now)
     state.note_decision(process, decision, "assigned", now)
@@ -103,11 +122,14 @@ def _assign(state: MasterState, process: Process, ranking: Ranking, column: int,
 
 def _set_aside(state: MasterState, process: Process, reason: str, now: float) -> None:
     state.queue.remove(process.name)
-    if process.excluded and len(process.excluded) >= len(state.hosts):
+    if refused_everywhere(state.hosts, demand_of(state, process)):
         state.set_phase(process, ProcessPhase.FAILED, now, f"no host can start it: {reason}")
-        state.record(now, "failed", f"{process.name} failed: {process.reason}", process=process.name)
+        state.record(
+            now, "failed", f"{process.name} failed: {process.reason}", process=process.name
+        )
     else:
-        state.set_phase(process, ProcessPhase.SET_ASIDE, now, f"no host may ever take it: {reason}")
+        state.set_phase(process, ProcessPhase.SET_ASIDE, now, f"no host may take it: {reason}")
+        state.set_aside.add(process.name)
         state.record(
             now, "set_aside", f"{process.name} is set aside: {process.reason}", process=process.name
         )
@@ -115,41 +137,47 @@ def _set_aside(state: MasterState, process: Process, reason: str, now: float) ->
 
 
 def reconsider_set_aside(state: MasterState, now: float) -> None:
-    """A host came or changed: those that none could take return to the queue."""
-    for process in state.processes.values():
-        if process.phase is ProcessPhase.SET_ASIDE and not why_never(
-            state.hosts, demand_of(state, process)
-        ):
-            state.enqueue(process, now)
-            state.record(
-                now, "queued", f"{process.name} returns to the queue: a host may take it now",
-                process=process.name,
-            )  # fmt: skip
-            state.save(process)
+    """Hosts came or changed: those that none could take return to the queue, in order."""
+    if not state.set_aside:
+        return
+    judged: dict[object, str] = {}
+    for process in sorted(
+        (state.processes[name] for name in state.set_aside), key=lambda one: one.order
+    ):
+        demand = demand_of(state, process)
+        if demand.key not in judged:
+            judged[demand.key] = why_never(state.hosts, demand)
+        if judged[demand.key]:
+            continue
+        state.set_aside.discard(process.name)
+        state.enqueue(process, now)
+        state.record(
+            now, "queued", f"{process.name} returns to the queue: a host may take it now",
+            process=process.name,
+        )  # fmt: skip
+        state.save(process)
 
 
 def _tell_waiting(state: MasterState, process: Process, now: float) -> None:
     """Say once that the head of the queue waits, and why."""
-    if state.queue_told == (process.name, process.reason) and process.reason:
+    there = len(state.hosts) > 0
+    reason = "no host has room for it now" if there else "no host has registered yet"
+    if process.reason == reason:
         return
-    if not len(state.hosts):
-        reason = "no host has registered yet"
-    else:
-        reason = "no host has room for it now"
-        state.note_decision(process, decide_now(state, process), "waits", now)
     process.reason = reason
-    state.queue_told = (process.name, reason)
+    if there:
+        state.note_decision(process, decide_now(state, process), "waits", now)
     state.record(
         now, "waits", f"{process.name} waits: {reason}", process=process.name,
-        facts={"decision": process.decision} if len(state.hosts) else {},
+        facts={"decision": process.decision} if there else EMPTY,
     )  # fmt: skip
 
 
 def _tell_failure(state: MasterState, ranking: Ranking, now: float) -> None:
-    if not ranking.failure or now - state.policy_told < _PLUGIN_TOLD_EVERY:
+    if now - state.policy_told < _PLUGIN_TOLD_EVERY:
         return
     state.policy_told = now
     state.record(
         now, "plugin_failed",
-        f"the scoring policy {state.policy_name!r} is left out of decisions: {ranking.failure}",
+        f"the scoring policy {state.policy_name!r} does not decide: {ranking.failure}",
     )  # fmt: skip

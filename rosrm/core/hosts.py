@@ -1,7 +1,7 @@
-"""The hosts as standing arrays: one column a host, one row a resource, never rebuilt.
+"""The hosts: what they say of themselves, what is promised to them, and who may be given work.
 
-What placement and liveness need of a thousand hosts at once lives here; what is asked of one host
-at a time (its description, its labels) lives in `Host` beside it.
+What placement and liveness need of a thousand hosts at once stands in arrays (`columns.py`); what
+is asked of one host at a time (its description, its labels) lives in `Host` beside them.
 """
 
 from __future__ import annotations
@@ -12,18 +12,24 @@ from enum import IntEnum
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
-from rosrm.core.events import ReadingsReceived
+from rosrm.core.columns import (
+    BUSY,
+    LOAD,
+    NO_BOUND,
+    USAGE,
+    BoolArray,
+    FloatArray,
+    HostColumns,
+    IntArray,
+)
 from rosrm.core.model import RESOURCE_SLOTS, HostDescription
-
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
 
 #: A usage above this is no measurement but a mistake (a CPU reading of 1.2 can be real).
 ABSURD_USAGE: Final = 64.0
-
-_GROWTH: Final = 2
+#: An estimate, unlike a declared need, fills at most this part of a host's limit: a guess alone
+#: must not keep a process off every host for ever.
+_MOST_GUESSED: Final = 0.5
 
 
 class HostCondition(IntEnum):
@@ -36,7 +42,7 @@ class HostCondition(IntEnum):
     EXPECTED = 4  # known from the journal, not heard since this master's start
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, eq=False)
 class Host:
     """What is asked of one host at a time.
 
@@ -44,6 +50,7 @@ class Host:
         column: of this host in the arrays of `HostTable`.
         instances: numbers of the instances that it holds or was promised.
         over_since: resource name to the time since when it is over its limit.
+        told: kind of a record that is not repeated at once, to when it was made.
     """
 
     column: int
@@ -65,116 +72,34 @@ class Host:
         return self.description.name
 
 
-class HostTable:
-    """Every known host. Arrays are (R, H) or (H,): resources R, hosts H, in order of registration.
+class HostTable(HostColumns):
+    """Every known host.
 
     Attributes:
-        usage: (R, H) newest reading, fraction; 0 where a host has no such resource.
-        load: (R, H) promised to instances that do not show in the readings yet, fraction.
-        limit: (R, H) fraction; 1 where a host has no such resource.
-        capacity: (R, H) base units; 0 where a host has no such resource.
-        condition: (H,) HostCondition.
-        asking: (H,) it has asked for work since it came up.
-        accepting: (H,) its newest reading says that it is under all its limits.
-        closed: (H,) cordoned or draining.
-        stale: (H,) any reading of a limited resource is stale.
-        heard: (H,) time of the newest message.
-        processes, max_processes: (H,) held or promised; bound (0: none).
         version: grows with every change that touches many hosts.
-        touched: columns that single assignments have changed since `version` grew.
+        touched: columns that single assignments and ends have changed since `version` grew.
     """
 
     def __init__(self) -> None:
-        self.resources: tuple[str, ...] = ()
+        super().__init__()
         self.by_name: dict[str, Host] = {}
         self.hosts: list[Host] = []
         self.version = 0
         self.touched: list[int] = []
-        self._allocate(rows=0, columns=4)
-
-    # --- shape ---------------------------------------------------------------------------
-
-    def _allocate(self, rows: int, columns: int) -> None:
-        self._usage = np.zeros((rows, columns))
-        self._load = np.zeros((rows, columns))
-        self._limit = np.ones((rows, columns))
-        self._capacity = np.zeros((rows, columns))
-        self._condition = np.zeros(columns, np.int8)
-        self._asking = np.zeros(columns, np.bool_)
-        self._accepting = np.zeros(columns, np.bool_)
-        self._closed = np.zeros(columns, np.bool_)
-        self._stale = np.zeros(columns, np.uint32)
-        self._heard = np.zeros(columns)
-        self._processes = np.zeros(columns, np.int64)
-        self._max_processes = np.zeros(columns, np.int64)
-        self._incarnation = np.zeros(columns, np.uint64)
-        self._sequence = np.zeros(columns, np.uint64)
-        self._reported = np.zeros(columns, np.uint64)
-        self._status_sequence = np.zeros(columns, np.uint64)
-        # Slot of a message -> row here; the row past the last is a bin for slots not in use.
-        self._row_of_slot = np.full((columns, RESOURCE_SLOTS), -1, np.int64)
-
-    def _grow_columns(self) -> None:
-        old = dict(self.__dict__)
-        columns = len(self._condition) * _GROWTH
-        used = len(self.hosts)
-        self._allocate(len(self.resources), columns)
-        for name in _ARRAYS:
-            fresh, kept = getattr(self, name), old[name]
-            if name in _BY_RESOURCE:
-                fresh[:, :used] = kept[:, :used]
-            else:
-                fresh[:used] = kept[:used]
-
-    def _add_resource(self, name: str) -> None:
-        self.resources = (*self.resources, name)
-        for array, fill in (("_usage", 0.0), ("_load", 0.0), ("_limit", 1.0), ("_capacity", 0.0)):
-            kept: FloatArray = getattr(self, array)
-            row = np.full((1, kept.shape[1]), fill)
-            setattr(self, array, np.concatenate([kept, row]))
-
-    def __len__(self) -> int:
-        return len(self.hosts)
-
-    @property
-    def usage(self) -> FloatArray:
-        return self._usage[:, : len(self.hosts)]
-
-    @property
-    def load(self) -> FloatArray:
-        return self._load[:, : len(self.hosts)]
-
-    @property
-    def limit(self) -> FloatArray:
-        return self._limit[:, : len(self.hosts)]
-
-    @property
-    def capacity(self) -> FloatArray:
-        return self._capacity[:, : len(self.hosts)]
-
-    @property
-    def condition(self) -> npt.NDArray[np.int8]:
-        return self._condition[: len(self.hosts)]
-
-    @property
-    def heard(self) -> FloatArray:
-        return self._heard[: len(self.hosts)]
-
-    @property
-    def processes(self) -> npt.NDArray[np.int64]:
-        return self._processes[: len(self.hosts)]
+        self._labelled: dict[tuple[str, str], BoolArray] = {}
 
     # --- registration --------------------------------------------------------------------
 
-    def expect(self, name: str, *, cordoned: bool = False) -> Host:
+    def expect(
+        self, name: str, now: float = 0.0, *, cordoned: bool = False, draining: bool = False
+    ) -> Host:
         """Give a host its column before it is heard, so that its number stays across restarts."""
-        if len(self.hosts) == len(self._condition):
-            self._grow_columns()
-        host = Host(len(self.hosts), HostDescription(name, 0), cordoned=cordoned)
+        host = Host(self.add_column(), HostDescription(name, 0))
         self.hosts.append(host)
         self.by_name[name] = host
-        self._condition[host.column] = HostCondition.EXPECTED
-        self._closed[host.column] = cordoned
+        self.heard[host.column] = now
+        self.condition[host.column] = HostCondition.EXPECTED
+        self.set_closed(host, cordoned=cordoned, draining=draining)
         return host
 
     def register(self, description: HostDescription, now: float) -> Host:
@@ -185,30 +110,38 @@ class HostTable:
         host.over_since.clear()
         for resource in description.resources:
             if resource.name not in self.resources:
-                self._add_resource(resource.name)
+                self.add_resource(resource.name)
         rows = [self.resources.index(resource.name) for resource in description.resources]
-        self._row_of_slot[column] = -1
-        self._row_of_slot[column, : len(rows)] = rows
-        self._capacity[:, column] = 0.0
-        self._capacity[rows, column] = [resource.capacity for resource in description.resources]
-        self._usage[:, column] = 0.0
-        self._limit[:, column] = 1.0
-        self._condition[column] = HostCondition.UP
-        self._asking[column] = self._accepting[column] = False
-        self._stale[column] = 0
-        self._heard[column] = now
-        self._max_processes[column] = description.max_processes
-        self._incarnation[column] = description.incarnation
-        self._sequence[column] = self._reported[column] = self._status_sequence[column] = 0
+        self.clear_column(column)
+        self.row_of_slot[column, : len(rows)] = rows
+        self.capacity[rows, column] = [resource.capacity for resource in description.resources]
+        self.usage[rows, column] = 0.0
+        self.busy[rows, column] = self.load[rows, column]
+        self.condition[column] = HostCondition.UP
+        self.asking[column] = self.accepting[column] = False
+        self.stale[column] = 0
+        self.heard[column] = now
+        self.bound[column] = description.max_processes or NO_BOUND
+        self.incarnation[column] = description.incarnation
+        self.sequence[column] = self.reported[column] = self.status_sequence[column] = 0
+        self._labelled.clear()
         self.changed()
         return host
 
     def find(self, host_id: int, incarnation: int) -> Host | None:
         """The host of this number, if it is this run of it."""
         column = host_id - 1
-        if not 0 <= column < len(self.hosts) or int(self._incarnation[column]) != incarnation:
+        if not 0 <= column < len(self.hosts) or int(self.incarnation[column]) != incarnation:
             return None
         return self.hosts[column]
+
+    def labelled(self, key: str, value: str) -> BoolArray:
+        """(H,) True: the host has this label; kept until a host registers."""
+        known = self._labelled.get((key, value))
+        if known is None or len(known) != len(self):
+            found = [host.description.labels.get(key) == value for host in self.hosts]
+            known = self._labelled[key, value] = np.array(found, np.bool_)
+        return known
 
     # --- what changes --------------------------------------------------------------------
 
@@ -217,177 +150,184 @@ class HostTable:
         self.version += 1
         self.touched.clear()
 
-    def apply(self, readings: ReadingsReceived, now: float) -> BoolArray:
-        """Take in a batch of readings.
-
-        Returns:
-            (N,) True where a reading was refused: an unknown or former host, NaN, a negative or
-            absurd value. Nothing of a refused reading is used.
-        """
-        columns = readings.host_id - 1
-        known = (columns >= 0) & (columns < len(self.hosts))
-        safe = np.where(known, columns, 0)
-        known &= self._incarnation[safe] == readings.incarnation
-        sane = (
-            (readings.usage >= 0.0) & (readings.usage <= ABSURD_USAGE)
-            & (readings.limit >= 0.0) & (readings.limit <= 1.0)
-        ).all(axis=1)  # fmt: skip
-        good = known & sane
-        self._store(readings, columns, good, now)
-        return np.asarray(~good)
-
-    def _store(
-        self, readings: ReadingsReceived, columns: npt.NDArray[np.int64], good: BoolArray, now: float
-    ) -> None:
-        rows_used = columns[good]
-        rows = self._row_of_slot[rows_used]
-        used = rows >= 0
-        where = np.broadcast_to(rows_used[:, None], rows.shape)[used]
-        self._usage[rows[used], where] = readings.usage[good][used]
-        self._limit[rows[used], where] = readings.limit[good][used]
-        self._stale[rows_used] = readings.stale[good]
-        self._accepting[rows_used] = readings.accepting[good]
-        self._sequence[rows_used] = readings.sequence[good]
-        self._reported[rows_used] = readings.status_sequence[good]
-        self._heard[rows_used] = now
-        self.changed()
-
     def ask(self, host: Host) -> None:
         """The host asked for work; a request also says that it is under its limits."""
         column = host.column
-        if not (self._asking[column] and self._accepting[column]):
-            self._asking[column] = self._accepting[column] = True
+        if not (self.asking[column] and self.accepting[column]):
+            self.asking[column] = self.accepting[column] = True
             self.changed()
 
     def set_condition(self, host: Host, condition: HostCondition) -> None:
-        self._condition[host.column] = condition
+        """Note how well a host is heard."""
+        self.condition[host.column] = condition
         if condition is HostCondition.LEFT:
-            self._asking[host.column] = False
+            self.asking[host.column] = False
         self.changed()
 
     def condition_of(self, host: Host) -> HostCondition:
-        return HostCondition(int(self._condition[host.column]))
+        """How well a host is heard."""
+        return HostCondition(int(self.condition[host.column]))
 
     def set_closed(self, host: Host, *, cordoned: bool, draining: bool) -> None:
         """Cordon, drain or reopen a host."""
         host.cordoned, host.draining = cordoned, draining
-        self._closed[host.column] = cordoned or draining
+        self.closed[host.column] = cordoned or draining
         self.changed()
 
     def charge(self, host: Host, amount: FloatArray, processes: int = 0) -> None:
         """Add to (or, negative, take from) the in-flight load and process count of one host.
 
-        Args:
-            amount: (R',) fractions, R' at most the resources known now.
+        `amount` is (R',) fractions, R' at most the resources known now.
         """
         column = host.column
-        load = self._load[: len(amount), column]
-        np.maximum(load + amount, 0.0, out=load)
-        self._processes[column] += processes
+        load = self.cells[LOAD, : len(amount), column]
+        load += amount
+        np.maximum(load, 0.0, out=load)
+        self.cells[BUSY, : len(amount), column] = self.cells[USAGE, : len(amount), column] + load
+        self.processes[column] += processes
         self.touched.append(column)
 
     # --- what is asked -------------------------------------------------------------------
 
-    def fractions(self, amounts: Mapping[str, float]) -> FloatArray:
-        """(R, H): base-unit amounts as fractions of each host's capacity; inf where it has none."""
-        need = np.zeros((len(self.resources), len(self.hosts)))
-        for name, amount in amounts.items():
-            if amount > 0.0 and name in self.resources:
-                row = self.resources.index(name)
-                with np.errstate(divide="ignore"):
-                    need[row] = amount / self._capacity[row, : len(self.hosts)]
-        return need
+    def fractions(
+        self, amounts: Mapping[str, float], estimated: frozenset[str] = frozenset()
+    ) -> FloatArray:
+        """(R, H): base-unit amounts as fractions of each host's capacity.
 
-    def fractions_of(self, host: Host, amounts: Mapping[str, float]) -> FloatArray:
+        inf where a host has no such resource, and 0 there for an amount that is only estimated.
+        """
+        return self._fractions(slice(0, len(self)), amounts, estimated)
+
+    def fractions_of(
+        self, host: Host, amounts: Mapping[str, float], estimated: frozenset[str] = frozenset()
+    ) -> FloatArray:
         """(R,): as `fractions`, for one host."""
-        need = np.zeros(len(self.resources))
+        one = slice(host.column, host.column + 1)
+        return self._fractions(one, amounts, estimated)[:, 0]
+
+    def _fractions(
+        self, columns: slice, amounts: Mapping[str, float], estimated: frozenset[str]
+    ) -> FloatArray:
+        need = np.zeros((len(self.resources), columns.stop - columns.start))
         for row, name in enumerate(self.resources):
             amount = amounts.get(name, 0.0)
-            if amount > 0.0:
-                capacity = self._capacity[row, host.column]
-                need[row] = amount / capacity if capacity > 0.0 else np.inf
+            if amount <= 0.0:
+                continue
+            part = np.divide(amount, self.capacity[row, columns], out=need[row])
+            if name in estimated:
+                np.fmin(part, _MOST_GUESSED * self.limit[row, columns], out=part)
+                absent = 0.0
+            else:
+                absent = np.inf
+            part[np.isnan(self.capacity[row, columns])] = absent
         return need
 
-    def taking(self) -> BoolArray:
-        """(H,) True: may be given work now, its room aside."""
-        used = slice(0, len(self.hosts))
-        slots = (self._max_processes[used] == 0) | (
-            self._processes[used] < self._max_processes[used]
-        )
+    def open(self) -> BoolArray:
+        """(H,) True: may be given work now, room and number of processes aside."""
         return np.asarray(
-            (self._condition[used] == HostCondition.UP)
-            & self._asking[used] & self._accepting[used]
-            & ~self._closed[used] & (self._stale[used] == 0) & slots
+            (self.condition == HostCondition.UP) & self.asking & self.accepting
+            & ~self.closed & (self.stale == 0)
         )  # fmt: skip
-
-    def takes(self, column: int) -> bool:
-        """As `taking`, for one host."""
-        return self.why_closed(column) == ""
 
     def why_closed(self, column: int) -> str:
         """Why a host may not be given work now, its room aside; "" if it may."""
         host = self.hosts[column]
-        condition = self.condition_of(host)
-        if condition is not HostCondition.UP:
-            return _CONDITION_REASON[condition]
-        if host.draining or host.cordoned:
-            return "it is being drained" if host.draining else "it is cordoned"
-        if self._max_processes[column] and self._processes[column] >= self._max_processes[column]:
-            return f"it holds its most processes, {self._max_processes[column]}"
-        if self._stale[column]:
-            return f"its reading of {', '.join(self.stale_resources(column))} is stale"
-        if not self._accepting[column]:
+        away = self.why_away(column)
+        if away:
+            return away
+        if self.condition[column] == HostCondition.SUSPECT:
+            return "it has been silent for a moment"
+        if self.processes[column] >= self.bound[column]:
+            return f"it holds its most processes, {self.bound[column]}"
+        if self.stale[column]:
+            return f"its reading of {', '.join(self.stale_resources(host))} is stale"
+        if not self.accepting[column]:
             over = self.over_limit(column)
             return f"it is over its limit of {', '.join(over)}" if over else "it takes no work now"
-        if not self._asking[column]:
+        if not self.asking[column]:
             return "it has not asked for work yet"
         return ""
 
-    def stale_resources(self, column: int) -> Sequence[str]:
-        """Names of the resources of a host whose reading is stale."""
-        described = self.hosts[column].description.resources
-        bits = int(self._stale[column])
+    def away(self) -> BoolArray:
+        """(H,) True: gets no work until somebody brings it back: lost, left, cordoned, drained."""
+        return np.asarray(
+            self.closed
+            | (self.condition == HostCondition.LOST) | (self.condition == HostCondition.LEFT)
+        )  # fmt: skip
+
+    def why_away(self, column: int) -> str:
+        """Why a host is away, or may be; "" if it is there."""
+        host = self.hosts[column]
+        reason = _AWAY.get(self.condition_of(host), "")
+        if reason:
+            return reason
+        if host.draining or host.cordoned:
+            return "it is being drained" if host.draining else "it is cordoned"
+        return ""
+
+    def stale_resources(self, host: Host) -> Sequence[str]:
+        """Names of the limited resources of a host whose reading is stale."""
+        bits = int(self.stale[host.column])
+        described = host.description.resources
         return [resource.name for slot, resource in enumerate(described) if bits >> slot & 1]
 
     def over_limit(self, column: int) -> list[str]:
         """Names of the resources whose reading is at or over the limit of a host."""
-        over = (self._usage[:, column] >= self._limit[:, column]) & (self._capacity[:, column] > 0)
+        over = self.usage[:, column] >= self.limit[:, column]  # NaN, no such resource: False
         return [self.resources[row] for row in np.flatnonzero(over)]
 
-    def hosts_over_limit(self) -> npt.NDArray[np.int64]:
+    def hosts_over_limit(self) -> IntArray:
         """Columns of the hosts that are up and at or over any limit."""
-        used = slice(0, len(self.hosts))
-        over = (self.usage >= self.limit) & (self.capacity > 0)
-        return np.flatnonzero(over.any(axis=0) & (self._condition[used] == HostCondition.UP))
+        over = (self.usage >= self.limit).any(axis=0)
+        return np.flatnonzero(over & (self.condition == HostCondition.UP))
 
-    def statuses_missing(self) -> npt.NDArray[np.int64]:
+    def statuses_missing(self) -> IntArray:
         """Columns of hosts that say they sent statuses which have not come."""
-        used = slice(0, len(self.hosts))
-        behind = self._reported[used] > self._status_sequence[used]
-        return np.flatnonzero(behind & (self._condition[used] == HostCondition.UP))
+        behind = self.reported > self.status_sequence
+        return np.flatnonzero(behind & (self.condition == HostCondition.UP))
 
-    def note_statuses(self, host: Host, sequence: int, now: float) -> bool:
-        """Take note of a status batch; False: one before it was missed."""
-        expected = int(self._status_sequence[host.column]) + 1
-        self._status_sequence[host.column] = max(sequence, expected - 1)
-        self._heard[host.column] = now
-        return sequence <= expected
+    def note_statuses(self, host: Host, sequence: int, now: float) -> bool | None:
+        """Take note of a status batch.
+
+        Returns:
+            None: it is older than what is known; True: it is the next; False: one before it was
+            missed.
+        """
+        newest = int(self.status_sequence[host.column])
+        if sequence <= newest:
+            return None
+        self.status_sequence[host.column] = sequence
+        self.heard[host.column] = now
+        return sequence == newest + 1
 
     def is_accepting(self, host: Host) -> bool:
         """Under all its limits, and it has asked."""
-        return bool(self._accepting[host.column] and self._asking[host.column])
+        return bool(self.accepting[host.column] and self.asking[host.column])
 
 
-_CONDITION_REASON: Final = {
-    HostCondition.SUSPECT: "it has been silent for a moment",
+def description_fault(description: HostDescription) -> str:
+    """What is wrong with what a slave says of itself; "" for nothing."""
+    resources = description.resources
+    if not description.name:
+        return "a host needs a name"
+    if not description.incarnation:
+        return f"{description.name}: the incarnation of a slave is not 0"
+    if len(resources) > RESOURCE_SLOTS:
+        return f"{description.name} has {len(resources)} resources; {RESOURCE_SLOTS} are the most"
+    names = [resource.name for resource in resources]
+    if len(set(names)) < len(names):
+        return f"{description.name} names a resource twice: {', '.join(names)}"
+    for resource in resources:
+        if not 0.0 < resource.capacity < np.inf:
+            return (
+                f"{description.name}: the capacity of {resource.name} is {resource.capacity:g} "
+                f"{resource.unit}; it must be above 0"
+            )
+    return ""
+
+
+_AWAY: Final[Mapping[HostCondition, str]] = {
     HostCondition.LOST: "it is lost",
     HostCondition.LEFT: "it has left",
     HostCondition.EXPECTED: "it has not come back since the master started",
 }
-
-_BY_RESOURCE: Final = ("_usage", "_load", "_limit", "_capacity")
-_ARRAYS: Final = (
-    *_BY_RESOURCE, "_condition", "_asking", "_accepting", "_closed", "_stale", "_heard",
-    "_processes", "_max_processes", "_incarnation", "_sequence", "_reported", "_status_sequence",
-    "_row_of_slot",
-)  # fmt: skip

@@ -7,8 +7,11 @@ import numpy as np
 from rosrm.core import events as happened
 from rosrm.core import lifecycle
 from rosrm.core.assigning import reconsider_set_aside
-from rosrm.core.commands import Reply
-from rosrm.core.hosts import Host, HostCondition
+from rosrm.core.charges import settle_charge
+from rosrm.core.commands import Order, Reply
+from rosrm.core.hosts import Host, HostCondition, description_fault
+from rosrm.core.liveness import welcome_back
+from rosrm.core.readings import take_readings
 from rosrm.core.state import MasterState, Wanted
 from rosrm.ports import Intent
 
@@ -19,11 +22,17 @@ _TOLD_EVERY = 10.0
 def host_registered(state: MasterState, event: happened.HostRegistered, now: float) -> None:
     """Take a host in, unless a live slave has its name."""
     description = event.description
+    fault = description_fault(description)
+    if fault:
+        _refuse_host(state, event, "invalid", fault, now)
+        return
     known = state.hosts.by_name.get(description.name)
-    refusal = _why_refused(state, known, event)
-    if refusal:
-        state.record(now, "host_refused", refusal, host=description.name)
-        state.emit(Reply(event.request, False, "name_taken", refusal))
+    if known is not None and known.description.incarnation == description.incarnation:
+        _registered_again(state, known, event, now)
+        return
+    taken = _name_taken(state, known, event)
+    if taken:
+        _refuse_host(state, event, "name_taken", taken, now)
         return
     host = state.hosts.register(description, now)
     if known is None:
@@ -37,17 +46,47 @@ def host_registered(state: MasterState, event: happened.HostRegistered, now: flo
             "absent": dict(description.absent),
         },
     )  # fmt: skip
+    lifecycle.regained_sight(state, host, now)
     lifecycle.reconcile(state, host, event.instances, now, registering=True)
+    _forgive(state, host)
     reconsider_set_aside(state, now)
     state.emit(Reply(event.request, host_id=host.host_id))
 
 
-def _why_refused(
-    state: MasterState, known: Host | None, event: happened.HostRegistered
-) -> str:
-    if known is None or known.description.incarnation in (0, event.description.incarnation):
-        return ""
-    if state.hosts.condition_of(known) is not HostCondition.UP:
+def _refuse_host(
+    state: MasterState, event: happened.HostRegistered, code: str, why: str, now: float
+) -> None:
+    state.record(now, "host_refused", why, host=event.description.name)
+    state.emit(Reply(event.request, False, code, why))
+
+
+def _registered_again(
+    state: MasterState, host: Host, event: happened.HostRegistered, now: float
+) -> None:
+    """The same run of a slave once more: its first answer was lost, or the request came twice.
+
+    Nothing that it has said since is forgotten, and what it says it holds may be old news: it is
+    asked for everything in order.
+    """
+    state.hosts.heard[host.column] = now
+    condition = state.hosts.condition_of(host)
+    if condition in (HostCondition.LOST, HostCondition.SUSPECT):
+        welcome_back(state, host, now)
+    if condition is not HostCondition.LOST:
+        state.emit(Order(state.order_id(), host.host_id, "report"))
+    state.emit(Reply(event.request, host_id=host.host_id))
+
+
+def _forgive(state: MasterState, host: Host) -> None:
+    """A slave that was started anew may find what it lacked before."""
+    for process in state.processes.values():
+        if host.name in process.excluded and not process.phase.over:
+            del process.excluded[host.name]
+            process.demand = None
+
+
+def _name_taken(state: MasterState, known: Host | None, event: happened.HostRegistered) -> str:
+    if known is None or state.hosts.condition_of(known) is not HostCondition.UP:
         return ""
     first = known.description
     return (
@@ -60,7 +99,15 @@ def _why_refused(
 def save_host(state: MasterState, host: Host) -> None:
     """Make durable what is intended with a host."""
     state.emit(
-        Intent("host", host.name, {"host_id": host.host_id, "cordoned": host.cordoned})
+        Intent(
+            "host",
+            host.name,
+            {
+                "host_id": host.host_id,
+                "cordoned": host.cordoned,
+                "draining": host.draining,
+            },
+        )
     )
 
 
@@ -72,10 +119,9 @@ def host_left(state: MasterState, event: happened.HostLeft, now: float) -> None:
         return
     state.hosts.set_condition(host, HostCondition.LEFT)
     state.record(now, "host_left", f"{host.name} leaves", host=host.name)
-    for number in list(host.instances):
-        instance = state.instances[number]
-        process = state.processes[instance.id.process]
-        if process.owner == number and process.wanted is Wanted.RUN:
+    for number in sorted(host.instances):
+        process = state.owned_by(state.instances[number])
+        if process is not None and process.wanted is Wanted.RUN:
             process.wanted = Wanted.REQUEUE
             state.save(process)
     state.emit(Reply(event.request))
@@ -92,7 +138,7 @@ def process_requested(state: MasterState, event: happened.ProcessRequested, now:
 
 def readings_received(state: MasterState, event: happened.ReadingsReceived, now: float) -> None:
     """Note a batch of readings; nonsense is refused and said."""
-    refused = state.hosts.apply(event, now)
+    refused = take_readings(state.hosts, event, now)
     for row in np.flatnonzero(refused):
         host = state.hosts.find(int(event.host_id[row]), int(event.incarnation[row]))
         if host is not None:
@@ -128,7 +174,7 @@ def usages_received(state: MasterState, event: happened.UsagesReceived, now: flo
         instance.seen = {"cpu": float(cpu), "memory": float(memory)}
         for resource, amount in instance.seen.items():
             instance.peak[resource] = max(amount, instance.peak.get(resource, 0.0))
-        lifecycle.settle_charge(state, instance, now)
+        settle_charge(state, instance, now)
 
 
 def peer_refused(state: MasterState, event: happened.PeerRefused, now: float) -> None:

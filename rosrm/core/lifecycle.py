@@ -5,36 +5,39 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Final
 
-import numpy as np
-
 from rosrm.core import events as happened
+from rosrm.core.charges import learn_from
 from rosrm.core.commands import Order
-from rosrm.core.hosts import Host
-from rosrm.core.model import InstanceState, InstanceStatus
+from rosrm.core.hosts import Host, HostCondition
+from rosrm.core.model import EMPTY, InstanceId, InstanceState, InstanceStatus, Kind
+from rosrm.core.processes import End, Run
 from rosrm.core.state import Instance, MasterState, Process, ProcessPhase, Wanted
-from rosrm.ports import Intent
 
 #: What the state of the owning instance means for the process.
 _PHASE: Final = {
+    None: ProcessPhase.ASSIGNED,
     InstanceState.STARTING: ProcessPhase.STARTING,
     InstanceState.RUNNING: ProcessPhase.STARTING,
     InstanceState.READY: ProcessPhase.RUNNING,
     InstanceState.BACKOFF: ProcessPhase.BACKOFF,
     InstanceState.STOPPING: ProcessPhase.STOPPING,
 }
+_ALIVE: Final = frozenset({InstanceState.STARTING, InstanceState.RUNNING, InstanceState.READY})
 
 
 def statuses_received(state: MasterState, event: happened.StatusesReceived, now: float) -> None:
-    """Take in what a slave says of its instances, in order."""
+    """Take in what a slave says of its instances, in order; what comes late is known already."""
     host = state.hosts.find(event.host_id, event.incarnation)
     if host is None:
         return
-    without_gap = state.hosts.note_statuses(host, event.sequence, now)
+    is_next = state.hosts.note_statuses(host, event.sequence, now)
+    if is_next is None:
+        return
     if event.complete:
         state.missing_since.pop(host.column, None)
         reconcile(state, host, event.statuses, now)
         return
-    if not without_gap:
+    if not is_next:
         state.emit(Order(state.order_id(), host.host_id, "report"))
     for status in event.statuses:
         take_status(state, host, status, now)
@@ -52,45 +55,47 @@ def reconcile(
     held = {status.instance.number: status for status in statuses}
     for status in held.values():
         take_status(state, host, status, now)
-    for number in list(host.instances - held.keys()):
+    for number in sorted(host.instances - held.keys()):
         instance = state.instances[number]
         if instance.state is None and not registering:
             continue
-        _gone(state, instance, now, f"{host.name} does not hold it any more")
+        gone(state, instance, now, f"{host.name} does not hold it any more")
 
 
 def take_status(state: MasterState, host: Host, status: InstanceStatus, now: float) -> None:
     """One instance changed."""
     instance = state.instances.get(status.instance.number)
     if instance is None or instance.host is not host:
-        _stop_stranger(state, host, status)
+        _take_stranger(state, host, status, now)
         return
-    changed = instance.state is not status.state
+    before = instance.state
     instance.state, instance.pid, instance.restarts = status.state, status.pid, status.restarts
     if status.state.ended:
-        _ended(state, instance, status, now)
+        _ended(state, instance, status, before, now)
         return
-    process = state.processes[instance.id.process]
-    if process.owner != instance.id.number:
+    if status.state in _ALIVE:
+        instance.recalled = False
+    process = state.owned_by(instance)
+    if process is None:
         return
     process.restarts = status.restarts
     if process.wanted is not Wanted.RUN and not instance.stopping:
         stop_instance(state, instance, now)
-    if process.name not in state.runs and changed:
-        _follow(state, process, instance, status, now)
+    if process.name not in state.runs:
+        _follow(state, process, instance, status, now, repeated=before is status.state)
 
 
 def _follow(
-    state: MasterState, process: Process, instance: Instance, status: InstanceStatus, now: float
-) -> None:
+    state: MasterState, process: Process, instance: Instance, status: InstanceStatus, now: float,
+    *, repeated: bool,
+) -> None:  # fmt: skip
     """The process goes where its owning instance went."""
-    phase = _PHASE[status.state]
-    if process.wanted is Wanted.CANCEL:
-        phase = ProcessPhase.STOPPING
     before = process.phase
+    phase = phase_of(process, instance)
     state.set_phase(process, phase, now, status.message)
     if phase is not before:
-        kind = {"running": "ready"}.get(phase.value, phase.value)
+        kind = "ready" if phase is ProcessPhase.RUNNING else phase.value
+        kind = "reachable" if repeated else kind
         state.record(
             now, kind, f"{process.name} is {kind} on {instance.host.name}"
             + (f": {status.message}" if status.message else ""),
@@ -101,10 +106,40 @@ def _follow(
             state.save(process)
 
 
-def _stop_stranger(state: MasterState, host: Host, status: InstanceStatus) -> None:
-    """An instance that nobody intends here must not run: it may have a successor elsewhere."""
-    if not status.state.ended and status.state is not InstanceState.STOPPING:
-        state.emit(Order(state.order_id(), host.host_id, "stop", status.instance))
+def phase_of(process: Process, owner: Instance) -> ProcessPhase:
+    """Where a process stands by what is known of the instance that owns its name."""
+    if process.wanted is not Wanted.RUN:
+        return ProcessPhase.STOPPING
+    return _PHASE.get(owner.state, ProcessPhase.STARTING)
+
+
+def _take_stranger(state: MasterState, host: Host, status: InstanceStatus, now: float) -> None:
+    """An instance that nobody intends here must not run: it may have a successor elsewhere.
+
+    It is kept on the books until it has ended, so that it is told to stop until it does, and no
+    successor is started beside it.
+    """
+    if status.state.ended:
+        return
+    if status.instance.number in state.instances:  # it is intended, but on another host
+        if status.state is not InstanceState.STOPPING:
+            state.emit(Order(state.order_id(), host.host_id, "stop", status.instance))
+        return
+    state.record(
+        now, "stranger_stopped", f"{status.instance} is not meant to run on {host.name}: stopped",
+        process=status.instance.process, host=host.name,
+    )  # fmt: skip
+    stranger = adopt_to_stop(state, status.instance, host, now)
+    stranger.state, stranger.pid = status.state, status.pid
+    stop_instance(state, stranger, now)
+
+
+def adopt_to_stop(state: MasterState, instance: InstanceId, host: Host, now: float) -> Instance:
+    """Keep an instance on the books that is only to end; what it uses shows in the readings."""
+    nothing = state.hosts.fractions_of(host, EMPTY)
+    adopted = state.charge_instance(instance, host, now, EMPTY, frozenset(), nothing)
+    adopted.stopping = True
+    return adopted
 
 
 def stop_instance(state: MasterState, instance: Instance, now: float) -> None:
@@ -117,82 +152,133 @@ def stop_instance(state: MasterState, instance: Instance, now: float) -> None:
 # --- ends -------------------------------------------------------------------------------------
 
 
-def _ended(state: MasterState, instance: Instance, status: InstanceStatus, now: float) -> None:
-    process = state.processes[instance.id.process]
-    _learn(state, process, instance, status)
+def _ended(
+    state: MasterState, instance: Instance, status: InstanceStatus, before: InstanceState | None,
+    now: float,
+) -> None:  # fmt: skip
+    process = state.processes.get(instance.id.process)
     state.drop_instance(instance)
+    if process is None:
+        return
+    learn_from(state, process.spec, instance, status)
+    end = _end(process, instance, status, before)
     run = state.runs.get(process.name)
     if run is not None:
-        run.ended[instance.id.number] = status
+        run.ended[instance.id.number] = end
+        if status.state is InstanceState.REFUSED and not _recalled(run, instance):
+            exclude(process, instance.host, status)
     if process.owner != instance.id.number:
         state.record(
             now, "instance_ended", f"{instance.id} ended on {instance.host.name}"
             + (f": {status.message}" if status.message else ""),
             process=process.name, host=instance.host.name,
         )  # fmt: skip
+        requeue_if_clear(state, process, now)
         return
     process.exit_code = status.exit_code or -status.exit_signal
     if run is None:  # else the plan in hand knows what this end means
-        conclude(state, process, status, instance.host, now)
+        conclude(state, process, end, instance.host, now)
 
 
-def conclude(
-    state: MasterState, process: Process, status: InstanceStatus, host: Host, now: float
-) -> None:
+def _end(
+    process: Process, instance: Instance, status: InstanceStatus, before: InstanceState | None
+) -> End:
+    """How it ended: by itself, or because it was told to."""
+    completed = (
+        process.spec.kind is Kind.JOB
+        and status.state is InstanceState.EXITED
+        and before is not InstanceState.STOPPING
+        and status.exit_code == 0 and status.exit_signal == 0
+    )  # fmt: skip
+    told = instance.stopping or instance.recalled or process.wanted is Wanted.REQUEUE
+    return End(status, ordered=told and not completed, completed=completed)
+
+
+def conclude(state: MasterState, process: Process, end: End, host: Host, now: float) -> None:
     """The owning instance has ended, and no plan is under way: what becomes of the process?"""
+    status = end.status
     process.owner = 0
     if process.wanted is Wanted.CANCEL:
-        _finish(state, process, ProcessPhase.CANCELLED, "cancelled", host, now, "")
-    elif process.wanted is Wanted.REQUEUE:
+        _finish(state, process, ProcessPhase.CANCELLED, host, now, "")
+    elif end.gone:
+        _requeue(state, process, host, now, status.message)
+    elif end.ordered:
         _requeue(state, process, host, now, f"it was ended on {host.name}")
     elif status.state is InstanceState.REFUSED:
-        process.excluded[host.name] = status.message or "its slave refused it"
+        exclude(process, host, status)
         _requeue(state, process, host, now, f"{host.name} cannot run it: {status.message}")
     elif status.state is InstanceState.EXITED and process.exit_code == 0:
-        _finish(state, process, ProcessPhase.FINISHED, "finished", host, now, status.message)
+        _finish(state, process, ProcessPhase.FINISHED, host, now, status.message)
     else:
         reason = status.message or f"exit code {process.exit_code}"
-        _finish(state, process, ProcessPhase.FAILED, "failed", host, now, reason)
+        _finish(state, process, ProcessPhase.FAILED, host, now, reason)
+
+
+def exclude(process: Process, host: Host, status: InstanceStatus) -> None:
+    """The host cannot run this process: it is not asked again."""
+    process.excluded[host.name] = status.message or "its slave refused it"
+    process.demand = None
+
+
+def _recalled(run: Run, instance: Instance) -> bool:
+    """A refusal may only say that the order to stop came before the order to start."""
+    return instance.stopping or (run.undo is not None and instance.id == run.destination)
 
 
 def _finish(
-    state: MasterState, process: Process, phase: ProcessPhase, kind: str, host: Host, now: float,
-    reason: str,
-) -> None:  # fmt: skip
+    state: MasterState, process: Process, phase: ProcessPhase, host: Host, now: float, reason: str
+) -> None:
     state.set_phase(process, phase, now, reason)
     state.record(
-        now, kind, f"{process.name} {kind} on {host.name}" + (f": {reason}" if reason else ""),
+        now, phase.value,
+        f"{process.name} {phase.value} on {host.name}" + (f": {reason}" if reason else ""),
         process=process.name, host=host.name, facts={"exit_code": process.exit_code},
     )  # fmt: skip
     state.save(process)
 
 
 def _requeue(state: MasterState, process: Process, host: Host, now: float, reason: str) -> None:
-    state.enqueue(process, now, "")
+    """Back to its place in the line, once no other instance of it can be active any more."""
     state.record(
         now, "queued", f"{process.name} returns to the queue: {reason}", process=process.name,
         host=host.name,
     )  # fmt: skip
+    process.wanted = Wanted.REQUEUE
+    for instance in state.instances_of(process):
+        if not instance.stopping:
+            stop_instance(state, instance, now)
+    if not requeue_if_clear(state, process, now):
+        left = ", ".join(f"{one.id} on {one.host.name}" for one in state.instances_of(process))
+        state.set_phase(process, ProcessPhase.STOPPING, now, f"waits for the end of {left}")
+        state.save(process)
+
+
+def requeue_if_clear(state: MasterState, process: Process, now: float) -> bool:
+    """Queue a process that is to return, unless an instance of it may still run."""
+    if process.owner or process.instances or process.name in state.runs:
+        return False
+    if process.wanted is not Wanted.REQUEUE or process.phase.over:
+        return False
+    state.enqueue(process, now)
     state.save(process)
+    return True
 
 
-def _gone(state: MasterState, instance: Instance, now: float, reason: str) -> None:
+def gone(state: MasterState, instance: Instance, now: float, reason: str) -> None:
     """The host is heard, and says nothing of an instance that should be there."""
-    process = state.processes[instance.id.process]
+    process = state.processes.get(instance.id.process)
     state.drop_instance(instance)
+    if process is None:
+        return
+    status = InstanceStatus(instance.id, InstanceState.FAILED, exit_code=1, message=reason)
+    end = End(status, gone=True)
     run = state.runs.get(process.name)
     if run is not None:
-        run.ended[instance.id.number] = InstanceStatus(
-            instance.id, InstanceState.FAILED, exit_code=1, message=reason
-        )
-        return
-    if process.owner != instance.id.number:
-        return
-    process.owner = 0
-    if process.wanted is Wanted.CANCEL:
-        _finish(state, process, ProcessPhase.CANCELLED, "cancelled", instance.host, now, reason)
+        run.ended[instance.id.number] = end
+    elif process.owner == instance.id.number:
+        conclude(state, process, end, instance.host, now)
     else:
-        _requeue(state, process, instance.host, now, reason)
+        requeue_if_clear(state, process, now)
 
 
 def assignment_withdrawn(
@@ -201,14 +287,17 @@ def assignment_withdrawn(
     """The slave never saw it: the process goes back to its place."""
     instance = state.instances.get(event.instance.number)
     if instance is not None:
-        _gone(state, instance, now, f"{instance.host.name} did not take it up in time")
+        gone(state, instance, now, f"{instance.host.name} did not take it up in time")
+
+
+# --- hosts that are lost and come back --------------------------------------------------------
 
 
 def lost_sight(state: MasterState, host: Host, now: float) -> None:
     """A host is lost: its processes are out of reach, not gone."""
     for number in host.instances:
-        process = state.processes[state.instances[number].id.process]
-        if process.owner == number and process.name not in state.runs:
+        process = state.owned_by(state.instances[number])
+        if process is not None and process.name not in state.runs:
             state.set_phase(process, ProcessPhase.UNREACHABLE, now, f"{host.name} is lost")
 
 
@@ -216,43 +305,13 @@ def regained_sight(state: MasterState, host: Host, now: float) -> None:
     """A lost host is heard again: its processes are again what their instances were last."""
     for number in host.instances:
         instance = state.instances[number]
-        process = state.processes[instance.id.process]
-        if process.owner == number and process.phase is ProcessPhase.UNREACHABLE:
-            phase = _PHASE.get(instance.state) if instance.state else ProcessPhase.ASSIGNED
-            state.set_phase(process, phase or ProcessPhase.STARTING, now)
+        process = state.owned_by(instance)
+        if process is not None and process.phase is ProcessPhase.UNREACHABLE:
+            state.set_phase(process, phase_of(process, instance), now)
 
 
-# --- what counts against a host ---------------------------------------------------------------
-
-
-def settle_charge(state: MasterState, instance: Instance, now: float) -> None:
-    """Lower what is counted in flight to what does not show in the readings yet."""
-    table = state.hosts
-    settled = now - instance.since >= state.settings.settle
-    left = {}
-    for resource, amount in instance.amounts.items():
-        hidden = amount - instance.seen.get(resource, 0.0)
-        left[resource] = 0.0 if settled and resource in instance.estimated else max(0.0, hidden)
-    need = table.fractions_of(instance.host, left)
-    need = np.where(np.isfinite(need), need, 0.0)
-    change = need.copy()
-    change[: len(instance.charged)] -= instance.charged
-    if np.any(change):
-        instance.charged = need
-        table.charge(instance.host, change)
-
-
-def _learn(
-    state: MasterState, process: Process, instance: Instance, status: InstanceStatus
-) -> None:
-    """Remember what a run used, for the next process of the same program."""
-    if status.state is InstanceState.REFUSED:
-        return
-    cpu = status.cpu_time / status.run_time if status.run_time > 0.0 else 0.0
-    peaks = {
-        "memory": max(status.peak_memory, instance.peak.get("memory", 0.0)),
-        "cpu": max(cpu, instance.peak.get("cpu", 0.0)),
-    }
-    if any(peaks.values()):
-        program = process.spec.program
-        state.emit(Intent("learned", program, dict(state.learned.learn(program, peaks))))
+def phase_in_sight(state: MasterState, process: Process, owner: Instance) -> ProcessPhase:
+    """As `phase_of`, unless the host is lost."""
+    if state.hosts.condition_of(owner.host) is HostCondition.LOST:
+        return ProcessPhase.UNREACHABLE
+    return phase_of(process, owner)

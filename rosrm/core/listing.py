@@ -26,7 +26,7 @@ def host_rows(state: MasterState, now: float) -> list[HostRow]:
 
 def _host_row(state: MasterState, host: Host, now: float) -> HostRow:
     table, column = state.hosts, host.column
-    stale = set(table.stale_resources(column))
+    stale = set(table.stale_resources(host))
     rows = []
     for resource in host.description.resources:
         at = table.resources.index(resource.name)

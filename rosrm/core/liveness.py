@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from rosrm.core import lifecycle
+from rosrm.core.assigning import reconsider_set_aside
 from rosrm.core.commands import Order
 from rosrm.core.hosts import Host, HostCondition
 from rosrm.core.state import MasterState
@@ -24,15 +25,16 @@ def review_liveness(state: MasterState, now: float) -> None:
     gone = age >= state.settings.lease
     up, suspect = condition == HostCondition.UP, condition == HostCondition.SUSPECT
     lost = condition == HostCondition.LOST
-    silent = up & ~fresh
-    past_lease = (up | suspect) & gone
-    back = (suspect | lost) & fresh
-    for column in np.flatnonzero(silent & ~past_lease):
+    # Of a host that left nothing more is expected, unless it still holds something; one that is
+    # expected back has its lease from this master's start on.
+    left = (condition == HostCondition.LEFT) & (table.processes > 0)
+    past_lease = (up | suspect | left | (condition == HostCondition.EXPECTED)) & gone
+    for column in np.flatnonzero(up & ~fresh & ~past_lease):
         _suspect(state, table.hosts[column], float(age[column]), now)
     for column in np.flatnonzero(past_lease):
         _lose(state, table.hosts[column], float(age[column]), now)
-    for column in np.flatnonzero(back):
-        _welcome_back(state, table.hosts[column], now)
+    for column in np.flatnonzero((suspect | lost) & fresh):
+        welcome_back(state, table.hosts[column], now)
 
 
 def _suspect(state: MasterState, host: Host, age: float, now: float) -> None:
@@ -53,10 +55,12 @@ def _lose(state: MasterState, host: Host, age: float, now: float) -> None:
     lifecycle.lost_sight(state, host, now)
 
 
-def _welcome_back(state: MasterState, host: Host, now: float) -> None:
+def welcome_back(state: MasterState, host: Host, now: float) -> None:
+    """A host that was suspect or lost is heard again."""
     was_lost = state.hosts.condition_of(host) is HostCondition.LOST
     state.hosts.set_condition(host, HostCondition.UP)
     state.record(now, "host_back", f"{host.name} is heard again", host=host.name)
     if was_lost:
         lifecycle.regained_sight(state, host, now)
         state.emit(Order(state.order_id(), host.host_id, "report"))
+    reconsider_set_aside(state, now)

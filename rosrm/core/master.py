@@ -27,8 +27,8 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any, Final
 
-from rosrm.core import intake, lifecycle, moves, requests, upkeep
 from rosrm.core import events as happened
+from rosrm.core import intake, lifecycle, moves, requests, upkeep
 from rosrm.core.assigning import place_waiting
 from rosrm.core.commands import Command
 from rosrm.core.state import MasterState

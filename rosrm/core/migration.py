@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Union
+from math import inf
+from typing import Any
 
 from rosrm.core.model import EMPTY, InstanceId, ProcessSpec
 
@@ -87,7 +88,7 @@ class Execute:
     undo: Step | None = None
 
 
-Step = Union[Start, AwaitReady, Stop, Commit, Execute]
+Step = Start | AwaitReady | Stop | Commit | Execute
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,14 +111,31 @@ def plan_fault(plan: Plan, move: Move) -> str:
     commits = sum(isinstance(step, Commit) for step in plan.steps)
     if commits != 1:
         return f"it has {commits} commit points, not one"
-    hosts = {move.source_host, move.destination_host}
+    if not 0.0 <= plan.overlap < inf:
+        return f"its overlap is {plan.overlap:g} s"
     for step in _all_steps(plan):
+        fault = _step_fault(step, move)
+        if fault:
+            return f"{type(step).__name__} {fault}"
+    for step in plan.steps:
         if isinstance(step, Commit):
-            continue
-        if step.host not in hosts:
-            return f"{type(step).__name__} names the host {step.host!r}, not one of {sorted(hosts)}"
-        if not step.timeout > 0.0:
-            return f"{type(step).__name__} has no time-out"
+            return "it commits to a destination that it never starts or awaits"
+        if isinstance(step, (Start, AwaitReady)) and step.instance == move.destination:
+            return ""
+    return ""
+
+
+def _step_fault(step: Step, move: Move) -> str:
+    if isinstance(step, Commit):
+        return ""
+    hosts = {move.source_host, move.destination_host}
+    if step.host not in hosts:
+        return f"names the host {step.host!r}, not one of {sorted(hosts)}"
+    if not 0.0 < step.timeout < inf:
+        return "has no time-out"
+    numbered = (move.source, move.destination, move.fallback)
+    if not isinstance(step, Execute) and step.instance not in numbered:
+        return f"names the instance {step.instance}, which is not of this move"
     return ""
 
 

@@ -8,22 +8,23 @@ forward   fails, no commit    the undo of every step so far, newest first
 forward   fails, committed    it is tried again; the process is shown as stuck until it is done
 back      is done             the next undo; after the last, the source goes on
 back      fails               it is tried again; the process is shown as stuck until it is done
+any       cannot be done      it is left out: an instance that has ended never starts again
 ========  ==================  ==============================================================
+
+A process that is to be cancelled turns back; one that is stuck is given up, and all its instances
+are stopped. When neither source nor destination is left, the process returns to the queue.
 """
 
 from __future__ import annotations
 
-from functools import singledispatch
-from typing import Any, Final
+from dataclasses import replace
 
 from rosrm.core import events as happened
 from rosrm.core import lifecycle
-from rosrm.core.commands import Order
 from rosrm.core.hosts import Host
 from rosrm.core.migration import (
     AwaitReady,
     Commit,
-    Execute,
     Move,
     Plan,
     Start,
@@ -31,21 +32,20 @@ from rosrm.core.migration import (
     Stop,
     plan_fault,
 )
-from rosrm.core.model import InstanceState
+from rosrm.core.model import InstanceId
+from rosrm.core.placement import Ranking
 from rosrm.core.state import MasterState, Process, ProcessPhase, Run, Wanted
+from rosrm.core.steps import DONE, give_order, give_order_again, outcome_of, title
 from rosrm.ports import Intent
-
-_DONE: Final = ""
-_RUNS: Final = frozenset({InstanceState.RUNNING, InstanceState.READY})
-
 
 # --- begin ------------------------------------------------------------------------------------
 
 
 def begin_move(
-    state: MasterState, process: Process, destination: Host, cause: str, now: float
-) -> str:
-    """Begin to move a running process.
+    state: MasterState, process: Process, ranking: Ranking, destination: Host, cause: str,
+    now: float,
+) -> str:  # fmt: skip
+    """Begin to move a running process to a host that has room for it by a ranking.
 
     Returns:
         "" or why it cannot be moved; then nothing has changed.
@@ -67,7 +67,11 @@ def begin_move(
         process.name, plan, name, source.id, source.host, move.destination, destination, cause, now
     )
     state.runs[process.name] = run
-    state.add_instance(move.destination, process.spec, destination, now, at_least=source.seen)
+    demand = ranking.demand
+    state.charge_instance(
+        move.destination, destination, now, demand.amounts, demand.estimated,
+        ranking.need[:, destination.column],
+    )  # fmt: skip
     state.set_phase(process, ProcessPhase.MIGRATING, now, f"to {destination.name}: {cause}")
     state.record(
         now, "migration_begun",
@@ -75,10 +79,11 @@ def begin_move(
         process=process.name, host=destination.name,
         facts={
             "from": source.host.name, "to": destination.name, "strategy": name, "cause": cause,
-            "steps": [_title(step) for step in plan.steps], "overlap": plan.overlap,
+            "steps": [title(step) for step in plan.steps], "overlap": plan.overlap,
             "source": source.id.number, "destination": move.destination.number,
         },
     )  # fmt: skip
+    state.save(process)
     _save(state, run)
     return ""
 
@@ -87,15 +92,19 @@ def why_immovable(state: MasterState, process: Process) -> str:
     """Why a process cannot be moved now; "" if it can."""
     strategy = process.spec.migration.strategy
     if process.name in state.runs:
-        return f"{process.name} is moving already, to {state.runs[process.name].destination_host.name}"
+        return (
+            f"{process.name} is moving already, to {state.runs[process.name].destination_host.name}"
+        )
     if process.phase is not ProcessPhase.RUNNING:
         return f"{process.name} is {process.phase.value}; only a running process can be moved"
+    if len(process.instances) > 1:
+        return f"an earlier instance of {process.name} is still being stopped"
     if strategy is None:
         return f"{process.name} has no migration strategy; give it `migration:` in its file"
     if strategy not in state.strategies:
         return (
-            f"{process.name} wants the migration strategy {strategy!r}, which is not selected here; "
-            f"there are {', '.join(sorted(state.strategies)) or 'none'}"
+            f"{process.name} wants the migration strategy {strategy!r}, which is not selected "
+            f"here; there are {', '.join(sorted(state.strategies)) or 'none'}"
         )
     return ""
 
@@ -134,6 +143,11 @@ def advance_all(state: MasterState, now: float) -> None:
             pass
 
 
+def moves_under_way(state: MasterState) -> int:
+    """How many processes are moving; one that is stuck does not keep others from moving."""
+    return sum(not run.stuck for run in state.runs.values())
+
+
 def order_answered(state: MasterState, event: happened.OrderAnswered, now: float) -> None:
     """A slave took an order, refused it, or did not answer in time."""
     name = state.runs_by_order.pop(event.order, None)
@@ -144,28 +158,35 @@ def order_answered(state: MasterState, event: happened.OrderAnswered, now: float
 
 def _advance(state: MasterState, run: Run, now: float) -> bool:
     """Look at the step in hand; True: there may be more to do at once."""
-    if _source_ended_by_itself(state, run):
-        _turn_back(state, run, f"{run.source} ended by itself", now)
+    if run.undo is None and not run.committed:
+        reason = _why_turn_back(state, run)
+        if reason:
+            _turn_back(state, run, reason, now)
     step = _step_in_hand(run)
-    if step is None:
+    if step is None or (run.stuck and state.processes[run.process].wanted is Wanted.CANCEL):
         _conclude(state, run, now)
         return False
+    if isinstance(step, Start) and run.undo is not None and not _goes_on(state, run):
+        _go_on(state, run, now)
+        return True
     if not run.begun:
+        if now < run.retry_at:
+            return False
         run.begun, run.answer = True, None
         run.deadline = now + max(step.timeout, 0.0)
-        _order(state, run, step, now)
-    outcome = _outcome(step, state, run)
-    if outcome is None and isinstance(step, Stop | Start):
-        _order_again(state, run, step, now)
+        give_order(state, run, step, now)
+    outcome = outcome_of(step, state, run)
+    if outcome is None and isinstance(step, (Stop, Start)):
+        give_order_again(state, run, step, now)
     if outcome is None and now >= run.deadline:
-        outcome = f"{_title(step)} took longer than {step.timeout:g} s"
+        outcome = f"{title(step)} took longer than {step.timeout:g} s"
     if outcome is None:
         return False
-    if outcome == _DONE:
+    if outcome == DONE:
         _next(state, run, step, now)
     else:
         _failed(state, run, step, outcome, now)
-    return outcome == _DONE or run.undo is not None and not run.stuck
+    return run.begun or not run.stuck
 
 
 def _step_in_hand(run: Run) -> Step | None:
@@ -175,8 +196,8 @@ def _step_in_hand(run: Run) -> Step | None:
 
 def _next(state: MasterState, run: Run, step: Step, now: float) -> None:
     state.record(
-        now, "migration_step", f"{run.process}: {_title(step)} done", process=run.process,
-        facts={"step": _title(step), "back": run.undo is not None},
+        now, "migration_step", f"{run.process}: {title(step)} done", process=run.process,
+        facts={"step": title(step), "back": run.undo is not None},
     )  # fmt: skip
     process = state.processes[run.process]
     if isinstance(step, Commit):
@@ -184,25 +205,41 @@ def _next(state: MasterState, run: Run, step: Step, now: float) -> None:
         process.owner = run.destination.number
         process.migrations += 1
         process.moved_at = now
+        if process.wanted is Wanted.REQUEUE:
+            process.wanted = Wanted.RUN  # that was meant for the host which it has left
         state.save(process)
     elif isinstance(step, Start) and run.undo is not None:
         process.owner = step.instance.number
         state.save(process)
+    _go_on(state, run, now)
+
+
+def _go_on(state: MasterState, run: Run, now: float) -> None:
+    """To the next step, or the next undo."""
     run.index += 1
     run.begun = False
-    _unstick(state, run, now)
+    run.retry_at = now
+    if run.stuck:
+        run.stuck = False
+        process = state.processes[run.process]
+        state.set_phase(process, ProcessPhase.MIGRATING, now, f"to {run.destination_host.name}")
     _save(state, run)
 
 
 def _failed(state: MasterState, run: Run, step: Step, reason: str, now: float) -> None:
-    state.record(
-        now, "migration_step_failed", f"{run.process}: {reason}", process=run.process,
-        facts={"step": _title(step), "back": run.undo is not None},
-    )  # fmt: skip
+    if not run.stuck:
+        state.record(
+            now, "migration_step_failed", f"{run.process}: {reason}", process=run.process,
+            facts={"step": title(step), "back": run.undo is not None},
+        )  # fmt: skip
     if run.undo is None and not run.committed:
         _turn_back(state, run, reason, now)
         return
+    if isinstance(step, (Start, AwaitReady)) and step.instance.number in run.ended:
+        _go_on(state, run, now)
+        return
     run.begun = False
+    run.retry_at = now + state.settings.order_retry
     if not run.stuck:
         run.stuck = True
         way = "forward" if run.undo is None else "back"
@@ -212,13 +249,6 @@ def _failed(state: MasterState, run: Run, step: Step, reason: str, now: float) -
             now, "migration_stuck", f"{run.process} is STUCK on its way {way}: {reason}",
             process=run.process,
         )  # fmt: skip
-
-
-def _unstick(state: MasterState, run: Run, now: float) -> None:
-    if run.stuck:
-        run.stuck = False
-        process = state.processes[run.process]
-        state.set_phase(process, ProcessPhase.MIGRATING, now, f"to {run.destination_host.name}")
 
 
 def _turn_back(state: MasterState, run: Run, reason: str, now: float) -> None:
@@ -231,11 +261,27 @@ def _turn_back(state: MasterState, run: Run, reason: str, now: float) -> None:
     _save(state, run)
 
 
-def _source_ended_by_itself(state: MasterState, run: Run) -> bool:
-    if run.committed or run.undo is not None or run.source.number not in run.ended:
-        return False
-    ordered = run.plan.steps[: run.index + 1]
-    return not any(isinstance(step, Stop) and step.instance == run.source for step in ordered)
+def _why_turn_back(state: MasterState, run: Run) -> str:
+    """Why the steps before the commit are not worth going on with; "" if they are."""
+    if state.processes[run.process].wanted is Wanted.CANCEL:
+        return f"{run.process} is to be cancelled"
+    end = run.ended.get(run.source.number)
+    if end is not None and (end.completed or not _told_to_stop(run, run.source)):
+        return f"{run.source} ended by itself"
+    return ""
+
+
+def _goes_on(state: MasterState, run: Run) -> bool:
+    """The process is to go on where it was: nobody cancelled it, and it has not completed."""
+    end = run.ended.get(run.source.number)
+    completed = end is not None and end.completed
+    return not completed and state.processes[run.process].wanted is Wanted.RUN
+
+
+def _told_to_stop(run: Run, instance: InstanceId) -> bool:
+    """The plan has ordered this instance to stop."""
+    so_far = run.plan.steps if run.undo is not None else run.plan.steps[: run.index + 1]
+    return any(isinstance(step, Stop) and step.instance == instance for step in so_far)
 
 
 # --- the end ----------------------------------------------------------------------------------
@@ -248,12 +294,14 @@ def _conclude(state: MasterState, run: Run, now: float) -> None:
     process = state.processes[run.process]
     moved = run.undo is None
     process.moved_at = now
-    for instance in list(state.instances_of(run.process)):
+    for instance in state.instances_of(process):
         if instance.id.number != process.owner and not instance.stopping:
-            if instance.state is None:
+            if instance.state is None and instance.id.number not in run.launched:
                 state.drop_instance(instance)  # it was counted, and never started
             else:
                 lifecycle.stop_instance(state, instance, now)
+    for name in run.source_host.over_since:
+        run.source_host.over_since[name] = now  # see first what this move brings
     state.record(
         now, "migrated" if moved else "stayed",
         f"{run.process} moved from {run.source_host.name} to {run.destination_host.name}"
@@ -271,108 +319,13 @@ def _settle_owner(state: MasterState, process: Process, run: Run, now: float) ->
     owner = state.instances.get(process.owner)
     if owner is None:
         host = run.destination_host if run.committed else run.source_host
-        lifecycle.conclude(state, process, run.ended[process.owner], host, now)
+        end = run.ended[process.owner]
+        told = process.owner == run.source.number and _told_to_stop(run, run.source)
+        if told and not end.completed:
+            end = replace(end, ordered=True)
+        lifecycle.conclude(state, process, end, host, now)
         return
-    if process.wanted is not Wanted.RUN:
+    if process.wanted is not Wanted.RUN and not owner.stopping:
         lifecycle.stop_instance(state, owner, now)
-    ready = owner.state is InstanceState.READY
-    state.set_phase(process, ProcessPhase.RUNNING if ready else ProcessPhase.STARTING, now)
+    state.set_phase(process, lifecycle.phase_in_sight(state, process, owner), now)
     state.save(process)
-
-
-# --- steps ------------------------------------------------------------------------------------
-
-
-def _order(state: MasterState, run: Run, step: Step, now: float) -> None:
-    """Ask the slave for what the step needs."""
-    if isinstance(step, Commit | AwaitReady):
-        return
-    host = state.hosts.by_name[step.host]
-    run.order, run.order_at = state.order_id(), now
-    state.runs_by_order[run.order] = run.process
-    if isinstance(step, Stop):
-        state.emit(Order(run.order, host.host_id, "stop", step.instance))
-    elif isinstance(step, Execute):
-        state.emit(
-            Order(
-                run.order, host.host_id, "execute", executor=step.executor,
-                arguments=step.arguments, timeout=step.timeout,
-            )
-        )  # fmt: skip
-    else:
-        _order_start(state, run, step, host, now)
-
-
-def _order_start(state: MasterState, run: Run, step: Start, host: Host, now: float) -> None:
-    spec = state.processes[run.process].spec
-    if step.instance.number not in state.instances and step.instance.number not in run.ended:
-        state.add_instance(step.instance, spec, host, now)
-    assignment = state.assignment(step.instance, spec, step.node_name)
-    state.emit(Order(run.order, host.host_id, "start", step.instance, assignment))
-
-
-def _order_again(state: MasterState, run: Run, step: Stop | Start, now: float) -> None:
-    """A start or stop may be given twice without harm; one may have been lost."""
-    if now - run.order_at >= state.settings.order_retry:
-        _order(state, run, step, now)
-
-
-@singledispatch
-def _outcome(step: Any, state: MasterState, run: Run) -> str | None:
-    """Of the step in hand: None: not yet; "": done; else why it failed."""
-    raise TypeError(step)
-
-
-@_outcome.register
-def _(step: Start, state: MasterState, run: Run) -> str | None:
-    instance = state.instances.get(step.instance.number)
-    if instance is None:
-        return f"{step.instance} ended on {step.host}: {_end_of(run, step.instance.number)}"
-    if run.answer is not None and not run.answer[0]:
-        return f"{step.host} refused to start {step.instance}: {run.answer[1]}"
-    return _DONE if instance.state in _RUNS else None
-
-
-@_outcome.register
-def _(step: AwaitReady, state: MasterState, run: Run) -> str | None:
-    instance = state.instances.get(step.instance.number)
-    if instance is None:
-        return f"{step.instance} ended on {step.host}: {_end_of(run, step.instance.number)}"
-    return _DONE if instance.state is InstanceState.READY else None
-
-
-@_outcome.register
-def _(step: Stop, state: MasterState, run: Run) -> str | None:
-    return _DONE if step.instance.number not in state.instances else None
-
-
-@_outcome.register
-def _(step: Commit, state: MasterState, run: Run) -> str | None:
-    return _DONE
-
-
-@_outcome.register
-def _(step: Execute, state: MasterState, run: Run) -> str | None:
-    if run.answer is None:
-        return None
-    accepted, message = run.answer
-    return _DONE if accepted else f"{step.executor} failed on {step.host}: {message}"
-
-
-def _end_of(run: Run, number: int) -> str:
-    status = run.ended.get(number)
-    if status is None:
-        return "it was never started"
-    return status.message or f"exit code {status.exit_code}, signal {status.exit_signal}"
-
-
-def _title(step: Step) -> str:
-    """A step in a few words."""
-    if isinstance(step, Commit):
-        return "commit"
-    if isinstance(step, Execute):
-        return f"execute {step.executor} on {step.host}"
-    word = {Start: "start", AwaitReady: "await ready", Stop: "stop"}[type(step)]
-    return f"{word} {step.instance} on {step.host}"
-
-

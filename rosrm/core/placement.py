@@ -1,9 +1,12 @@
-"""Which host takes a process: filter, score, pick; and why that one and not the others.
+"""Which host takes a process: filter, score, pick.
 
 A host fits when reading + in-flight load + need stays under every limit. Among the hosts that fit
 the lowest score goes first (Eq. 1 of the paper with the policy `weighted`). A `Ranking` keeps the
 scores of one demand, so that a queue of equal processes is judged once and then only where an
 assignment has changed a host.
+
+This module is the hot path of the master: a ranking is made once for each demand and batch of
+readings (one pass over all hosts), and one refresh and one argmin follow for each assignment.
 """
 
 from __future__ import annotations
@@ -15,15 +18,19 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from rosrm.core.hosts import BoolArray, FloatArray, HostTable
-from rosrm.core.model import ProcessSpec
+from rosrm.core.columns import BoolArray, FloatArray, IntArray
+from rosrm.core.hosts import HostTable
+from rosrm.core.model import EMPTY, ProcessSpec
 from rosrm.ports import HostView, ProcessView, Scores, ScoringPolicy
 
 #: Equal scores: the host with fewer processes goes first, then the one registered first.
-_TIE: Final = 1e-9
-#: An explanation names every host up to this many, else the best of those that fit.
-_NAMED_HOSTS: Final = 16
-_CLOSE: Final = 1e-9
+TIE: Final = 1e-9
+#: Sums of fractions are compared with this much tolerance.
+CLOSE: Final = 1e-9
+
+#: A scoring policy with its name.
+NamedPolicy = tuple[str, ScoringPolicy]
+Columns = slice | IntArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,74 +38,37 @@ class Demand:
     """What decides where a process may go; equal demands share a ranking.
 
     Attributes:
-        needs: (resource, amount in base units), sorted.
-        excluded: (host name, why) where it must not go, sorted.
+        amounts: needs in base units by resource.
+        estimated: resources whose amount is a guess, not declared and not measured.
+        excluded: host name to the reason why it must not go there.
         headroom: fraction by which a host must stay under each limit.
+        key: equal for processes that every host judges alike.
     """
 
     spec: ProcessSpec
-    needs: tuple[tuple[str, float], ...]
-    excluded: tuple[tuple[str, str], ...] = ()
+    amounts: Mapping[str, float]
+    estimated: frozenset[str] = frozenset()
+    excluded: Mapping[str, str] = field(default_factory=lambda: EMPTY)
     headroom: float = 0.0
+    key: tuple[Any, ...] = field(init=False, compare=False)
+
+    def __post_init__(self) -> None:
+        spec = self.spec
+        key = (
+            spec.program, spec.namespace, spec.kind, spec.priority,
+            _key(self.amounts), self.estimated, _key(self.excluded), self.headroom,
+            _key(spec.required_labels), _key(spec.preferred_labels), _key(spec.avoided_labels),
+        )  # fmt: skip
+        object.__setattr__(self, "key", key)
 
     @property
-    def key(self) -> tuple[Any, ...]:
-        """Equal for processes that every host judges alike."""
-        spec = self.spec
-        return (
-            spec.program, self.needs, self.excluded, self.headroom,
-            tuple(sorted(spec.required_labels.items())),
-            tuple(sorted(spec.preferred_labels.items())),
-            tuple(sorted(spec.avoided_labels.items())),
-        )  # fmt: skip
+    def declared(self) -> frozenset[str]:
+        """Resources that a host must have."""
+        return frozenset(name for name, much in self.amounts.items() if much > 0) - self.estimated
 
 
-@dataclass(frozen=True, slots=True)
-class Verdict:
-    """What was found of one host.
-
-    Attributes:
-        verdict: "chosen", "fits", "full", "vetoed" or "excluded".
-        score: where it fits.
-    """
-
-    host: str
-    verdict: str
-    score: float | None
-    reason: str
-
-    def to_json(self) -> dict[str, Any]:
-        """As it stands in the event record."""
-        return {
-            "name": self.host, "verdict": self.verdict, "score": self.score, "reason": self.reason,
-        }  # fmt: skip
-
-
-@dataclass(frozen=True, slots=True)
-class Decision:
-    """The outcome for one process.
-
-    Attributes:
-        column: of the chosen host; -1: none fits now.
-        needs: base units by resource.
-        verdicts: of up to 16 hosts; the chosen one first.
-        omitted: how many hosts had which verdict beside those.
-    """
-
-    column: int
-    policy: str
-    needs: Mapping[str, float]
-    verdicts: tuple[Verdict, ...]
-    omitted: Mapping[str, int] = field(default_factory=dict)
-
-    def to_json(self, kind: str) -> dict[str, Any]:
-        """As it stands in the event record."""
-        chosen = self.verdicts[0].host if self.column >= 0 else None
-        return {
-            "kind": kind, "policy": self.policy, "chosen": chosen, "need": dict(self.needs),
-            "hosts": [verdict.to_json() for verdict in self.verdicts],
-            "omitted": dict(self.omitted),
-        }  # fmt: skip
+def _key(mapping: Mapping[str, Any]) -> tuple[tuple[str, Any], ...]:
+    return tuple(sorted(mapping.items())) if mapping else ()
 
 
 class Ranking:
@@ -107,243 +77,207 @@ class Ranking:
     Attributes:
         need: (R, H) fractions of each host's capacity.
         value: (H,) score plus tie-break; inf where the host does not fit now.
-        failure: why the policy was left out; then every host that fits scores 0.
+        policy: that judges; None: every one was left out, all that fit score 0.
+        failure: why policies were left out.
     """
 
-    def __init__(self, table: HostTable, policy: ScoringPolicy, demand: Demand) -> None:
-        self._table = table
-        self._policy = policy
+    def __init__(self, table: HostTable, policies: Sequence[NamedPolicy], demand: Demand) -> None:
+        self.table = table
         self.demand = demand
         self.failure = ""
         self.version = table.version
+        self.need = table.fractions(demand.amounts, demand.estimated)
+        self._left = list(policies)
         self._seen = len(table.touched)
-        self.need = table.fractions(dict(demand.needs))
-        self.eligible = eligible(table, demand)
+        self._open = table.open() & eligible(table, demand)
+        self._allowed = table.limit - (demand.headroom - CLOSE)
         self._tier = _tiers(table, demand.spec)
-        self.value = self._judge(slice(0, len(table)))
+        self.value = np.full(len(table), np.inf)
+        self._judge(slice(0, len(table)))
+
+    @property
+    def policy(self) -> ScoringPolicy | None:
+        """The policy that judges now."""
+        return self._left[0][1] if self._left else None
+
+    @property
+    def policy_name(self) -> str:
+        """The name of the policy that judges, and which was left out, and why."""
+        name = self._left[0][0] if self._left else ""
+        if not self.failure:
+            return name
+        return f"{name} ({self.failure})" if name else self.failure
 
     def refresh(self) -> None:
         """Judge anew the columns that assignments have changed since."""
-        touched = self._table.touched
-        for column in set(touched[self._seen :]):
-            self.value[column] = self._judge(slice(column, column + 1))[0]
+        touched = self.table.touched
+        if len(touched) == self._seen:
+            return
+        columns = set(touched[self._seen :])
         self._seen = len(touched)
+        if len(columns) == 1:
+            (only,) = columns
+            self._judge(slice(only, only + 1))
+        else:
+            self._judge(np.fromiter(columns, np.int64, len(columns)))
 
     def best(self) -> int:
         """The column with the lowest value; -1: none fits."""
+        best = self.lowest(1)
+        return best[0] if best else -1
+
+    def lowest(self, most: int) -> list[int]:
+        """The columns that fit with the lowest values, best first."""
         if not len(self.value):
-            return -1
-        column = int(np.argmin(self._preferred()))
-        return column if bool(np.isfinite(self.value[column])) else -1
+            return []
+        value = self._preferred()
+        found: list[tuple[int, float]] = []
+        for _ in range(most):
+            column = int(value.argmin())
+            if value[column] == np.inf:
+                break
+            found.append((column, float(value[column])))
+            value[column] = np.inf
+        for column, was in found:
+            value[column] = was
+        return [column for column, _ in found]
 
-    def scores(self, columns: slice) -> Scores:
-        """The policy's judgement; one that raises or answers nonsense is left out, and named."""
-        if not self.failure:
-            try:
-                return self._ask_policy(columns)
-            except Exception as error:  # noqa: BLE001 - a third party's code: anything may come
-                self.failure = f"{type(error).__name__}: {error}"
-        return Scores(np.zeros(columns.stop - columns.start))
+    def fits(self, column: int) -> bool:
+        """True: this host may take it now."""
+        return bool(self.value[column] < np.inf)
 
-    def _ask_policy(self, columns: slice) -> Scores:
-        table = self._table
-        hosts = HostView(
-            names=[host.name for host in table.hosts[columns]] if columns.stop - columns.start < 64
-            else _Names(table, columns),
-            resources=table.resources,
-            usage=(table.usage[:, columns] + table.load[:, columns]).T,
-            limit=table.limit[:, columns].T,
-            capacity=table.capacity[:, columns].T,
-            processes=table.processes[columns],
-        )  # fmt: skip
-        scores = self._policy.score(hosts, ProcessView(self.demand.spec, self.need[:, columns].T))
-        size = columns.stop - columns.start
-        if np.shape(scores.value) != (size,):
-            raise ValueError(f"scores of shape {np.shape(scores.value)} for {size} hosts")
-        if np.isnan(scores.value).any():
-            raise ValueError(f"the score of host {hosts.names[int(np.isnan(scores.value).argmax())]} is NaN")
-        return scores
-
-    def room(self, columns: slice) -> BoolArray:
+    def room(self, columns: Columns) -> BoolArray:
         """(n,) True where reading + in-flight load + need stays under every limit."""
-        table = self._table
-        total = table.usage[:, columns] + table.load[:, columns]
-        total += self.need[:, columns]
-        allowed = table.limit[:, columns] - self.demand.headroom + _CLOSE
-        return np.asarray((total <= allowed).all(axis=0))
+        total = self.table.busy[:, columns] + self.need[:, columns]
+        # A host without a resource has NaN there, which is over nothing.
+        return np.asarray(~(total > self._allowed[:, columns]).any(axis=0))
 
-    def _judge(self, columns: slice) -> FloatArray:
-        table = self._table
-        if columns.stop - columns.start == 1:
-            open_now = self.eligible[columns] & table.takes(columns.start)
-        else:
-            open_now = self.eligible[columns] & table.taking()[columns]
-        fits = open_now & self.room(columns)
+    def _judge(self, columns: Columns) -> None:
+        """Set `value` of some columns; a policy that raises or answers nonsense is left out."""
+        table = self.table
+        fits = self._open[columns] & self.room(columns)
+        fits &= table.processes[columns] < table.bound[columns]
         if not fits.any():
-            return np.full(columns.stop - columns.start, np.inf)
-        scores = self.scores(columns)
-        if scores.veto is not None:
-            fits = fits & ~scores.veto
-        value = scores.value + _TIE * table.processes[columns]
-        return np.asarray(np.where(fits, value, np.inf))
+            self.value[columns] = np.inf
+            return
+        try:
+            score = self._scores(columns, fits)
+        except Exception as error:  # noqa: BLE001 - a third party's code: anything may come
+            name, _ = self._left.pop(0)
+            reason = f"left out: {name!r}, {type(error).__name__}: {error}"
+            self.failure = f"{self.failure}; {reason}" if self.failure else reason
+            self._judge(slice(0, len(table)))  # scores of two policies do not compare
+            return
+        self.value[columns] = np.where(fits, score, np.inf)
+
+    def _scores(self, columns: Columns, fits: BoolArray) -> FloatArray:
+        """Scores with the tie-break; inf: vetoed."""
+        tie: FloatArray = TIE * self.table.processes[columns].astype(np.float64)
+        if not self._left:
+            return tie
+        hosts = view_of(self.table, columns)
+        scores = self._left[0][1].score(
+            hosts, ProcessView(self.demand.spec, _read_only(self.need[:, columns].T))
+        )
+        value, veto = sound(scores, hosts, fits)
+        value = value + tie
+        if veto is not None:
+            value[veto] = np.inf
+        return value
 
     def _preferred(self) -> FloatArray:
         """The values, only those of the best tier of labels that any fitting host is in."""
         if self._tier is None:
             return self.value
-        fitting = np.isfinite(self.value)
+        fitting = self.value < np.inf
         if not fitting.any():
             return self.value
         best = self._tier[fitting].min()
         return np.where(self._tier == best, self.value, np.inf)
 
 
-class _Names(Sequence[str]):
+def view_of(table: HostTable, columns: Columns) -> HostView:
+    """What a scoring policy sees of some hosts; it cannot change the table."""
+    return HostView(
+        Names(table, columns), table.resources,
+        _read_only(table.busy[:, columns].T), _read_only(table.limit[:, columns].T),
+        _read_only(table.capacity[:, columns].T), _read_only(table.processes[columns]),
+    )  # fmt: skip
+
+
+def _read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    array.flags.writeable = False  # of this view; the standing array stays writable
+    return array
+
+
+def sound(scores: Scores, hosts: HostView, fits: BoolArray) -> tuple[FloatArray, BoolArray | None]:
+    """The value and veto of an answer that keeps to the contract; raises for any other."""
+    size = len(fits)
+    value = np.asarray(scores.value, np.float64)
+    if value.shape != (size,):
+        raise ValueError(f"scores of shape {value.shape} for {size} hosts")
+    veto = None
+    asked = fits
+    if scores.veto is not None:
+        veto = np.asarray(scores.veto, np.bool_)
+        if veto.shape != (size,):
+            raise ValueError(f"vetoes of shape {veto.shape} for {size} hosts")
+        asked = fits & ~veto
+    if not np.isfinite(value).all():
+        wrong = np.flatnonzero(asked & ~np.isfinite(value))
+        if len(wrong):
+            name = hosts.names[int(wrong[0])]
+            raise ValueError(f"the score of host {name} is {value[wrong[0]]}")
+    return value, veto
+
+
+class Names(Sequence[str]):
     """Host names on demand: a thousand of them are not listed for each decision."""
 
-    def __init__(self, table: HostTable, columns: slice) -> None:
+    def __init__(self, table: HostTable, columns: Columns) -> None:
         self._hosts = table.hosts
-        self._start, self._length = columns.start, columns.stop - columns.start
+        self._columns = columns
+
+    def _list(self) -> Sequence[int]:
+        if isinstance(self._columns, slice):
+            return range(self._columns.start, self._columns.stop)
+        return [int(column) for column in self._columns]
 
     def __len__(self) -> int:
-        return self._length
+        return len(self._list())
 
     def __getitem__(self, row: Any) -> Any:
-        return self._hosts[self._start + row].name
+        columns = self._list()[row]
+        if isinstance(columns, int):
+            return self._hosts[columns].name
+        return [self._hosts[column].name for column in columns]
 
 
 def eligible(table: HostTable, demand: Demand) -> BoolArray:
-    """(H,) True: labels and exclusions allow the host."""
+    """(H,) True: labels, exclusions and the resources that it has allow the host."""
     allowed = np.ones(len(table), np.bool_)
-    excluded = {name for name, _ in demand.excluded}
-    if not excluded and not demand.spec.required_labels:
-        return allowed
-    for host in table.hosts:
-        labels = host.description.labels
-        allowed[host.column] = host.name not in excluded and all(
-            labels.get(key) == value for key, value in demand.spec.required_labels.items()
-        )
+    for key, value in demand.spec.required_labels.items():
+        allowed &= table.labelled(key, value)
+    for name in demand.excluded:
+        host = table.by_name.get(name)
+        if host is not None:
+            allowed[host.column] = False
+    for resource in demand.declared:
+        if resource not in table.resources:
+            allowed[:] = False
+        else:
+            allowed &= table.capacity[table.resources.index(resource)] > 0.0
     return allowed
 
 
-def why_never(table: HostTable, demand: Demand) -> str:
-    """Why no known host may ever take this process; "" if one may, or none is known yet."""
-    if not len(table):
-        return ""
-    need = table.fractions(dict(demand.needs))
-    possible = eligible(table, demand)
-    # A host that is expected back has told no capacity yet: it is not held against it.
-    untold = (table.capacity <= 0.0).all(axis=0)
-    large = (need > table.limit + _CLOSE).any(axis=0) & ~untold
-    if (possible & ~large).any():
-        return ""
-    return "; ".join(
-        f"{host.name}: {_never_reason(table, demand, host.column, need)}"
-        for host in table.hosts[:_NAMED_HOSTS]
-    )
-
-
-def _never_reason(table: HostTable, demand: Demand, column: int, need: FloatArray) -> str:
-    host = table.hosts[column]
-    reason = _exclusion(demand, host.name, host.description.labels)
-    if reason:
-        return reason
-    row = int(np.argmax(need[:, column] > table.limit[:, column] + _CLOSE))
-    name = table.resources[row]
-    if table.capacity[row, column] <= 0:
-        return f"it has no {name}"
-    return f"it needs {need[row, column]:.0%} of its {name}, over the limit of {table.limit[row, column]:.0%}"
-
-
-def _exclusion(demand: Demand, name: str, labels: Mapping[str, str]) -> str:
-    reason = dict(demand.excluded).get(name)
-    if reason is not None:
-        return reason
-    missing = {k: v for k, v in demand.spec.required_labels.items() if labels.get(k) != v}
-    if missing:
-        return "it lacks the label " + ", ".join(f"{key}={value}" for key, value in missing.items())
-    return ""
-
-
-def _tiers(table: HostTable, spec: ProcessSpec) -> npt.NDArray[np.int64] | None:
+def _tiers(table: HostTable, spec: ProcessSpec) -> IntArray | None:
     """(H,) lower goes first: avoided labels count up, preferred ones down; None: no such labels."""
     if not spec.preferred_labels and not spec.avoided_labels:
         return None
     many = len(spec.preferred_labels) + 1
     tiers = np.zeros(len(table), np.int64)
-    for host in table.hosts:
-        labels = host.description.labels
-        avoided = sum(labels.get(key) == value for key, value in spec.avoided_labels.items())
-        preferred = sum(labels.get(key) == value for key, value in spec.preferred_labels.items())
-        tiers[host.column] = avoided * many - preferred
+    for key, value in spec.avoided_labels.items():
+        tiers += many * table.labelled(key, value)
+    for key, value in spec.preferred_labels.items():
+        tiers -= table.labelled(key, value)
     return tiers
-
-
-def decide(ranking: Ranking, policy: str, *, chosen: int | None = None) -> Decision:
-    """The outcome of a ranking with its reasons.
-
-    Args:
-        ranking: refreshed.
-        policy: name of the scoring policy.
-        chosen: column decided elsewhere; None: the best.
-    """
-    column = ranking.best() if chosen is None else chosen
-    table = ranking._table  # noqa: SLF001 - the two are one thing, split for reading
-    columns = _named(ranking, column)
-    verdicts = tuple(_verdict(ranking, at, column) for at in columns)
-    omitted = {}
-    if len(columns) < len(table):
-        fitting = int(np.isfinite(ranking.value).sum())
-        named = sum(v.verdict in ("fits", "chosen") for v in verdicts)
-        omitted = {
-            "fits with a higher score": fitting - named,
-            "does not fit now": len(table) - fitting - (len(verdicts) - named),
-        }
-    return Decision(column, policy, dict(ranking.demand.needs), verdicts, omitted)
-
-
-def _named(ranking: Ranking, column: int) -> list[int]:
-    hosts = len(ranking.value)
-    if hosts <= _NAMED_HOSTS:
-        named = list(range(hosts))
-    elif column >= 0:
-        # Of many hosts only those that were nearly chosen are of interest, and time is short.
-        named = [int(at) for at in np.argpartition(ranking.value, 3)[:3]]
-    else:
-        named = list(range(_NAMED_HOSTS))
-    others: list[int] = [at for at in named if at != column]
-    return ([column] if column >= 0 else []) + others
-
-
-def _verdict(ranking: Ranking, column: int, chosen: int) -> Verdict:
-    table = ranking._table  # noqa: SLF001 - the two are one thing, split for reading
-    host = table.hosts[column]
-    value = float(ranking.value[column])
-    if column == chosen or np.isfinite(value):
-        score = value - _TIE * float(table.processes[column])
-        verdict = "chosen" if column == chosen else "fits"
-        return Verdict(host.name, verdict, score if np.isfinite(score) else None, "")
-    exclusion = _exclusion(ranking.demand, host.name, host.description.labels)
-    if exclusion:
-        return Verdict(host.name, "excluded", None, exclusion)
-    closed = table.why_closed(column)
-    if closed:
-        return Verdict(host.name, "excluded", None, closed)
-    at = slice(column, column + 1)
-    if not ranking.room(at)[0]:
-        return Verdict(host.name, "full", None, _full_reason(ranking, column))
-    return Verdict(host.name, "vetoed", None, ranking.scores(at).veto_reason(0))
-
-
-def _full_reason(ranking: Ranking, column: int) -> str:
-    table = ranking._table  # noqa: SLF001 - the two are one thing, split for reading
-    need = ranking.need[:, column]
-    allowed = table.limit[:, column] - ranking.demand.headroom
-    total = table.usage[:, column] + table.load[:, column] + need
-    row = int(np.argmax(total - allowed))
-    if table.capacity[row, column] <= 0:
-        return f"it has no {table.resources[row]}"
-    return (
-        f"{table.resources[row]}: reading {table.usage[row, column]:.1%} + in flight "
-        f"{table.load[row, column]:.1%} + need {need[row]:.1%} > {allowed[row]:.1%}"
-    )

@@ -9,9 +9,14 @@ _Key = tuple[int, int, str]
 
 
 class Queue:
-    """Names of waiting processes in the order in which they are served."""
+    """Names of waiting processes in the order in which they are served.
+
+    Attributes:
+        version: grows with every change.
+    """
 
     def __init__(self) -> None:
+        self.version = 0
         self._keys: list[_Key] = []
         self._of: dict[str, _Key] = {}
 
@@ -21,12 +26,14 @@ class Queue:
             raise ValueError(f"{name} is in the queue already")
         key = (-priority, order, name)
         insort(self._keys, key)
+        self.version += 1
         self._of[name] = key
 
     def remove(self, name: str) -> None:
         """Take a process out, wherever it stands."""
         key = self._of.pop(name)
         del self._keys[bisect_left(self._keys, key)]
+        self.version += 1
 
     def __contains__(self, name: str) -> bool:
         return name in self._of

@@ -6,22 +6,22 @@ those the one with the largest relief goes. When no host has room nothing moves.
 
 from __future__ import annotations
 
-from rosrm.core.assigning import policy_in, ranking_of
+from rosrm.core.assigning import demand_to_move, ranking_of
 from rosrm.core.hosts import Host
 from rosrm.core.model import InstanceState
-from rosrm.core.moves import begin_move, why_immovable
-from rosrm.core.placement import Demand, decide
-from rosrm.core.state import Instance, MasterState, Process, larger
+from rosrm.core.moves import begin_move, moves_under_way, why_immovable
+from rosrm.core.state import Instance, MasterState, Process
+from rosrm.core.verdicts import decide, verdict_of
 
 #: Seconds between two records that nothing can be moved off a host.
 _TOLD_EVERY = 10.0
 
 
 def relieve_hosts(state: MasterState, now: float) -> None:
-    """Move processes off hosts that have been over a limit for long enough, and off drained ones."""
+    """Move processes off hosts that were over a limit for long enough, and off drained ones."""
     _note_limits(state, now)
     for host in state.hosts.hosts:
-        if len(state.runs) >= state.settings.max_migrations:
+        if moves_under_way(state) >= state.settings.max_migrations:
             return
         if host.draining:
             _drain(state, host, now)
@@ -75,11 +75,8 @@ def _relieve_resource(state: MasterState, host: Host, resource: str, now: float)
 
 
 def _largest_first(state: MasterState, host: Host, resource: str) -> list[Instance]:
-    owned = [
-        instance
-        for instance in (state.instances[number] for number in host.instances)
-        if state.processes[instance.id.process].owner == instance.id.number
-    ]
+    held = [state.instances[number] for number in host.instances]
+    owned = [instance for instance in held if state.owned_by(instance) is not None]
     return sorted(owned, key=lambda one: (-relief_of(one, resource), one.id.number))
 
 
@@ -96,9 +93,9 @@ def _why_not_now(
         return refusal
     if relief_of(instance, resource) <= 0.0:
         return f"{process.name} uses no {resource}"
-    since_move = now - process.moved_at
-    if since_move < state.settings.cooldown:
-        return f"{process.name} moved {since_move:.0f} s ago, its cool-down is {state.settings.cooldown:g} s"
+    since_move, cooldown = now - process.moved_at, state.settings.cooldown
+    if since_move < cooldown:
+        return f"{process.name} moved {since_move:.0f} s ago, its cool-down is {cooldown:g} s"
     if instance.state is not InstanceState.READY:
         return f"{process.name} is not ready"
     return ""
@@ -117,23 +114,17 @@ def try_move(
     if refusal:
         return refusal
     source = state.instances[process.owner]
-    estimate = state.learned.estimate(process.spec, state.settings.default_needs)
-    demand = Demand(
-        process.spec,
-        tuple(sorted(larger(estimate.amounts, source.seen).items())),
-        tuple(sorted({**process.excluded, source.host.name: "it is there already"}.items())),
-        headroom,
-    )
+    demand = demand_to_move(state, process, source.seen, source.host.name, headroom)
     ranking = ranking_of(state, demand)
     column = ranking.best() if host is None else host.column
-    decision = decide(ranking, policy_in(state, ranking), chosen=column)
     if column < 0:
         return f"no host has room for {process.name}"
-    if ranking.value[column] == float("inf"):
-        verdict = decide(ranking, policy_in(state, ranking), chosen=-1)
-        why = next((v.reason for v in verdict.verdicts if v.host == state.hosts.hosts[column].name), "")
-        return f"{process.name} does not fit on {state.hosts.hosts[column].name}: {why or 'no room'}"
-    reason = begin_move(state, process, state.hosts.hosts[column], cause, now)
+    destination = state.hosts.hosts[column]
+    if not ranking.fits(column):
+        why = verdict_of(ranking, column).reason
+        return f"{process.name} does not fit on {destination.name}: {why or 'no room'}"
+    decision = decide(ranking, chosen=column)
+    reason = begin_move(state, process, ranking, destination, cause, now)
     if not reason:
         state.note_decision(process, decision, "migrated", now)
     return reason
@@ -143,7 +134,7 @@ def _drain(state: MasterState, host: Host, now: float) -> None:
     reasons = []
     for instance in _largest_first(state, host, "memory"):
         process = state.processes[instance.id.process]
-        if len(state.runs) >= state.settings.max_migrations:
+        if moves_under_way(state) >= state.settings.max_migrations:
             return
         if process.name in state.runs:
             continue
@@ -161,8 +152,8 @@ def _tell_nothing_moves(
     if now - host.told.get(key, float("-inf")) < _TOLD_EVERY:
         return
     host.told[key] = now
+    why = "; ".join(reasons[:8]) or "it holds no process of ours"
     state.record(
-        now, "nothing_moves",
-        f"nothing can leave {host.name}: " + ("; ".join(reasons[:8]) or "it holds no process of ours"),
-        host=host.name, facts={"cause": what},
+        now, "nothing_moves", f"nothing can leave {host.name}: {why}", host=host.name,
+        facts={"cause": what},
     )  # fmt: skip

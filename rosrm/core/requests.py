@@ -7,6 +7,7 @@ from collections.abc import Iterable
 
 from rosrm.core import events as happened
 from rosrm.core import lifecycle
+from rosrm.core.assigning import reconsider_set_aside
 from rosrm.core.commands import Order, Reply
 from rosrm.core.intake import save_host
 from rosrm.core.relief import try_move
@@ -22,17 +23,20 @@ def _refuse(state: MasterState, request: int, message: str, code: str = "invalid
 # --- submit -----------------------------------------------------------------------------------
 
 
-def submission_received(
-    state: MasterState, event: happened.SubmissionReceived, now: float
-) -> None:
+def submission_received(state: MasterState, event: happened.SubmissionReceived, now: float) -> None:
     """Queue all of the processes, or refuse all."""
+    taken = _taken(state, event)
+    if taken:
+        _refuse(state, event.request, taken, "name_taken")
+        return
     fault = _submission_fault(state, event)
     if fault:
-        _refuse(state, event.request, fault, "name_taken")
+        _refuse(state, event.request, fault)
         return
     for spec in event.specs:
         process = Process(spec, state.next_order, ProcessPhase.QUEUED, now)
         state.next_order += 1
+        state.processes.pop(spec.name, None)  # listings are in order of submission
         state.processes[spec.name] = process
         state.enqueue(process, now)
         state.record(now, "submitted", f"{spec.name} was submitted", process=spec.name)
@@ -40,7 +44,8 @@ def submission_received(
     state.emit(Reply(event.request, message=f"{_count(len(event.specs))} queued"))
 
 
-def _submission_fault(state: MasterState, event: happened.SubmissionReceived) -> str:
+def _taken(state: MasterState, event: happened.SubmissionReceived) -> str:
+    """Which names cannot be given; "" for none."""
     twice = [name for name, n in Counter(spec.name for spec in event.specs).items() if n > 1]
     if twice:
         return f"submitted twice at once: {_names(twice)}; names are unique. Nothing was queued"
@@ -53,6 +58,24 @@ def _submission_fault(state: MasterState, event: happened.SubmissionReceived) ->
             f"in use already by a live process: {_names(taken)}. Cancel it first or choose another "
             f"name. Nothing was queued"
         )
+    for spec in event.specs:
+        left = _still_stopping(state, spec.name)
+        if left:
+            return f"{left}. Nothing was queued"
+    return ""
+
+
+def _still_stopping(state: MasterState, name: str) -> str:
+    """Of a process that is over or unknown, an instance that may still run; "" for none."""
+    process = state.processes.get(name)
+    numbers = state.orphans.get(name) if process is None else process.instances
+    if not numbers:
+        return ""
+    instance = state.instances[min(numbers)]
+    return f"an earlier {instance.id} is still being stopped on {instance.host.name}"
+
+
+def _submission_fault(state: MasterState, event: happened.SubmissionReceived) -> str:
     known = set(state.strategies)
     for spec in event.specs:
         strategy = spec.migration.strategy
@@ -82,7 +105,7 @@ def _known(state: MasterState, request: int, names: Iterable[str]) -> list[Proce
     if unknown:
         _refuse(state, request, f"no such process: {_names(unknown)}; see `rosrm ps`", "unknown")
         return None
-    return [state.processes[name] for name in names]
+    return [state.processes[name] for name in dict.fromkeys(names)]
 
 
 def cancel_requested(state: MasterState, event: happened.CancelRequested, now: float) -> None:
@@ -95,21 +118,31 @@ def cancel_requested(state: MasterState, event: happened.CancelRequested, now: f
         if not process.phase.over:
             _cancel(state, process, now)
     ended = f"; ended before: {_names(over)}" if over else ""
-    state.emit(Reply(event.request, message=f"{_count(len(processes) - len(over))} cancelled{ended}"))
+    state.emit(
+        Reply(event.request, message=f"{_count(len(processes) - len(over))} cancelled{ended}")
+    )
 
 
 def _cancel(state: MasterState, process: Process, now: float) -> None:
     process.wanted = Wanted.CANCEL
-    state.record(now, "cancel_requested", f"{process.name} is to be cancelled", process=process.name)
+    state.record(
+        now, "cancel_requested", f"{process.name} is to be cancelled", process=process.name
+    )
     if process.phase in _WAITING:
         if process.name in state.queue:
             state.queue.remove(process.name)
+        state.set_aside.discard(process.name)
         state.set_phase(process, ProcessPhase.CANCELLED, now)
-        state.record(now, "cancelled", f"{process.name} cancelled in the queue", process=process.name)
-    elif process.name not in state.runs:
-        owner = state.instances[process.owner]
+        state.record(
+            now, "cancelled", f"{process.name} cancelled in the queue", process=process.name
+        )
+    elif process.owner == 0:
+        # Its owner has ended and a former instance is being stopped: that goes on by itself.
+        state.set_phase(process, ProcessPhase.CANCELLED, now)
+        state.record(now, "cancelled", f"{process.name} cancelled", process=process.name)
+    elif process.name not in state.runs:  # else the plan in hand turns back first
         state.set_phase(process, ProcessPhase.STOPPING, now, "cancelled")
-        lifecycle.stop_instance(state, owner, now)
+        lifecycle.stop_instance(state, state.instances[process.owner], now)
     state.save(process)
 
 
@@ -133,8 +166,12 @@ def _restart_fault(state: MasterState, process: Process) -> str:
         return f"{process.name} waits in the queue already"
     if process.name in state.runs:
         return f"{process.name} is moving"
-    if process.wanted is not Wanted.RUN and not process.phase.over:
+    if process.phase.over:
+        return _still_stopping(state, process.name)
+    if process.wanted is not Wanted.RUN:
         return f"{process.name} is being stopped"
+    if process.phase is ProcessPhase.UNREACHABLE:
+        return f"{process.name} is out of reach: {process.reason}"
     return ""
 
 
@@ -142,11 +179,13 @@ def _restart(state: MasterState, process: Process, now: float) -> None:
     state.record(now, "restart_requested", f"{process.name} is restarted", process=process.name)
     if process.phase.over:
         process.excluded.clear()
+        process.demand = None
         process.order = state.next_order
         state.next_order += 1
         state.enqueue(process, now)
-    else:
-        owner = state.instances[process.owner]
+    elif (owner := state.instances[process.owner]).state is not None:
+        # One that its slave has not taken up yet is about to start anyway: a restart that came
+        # before it would keep it from ever starting.
         state.emit(Order(state.order_id(), owner.host.host_id, "restart", owner.id))
     state.save(process)
 
@@ -190,7 +229,9 @@ def host_state_requested(
     done = {"cordon": "cordoned", "uncordon": "uncordoned", "drain": "draining"}.get(event.action)
     if done is None:
         _refuse(
-            state, event.request, f"unknown action {event.action!r}; there are: cordon, uncordon, drain"
+            state,
+            event.request,
+            f"unknown action {event.action!r}; there are: cordon, uncordon, drain",
         )
         return
     state.hosts.set_closed(
@@ -199,4 +240,5 @@ def host_state_requested(
     host.told.clear()
     save_host(state, host)
     state.record(now, f"host_{done}", f"{host.name} is {done}", host=host.name)
+    reconsider_set_aside(state, now)
     state.emit(Reply(event.request, message=f"{host.name} is {done}"))

@@ -5,11 +5,13 @@ from __future__ import annotations
 from typing import Final
 
 from rosrm.core import events as happened
-from rosrm.core import lifecycle
+from rosrm.core.assigning import reconsider_set_aside
+from rosrm.core.charges import settle_charge
 from rosrm.core.commands import Order, Withdraw
+from rosrm.core.lifecycle import stop_instance
 from rosrm.core.liveness import review_liveness
 from rosrm.core.relief import relieve_hosts
-from rosrm.core.state import Instance, MasterState, ProcessPhase
+from rosrm.core.state import Instance, MasterState, ProcessPhase, Wanted
 
 #: Seconds between two reviews of what need not be looked at with every event.
 _REVIEW_EVERY: Final = 0.2
@@ -27,21 +29,31 @@ def time_passed(state: MasterState, event: happened.TimePassed, now: float) -> N
         _review_instance(state, instance, now)
     _ask_for_missing_statuses(state, now)
     relieve_hosts(state, now)
+    reconsider_set_aside(state, now)
 
 
 def _review_instance(state: MasterState, instance: Instance, now: float) -> None:
     age = now - instance.since
-    process = state.processes[instance.id.process]
-    late = instance.state is None and age >= state.settings.delivery_timeout
-    if late and process.owner == instance.id.number and process.phase is ProcessPhase.ASSIGNED:
-        if now - instance.order_at >= state.settings.delivery_timeout or not instance.order:
-            instance.order, instance.order_at = state.order_id(), now
-            state.emit(Withdraw(instance.order, instance.host.host_id, instance.id))
-    elif instance.stopping and now - instance.order_at >= state.settings.order_retry:
-        instance.order, instance.order_at = state.order_id(), now
-        state.emit(Order(instance.order, instance.host.host_id, "stop", instance.id))
-    if instance.charged.any() and age >= state.settings.settle:
-        lifecycle.settle_charge(state, instance, now)
+    if instance.state is None and age >= state.settings.delivery_timeout:
+        _withdraw(state, instance, now)
+    if instance.stopping and now - instance.order_at >= state.settings.order_retry:
+        stop_instance(state, instance, now)
+    if not instance.settled and age >= state.settings.settle:
+        settle_charge(state, instance, now)
+
+
+def _withdraw(state: MasterState, instance: Instance, now: float) -> None:
+    """Take back an assignment that was not taken up: however it ends now, it is queued again."""
+    process = state.owned_by(instance)
+    if process is None or process.phase is not ProcessPhase.ASSIGNED or instance.stopping:
+        return
+    if instance.order and now - instance.order_at < state.settings.delivery_timeout:
+        return
+    if process.wanted is Wanted.RUN:
+        process.wanted = Wanted.REQUEUE
+        state.save(process)
+    instance.order, instance.order_at = state.order_id(), now
+    state.emit(Withdraw(instance.order, instance.host.host_id, instance.id))
 
 
 def _ask_for_missing_statuses(state: MasterState, now: float) -> None:

@@ -1,0 +1,37 @@
+"""A mapping that is made when it is first read: who hands over facts need not spell them out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+
+class Lazy(Mapping[str, Any]):
+    """Renders itself once, from values that do not change any more (a snapshot, a frozen spec).
+
+    Args:
+        render: makes the mapping; must not look at anything that changes.
+    """
+
+    __slots__ = ("_render", "_rendered")
+
+    def __init__(self, render: Callable[[], Mapping[str, Any]]) -> None:
+        self._render: Callable[[], Mapping[str, Any]] | None = render
+        self._rendered: Mapping[str, Any] = {}
+
+    def _made(self) -> Mapping[str, Any]:
+        if self._render is not None:
+            self._rendered, self._render = self._render(), None
+        return self._rendered
+
+    def __getitem__(self, key: str) -> Any:
+        return self._made()[key]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._made())
+
+    def __len__(self) -> int:
+        return len(self._made())
+
+    def __repr__(self) -> str:
+        return repr(self._made())

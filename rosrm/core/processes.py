@@ -1,0 +1,189 @@
+"""What the master knows of each process, of each of its instances, and of each move under way."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Any, Final
+
+from rosrm.core.columns import FloatArray
+from rosrm.core.hosts import Host
+from rosrm.core.lazy import Lazy
+from rosrm.core.migration import Plan
+from rosrm.core.model import InstanceId, InstanceState, InstanceStatus, ProcessSpec
+from rosrm.core.placement import Demand
+from rosrm.core.specs import spec_to_dict
+
+#: Records of one process that `explain` tells.
+_HISTORY: Final = 12
+
+
+class ProcessPhase(str, Enum):
+    """Where a process stands, as the master sees it."""
+
+    QUEUED = "queued"
+    SET_ASIDE = "set_aside"
+    ASSIGNED = "assigned"
+    STARTING = "starting"
+    RUNNING = "running"
+    BACKOFF = "backoff"
+    STOPPING = "stopping"
+    MIGRATING = "migrating"
+    FINISHED = "finished"
+    FAILED = "failed"
+    CANCELLED = "cancelled"
+    UNREACHABLE = "unreachable"
+    STUCK = "stuck"
+
+    @property
+    def over(self) -> bool:
+        """Nothing more will happen to it unless somebody asks."""
+        return self in _OVER
+
+
+_OVER: Final = frozenset({ProcessPhase.FINISHED, ProcessPhase.FAILED, ProcessPhase.CANCELLED})
+
+
+class Wanted(str, Enum):
+    """What is to come of a process once its instance has ended."""
+
+    RUN = "run"
+    CANCEL = "cancel"
+    REQUEUE = "requeue"
+
+
+@dataclass(slots=True)
+class Instance:
+    """One run of a process on one host, as the master sees it.
+
+    Attributes:
+        state: as the slave said last; None: assigned, nothing said yet.
+        charged: (R',) fractions that still count against its host.
+        amounts: base units counted for it when it was assigned.
+        estimated: resources whose amount is an estimate and stops counting after `settle`.
+        since: time of the assignment.
+        seen: newest usage in base units.
+        peak: highest usage seen.
+        settled: its estimates stopped counting.
+        recalled: a master ordered it to stop and was itself restarted: its end is not its own.
+        order: of an unanswered stop, 0: none.
+        order_at: when it was given.
+    """
+
+    id: InstanceId
+    host: Host
+    since: float
+    amounts: Mapping[str, float]
+    estimated: frozenset[str]
+    charged: FloatArray
+    state: InstanceState | None = None
+    pid: int = 0
+    restarts: int = 0
+    seen: dict[str, float] = field(default_factory=dict)
+    peak: dict[str, float] = field(default_factory=dict)
+    stopping: bool = False
+    settled: bool = False
+    recalled: bool = False
+    order: int = 0
+    order_at: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class End:
+    """How an instance ended.
+
+    Attributes:
+        ordered: it had been told to stop, so that its exit code says nothing.
+        completed: a job that came to its end by itself, whatever it had been told meanwhile.
+        gone: its host does not hold it any more and says nothing of its end.
+    """
+
+    status: InstanceStatus
+    ordered: bool = False
+    completed: bool = False
+    gone: bool = False
+
+
+@dataclass(slots=True)
+class Run:
+    """A plan that is being carried out.
+
+    Attributes:
+        index: of the step in hand, in `steps` or, going back, in `undo`.
+        undo: steps still to be done on the way back; None: going forward.
+        committed: the destination owns the name.
+        deadline: of the step in hand.
+        begun: the step in hand has been ordered.
+        order: of the step in hand, 0: none.
+        stuck: a step that must be done failed; it is tried again from `retry_at` on.
+        answer: of the slave to the order of the step in hand: accepted, message.
+        launched: numbers of the instances that were ordered to start.
+        ended: how its instances ended, by number.
+    """
+
+    process: str
+    plan: Plan
+    strategy: str
+    source: InstanceId
+    source_host: Host
+    destination: InstanceId
+    destination_host: Host
+    cause: str
+    started: float
+    index: int = 0
+    undo: list[Any] | None = None
+    committed: bool = False
+    begun: bool = False
+    deadline: float = 0.0
+    order: int = 0
+    order_at: float = 0.0
+    failure: str = ""
+    stuck: bool = False
+    retry_at: float = 0.0
+    answer: tuple[bool, str] | None = None
+    launched: set[int] = field(default_factory=set)
+    ended: dict[int, End] = field(default_factory=dict)
+
+
+@dataclass(slots=True)
+class Process:
+    """One submitted process.
+
+    Attributes:
+        order: place in the line; kept when it returns to the queue.
+        owner: number of the instance that owns the name; 0: none.
+        instances: numbers of all its instances that may still run.
+        excluded: host name to the reason why it cannot run there.
+        decision: the newest one about it, with its kind.
+        demand: what decides where it may go, and the version of what was learned that is in it.
+    """
+
+    spec: ProcessSpec
+    order: int
+    phase: ProcessPhase
+    since: float
+    wanted: Wanted = Wanted.RUN
+    owner: int = 0
+    instances: set[int] = field(default_factory=set)
+    reason: str = ""
+    excluded: dict[str, str] = field(default_factory=dict)
+    migrations: int = 0
+    moved_at: float = float("-inf")
+    exit_code: int = 0
+    restarts: int = 0
+    decision: Mapping[str, Any] | None = None
+    decided_at: float = 0.0
+    history: deque[tuple[float, str, str]] = field(default_factory=lambda: deque(maxlen=_HISTORY))
+    demand: tuple[int, Demand] | None = None
+    plain: Mapping[str, Any] = field(init=False)
+
+    def __post_init__(self) -> None:
+        spec = self.spec
+        self.plain = Lazy(lambda: spec_to_dict(spec))
+
+    @property
+    def name(self) -> str:
+        """Its name."""
+        return self.spec.name

@@ -1,0 +1,133 @@
+"""The steps of a plan: what is asked of a slave for each, and when each is done or has failed."""
+
+from __future__ import annotations
+
+from functools import singledispatch
+from typing import Any, Final
+
+from rosrm.core import lifecycle
+from rosrm.core.commands import Order
+from rosrm.core.hosts import Host
+from rosrm.core.migration import AwaitReady, Commit, Execute, Start, Step, Stop
+from rosrm.core.model import InstanceState
+from rosrm.core.state import MasterState, Run
+
+DONE: Final = ""
+_RUNS: Final = frozenset({InstanceState.RUNNING, InstanceState.READY})
+
+
+def give_order(state: MasterState, run: Run, step: Step, now: float) -> None:
+    """Ask the slave for what the step needs."""
+    if isinstance(step, Commit | AwaitReady):
+        return
+    host = state.hosts.by_name[step.host]
+    run.order, run.order_at = state.order_id(), now
+    state.runs_by_order[run.order] = run.process
+    if isinstance(step, Stop):
+        state.emit(Order(run.order, host.host_id, "stop", step.instance))
+    elif isinstance(step, Execute):
+        state.emit(
+            Order(
+                run.order, host.host_id, "execute", executor=step.executor,
+                arguments=step.arguments, timeout=step.timeout,
+            )
+        )  # fmt: skip
+    else:
+        _order_start(state, run, step, host, now)
+
+
+def _order_start(state: MasterState, run: Run, step: Start, host: Host, now: float) -> None:
+    process = state.processes[run.process]
+    spec, number = process.spec, step.instance.number
+    if _in_the_way(state, run, step, now):
+        return
+    run.launched.add(number)
+    if number not in state.instances and number not in run.ended:
+        state.add_instance(step.instance, spec, host, now)
+        state.save(process)
+    assignment = state.assignment(step.instance, spec, step.node_name)
+    state.emit(Order(run.order, host.host_id, "start", step.instance, assignment))
+
+
+def _in_the_way(state: MasterState, run: Run, step: Start, now: float) -> bool:
+    """Another instance of the name may still run, and the plan does not allow two at a time.
+
+    On the way back it is stopped, whatever the plan says: the step that did not stop it failed.
+    """
+    process = state.processes[run.process]
+    back = run.undo is not None
+    if not back and (run.plan.overlap > 0.0 or step.node_name not in ("", process.name)):
+        return False
+    others = [one for one in state.instances_of(process) if one.id != step.instance]
+    for other in others:
+        if back and not other.stopping:
+            lifecycle.stop_instance(state, other, now)
+    return bool(others)
+
+
+def give_order_again(state: MasterState, run: Run, step: Stop | Start, now: float) -> None:
+    """A start or stop may be given twice without harm; one may have been lost."""
+    if now - run.order_at >= state.settings.order_retry:
+        give_order(state, run, step, now)
+
+
+@singledispatch
+def outcome_of(step: Any, state: MasterState, run: Run) -> str | None:
+    """Of the step in hand: None: not yet; "": done; else why it failed."""
+    raise TypeError(step)
+
+
+@outcome_of.register
+def _(step: Start, state: MasterState, run: Run) -> str | None:
+    if step.instance.number in run.ended:
+        return f"{step.instance} ended on {step.host}: {_end_of(run, step.instance.number)}"
+    instance = state.instances.get(step.instance.number)
+    if instance is None:
+        return None  # what is in its way has to end first
+    if run.answer is not None and not run.answer[0]:
+        return f"{step.host} refused to start {step.instance}: {run.answer[1]}"
+    return DONE if instance.state in _RUNS else None
+
+
+@outcome_of.register
+def _(step: AwaitReady, state: MasterState, run: Run) -> str | None:
+    instance = state.instances.get(step.instance.number)
+    if instance is None:
+        return f"{step.instance} ended on {step.host}: {_end_of(run, step.instance.number)}"
+    return DONE if instance.state is InstanceState.READY else None
+
+
+@outcome_of.register
+def _(step: Stop, state: MasterState, run: Run) -> str | None:
+    return DONE if step.instance.number not in state.instances else None
+
+
+@outcome_of.register
+def _(step: Commit, state: MasterState, run: Run) -> str | None:
+    return DONE
+
+
+@outcome_of.register
+def _(step: Execute, state: MasterState, run: Run) -> str | None:
+    if run.answer is None:
+        return None
+    accepted, message = run.answer
+    return DONE if accepted else f"{step.executor} failed on {step.host}: {message}"
+
+
+def _end_of(run: Run, number: int) -> str:
+    end = run.ended.get(number)
+    if end is None:
+        return "it was never started"
+    status = end.status
+    return status.message or f"exit code {status.exit_code}, signal {status.exit_signal}"
+
+
+def title(step: Step) -> str:
+    """A step in a few words."""
+    if isinstance(step, Commit):
+        return "commit"
+    if isinstance(step, Execute):
+        return f"execute {step.executor} on {step.host}"
+    word = {Start: "start", AwaitReady: "await ready", Stop: "stop"}[type(step)]
+    return f"{word} {step.instance} on {step.host}"

@@ -1,0 +1,290 @@
+"""Why this host and not the others: the outcome of a ranking, with its reasons.
+
+Many decisions are made and few are read, so a decision copies what was known of the few hosts that
+it names, and spells its verdicts out when somebody reads them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from rosrm.core.columns import BUSY, CAPACITY, LIMIT, LOAD, USAGE, BoolArray, FloatArray, IntArray
+from rosrm.core.hosts import HostTable
+from rosrm.core.lazy import Lazy
+from rosrm.core.model import EMPTY
+from rosrm.core.placement import CLOSE, TIE, Demand, Ranking, eligible
+from rosrm.ports import HostView, ProcessView, Scores, ScoringPolicy
+
+#: An explanation names every host up to this many, else the best of those that fit.
+_NAMED_HOSTS: Final = 16
+#: Of more hosts, so many beside the chosen one.
+_RUNNERS_UP: Final = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What was found of one host.
+
+    Attributes:
+        verdict: "chosen", "fits", "full", "vetoed" or "excluded".
+        score: where it fits.
+    """
+
+    host: str
+    verdict: str
+    score: float | None
+    reason: str
+
+    def to_json(self) -> dict[str, Any]:
+        """As it stands in the event record."""
+        return {
+            "name": self.host, "verdict": self.verdict, "score": self.score, "reason": self.reason,
+        }  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """What was known of n hosts when a decision was made; copies, which change no more.
+
+    Attributes:
+        closed: why each could not be given work, its room aside; "" if it could.
+        cells: (planes, R, n) as in `HostColumns`.
+        need: (R, n) fractions.
+        value: (n,) score plus tie-break; inf where it did not fit.
+        processes: (n,) held or promised.
+    """
+
+    demand: Demand
+    policy: ScoringPolicy | None
+    resources: tuple[str, ...]
+    names: tuple[str, ...]
+    closed: tuple[str, ...]
+    cells: FloatArray
+    need: FloatArray
+    value: FloatArray
+    processes: IntArray
+
+    def scores(self) -> Scores | None:
+        """The policy's judgement once more (it is pure), for its reasons; None: it has none."""
+        if self.policy is None or not self.names:
+            return None
+        hosts = HostView(
+            self.names, self.resources, self.cells[BUSY].T, self.cells[LIMIT].T,
+            self.cells[CAPACITY].T, self.processes,
+        )  # fmt: skip
+        try:
+            return self.policy.score(hosts, ProcessView(self.demand.spec, self.need.T))
+        except Exception:  # noqa: BLE001 - a third party's code; the decision is made already
+            return None
+
+
+class Decision:
+    """The outcome for one process.
+
+    Attributes:
+        column: of the chosen host; -1: none fits now.
+        policy: name of the policy that decided, and which was left out.
+        needs: base units by resource.
+        omitted: how many hosts had which verdict beside those that are named.
+    """
+
+    __slots__ = ("_moment", "_verdicts", "column", "needs", "omitted", "policy")
+
+    def __init__(
+        self, column: int, policy: str, moment: Moment, omitted: Mapping[str, int]
+    ) -> None:
+        self.column = column
+        self.policy = policy
+        self.needs = moment.demand.amounts
+        self.omitted = omitted
+        self._moment = moment
+        self._verdicts: tuple[Verdict, ...] | None = None
+
+    @property
+    def verdicts(self) -> tuple[Verdict, ...]:
+        """Of up to 16 hosts; the chosen one first."""
+        if self._verdicts is None:
+            scores = self._moment.scores()
+            self._verdicts = tuple(
+                _verdict(self._moment, scores, at, chosen=self.column >= 0 and at == 0)
+                for at in range(len(self._moment.names))
+            )
+        return self._verdicts
+
+    def to_json(self, kind: str) -> Mapping[str, Any]:
+        """As it stands in the event record; rendered when it is read."""
+        return Lazy(lambda: self._rendered(kind))
+
+    def _rendered(self, kind: str) -> Mapping[str, Any]:
+        return {
+            "kind": kind,
+            "policy": self.policy,
+            "chosen": self.verdicts[0].host if self.column >= 0 else None,
+            "need": dict(self.needs),
+            "hosts": [verdict.to_json() for verdict in self.verdicts],
+            "omitted": dict(self.omitted),
+        }
+
+
+def decide(ranking: Ranking, *, chosen: int | None = None) -> Decision:
+    """The outcome of a ranking with its reasons.
+
+    Args:
+        ranking: refreshed.
+        chosen: column decided elsewhere, -1: none; None: the best.
+    """
+    column = ranking.best() if chosen is None else chosen
+    hosts = len(ranking.value)
+    if hosts <= _NAMED_HOSTS:
+        return Decision(column, ranking.policy_name, _moment(ranking, column, range(hosts)), EMPTY)
+    # Of many hosts only those that were nearly chosen are of interest, and time is short.
+    nearly = ranking.lowest(_RUNNERS_UP + 1) if column >= 0 else range(_NAMED_HOSTS)
+    moment = _moment(ranking, column, nearly[: _RUNNERS_UP + 1] if column >= 0 else nearly)
+    fitting = int((ranking.value < np.inf).sum())
+    named = int((moment.value < np.inf).sum())
+    omitted = {
+        "fits with a higher score": fitting - named,
+        "does not fit now": hosts - fitting - (len(moment.names) - named),
+    }
+    return Decision(column, ranking.policy_name, moment, omitted)
+
+
+def verdict_of(ranking: Ranking, column: int) -> Verdict:
+    """What is found of one host."""
+    moment = _moment(ranking, -1, [column])
+    return _verdict(moment, moment.scores(), 0, chosen=False)
+
+
+def _moment(ranking: Ranking, first: int, columns: Sequence[int]) -> Moment:
+    at = [column for column in columns if column != first]
+    if first >= 0:
+        at.insert(0, first)
+    table, value = ranking.table, ranking.value[at]
+    closed = tuple(
+        "" if fits else _why_closed(table, ranking.demand, column)
+        for column, fits in zip(at, (value < np.inf).tolist(), strict=True)
+    )
+    return Moment(
+        ranking.demand, ranking.policy, table.resources,
+        tuple([table.hosts[column].name for column in at]), closed, table.cells[:, :, at],
+        ranking.need[:, at], value, table.processes[at],
+    )  # fmt: skip
+
+
+def _why_closed(table: HostTable, demand: Demand, column: int) -> str:
+    return _exclusion(table, demand, column) or table.why_closed(column)
+
+
+def _exclusion(table: HostTable, demand: Demand, column: int) -> str:
+    host = table.hosts[column]
+    if host.name in demand.excluded:
+        return demand.excluded[host.name]
+    labels = host.description.labels
+    missing = {k: v for k, v in demand.spec.required_labels.items() if labels.get(k) != v}
+    if missing:
+        return "it lacks the label " + ", ".join(f"{key}={value}" for key, value in missing.items())
+    for resource in sorted(demand.declared):
+        row = table.resources.index(resource) if resource in table.resources else -1
+        if row < 0 or not table.capacity[row, column] > 0.0:
+            return f"it has no {resource}"
+    return ""
+
+
+def _verdict(moment: Moment, scores: Scores | None, at: int, *, chosen: bool) -> Verdict:
+    name, value = moment.names[at], float(moment.value[at])
+    if value < np.inf:
+        score = value - TIE * float(moment.processes[at])
+        return Verdict(name, "chosen" if chosen else "fits", score, _said(scores, at, veto=False))
+    if moment.closed[at]:
+        return Verdict(name, "excluded", None, moment.closed[at])
+    full = _full_reason(moment, at)
+    if full:
+        return Verdict(name, "full", None, full)
+    return Verdict(name, "vetoed", None, _said(scores, at, veto=True))
+
+
+def _said(scores: Scores | None, at: int, *, veto: bool) -> str:
+    """The policy's own reason; one that raises says nothing."""
+    if scores is None:
+        return ""
+    try:
+        return str(scores.veto_reason(at) if veto else scores.reason(at))
+    except Exception as error:  # noqa: BLE001 - a third party's code: anything may come
+        return f"(its reason: {type(error).__name__}: {error})"
+
+
+def _full_reason(moment: Moment, at: int) -> str:
+    """Which resource has too little room; "" if none."""
+    limit = moment.cells[LIMIT, :, at] - moment.demand.headroom
+    over = moment.cells[BUSY, :, at] + moment.need[:, at] - limit
+    if not (over > CLOSE).any():
+        return ""
+    row = int(np.nanargmax(over))
+    return (
+        f"{moment.resources[row]}: reading {moment.cells[USAGE, row, at]:.1%} + in flight "
+        f"{moment.cells[LOAD, row, at]:.1%} + need {moment.need[row, at]:.1%} > {limit[row]:.1%}"
+    )
+
+
+# --- none may ever ----------------------------------------------------------------------------
+
+
+def why_never(table: HostTable, demand: Demand) -> str:
+    """Why no host may take this process before something other than room changes; "" if one may.
+
+    A host that is lost, has left or is cordoned may not, as long as another one is there: what
+    waits for it must not block those who do not. A host that is expected back has told no capacity
+    yet: that is not held against it.
+    """
+    if not len(table):
+        return ""
+    possible = eligible(table, demand) | _untold(table)
+    away = table.away()
+    if not away.all():
+        possible &= ~away
+    for name in demand.excluded:
+        host = table.by_name.get(name)
+        if host is not None:
+            possible[host.column] = False
+    if (possible & ~_too_large(table, demand)).any():
+        return ""
+    return "; ".join(
+        f"{host.name}: {_never_reason(table, demand, host.column)}"
+        for host in table.hosts[:_NAMED_HOSTS]
+    )
+
+
+def refused_everywhere(table: HostTable, demand: Demand) -> bool:
+    """Every host that might have taken the process has refused it."""
+    if not demand.excluded:
+        return False
+    allowed = Demand(demand.spec, demand.amounts, demand.estimated)
+    might = (eligible(table, allowed) & ~_too_large(table, demand)) | _untold(table)
+    return all(table.hosts[column].name in demand.excluded for column in np.flatnonzero(might))
+
+
+def _untold(table: HostTable) -> BoolArray:
+    """(H,) True: a host that has not said yet what it has."""
+    return np.asarray(table.incarnation == 0)
+
+
+def _too_large(table: HostTable, demand: Demand) -> BoolArray:
+    """(H,) True: it would not fit on the host even if nothing else ran there."""
+    need = table.fractions(demand.amounts, demand.estimated)
+    return np.asarray(((need > table.limit + CLOSE) & (table.capacity > 0.0)).any(axis=0))
+
+
+def _never_reason(table: HostTable, demand: Demand, column: int) -> str:
+    reason = _exclusion(table, demand, column) or table.why_away(column)
+    if reason:
+        return reason
+    need = table.fractions_of(table.hosts[column], demand.amounts, demand.estimated)
+    row = int(np.argmax(need - table.limit[:, column]))
+    return (
+        f"it needs {need[row]:.0%} of its {table.resources[row]}, over the limit of "
+        f"{table.limit[row, column]:.0%}"
+    )

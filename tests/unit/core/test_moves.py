@@ -1,0 +1,448 @@
+"""Migrations by plan: forward, back from each step, and what can be neither."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from rosrm.core import events as happened
+from rosrm.core import slave
+from rosrm.core.migration import AwaitReady, Commit, Execute, Move, Plan, Start, Stop
+from rosrm.core.model import InstanceId, MigrationPolicy
+from tests.unit.core.cluster import Cluster, Machine, StartFirstOrStopFirst, job, movable, process
+
+
+def two_hosts(*, overlap: bool = True, **settings: Any) -> Cluster:
+    """P runs on a, as a ROS node; b has room."""
+    cluster = Cluster("a", Machine("b", busy={"memory": 0.5, "cpu": 0.1}), **settings)
+    cluster.submit(movable("p", overlap=overlap, ros=True))
+    cluster.machines["a"].seen_in_graph("p", cluster.now)
+    cluster.settle()
+    assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
+    return cluster
+
+
+def ready_on(cluster: Cluster, host: str, name: str = "p") -> None:
+    cluster.machines[host].seen_in_graph(name, cluster.now)
+    cluster.settle()
+
+
+# --- forward ----------------------------------------------------------------------------------
+
+
+def test_start_first_runs_both_until_the_new_one_is_ready() -> None:
+    """Start there, ready there, commit, stop here."""
+    cluster = two_hosts()
+    reply = cluster.migrate("p")
+    assert (reply.accepted, reply.host, reply.message) == (True, "b", "p moves to b")
+    assert (cluster.phase("p"), cluster.where("p")) == ("migrating", ["a", "b"])
+    ready_on(cluster, "b")
+    assert (cluster.phase("p"), cluster.where("p")) == ("running", ["b"])
+    assert (cluster["p"].migrations, cluster["p"].owner) == (1, 2)
+    assert cluster.told("migrated") == ["p moved from a to b"]
+
+
+def test_stop_first_never_runs_two() -> None:
+    """Stop here, start there, ready there, commit."""
+    cluster = two_hosts(overlap=False)
+    cluster.machines["a"].stubborn.add("p")
+    cluster.migrate("p")
+    assert cluster.where("p") == ["a"]
+    cluster.machines["a"].let_go("p", cluster.now)
+    cluster.settle()
+    assert (cluster.phase("p"), cluster.where("p")) == ("migrating", ["b"])
+    ready_on(cluster, "b")
+    assert (cluster.phase("p"), cluster.where("p")) == ("running", ["b"])
+    assert not cluster.intents["migration"]
+
+
+def test_the_destination_is_counted_from_the_beginning_and_the_source_to_its_end() -> None:
+    """Both hosts have the room that the move needs."""
+    cluster = two_hosts()
+    cluster.migrate("p")
+    assert cluster.state.hosts.processes.tolist() == [1, 1]
+    ready_on(cluster, "b")
+    assert cluster.state.hosts.processes.tolist() == [0, 1]
+
+
+def test_what_was_seen_of_the_source_is_counted_at_the_destination() -> None:
+    """A process that uses more than anybody declared needs that much room there."""
+    cluster = two_hosts()
+    cluster.machines["a"].shown["p"] = {"memory": 6 * 2.0**30}
+    cluster.wait(0.2)
+    reply = cluster.migrate("p")
+    assert reply.message == "no host has room for p"
+    reply = cluster.migrate("p", "b")
+    assert "p does not fit on b: memory: reading 50.0%" in reply.message
+
+
+def test_a_move_is_refused_with_its_reason() -> None:
+    """Nothing has changed then."""
+    cluster = two_hosts()
+    cluster.submit(process("fixed"), process("waits", memory=1e6))
+    cases = [
+        (("x",), "no such process: x"),
+        (("p", "z"), "no such host: 'z'; there are: a, b"),
+        (("p", "a"), "it is there already"),
+        (("fixed",), "has no migration strategy"),
+        (("waits",), "only a running process can be moved"),
+    ]
+    for asked, said in cases:
+        reply = cluster.migrate(*asked)
+        assert not reply.accepted
+        assert said in reply.message
+    cluster.set_host("b", "cordon")
+    assert "p does not fit on b: it is cordoned" in cluster.migrate("p", "b").message
+    cluster.set_host("b", "uncordon")
+    cluster.migrate("p")
+    assert "p is moving already, to b" in cluster.migrate("p").message
+
+
+# --- back -------------------------------------------------------------------------------------
+
+
+def test_a_destination_that_never_becomes_ready_is_stopped_and_the_source_goes_on() -> None:
+    """Before the commit a failure is undone."""
+    cluster = two_hosts()
+    cluster.migrate("p")
+    cluster.wait(11.0)
+    assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
+    (said,) = cluster.told("stayed")
+    assert said == "p stayed on a: await ready p#2 on b took longer than 10 s"
+    assert cluster.state.hosts.processes.tolist() == [1, 0]
+
+
+def test_a_destination_that_refuses_or_ends_is_undone() -> None:
+    """The source never stopped."""
+    cluster = two_hosts()
+    cluster.machines["b"].refuses["p"] = "no such executable"
+    cluster.migrate("p")
+    assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
+    assert "no such executable" in cluster.told("stayed")[0]
+
+
+def test_stop_first_starts_again_at_the_source_when_the_destination_fails() -> None:
+    """The fallback is a new instance, and the owner."""
+    cluster = two_hosts(overlap=False)
+    cluster.machines["b"].refuses["p"] = "no such executable"
+    cluster.migrate("p")
+    assert (cluster.phase("p"), cluster.where("p")) == ("starting", ["a"])
+    ready_on(cluster, "a")
+    assert (cluster.phase("p"), cluster["p"].owner) == ("running", 3)
+
+
+def test_a_fallback_is_not_started_beside_a_source_that_has_not_ended() -> None:
+    """The stop took too long: the way back waits until the source is really gone."""
+    cluster = two_hosts(overlap=False)
+    cluster.machines["a"].stubborn.add("p")
+    cluster.migrate("p")
+    cluster.wait(25.0)
+    assert (cluster.phase("p"), cluster.where("p")) == ("stuck", ["a"])
+    assert not cluster.orders("start")
+    cluster.machines["a"].let_go("p", cluster.now)
+    cluster.wait(3.0)
+    ready_on(cluster, "a")
+    assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
+    assert cluster["p"].owner == 3
+
+
+def test_when_neither_side_can_run_it_the_process_returns_to_the_queue() -> None:
+    """Destination and fallback refused: it is placed anew rather than lost."""
+    cluster = two_hosts(overlap=False)
+    cluster.add(Machine("c", busy={"memory": 0.6}))
+    for name in "ab":
+        cluster.machines[name].refuses["p"] = "no such executable"
+    cluster.migrate("p")
+    assert not cluster.state.runs
+    assert cluster.where("p") == ["c"]
+    assert sorted(cluster["p"].excluded) == ["a", "b"]
+
+
+def test_a_source_that_ends_by_itself_ends_the_move() -> None:
+    """Its own end counts, and the destination is stopped."""
+    cluster = Cluster("a", Machine("b", busy={"memory": 0.5}))
+    cluster.submit(job("p", migration=MigrationPolicy("relaunch"), ros=True))
+    cluster.machines["a"].seen_in_graph("p", cluster.now)
+    cluster.settle()
+    cluster.migrate("p")
+    cluster.machines["a"].finish("p", cluster.now)
+    cluster.settle()
+    assert (cluster.phase("p"), cluster.where("p")) == ("finished", [])
+    assert cluster.told("stayed") == ["p stayed on a: p#1 ended by itself"]
+
+
+def test_a_job_that_completes_while_it_is_told_to_stop_has_finished() -> None:
+    """A stop-first move does not run it once more."""
+    cluster = Cluster("a", Machine("b", busy={"memory": 0.5}))
+    cluster.submit(job("p", migration=MigrationPolicy("relaunch", overlap=False)))
+    machine = cluster.machines["a"]
+    cluster.carry_out(cluster.decide(happened.MigrationRequested(9, "p")))
+    machine.finish("p", cluster.now)
+    cluster.settle()
+    assert (cluster.phase("p"), cluster.where("p")) == ("finished", [])
+
+
+def test_a_source_whose_host_forgot_it_returns_to_the_queue() -> None:
+    """Gone without a word is no failure of the process."""
+    cluster = two_hosts()
+    cluster.migrate("p")
+    machine = cluster.machines["a"]
+    machine.programs.clear()
+    machine.slave.held.clear()
+    machine.tell(slave.ReportRequested(), cluster.now)
+    cluster.settle()
+    assert cluster.phase("p") in {"starting", "running"}
+    assert len(cluster.where("p")) == 1
+
+
+# --- stuck ------------------------------------------------------------------------------------
+
+
+def test_after_the_commit_a_source_that_does_not_stop_leaves_the_move_stuck() -> None:
+    """It is said, tried again, and over once the source has ended."""
+    cluster = two_hosts()
+    cluster.machines["a"].stubborn.add("p")
+    cluster.migrate("p")
+    ready_on(cluster, "b")
+    cluster.wait(11.0)
+    assert cluster.phase("p") == "stuck"
+    (said,) = cluster.told("migration_stuck")
+    assert said.startswith("p is STUCK on its way forward: stop p#1 on a took longer")
+    cluster.wait(60.0)
+    assert len(cluster.told("migration_stuck")) == 1
+    assert len(cluster.told("migration_step_failed")) == 1
+    cluster.machines["a"].let_go("p", cluster.now)
+    cluster.settle()
+    assert (cluster.phase("p"), cluster.where("p")) == ("running", ["b"])
+
+
+def test_one_that_is_stuck_can_be_cancelled() -> None:
+    """What can be reached is stopped; the rest is told to stop until it has."""
+    cluster = two_hosts()
+    cluster.machines["a"].stubborn.add("p")
+    cluster.migrate("p")
+    ready_on(cluster, "b")
+    cluster.wait(11.0)
+    cluster.cancel("p")
+    assert cluster.phase("p") == "cancelled"
+    assert cluster.where("p") == ["a"]
+    assert not cluster.submit(process("p")).accepted
+    assert not cluster.restart("p").accepted
+    cluster.machines["a"].let_go("p", cluster.now)
+    cluster.settle()
+    assert cluster.submit(process("p")).accepted
+
+
+def test_one_that_is_stuck_does_not_keep_others_from_moving() -> None:
+    """It does not count towards the most moves at a time."""
+    cluster = two_hosts(max_migrations=1)
+    cluster.machines["a"].stubborn.add("p")
+    cluster.submit(movable("q"))
+    cluster.migrate("p")
+    ready_on(cluster, "b")
+    cluster.wait(11.0)
+    assert cluster.phase("p") == "stuck"
+    cluster.set_host("a", "drain")
+    cluster.wait(1.0)
+    assert cluster.where("q") == ["b"]
+
+
+def test_a_destination_host_that_is_lost_on_the_way_leaves_the_source_running() -> None:
+    """The move is stuck until the host is heard; its instance is stopped then."""
+    cluster = two_hosts()
+    cluster.migrate("p")
+    cluster.machines["b"].connected = False
+    cluster.wait(25.0)
+    assert (cluster.phase("p"), cluster.where("p")) == ("stuck", ["a", "b"])
+    cluster.machines["b"].connected = True
+    cluster.wait(25.0)
+    assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
+
+
+def test_a_source_host_that_leaves_during_the_move() -> None:
+    """The move turns back and the process is queued: it ends up running once."""
+    cluster = two_hosts()
+    cluster.migrate("p")
+    cluster.leave(cluster.machines["a"])
+    assert cluster.where("p") == ["b"]
+    ready_on(cluster, "b")
+    assert cluster.phase("p") == "running"
+
+
+# --- strange strategies -----------------------------------------------------------------------
+
+
+class Strange:
+    """Proposes what a test says."""
+
+    def __init__(self, make: Any) -> None:
+        self.make = make
+
+    def propose(self, move: Move) -> Plan:
+        return self.make(move)
+
+
+def raises(move: Move) -> Plan:
+    raise RuntimeError("no idea")
+
+
+def no_commit(move: Move) -> Plan:
+    return Plan((Start(move.destination, move.destination_host, 1.0),))
+
+
+def two_commits(move: Move) -> Plan:
+    return Plan((Commit(), Commit()))
+
+
+def foreign_host(move: Move) -> Plan:
+    return Plan((Start(move.destination, "elsewhere", 1.0), Commit()))
+
+
+def no_timeout(move: Move) -> Plan:
+    return Plan((Start(move.destination, move.destination_host, 0.0), Commit()))
+
+
+def foreign_instance(move: Move) -> Plan:
+    foreign = type(move.source)("other", 1)
+    return Plan((Stop(foreign, move.source_host, 1.0), Commit()))
+
+
+def never_starts(move: Move) -> Plan:
+    return Plan((Stop(move.source, move.source_host, 1.0), Commit()))
+
+
+def none_at_all(move: Move) -> Any:
+    return None
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (raises, "gave no plan: RuntimeError: no idea"),
+        (no_commit, "0 commit points"),
+        (two_commits, "2 commit points"),
+        (foreign_host, "'elsewhere'"),
+        (no_timeout, "no time-out"),
+        (foreign_instance, "other#1"),
+        (never_starts, "never starts"),
+        (none_at_all, "gave no plan"),
+    ],
+)
+def test_a_strategy_that_raises_or_proposes_nonsense_moves_nothing(make: Any, said: str) -> None:
+    """It is named, and the process runs on."""
+    cluster = Cluster(
+        "a", Machine("b", busy={"memory": 0.5}), strategies={"strange": Strange(make)}
+    )
+    cluster.submit(process("p", migration=MigrationPolicy("strange")))
+    reply = cluster.migrate("p")
+    assert not reply.accepted
+    assert "the migration strategy 'strange' gave" in reply.message
+    assert said in reply.message
+    assert cluster.told("plugin_failed") == [reply.message]
+    assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
+    assert cluster.state.hosts.processes.tolist() == [1, 0]
+
+
+def test_a_plan_without_undo_leaves_no_instance_behind() -> None:
+    """What it started and does not own the name is stopped; nothing else is started meanwhile."""
+
+    def careless(move: Move) -> Plan:
+        return Plan(
+            (
+                Start(move.destination, move.destination_host, 5.0),
+                AwaitReady(move.destination, move.destination_host, 5.0),
+                Commit(),
+            ),
+            overlap=5.0,
+        )
+
+    cluster = Cluster(
+        "a", Machine("b", busy={"memory": 0.5}), strategies={"strange": Strange(careless)}
+    )
+    cluster.submit(process("p", migration=MigrationPolicy("strange")))
+    cluster.migrate("p")
+    assert (cluster.phase("p"), cluster.where("p")) == ("running", ["b"])
+
+
+def test_a_same_name_start_waits_where_no_overlap_is_declared() -> None:
+    """A plan that would run two under one name is kept from it, and undone."""
+
+    def overlapping(move: Move) -> Plan:
+        stop = Stop(move.destination, move.destination_host, 5.0)
+        start = Start(move.destination, move.destination_host, 5.0, undo=stop)
+        return Plan((start, Commit(), Stop(move.source, move.source_host, 5.0)))
+
+    cluster = Cluster(
+        "a", Machine("b", busy={"memory": 0.5}), strategies={"strange": Strange(overlapping)}
+    )
+    cluster.submit(process("p", migration=MigrationPolicy("strange")))
+    cluster.migrate("p")
+    assert cluster.where("p") == ["a"]
+    cluster.wait(12.0)
+    assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
+
+
+def executing(move: Move) -> Plan:
+    undo = Execute("sweep", move.source_host, {"what": "image"}, 5.0)
+    stop_there = Stop(move.destination, move.destination_host, 5.0)
+    return Plan(
+        (
+            Execute("dump", move.source_host, {"what": "image"}, 5.0, undo=undo),
+            Start(move.destination, move.destination_host, 5.0, "alias", undo=stop_there),
+            AwaitReady(move.destination, move.destination_host, 5.0),
+            Commit(),
+            Stop(move.source, move.source_host, 5.0),
+        )
+    )
+
+
+def test_an_executor_does_the_open_step_on_its_host() -> None:
+    """With the arguments of the plan; a shadow under an alias may run beside the source."""
+    done: list[Any] = []
+    cluster = Cluster(
+        Machine("a", executors={"dump": done.append, "sweep": done.append}),
+        Machine("b", busy={"memory": 0.5}), strategies={"strange": Strange(executing)},
+    )  # fmt: skip
+    cluster.submit(process("p", migration=MigrationPolicy("strange")))
+    cluster.migrate("p")
+    assert done == [{"what": "image"}]
+    assert (cluster.phase("p"), cluster.where("p")) == ("running", ["b"])
+
+
+def test_an_executor_that_fails_is_undone() -> None:
+    """With the undo of its own step."""
+    swept: list[Any] = []
+
+    def fails(arguments: Any) -> None:
+        raise OSError("disk full")
+
+    cluster = Cluster(
+        Machine("a", executors={"dump": fails, "sweep": swept.append}),
+        Machine("b", busy={"memory": 0.5}), strategies={"strange": Strange(executing)},
+    )  # fmt: skip
+    cluster.submit(process("p", migration=MigrationPolicy("strange")))
+    cluster.migrate("p")
+    assert swept == [{"what": "image"}]
+    assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
+    assert cluster.told("stayed") == ["p stayed on a: dump failed on a: disk full"]
+
+
+def test_a_lost_order_is_given_again() -> None:
+    """Starts and stops may be given twice without harm."""
+    cluster = two_hosts(order_retry=2.0)
+    cluster.carry_out(cluster.decide(happened.MigrationRequested(9, "p")))
+    cluster.machines["b"].ordered.clear()
+    cluster.wait(2.5)
+    ready_on(cluster, "b")
+    assert (cluster.phase("p"), cluster.where("p")) == ("running", ["b"])
+
+
+def test_the_shipped_shape_of_relaunch_keeps_to_its_declared_overlap() -> None:
+    """Stop-first declares none, start-first a bound."""
+    move = Move(movable("p"), _id(1), "a", _id(2), "b", _id(3), 0)
+    assert StartFirstOrStopFirst().propose(move).overlap > 0.0
+
+
+def _id(number: int) -> Any:
+    return InstanceId("p", number)

@@ -1,0 +1,274 @@
+"""Where the head of the queue goes."""
+
+from __future__ import annotations
+
+import pytest
+
+from rosrm.core import events as happened
+from rosrm.core.model import ResourceDescription
+from tests.unit.core.cluster import GIB, MIB, Cluster, Eq1, Machine, job, process
+
+
+def machine(name: str, memory: float = 0.1, cpu: float = 0.1, **fields: object) -> Machine:
+    return Machine(name, busy={"memory": memory, "cpu": cpu}, **fields)
+
+
+def test_the_host_with_the_largest_margin_is_chosen() -> None:
+    """Eq. 1: the lowest weighted usage goes first."""
+    cluster = Cluster(machine("a", memory=0.5), machine("b", memory=0.2), machine("c", memory=0.3))
+    cluster.submit(process("p"))
+    assert cluster.where("p") == ["b"]
+
+
+def test_the_weights_of_eq_1_decide() -> None:
+    """With the whole weight on CPU, memory does not matter."""
+    hosts = machine("a", memory=0.1, cpu=0.5), machine("b", memory=0.5, cpu=0.1)
+    cluster = Cluster(*hosts, policy=Eq1(memory=0.0, cpu=1.0))
+    cluster.submit(process("p"))
+    assert cluster.where("p") == ["b"]
+
+
+def test_equal_scores_go_to_the_host_with_fewer_processes_then_to_the_first() -> None:
+    """A tie is broken by the number of processes, then by the order of registration."""
+    cluster = Cluster("a", "b", policy=Eq1(memory=0.0))
+    for name in "pqr":
+        cluster.submit(process(name))
+    assert [cluster.where(name) for name in "pqr"] == [["a"], ["b"], ["a"]]
+
+
+@pytest.mark.parametrize("needs", ["declared", "default", "learned"])
+def test_sixty_equal_processes_on_three_equal_hosts_end_20_20_20(needs: str) -> None:
+    """What was just assigned counts before it shows, however its needs are known."""
+    cluster = Cluster("a", "b", "c")
+    if needs == "learned":
+        cluster.machines["a"].shown["first"] = {"memory": 90 * MIB}
+        cluster.submit(job("first"))
+        cluster.machines["a"].finish("first", cluster.now)
+        cluster.settle()
+        assert cluster["first"].phase.value == "finished"
+    memory = 80.0 if needs == "declared" else 0.0
+    cluster.submit(*[process(f"p{i}", memory=memory) for i in range(60)])
+    assert cluster.counts() == {"a": 20, "b": 20, "c": 20}
+
+
+def test_learned_needs_stand_in_for_those_that_were_not_declared() -> None:
+    """The peak of an earlier run of the same program counts against the host."""
+    cluster = Cluster("a")
+    cluster.machines["a"].shown["first"] = {"memory": 160 * MIB, "cpu": 0.5}
+    cluster.submit(job("first"))
+    cluster.machines["a"].finish("first", cluster.now)
+    cluster.settle()
+    cluster.submit(process("second"))
+    need = cluster.explain("second")["decision"]["need"]
+    assert need == {"memory": 160 * MIB, "cpu": 0.5}
+
+
+def test_cpu_is_not_learned_from_a_run_too_short_to_tell() -> None:
+    """The start of `true` looks like a whole core; it must not keep its likes off small hosts."""
+    cluster = Cluster("a")
+    cluster.submit(job("first"))
+    cluster.machines["a"].shown["first"] = {"cpu": 1.0, "memory": 2 * MIB}
+    cluster.machines["a"].finish("first", cluster.now, run_time=0.01)
+    cluster.settle()
+    cluster.submit(process("second"))
+    assert cluster.explain("second")["decision"]["need"] == {"memory": 2 * MIB, "cpu": 0.1}
+
+
+def test_a_declared_need_holds_an_estimate_is_capped() -> None:
+    """A guess fills at most half of a limit: a guess alone keeps no process off every host."""
+    cluster = Cluster(Machine("tiny", memory=64 * MIB, cpu=0.1))
+    cluster.submit(process("guessed"))
+    assert cluster.where("guessed") == ["tiny"]
+    cluster.submit(process("declared", memory=64))
+    assert cluster.phase("declared") == "set_aside"
+
+
+def test_an_estimate_of_a_resource_that_a_host_has_not_counts_nothing() -> None:
+    """A host that probes memory only still takes processes whose CPU need is a guess."""
+    only_memory = Machine("a", resources=(ResourceDescription("memory", "B", GIB),))
+    cluster = Cluster(only_memory)
+    cluster.submit(process("p"))
+    assert cluster.where("p") == ["a"]
+
+
+def test_a_declared_need_of_a_resource_that_a_host_has_not_excludes_it() -> None:
+    """Who needs a GPU never goes where there is none."""
+    gpu = Machine(
+        "g", resources=(ResourceDescription("memory", "B", GIB), ResourceDescription("gpu", "1", 1))
+    )
+    cluster = Cluster("a")
+    cluster.submit(process("p", needs={"gpu": 0.5}))
+    assert cluster.phase("p") == "set_aside"
+    assert "it has no gpu" in cluster["p"].reason
+    cluster.add(gpu)
+    assert cluster.where("p") == ["g"]
+
+
+def test_a_host_without_any_resource_takes_no_declared_need() -> None:
+    """Nothing is known of its room."""
+    cluster = Cluster(Machine("a", resources=(ResourceDescription("disk", "B", GIB),)))
+    cluster.submit(process("p", memory=1))
+    assert cluster.phase("p") == "set_aside"
+
+
+def test_nothing_is_assigned_over_a_limit() -> None:
+    """Reading + in-flight load + need stays under every limit."""
+    cluster = Cluster(Machine("a", memory=1000 * MIB, busy={"memory": 0.3}))
+    cluster.submit(*[process(f"p{i}", memory=100) for i in range(9)])
+    assert cluster.counts() == {"a": 5}  # 0.3 + 5 x 0.1 = 0.8
+    assert cluster.queue() == ["p5", "p6", "p7", "p8"]
+
+
+def test_one_more_goes_when_usage_falls() -> None:
+    """What waits is placed as soon as a reading leaves room."""
+    cluster = Cluster(Machine("a", memory=1000 * MIB, busy={"memory": 0.75}))
+    cluster.submit(process("p", memory=100))
+    assert cluster.phase("p") == "queued"
+    cluster.machines["a"].busy["memory"] = 0.6
+    cluster.read()
+    cluster.settle()
+    assert cluster.where("p") == ["a"]
+
+
+def test_max_processes_is_the_most_that_a_host_holds() -> None:
+    """Slots are counted from the assignment to the end."""
+    cluster = Cluster(Machine("a", max_processes=2), Machine("b", max_processes=1))
+    cluster.submit(*[job(f"p{i}") for i in range(5)])
+    assert cluster.counts() == {"a": 2, "b": 1}
+    cluster.machines["b"].finish("p1", cluster.now)
+    cluster.settle()
+    assert cluster.where("p3") == ["b"]
+    assert cluster.queue() == ["p4"]
+
+
+# --- in-flight load ---------------------------------------------------------------------------
+
+
+def load(cluster: Cluster, host: str) -> float:
+    state = cluster.state
+    return float(state.hosts.load[0, state.hosts.by_name[host].column]) * 1000
+
+
+def test_a_charge_sinks_as_usage_shows() -> None:
+    """A process is not counted twice: in flight and in the reading."""
+    cluster = Cluster(Machine("a", memory=1000 * MIB))
+    cluster.submit(process("p", memory=100))
+    assert load(cluster, "a") == pytest.approx(100)
+    cluster.machines["a"].shown["p"] = {"memory": 60 * MIB}
+    cluster.wait(0.1)
+    assert load(cluster, "a") == pytest.approx(40)
+    cluster.machines["a"].shown["p"] = {"memory": 150 * MIB}
+    cluster.wait(0.1)
+    assert load(cluster, "a") == pytest.approx(0)
+
+
+def test_a_charge_ends_with_its_instance() -> None:
+    """Nothing of it is left behind."""
+    cluster = Cluster("a")
+    cluster.submit(job("p", memory=100))
+    cluster.machines["a"].finish("p", cluster.now)
+    cluster.settle()
+    assert load(cluster, "a") == 0.0
+
+
+def test_an_estimate_expires_and_a_declared_need_stays() -> None:
+    """After `settle` the readings are believed, save where somebody declared more."""
+    cluster = Cluster(Machine("a", memory=1000 * MIB), settle=10.0)
+    cluster.submit(process("guessed"), process("declared", memory=100))
+    assert load(cluster, "a") == pytest.approx(164)
+    cluster.wait(9.0)
+    assert load(cluster, "a") == pytest.approx(164)
+    cluster.wait(2.0)
+    assert load(cluster, "a") == pytest.approx(100)
+
+
+# --- labels -----------------------------------------------------------------------------------
+
+
+def test_a_process_goes_only_where_its_required_labels_are() -> None:
+    """However full that host is beside others."""
+    hosts = machine("a"), machine("b", memory=0.7, labels={"lidar": "front"})
+    cluster = Cluster(*hosts)
+    cluster.submit(process("driver", required_labels={"lidar": "front"}))
+    assert cluster.where("driver") == ["b"]
+
+
+def test_preferred_labels_go_before_the_margin() -> None:
+    """Among hosts that fit, those with more of the preferred labels go first."""
+    both = {"ssd": "yes", "fast": "yes"}
+    hosts = [
+        machine("a"), machine("b", memory=0.4, labels={"ssd": "yes"}),
+        machine("c", memory=0.6, labels=both),
+    ]  # fmt: skip
+    cluster = Cluster(*hosts)
+    cluster.submit(process("p", preferred_labels=both))
+    assert cluster.where("p") == ["c"]
+
+
+def test_avoided_labels_are_taken_only_when_no_other_fits() -> None:
+    """A host to be avoided is better than none."""
+    hosts = machine("a", labels={"battery": "yes"}), machine("b", memory=0.7)
+    cluster = Cluster(*hosts)
+    cluster.submit(process("p", avoided_labels={"battery": "yes"}))
+    assert cluster.where("p") == ["b"]
+    cluster.machines["b"].busy["memory"] = 0.9
+    cluster.read()
+    cluster.submit(process("q", avoided_labels={"battery": "yes"}))
+    assert cluster.where("q") == ["a"]
+
+
+# --- explain ----------------------------------------------------------------------------------
+
+
+def test_every_placement_explains_itself() -> None:
+    """Why this host, with its score, and why not the others."""
+    hosts = [
+        machine("full", memory=0.79), machine("good", memory=0.2), machine("fair", memory=0.3),
+        machine("closed"), machine("other", labels={"arch": "arm"}),
+    ]  # fmt: skip
+    cluster = Cluster(*hosts)
+    cluster.set_host("closed", "cordon")
+    cluster.machines["other"].busy["memory"] = 0.95
+    cluster.read()
+    cluster.submit(process("p", memory=1024))
+    story = cluster.explain("p")
+    decision = story["decision"]
+    assert (story["state"], story["host"], decision["chosen"]) == ("running", "good", "good")
+    found = {one["name"]: (one["verdict"], one["reason"]) for one in decision["hosts"]}
+    assert found["good"] == ("chosen", "0.200 by Eq. 1")
+    assert found["fair"] == ("fits", "0.300 by Eq. 1")
+    assert found["full"] == (
+        "full", "memory: reading 79.0% + in flight 0.0% + need 6.2% > 80.0%",
+    )  # fmt: skip
+    assert found["closed"] == ("excluded", "it is cordoned")
+    assert found["other"] == ("excluded", "it is over its limit of memory")
+    assert decision["hosts"][0]["name"] == "good"
+
+
+def test_an_explanation_is_of_its_moment() -> None:
+    """What happens afterwards does not change why it went there."""
+    cluster = Cluster(machine("a", memory=0.2), machine("b", memory=0.3))
+    commands = cluster.decide(happened.SubmissionReceived(1, (process("p"),)))
+    (record,) = [c for c in commands if getattr(c, "kind", "") == "assigned"]
+    cluster.machines["a"].busy["memory"] = 0.7
+    cluster.read()
+    scores = [host["score"] for host in record.facts["decision"]["hosts"]]
+    assert scores == pytest.approx([0.2, 0.3])
+
+
+def test_of_many_hosts_the_best_are_named_and_the_rest_counted() -> None:
+    """A thousand hosts do not make a record of a thousand lines."""
+    cluster = Cluster(*[machine(f"h{i}", memory=0.01 * i) for i in range(40)])
+    cluster.set_host("h39", "cordon")
+    cluster.submit(process("p"))
+    decision = cluster.explain("p")["decision"]
+    assert [host["name"] for host in decision["hosts"]] == ["h0", "h1", "h2", "h3"]
+    assert decision["omitted"] == {"fits with a higher score": 35, "does not fit now": 1}
+
+
+def test_a_waiting_process_tells_who_is_before_it() -> None:
+    """`explain` of one in the queue names the head that it waits behind."""
+    cluster = Cluster()
+    cluster.submit(process("p"), process("q"))
+    assert cluster.explain("p")["reason"] == "no host has registered yet"
+    assert "1 before it in the queue, p first" in cluster.explain("q")["reason"]

@@ -1,0 +1,189 @@
+"""Scoring policies of third parties: used as they say, left out and named where they are broken."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rosrm.core.model import ResourceDescription
+from rosrm.ports import HostView, ProcessView, Scores
+from tests.unit.core.cluster import Cluster, Eq1, Machine, process
+
+
+class Policy:
+    """Scores as a test says."""
+
+    def __init__(self, make: Any) -> None:
+        self.make = make
+        self.seen: list[HostView] = []
+
+    def score(self, hosts: HostView, process: ProcessView) -> Scores:
+        self.seen.append(hosts)
+        return self.make(hosts, process)
+
+
+def raises(hosts: HostView, process: ProcessView) -> Scores:
+    raise ZeroDivisionError("oops")
+
+
+def nan(hosts: HostView, process: ProcessView) -> Scores:
+    return Scores(np.full(len(hosts.names), np.nan))
+
+
+def infinite(hosts: HostView, process: ProcessView) -> Scores:
+    return Scores(np.full(len(hosts.names), -np.inf))
+
+
+def too_few(hosts: HostView, process: ProcessView) -> Scores:
+    return Scores(np.zeros(1))
+
+
+def a_number(hosts: HostView, process: ProcessView) -> Any:
+    return 0.5
+
+
+def words(hosts: HostView, process: ProcessView) -> Any:
+    return Scores(["good"] * len(hosts.names))
+
+
+def wrong_veto(hosts: HostView, process: ProcessView) -> Scores:
+    return Scores(np.zeros(len(hosts.names)), np.zeros(1, np.bool_))
+
+
+def writes(hosts: HostView, process: ProcessView) -> Scores:
+    hosts.usage[:] = 0.0
+    return Scores(np.zeros(len(hosts.names)))
+
+
+BROKEN = [
+    (raises, "ZeroDivisionError: oops"),
+    (nan, "the score of host a is nan"),
+    (infinite, "the score of host a is -inf"),
+    (too_few, "scores of shape (1,) for 3 hosts"),
+    (a_number, "AttributeError"),
+    (words, "ValueError"),
+    (wrong_veto, "vetoes of shape (1,) for 3 hosts"),
+    (writes, "read-only"),
+]
+
+
+def three(**fields: Any) -> Cluster:
+    hosts = [Machine(n, busy={"memory": m}) for n, m in (("a", 0.5), ("b", 0.2), ("c", 0.4))]
+    return Cluster(*hosts, **fields)
+
+
+@pytest.mark.parametrize(("make", "said"), BROKEN)
+def test_a_broken_policy_is_left_out_and_named(make: Any, said: str) -> None:
+    """Any host that fits takes the process, and the decision says why it was so."""
+    cluster = three(policy=Policy(make))
+    cluster.submit(process("p"))
+    assert cluster.where("p") == ["a"]
+    policy = cluster.explain("p")["decision"]["policy"]
+    assert policy.startswith("left out: 'eq1', ")
+    assert said in policy
+    (told,) = cluster.told("plugin_failed")
+    assert told.startswith("the scoring policy 'eq1' does not decide: left out")
+
+
+@pytest.mark.parametrize(("make", "said"), BROKEN)
+def test_a_fallback_decides_where_the_policy_is_broken(make: Any, said: str) -> None:
+    """Both are named."""
+    cluster = three(policy=Policy(make), fallback=("weighted", Eq1()))
+    cluster.submit(process("p"))
+    assert cluster.where("p") == ["b"]
+    policy = cluster.explain("p")["decision"]["policy"]
+    assert policy.startswith("weighted (left out: 'eq1', ")
+    assert said in policy
+
+
+def test_a_policy_that_breaks_on_one_host_is_left_out_for_all() -> None:
+    """Scores of two policies do not compare: all hosts are judged anew."""
+
+    def breaks_when_loaded(hosts: HostView, process: ProcessView) -> Scores:
+        if (hosts.processes > 0).any():
+            raise RuntimeError("busy")
+        return Scores(100.0 + hosts.column("memory"))
+
+    cluster = three(policy=Policy(breaks_when_loaded), fallback=("weighted", Eq1()))
+    cluster.submit(process("p", memory=1), process("q", memory=1))
+    assert (cluster.where("p"), cluster.where("q")) == (["b"], ["b"])
+
+
+def test_a_policy_is_asked_again_with_the_next_reading() -> None:
+    """It is left out of a decision, not for ever."""
+    broken = [True]
+
+    def recovers(hosts: HostView, process: ProcessView) -> Scores:
+        if broken[0]:
+            raise RuntimeError("not yet")
+        return Scores(-hosts.column("memory"))
+
+    cluster = three(policy=Policy(recovers))
+    cluster.submit(process("p"))
+    broken[0] = False
+    cluster.read()
+    cluster.submit(process("q"))
+    assert cluster.where("q") == ["a"]
+    assert cluster.explain("q")["decision"]["policy"] == "eq1"
+
+
+def test_a_vetoed_host_takes_nothing() -> None:
+    """With the policy's reason."""
+
+    def not_b(hosts: HostView, process: ProcessView) -> Scores:
+        veto = np.array([name == "b" for name in hosts.names])
+        return Scores(hosts.column("memory"), veto, veto_reason=lambda row: "b is for the boss")
+
+    cluster = three(policy=Policy(not_b))
+    cluster.submit(process("p"))
+    assert cluster.where("p") == ["c"]
+    found = {one["name"]: one for one in cluster.explain("p")["decision"]["hosts"]}
+    assert (found["b"]["verdict"], found["b"]["reason"]) == ("vetoed", "b is for the boss")
+
+
+def test_a_score_of_a_host_that_does_not_fit_may_be_anything() -> None:
+    """NaN where a host has no such resource harms nobody who is not asked."""
+
+    def by_gpu(hosts: HostView, process: ProcessView) -> Scores:
+        return Scores(hosts.usage[:, hosts.resources.index("gpu")])
+
+    memory = ResourceDescription("memory", "B", 1e9)
+    gpu = ResourceDescription("gpu", "1", 1.0)
+    cluster = Cluster(
+        Machine("a", resources=(memory,)), Machine("b", resources=(memory, gpu)),
+        policy=Policy(by_gpu),
+    )  # fmt: skip
+    cluster.submit(process("p", needs={"gpu": 0.1}))
+    assert cluster.where("p") == ["b"]
+    assert cluster.explain("p")["decision"]["policy"] == "eq1"
+
+
+def test_a_reason_that_raises_harms_no_decision() -> None:
+    """It is told in its place."""
+
+    def shy(hosts: HostView, process: ProcessView) -> Scores:
+        return Scores(hosts.column("memory"), reason=lambda row: f"{1 / 0}")
+
+    cluster = three(policy=Policy(shy))
+    cluster.submit(process("p"))
+    (chosen, *_) = cluster.explain("p")["decision"]["hosts"]
+    assert (chosen["name"], chosen["verdict"]) == ("b", "chosen")
+    assert "ZeroDivisionError" in chosen["reason"]
+
+
+def test_a_policy_sees_nan_where_a_host_has_no_such_resource() -> None:
+    """As `HostView` says: usage and capacity NaN, limit 1."""
+    memory, gpu = ResourceDescription("memory", "B", 1e9), ResourceDescription("gpu", "1", 1.0)
+    policy = Policy(lambda hosts, process: Scores(hosts.column("memory")))
+    cluster = Cluster(
+        Machine("a", resources=(memory,)), Machine("b", resources=(memory, gpu)), policy=policy
+    )
+    cluster.submit(process("p"))
+    view = policy.seen[0]
+    assert view.resources == ("memory", "gpu")
+    assert np.isnan([view.usage[0, 1], view.capacity[0, 1]]).all()
+    assert view.limit[0, 1] == 1.0
+    assert list(view.names) == ["a", "b"]
+    assert (view.names[0], view.names[-1], view.names[0:1]) == ("a", "b", ["a"])

@@ -1,0 +1,158 @@
+"""First in, first out, within a priority; who waits, who is set aside, and who comes back."""
+
+from __future__ import annotations
+
+from rosrm.core import events as happened
+from rosrm.core.model import InstanceId
+from rosrm.ports import Record
+from tests.unit.core.cluster import MIB, Cluster, Machine, job, process
+
+
+def full() -> Machine:
+    return Machine("a", memory=1000 * MIB, busy={"memory": 0.79, "cpu": 0.0})
+
+
+def make_room(cluster: Cluster, memory: float = 0.1) -> None:
+    cluster.machines["a"].busy["memory"] = memory
+    cluster.read()
+    cluster.settle()
+
+
+def test_those_who_wait_go_in_the_order_in_which_they_came() -> None:
+    """FIFO over several submissions."""
+    cluster = Cluster(full())
+    cluster.submit(process("p", memory=20), process("q", memory=20))
+    cluster.submit(process("r", memory=20))
+    make_room(cluster)
+    assert cluster.assigned() == ["p", "q", "r"]
+
+
+def test_a_higher_priority_goes_first_and_fifo_holds_within_one() -> None:
+    """Priority decides, then the order of submission."""
+    cluster = Cluster(full())
+    for name, priority in (("low1", 0), ("high1", 5), ("low2", 0), ("high2", 5), ("least", -1)):
+        cluster.submit(process(name, memory=20, priority=priority))
+    make_room(cluster)
+    assert cluster.assigned() == ["high1", "high2", "low1", "low2", "least"]
+
+
+def test_the_head_blocks_those_behind_it() -> None:
+    """Who waits for room is not passed by a smaller one."""
+    cluster = Cluster(Machine("a", memory=1000 * MIB))
+    cluster.submit(process("filler", memory=400))
+    cluster.submit(process("large", memory=600), process("small", memory=10))
+    assert cluster.queue() == ["large", "small"]
+    assert cluster.told("waits") == ["large waits: no host has room for it now"]
+
+
+def test_with_backfill_those_behind_may_pass() -> None:
+    """The large one keeps its place; equal ones still go in order."""
+    cluster = Cluster(Machine("a", memory=1000 * MIB), backfill=True)
+    cluster.submit(process("filler", memory=400))
+    cluster.submit(
+        process("large1", memory=600), process("small1", memory=100), process("large2", memory=600),
+        process("small2", memory=100),
+    )  # fmt: skip
+    assert cluster.assigned() == ["filler", "small1", "small2"]
+    assert cluster.queue() == ["large1", "large2"]
+
+
+def test_that_somebody_waits_is_said_once() -> None:
+    """Two demands that wait under backfill do not fill the record by turns."""
+    cluster = Cluster(full(), backfill=True)
+    cluster.submit(process("p", memory=100), process("q", memory=50))
+    cluster.wait(3.0)
+    assert len(cluster.told("waits")) == 2
+
+
+def test_who_may_never_run_is_set_aside_and_lets_the_others_pass() -> None:
+    """With its reason, host by host."""
+    cluster = Cluster("a", Machine("b", labels={"gpu": "old"}))
+    cluster.submit(process("p", required_labels={"gpu": "new"}), process("q"))
+    assert cluster.phase("p") == "set_aside"
+    reason = cluster["p"].reason
+    assert "a: it lacks the label gpu=new" in reason
+    assert "b: it lacks the label gpu=new" in reason
+    assert cluster.where("q")
+
+
+def test_who_is_too_large_for_every_host_is_set_aside() -> None:
+    """Not even an idle host would take it."""
+    cluster = Cluster(Machine("a", memory=1000 * MIB))
+    cluster.submit(process("p", memory=900))
+    assert cluster.phase("p") == "set_aside"
+    assert "it needs 90% of its memory, over the limit of 80%" in cluster["p"].reason
+
+
+def test_who_was_set_aside_returns_to_its_place_when_a_fitting_host_comes() -> None:
+    """Ahead of those that were submitted later and still wait."""
+    cluster = Cluster(full())
+    cluster.submit(process("special", memory=20, required_labels={"gpu": "yes"}))
+    cluster.submit(process("plain", memory=20))
+    assert cluster.queue() == ["plain"]
+    cluster.machines["b"] = machine = Machine("b", labels={"gpu": "yes"})
+    machine.takes = False
+    cluster.add(machine)
+    assert cluster.queue() == ["special", "plain"]
+    machine.takes = True
+    cluster.wait(0.2)
+    assert cluster.where("special") == ["b"]
+    assert cluster.where("plain") == ["b"]
+
+
+def test_with_no_host_at_all_everybody_waits() -> None:
+    """Nobody is set aside as long as nothing is known of any host."""
+    cluster = Cluster()
+    cluster.submit(process("p", memory=1e6), process("q"))
+    assert cluster.queue() == ["p", "q"]
+    assert cluster.told("waits") == ["p waits: no host has registered yet"]
+    cluster.add("a")
+    assert cluster.phase("p") == "set_aside"
+    assert cluster.where("q") == ["a"]
+
+
+def test_who_waits_for_a_host_that_is_away_does_not_block_the_others() -> None:
+    """Cordoned, left or lost: only somebody's doing brings it back."""
+    cluster = Cluster("a", Machine("b", labels={"gpu": "yes"}))
+    cluster.set_host("b", "cordon")
+    cluster.submit(process("special", required_labels={"gpu": "yes"}), process("plain"))
+    assert cluster.where("plain") == ["a"]
+    assert cluster.phase("special") == "set_aside"
+    assert "b: it is cordoned" in cluster["special"].reason
+    cluster.set_host("b", "uncordon")
+    assert cluster.where("special") == ["b"]
+
+
+def test_who_waits_for_a_lost_host_is_placed_when_it_is_back() -> None:
+    """Its lease decides when it is set aside, its next message when it returns."""
+    cluster = Cluster("a", Machine("b", labels={"gpu": "yes"}))
+    cluster.machines["b"].connected = False
+    cluster.wait(2.0)
+    cluster.submit(process("special", required_labels={"gpu": "yes"}), process("plain"))
+    assert cluster.queue() == ["special", "plain"]
+    cluster.wait(10.0)
+    assert cluster.phase("special") == "set_aside"
+    assert cluster.where("plain") == ["a"]
+    cluster.machines["b"].connected = True
+    cluster.wait(1.0)
+    assert cluster.where("special") == ["b"]
+
+
+def test_when_every_host_is_away_everybody_waits_in_order() -> None:
+    """Nobody is set aside only because there is nobody to wait behind."""
+    cluster = Cluster("a")
+    cluster.set_host("a", "cordon")
+    cluster.submit(process("p"), process("q"))
+    assert cluster.queue() == ["p", "q"]
+    cluster.set_host("a", "uncordon")
+    assert cluster.assigned() == ["p", "q"]
+
+
+def test_one_that_comes_back_goes_to_its_old_place() -> None:
+    """What was assigned and not taken up is still ahead of those behind it."""
+    cluster = Cluster(Machine("a", max_processes=1), delivery_timeout=5.0)
+    cluster.decide(happened.SubmissionReceived(1, (job("p"), job("q"))))
+    assert cluster.phase("p") == "assigned"
+    commands = cluster.decide(happened.AssignmentWithdrawn(InstanceId("p", 1)))
+    assert [c.kind for c in commands if isinstance(c, Record)] == ["queued", "assigned"]
+    assert (cluster.phase("p"), cluster.queue()) == ("assigned", ["q"])

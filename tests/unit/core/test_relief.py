@@ -1,0 +1,204 @@
+"""Which process leaves a host that is over a limit or is being drained, and when none does."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from tests.unit.core.cluster import GIB, MIB, Cluster, Machine, movable, process
+
+
+def machine(name: str, memory: float = 0.1) -> Machine:
+    """1000 MiB and 4 cores, 80 % of each allowed."""
+    return Machine(
+        name, memory=1000 * MIB, cpu=4.0, busy={"memory": memory, "cpu": 0.05},
+        limits={"memory": 0.8, "cpu": 0.8},
+    )  # fmt: skip
+
+
+def cluster_of(*machines: Machine, **settings: Any) -> Cluster:
+    return Cluster(*machines, **{"settle": 1.0, "hysteresis": 2.0, "cooldown": 30.0, **settings})
+
+
+def on_a(cluster: Cluster, **memory: float) -> None:
+    """Processes that run on a and use so many MiB."""
+    for name, used in memory.items():
+        cluster.machines["a"].shown[name] = {"memory": used * MIB}
+        cluster.submit(movable(name))
+        assert cluster.where(name) == ["a"]
+    cluster.wait(1.5)
+
+
+def test_the_largest_relief_leaves_a_host_that_is_over_its_limit() -> None:
+    """One process, of the resource that is over, to the host with room."""
+    cluster = cluster_of(machine("a"))
+    on_a(cluster, small=50, large=300, middle=200)
+    cluster.add(machine("b"))
+    cluster.machines["a"].busy["memory"] = 0.3
+    cluster.wait(3.0)
+    assert cluster.where("large") == ["b"]
+    assert cluster.counts() == {"a": 2, "b": 1}
+    assert cluster.told("over_limit") == ["a reached its limit of memory"]
+    (said,) = cluster.told("migration_begun")
+    assert said == "large moves from a to b by relaunch: a is over its limit of memory"
+    assert cluster.explain("large")["decision"]["kind"] == "migrated"
+
+
+def test_it_must_relieve_the_resource_that_is_over() -> None:
+    """A process that uses no CPU does not leave a host whose CPU is over."""
+    cluster = cluster_of(machine("a"))
+    on_a(cluster, fat=400, busy=10)
+    cluster.machines["a"].shown["busy"]["cpu"] = 1.0
+    cluster.add(machine("b"))
+    cluster.wait(0.3)
+    cluster.machines["a"].busy["cpu"] = 0.7
+    cluster.wait(3.0)
+    assert (cluster.where("busy"), cluster.where("fat")) == (["b"], ["a"])
+
+
+def test_it_must_fit_where_it_goes() -> None:
+    """The largest that fits goes; a destination keeps its headroom below the limit."""
+    cluster = cluster_of(machine("a"), headroom=0.05)
+    on_a(cluster, large=300, small=100)
+    cluster.add(machine("b", memory=0.5))  # 0.5 + 0.3 is the limit, and too near to it
+    cluster.machines["a"].busy["memory"] = 0.45
+    cluster.wait(3.0)
+    assert (cluster.where("small"), cluster.where("large")) == (["b"], ["a"])
+
+
+def test_nothing_moves_when_every_host_is_at_its_limits() -> None:
+    """And nothing is assigned: the queue waits."""
+    cluster = cluster_of(machine("a"), machine("b", memory=0.2))
+    on_a(cluster, p=300)
+    for name in "ab":
+        cluster.machines[name].busy["memory"] = 0.85
+    cluster.wait(5.0)
+    cluster.submit(movable("q"))
+    assert (cluster.where("p"), cluster.queue()) == (["a"], ["q"])
+    assert cluster.told("nothing_moves")[0] == "nothing can leave a: no host has room for p"
+
+
+def test_a_host_that_is_over_for_a_moment_only_is_left_alone() -> None:
+    """Hysteresis: less than that long, nothing moves."""
+    cluster = cluster_of(machine("a"), hysteresis=2.0)
+    on_a(cluster, p=300)
+    cluster.add(machine("b"))
+    for _ in range(3):
+        cluster.machines["a"].busy["memory"] = 0.6
+        cluster.wait(1.5)
+        cluster.machines["a"].busy["memory"] = 0.1
+        cluster.wait(0.5)
+    assert cluster.where("p") == ["a"]
+    assert cluster.told("under_limit")
+
+
+def test_a_process_that_moved_is_left_alone_for_its_cool_down() -> None:
+    """It does not flap between two full hosts."""
+    cluster = cluster_of(machine("a"), cooldown=30.0)
+    on_a(cluster, p=300)
+    cluster.add(machine("b"))
+    cluster.machines["a"].busy["memory"] = 0.6
+    cluster.wait(3.0)
+    assert cluster.where("p") == ["b"]
+    cluster.machines["a"].busy["memory"] = 0.1
+    cluster.machines["b"].busy["memory"] = 0.6
+    cluster.machines["b"].shown["p"] = {"memory": 300 * MIB}
+    cluster.wait(20.0)
+    assert cluster.where("p") == ["b"]
+    assert "its cool-down is 30 s" in cluster.told("nothing_moves")[-1]
+    cluster.wait(12.0)
+    assert cluster.where("p") == ["a"]
+
+
+def test_one_move_at_a_time_leaves_a_host_and_its_effect_is_seen_first() -> None:
+    """After a move the host has its hysteresis anew before the next one leaves."""
+    cluster = cluster_of(machine("a"))
+    on_a(cluster, p=150, q=150, r=150)
+    cluster.add(machine("b"))
+    cluster.machines["a"].busy["memory"] = 0.9
+    cluster.wait(2.5)
+    assert cluster.counts() == {"a": 2, "b": 1}
+    cluster.wait(1.0)
+    assert cluster.counts() == {"a": 2, "b": 1}
+    cluster.wait(1.5)
+    assert cluster.counts() == {"a": 1, "b": 2}
+
+
+def test_at_most_max_migrations_are_under_way() -> None:
+    """Over the whole cluster."""
+    cluster = cluster_of(machine("a"), max_migrations=2)
+    for name in "pqrs":
+        cluster.submit(movable(name, ros=True))
+        cluster.machines["a"].seen_in_graph(name, cluster.now)
+        cluster.settle()
+    cluster.add(machine("b"))
+    cluster.set_host("a", "drain")
+    cluster.wait(1.0)
+    assert len(cluster.state.runs) == 2
+    for name in list(cluster.state.runs):
+        cluster.machines["b"].seen_in_graph(name, cluster.now)
+    cluster.settle()
+    cluster.wait(0.4)
+    assert len(cluster.state.runs) == 2
+    assert cluster.counts()["b"] == 4
+
+
+def test_a_drained_host_is_emptied_of_what_can_move() -> None:
+    """What cannot stays, and why is said."""
+    cluster = cluster_of(machine("a"))
+    on_a(cluster, p=50, q=50)
+    cluster.submit(process("fixed"))
+    cluster.add(machine("b"))
+    assert cluster.set_host("a", "drain").message == "a is draining"
+    cluster.wait(3.0)
+    assert cluster.counts() == {"a": 1, "b": 2}
+    assert "fixed has no migration strategy" in cluster.told("nothing_moves")[0]
+    cluster.submit(process("new"))
+    assert cluster.where("new") == ["b"]
+
+
+def test_with_automatic_off_nothing_moves_by_itself() -> None:
+    """Drain and `migrate` still do."""
+    cluster = cluster_of(machine("a"), automatic=False)
+    on_a(cluster, p=300)
+    cluster.add(machine("b"))
+    cluster.machines["a"].busy["memory"] = 0.6
+    cluster.wait(5.0)
+    assert cluster.where("p") == ["a"]
+    assert cluster.migrate("p").accepted
+    assert cluster.where("p") == ["b"]
+
+
+def test_that_nothing_can_move_is_said_now_and_then_only() -> None:
+    """Not five times a second."""
+    cluster = cluster_of(machine("a"))
+    on_a(cluster, p=300)
+    cluster.machines["a"].busy["memory"] = 0.6
+    cluster.wait(25.0)
+    assert len(cluster.told("nothing_moves")) == 3
+
+
+def test_a_move_goes_to_the_largest_margin() -> None:
+    """The same order as for a new process."""
+    cluster = cluster_of(machine("a"))
+    on_a(cluster, p=100)
+    cluster.add(machine("b", memory=0.4))
+    cluster.add(machine("c", memory=0.2))
+    cluster.migrate("p")
+    assert cluster.where("p") == ["c"]
+
+
+@pytest.mark.parametrize("resource", ["memory", "cpu"])
+def test_what_leaves_is_counted_as_it_was_seen(resource: str) -> None:
+    """Relief is the usage that was seen, not what was once declared."""
+    cluster = cluster_of(machine("a"))
+    cluster.machines["a"].shown["p"] = {"memory": 300 * MIB, "cpu": 1.6}
+    cluster.machines["a"].shown["q"] = {"memory": 10 * MIB, "cpu": 0.1}
+    cluster.submit(movable("p", needs={"memory": 1.0 * MIB, "cpu": 0.0}))
+    cluster.submit(movable("q", needs={"memory": 0.1 * GIB, "cpu": 0.3}))
+    cluster.wait(1.5)
+    cluster.add(machine("b"))
+    cluster.machines["a"].busy[resource] = 0.6
+    cluster.wait(3.0)
+    assert (cluster.where("p"), cluster.where("q")) == (["b"], ["a"])

@@ -1,0 +1,341 @@
+"""Submit, cancel, restart: all or nothing, in every phase."""
+
+from __future__ import annotations
+
+import pytest
+
+from rosrm.core import events as happened
+from rosrm.core.model import MigrationPolicy
+from tests.unit.core.cluster import Cluster, Machine, job, movable, node, process
+
+# --- submit -----------------------------------------------------------------------------------
+
+
+def test_a_submission_is_taken_as_a_whole() -> None:
+    """The answer counts them."""
+    cluster = Cluster("a")
+    reply = cluster.submit(process("p"), process("q"))
+    assert (reply.accepted, reply.message) == (True, "2 processes queued")
+
+
+def test_a_name_that_is_given_twice_refuses_all() -> None:
+    """Nothing was queued."""
+    cluster = Cluster("a")
+    reply = cluster.submit(process("p"), process("q"), process("p"))
+    assert (reply.accepted, reply.code) == (False, "name_taken")
+    assert "submitted twice at once: p" in reply.message
+    assert not cluster.state.processes
+
+
+def test_the_name_of_a_live_process_refuses_all() -> None:
+    """In any phase in which it is not over."""
+    cluster = Cluster("a")
+    cluster.submit(process("p"))
+    reply = cluster.submit(process("q"), process("p"))
+    assert (reply.accepted, reply.code) == (False, "name_taken")
+    assert "in use already by a live process: p" in reply.message
+    assert list(cluster.state.processes) == ["p"]
+
+
+def test_the_name_of_a_process_that_is_over_can_be_used_again() -> None:
+    """It is a new process, the newest in the listing."""
+    cluster = Cluster("a")
+    cluster.submit(job("p"), job("q"))
+    cluster.machines["a"].finish("p", cluster.now)
+    cluster.settle()
+    assert cluster.submit(job("p")).accepted
+    assert list(cluster.state.processes) == ["q", "p"]
+    assert cluster.phase("p") == "running"
+
+
+def test_an_unknown_migration_strategy_refuses_all() -> None:
+    """With those that are selected."""
+    cluster = Cluster("a")
+    reply = cluster.submit(process("q"), process("p", migration=MigrationPolicy("teleport")))
+    assert (reply.accepted, reply.code) == (False, "invalid")
+    assert "unknown migration strategy 'teleport'; selected here: relaunch" in reply.message
+    assert not cluster.state.processes
+
+
+# --- cancel -----------------------------------------------------------------------------------
+
+
+def test_cancel_of_one_that_waits_takes_it_out_of_the_queue() -> None:
+    """Those behind it move up."""
+    cluster = Cluster()
+    cluster.submit(process("p"), process("q"))
+    assert cluster.cancel("p").message == "1 process cancelled"
+    assert (cluster.phase("p"), cluster.queue()) == ("cancelled", ["q"])
+
+
+def test_cancel_of_one_that_was_set_aside_ends_it() -> None:
+    """A host that would fit does not bring it back."""
+    cluster = Cluster("a")
+    cluster.submit(process("p", required_labels={"x": "y"}))
+    cluster.cancel("p")
+    cluster.add(Machine("b", labels={"x": "y"}))
+    cluster.wait(1.0)
+    assert (cluster.phase("p"), cluster.where("p")) == ("cancelled", [])
+
+
+def test_cancel_of_one_that_runs_stops_it() -> None:
+    """Its end, whatever its exit code, is a cancellation."""
+    cluster = Cluster("a")
+    cluster.submit(process("p"))
+    cluster.cancel("p")
+    assert (cluster.phase("p"), cluster.where("p")) == ("cancelled", [])
+
+
+def test_cancel_of_one_that_is_on_its_way_keeps_it_from_starting() -> None:
+    """The order to stop may overtake the assignment."""
+    cluster = Cluster("a")
+    cluster.carry_out(cluster.decide(happened.SubmissionReceived(1, (process("p"),))))
+    machine = cluster.machines["a"]
+    on_its_way, machine.polled = machine.polled, []
+    cluster.cancel("p")
+    machine.polled = on_its_way
+    cluster.settle()
+    assert (cluster.phase("p"), cluster.where("p")) == ("cancelled", [])
+
+
+def test_cancel_of_one_that_does_not_end_is_asked_again() -> None:
+    """Until the slave says that it has ended."""
+    cluster = Cluster("a", order_retry=2.0)
+    cluster.machines["a"].stubborn.add("p")
+    cluster.submit(process("p"))
+    cluster.cancel("p")
+    cluster.wait(5.0)
+    assert cluster.phase("p") == "stopping"
+    assert len(cluster.orders("stop")) == 3
+    cluster.machines["a"].let_go("p", cluster.now)
+    cluster.settle()
+    assert cluster.phase("p") == "cancelled"
+
+
+def test_cancel_of_one_whose_host_is_lost_ends_when_the_host_is_back() -> None:
+    """Until then it shows as being stopped."""
+    cluster = Cluster("a")
+    cluster.submit(process("p"))
+    cluster.machines["a"].connected = False
+    cluster.wait(11.0)
+    cluster.cancel("p")
+    assert cluster.phase("p") == "stopping"
+    cluster.machines["a"].connected = True
+    cluster.wait(3.0)
+    assert (cluster.phase("p"), cluster.where("p")) == ("cancelled", [])
+
+
+def test_cancel_of_one_that_is_over_says_so() -> None:
+    """And cancels the others."""
+    cluster = Cluster("a")
+    cluster.submit(job("p"), process("q"))
+    cluster.machines["a"].finish("p", cluster.now)
+    cluster.settle()
+    assert cluster.cancel("p", "q").message == "1 process cancelled; ended before: p"
+    assert (cluster.phase("p"), cluster.phase("q")) == ("finished", "cancelled")
+
+
+def test_an_unknown_name_refuses_the_whole_request() -> None:
+    """Nothing is cancelled or restarted."""
+    cluster = Cluster("a")
+    cluster.submit(process("p"))
+    for ask in (cluster.cancel, cluster.restart):
+        reply = ask("p", "x")
+        assert (reply.code, reply.message) == ("unknown", "no such process: x; see `rosrm ps`")
+    assert cluster.phase("p") == "running"
+
+
+@pytest.mark.parametrize("overlap", [True, False])
+def test_cancel_of_one_that_moves_ends_both_instances(overlap: bool) -> None:
+    """The move turns back at once; nothing is started again only to be stopped."""
+    cluster = Cluster("a", Machine("b", busy={"memory": 0.5}))
+    spec = movable("p", overlap=overlap, ros=True)
+    cluster.submit(spec)
+    cluster.machines["a"].seen_in_graph("p", cluster.now)
+    cluster.settle()
+    cluster.migrate("p")
+    assert cluster.phase("p") == "migrating"
+    assert cluster.where("p") == (["a", "b"] if overlap else ["b"])
+    cluster.cancel("p")
+    assert (cluster.phase("p"), cluster.where("p")) == ("cancelled", [])
+    assert len(cluster.orders("start")) == 1
+    assert not cluster.state.runs
+    assert not cluster.intents["migration"]
+
+
+# --- restart ----------------------------------------------------------------------------------
+
+
+def test_restart_of_one_that_runs_happens_where_it_is() -> None:
+    """The same instance, on the same host, ready again."""
+    cluster = Cluster("a")
+    cluster.submit(process("p"))
+    before = cluster.machines["a"].programs[cluster.machines["a"].find("p")].pid
+    assert cluster.restart("p").message == "1 process restarted"
+    after = cluster.machines["a"].programs[cluster.machines["a"].find("p")].pid
+    assert after > before
+    assert (cluster.phase("p"), cluster["p"].owner) == ("running", 1)
+
+
+def test_restart_of_one_that_is_over_queues_it_anew() -> None:
+    """At the end of the line, and on any host."""
+    cluster = Cluster("a")
+    cluster.submit(job("p"))
+    cluster.machines["a"].finish("p", cluster.now, code=3)
+    cluster.settle()
+    assert (cluster.phase("p"), cluster["p"].exit_code) == ("failed", 3)
+    cluster.restart("p", "p")
+    assert (cluster.phase("p"), cluster["p"].owner) == ("running", 2)
+
+
+def test_restart_of_one_that_is_on_its_way_does_not_keep_it_from_starting() -> None:
+    """There is nothing to restart yet."""
+    cluster = Cluster("a")
+    cluster.carry_out(cluster.decide(happened.SubmissionReceived(1, (process("p"),))))
+    assert cluster.restart("p").accepted
+    assert cluster.phase("p") == "running"
+
+
+def test_restart_is_refused_where_it_makes_no_sense() -> None:
+    """Waiting, being stopped, moving, out of reach: with the reason, and nothing is restarted."""
+    cluster = Cluster("a", Machine("b", busy={"memory": 0.5}))
+    cluster.machines["a"].stubborn.add("stops")
+    cluster.submit(process("stops"), movable("moves", ros=True), process("waits", memory=1e6))
+    cluster.machines["a"].seen_in_graph("moves", cluster.now)
+    cluster.settle()
+    cluster.migrate("moves")
+    cluster.cancel("stops")
+    for name, said in (("waits", "waits in the queue"), ("stops", "is being stopped"),
+                       ("moves", "is moving")):  # fmt: skip
+        reply = cluster.restart(name)
+        assert not reply.accepted
+        assert said in reply.message
+
+
+def test_restart_of_one_out_of_reach_is_refused() -> None:
+    """Its host would not hear of it."""
+    cluster = Cluster("a")
+    cluster.submit(process("p"))
+    cluster.machines["a"].connected = False
+    cluster.wait(11.0)
+    assert cluster.restart("p").message == "p is out of reach: a is lost. Nothing was restarted"
+
+
+# --- ends -------------------------------------------------------------------------------------
+
+
+def test_a_job_that_exits_with_0_has_finished_one_that_does_not_has_failed() -> None:
+    """With its exit code."""
+    cluster = Cluster("a")
+    cluster.submit(job("good"), job("bad"))
+    cluster.machines["a"].finish("good", cluster.now)
+    cluster.machines["a"].finish("bad", cluster.now, code=7)
+    cluster.settle()
+    assert (cluster.phase("good"), cluster.phase("bad")) == ("finished", "failed")
+    assert (cluster["bad"].exit_code, cluster["bad"].reason) == (7, "exit code 7")
+
+
+def test_a_node_runs_once_it_is_seen_in_the_graph() -> None:
+    """Until then it is starting."""
+    cluster = Cluster("a")
+    cluster.submit(node("p"))
+    assert cluster.phase("p") == "starting"
+    cluster.machines["a"].seen_in_graph("p", cluster.now)
+    cluster.settle()
+    assert cluster.phase("p") == "running"
+
+
+def test_a_node_that_is_never_seen_fails() -> None:
+    """By its slave, after its time-out."""
+    cluster = Cluster("a")
+    cluster.submit(node("p"))
+    cluster.wait(21.0)
+    assert cluster.phase("p") == "failed"
+    assert "not ready within 20 s" in cluster["p"].reason
+
+
+def test_a_host_that_cannot_start_it_is_left_out_and_another_tried() -> None:
+    """A missing executable on one host is no failure of the process."""
+    cluster = Cluster("a", Machine("b", busy={"memory": 0.5}))
+    cluster.machines["a"].refuses["p"] = "no such executable"
+    cluster.submit(process("p"))
+    assert cluster.where("p") == ["b"]
+    (said,) = cluster.told("queued")
+    assert said == "p returns to the queue: a cannot run it: no such executable"
+
+
+def test_one_that_every_host_refuses_has_failed() -> None:
+    """With each host's reason; a host that its labels forbid does not count."""
+    cluster = Cluster(*[
+        Machine(name, labels={"x": "y"} if name != "c" else {}, refuses={"p": f"not on {name}"})
+        for name in "abc"
+    ])  # fmt: skip
+    cluster.submit(process("p", required_labels={"x": "y"}), process("q"))
+    assert cluster.phase("p") == "failed"
+    assert "no host can start it: a: not on a; b: not on b" in cluster["p"].reason
+    assert cluster.phase("q") == "running"
+
+
+def test_a_slave_that_was_started_anew_may_find_what_it_lacked() -> None:
+    """Its former refusal is forgotten."""
+    a = Machine("a", refuses={"p": "no such package"})
+    cluster = Cluster(a, Machine("b", max_processes=1, labels={"x": "y"}))
+    cluster.submit(process("filler", required_labels={"x": "y"}), process("p"))
+    assert cluster.queue() == ["p"]  # b may take it, once it has room
+    a.refuses.clear()
+    a.connected = False
+    cluster.wait(2.0)
+    a.restart_slave(cluster.now)
+    a.connected = True
+    cluster.register(a)
+    assert cluster.where("p") == ["a"]
+
+
+def test_an_assignment_that_is_not_taken_up_is_withdrawn() -> None:
+    """After the delivery time-out the process goes back to its place, and elsewhere."""
+    cluster = Cluster("a", Machine("b", busy={"memory": 0.5}), delivery_timeout=5.0)
+    cluster.carry_out(cluster.decide(happened.SubmissionReceived(1, (process("p"),))))
+    cluster.machines["a"].connected = False  # hears nothing, but its readings come
+    for _ in range(60):
+        cluster.now += 0.1
+        cluster.tell(cluster.readings([cluster.machines["a"], cluster.machines["b"]]))
+        cluster.tell(happened.TimePassed())
+        if cluster.now > 104.0:
+            cluster.set_host("a", "cordon")
+    cluster.settle()
+    assert cluster.where("p") == ["b"]
+    assert "a did not take it up in time" in cluster.told("queued")[0]
+
+
+def test_one_that_was_fetched_and_never_heard_of_is_stopped_before_it_goes_elsewhere() -> None:
+    """Its refusal then is no reason against its host."""
+    cluster = Cluster("a", Machine("b", busy={"memory": 0.5}), delivery_timeout=5.0)
+    cluster.carry_out(cluster.decide(happened.SubmissionReceived(1, (process("p"),))))
+    cluster.machines["a"].polled.clear()  # fetched, and the answer got lost
+    cluster.wait(4.9)
+    assert cluster.phase("p") == "assigned"
+    cluster.wait(1.0)
+    assert cluster.phase("p") == "running"
+    assert cluster["p"].owner == 2
+    assert not cluster["p"].excluded
+
+
+def test_one_that_shows_up_after_it_was_withdrawn_is_stopped_and_queued_again() -> None:
+    """It is never active twice."""
+    cluster = Cluster("a", delivery_timeout=5.0)
+    cluster.carry_out(cluster.decide(happened.SubmissionReceived(1, (process("p"),))))
+    machine = cluster.machines["a"]
+    machine.fetch(cluster.now)
+    late, machine.said = list(machine.said), type(machine.said)()
+    machine.batches = 0
+    for _ in range(60):
+        cluster.now += 0.1
+        cluster.tell(cluster.readings([machine]))
+        cluster.tell(happened.TimePassed())
+    machine.said.extend(late)
+    machine.batches = len(late)
+    cluster.settle()
+    cluster.wait(1.0)
+    assert cluster.where("p") == ["a"]
+    assert cluster["p"].owner == 2
+    assert cluster.phase("p") == "running"
