@@ -10,14 +10,17 @@ import argparse
 import subprocess
 import tempfile
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks.hosts import three_hosts
 from benchmarks.machine import print_report
-from rosrm.core.model import InstanceId, Kind, ProcessSpec
+from rosrm.core.model import Kind, ProcessSpec
+from rosrm.errors import Refused
 from rosrm.local_cluster import LocalCluster
+from rosrm.slave.log_reading import newest_instance
 from rosrm.supervisor.client import log_path
 
 _STAMP = ("date", "+%s%N")
@@ -60,8 +63,8 @@ def _wait_for_end(cluster: LocalCluster, name: str, timeout: float = 10.0) -> No
 def _stamp_of(cluster: LocalCluster, name: str) -> int:
     for host in cluster.slaves:
         state = cluster.directory / "hosts" / host / "supervisor"
-        for log in log_path(state, InstanceId(name, 0)).parent.glob("*.log"):
-            return int(log.read_text())
+        with suppress(Refused):
+            return int(log_path(state, newest_instance(state, name)).read_text())
     raise FileNotFoundError(f"no slave has a log of {name}")
 
 
