@@ -1,0 +1,47 @@
+"""The options of every shipped plugin can be checked, carried as JSON and read back."""
+
+import json
+from types import MappingProxyType
+
+import pytest
+from pydantic import TypeAdapter, ValidationError
+
+from rosrm.config.plain import from_plain, to_plain
+from rosrm_resources.plugin import register_probes
+from rosrm_scoring.plugin import register_scoring_policies
+
+OFFERS = {offer.name: offer for offer in [*register_probes(), *register_scoring_policies()]}
+
+
+@pytest.mark.parametrize("name", OFFERS)
+def test_defaults_survive_the_way_to_the_slave(name):
+    """What is checked at the edge arrives as it was."""
+    options = OFFERS[name].options
+    plain = json.loads(json.dumps(to_plain(options())))
+    checked = TypeAdapter(options).validate_python(plain)
+    assert to_plain(checked) == plain
+    assert to_plain(from_plain(options, plain)) == plain
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "what"),
+    [
+        ("cpu", {"scope": "container"}, "machine"),
+        ("cpu", {"window": 0}, "greater than 0"),
+        ("disk", {"walk_period": -1}, "greater than 0"),
+        ("gpu", {"devices": [-1]}, "greater than or equal to 0"),
+        ("gpu", {"combine": "sum"}, "'max' or 'mean'"),
+        ("network", {"capacity": 0}, "greater than 0"),
+        ("weighted", {"weights": {"cpu": 1.5}}, "less than or equal to 1"),
+        ("threshold", {"enter": 0.5, "leave": 0.6}, "must be below enter"),
+    ],
+)
+def test_nonsense_is_refused(name, given, what):
+    """With what is allowed instead."""
+    with pytest.raises(ValidationError, match=what):
+        TypeAdapter(OFFERS[name].options).validate_python(given)
+
+
+def test_default_weights_cannot_be_changed():
+    """One policy's options are no other's."""
+    assert isinstance(OFFERS["weighted"].options().weights, MappingProxyType)
