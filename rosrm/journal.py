@@ -60,7 +60,12 @@ class SqliteJournal:
         self._path = path
         self._keep = keep_events
         self._wall = wall
-        path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        except OSError as error:
+            raise JournalError(
+                f"the journal {path} cannot be used ({error}); give the master another `state:`"
+            ) from error
         self._database = self._guarded(lambda: self._open(sync))
         newest = self._guarded(
             lambda: self._database.execute("SELECT max(sequence) FROM record").fetchone()
@@ -95,6 +100,13 @@ class SqliteJournal:
         text = str(error)
         if "full" in text:
             todo = "the disk is full: make room; nothing that was answered is lost"
+        elif "I/O" in text:
+            todo = (
+                "the disk does not take what is written: make room, look at quotas and at the "
+                "disk itself; nothing that was answered is lost"
+            )
+        elif "unable to open" in text or "readonly" in text:
+            todo = "look at its owner and permissions, or give the master another `state:`"
         elif "locked" in text:
             todo = "another program holds it: is a second master running on this state directory?"
         else:
@@ -172,7 +184,7 @@ class SqliteJournal:
                 "SELECT key, value FROM intent WHERE tbl = ?", (table,)
             ).fetchall()
         )
-        return {key: json.loads(value) for key, value in rows}
+        return {key: self._value(value) for key, value in rows}
 
     def records(
         self, *, after: int = 0, process: str = "", host: str = "", newest: int = 1000
@@ -193,10 +205,16 @@ class SqliteJournal:
         )
         return [
             StoredRecord(
-                row[0], row[1], row[2], Record(row[3], row[4], row[5], row[6], json.loads(row[7]))
+                row[0], row[1], row[2], Record(row[3], row[4], row[5], row[6], self._value(row[7]))
             )
             for row in reversed(rows)
         ]
+
+    def _value(self, text: str) -> Any:
+        try:
+            return json.loads(text)
+        except ValueError as error:
+            raise JournalError(self._advice(sqlite3.DatabaseError(str(error)))) from error
 
     def close(self) -> None:
         """Flush and release the files."""

@@ -195,15 +195,17 @@ class SlaveState:
 def under_limits(
     usage: npt.NDArray[np.float32], limit: npt.NDArray[np.float32], present: int, stale: int
 ) -> bool:
-    """Whether a host may ask for work: every reading is fresh and under its limit.
+    """Whether a host may ask for work: every reading that has a limit is fresh and under it.
 
     Args:
-        usage, limit: (slots,) fractions.
+        usage, limit: (slots,) fractions; 1 stands for no limit.
         present, stale: bit i speaks of slot i.
     """
-    if stale & present:
-        return False
     used = bin(present).count("1")
+    if stale & present:
+        limited = sum(1 << slot for slot in range(used) if limit[slot] < 1.0)
+        if stale & limited:
+            return False
     return bool((usage[:used] < limit[:used]).all())
 
 
@@ -219,7 +221,8 @@ _Commands = list[Command]
 
 
 def _registered(state: SlaveState, event: Registered, now: float) -> _Commands:
-    state.epoch = max(state.epoch, event.epoch)
+    # Not the highest that was ever heard: a master whose journal was lost begins at 1 again.
+    state.epoch = event.epoch
     return []
 
 
@@ -233,6 +236,7 @@ def _assigned(state: SlaveState, event: AssignmentsReceived, now: float) -> _Com
         if refusal:
             status = InstanceStatus(instance, InstanceState.REFUSED, message=refusal)
             state.held[instance] = Held(status, ended_at=now)
+            _bury(state, instance)
             refusals.append(status)
             continue
         name = _qualified(assignment) if awaits_graph(assignment.spec) else ""
@@ -252,7 +256,7 @@ def _why_not(state: SlaveState, assignment: Assignment) -> str:
     if assignment.epoch < state.epoch:
         return f"assigned in epoch {assignment.epoch}, this is epoch {state.epoch}"
     if assignment.instance in state.tombstones:
-        return "it was stopped before it was started"
+        return "it was stopped or refused here before this order came"
     return ""
 
 
@@ -265,6 +269,7 @@ def _launch_refused(state: SlaveState, event: LaunchRefused, now: float) -> _Com
     held = state.held[event.instance]
     held.status = InstanceStatus(event.instance, InstanceState.REFUSED, message=event.reason)
     held.ready_by, held.ended_at = None, now
+    _bury(state, event.instance)
     return [Report((held.status,))]
 
 

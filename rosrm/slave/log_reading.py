@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from pathlib import Path
 from typing import Final
@@ -9,6 +10,7 @@ from typing import Final
 from rosrm.core.model import InstanceId
 from rosrm.errors import Refused
 from rosrm.ros.slave_endpoint import LogSlice
+from rosrm.supervisor import paths
 from rosrm.supervisor.client import log_path
 
 #: Most bytes in one answer.
@@ -34,13 +36,13 @@ def read_log(
         with path.open("rb") as log:
             status = os.fstat(log.fileno())
             size = status.st_size
-            start = max(0, size + offset) if offset < 0 else min(offset, size)
+            start = max(0, size + offset) if offset < 0 else offset
+            if start > size:
+                start = 0  # it was cut, and no part of it was kept
             log.seek(start)
             content = log.read(min(max_bytes or _MOST, _MOST))
     except FileNotFoundError:
-        raise Refused(
-            f"there is no log of {instance} here (any more): {path}", "unknown"
-        ) from None
+        raise Refused(f"there is no log of {instance} here (any more): {path}", "unknown") from None
     at_end = start + len(content) >= size
     return LogSlice(content, start + len(content), _generation(path), ended and at_end)
 
@@ -59,8 +61,12 @@ def newest_instance(state_directory: Path, process: str) -> InstanceId:
     Raises:
         Refused: none has.
     """
-    folder = log_path(state_directory, InstanceId(process, 0)).parent
-    numbers = [int(path.stem) for path in folder.glob("*.log") if path.stem.isdigit()]
+    state = str(state_directory)
+    name = paths.safe_name(process)
+    found: list[tuple[str, int] | None] = []
+    with contextlib.suppress(FileNotFoundError):
+        found = [paths.log_number(entry) for entry in os.listdir(paths.log_folder(state))]
+    numbers = [one[1] for one in found if one is not None and one[0] == name]
     if not numbers:
         raise Refused(f"this host has no log of {process}", "unknown")
     return InstanceId(process, max(numbers))

@@ -43,7 +43,7 @@ def test_a_plain_name_stays() -> None:
     st.lists(st.sampled_from(AWKWARD) | st.text(min_size=1, max_size=8), min_size=2, unique=True)
 )
 def test_different_hosts_have_different_names(hosts) -> None:
-    """In DDS all servers of one name execute a request: robot-1 must not hear what robot_1 is told."""
+    """All servers of a name execute a request: robot-1 must not hear what robot_1 is told."""
     assert len({token(host) for host in hosts}) == len(hosts)
     for host in hosts:
         validate_full_topic_name(Names("/rosrm").of_host(host, "control"))

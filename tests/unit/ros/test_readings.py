@@ -89,7 +89,7 @@ def test_newest_of_each_host_counts() -> None:
 
 
 def test_a_former_run_hides_no_reading() -> None:
-    """What a former run of a slave still sends neither replaces the new run's reading nor its beat."""
+    """What a former run of a slave still sends replaces neither reading nor beat of the new one."""
     now = serialize_message(info(host_id=1, incarnation=20, sequence=1, beat=100))
     late = serialize_message(info(host_id=1, incarnation=10, sequence=900, beat=5))
 

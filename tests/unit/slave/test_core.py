@@ -1,0 +1,331 @@
+"""The slave's reducer: what it does with orders and with what the supervisor tells."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
+
+from rosrm.core import slave
+from rosrm.core.model import (
+    Assignment,
+    InstanceId,
+    InstanceState,
+    InstanceStatus,
+    ProcessSpec,
+    Readiness,
+)
+
+PLAIN = ProcessSpec("p", command=("true",))
+NODE = ProcessSpec("n", module="m", ros=True, namespace="/robot", readiness=Readiness(timeout=10.0))
+STATE = InstanceState
+
+
+def assigned(spec=PLAIN, number=1, epoch=1) -> slave.AssignmentsReceived:
+    assignment = Assignment(InstanceId(spec.name, number), spec, epoch, spec.name)
+    return slave.AssignmentsReceived((assignment,))
+
+
+def told(state, name="p", number=1, **more) -> slave.SupervisorReported:
+    return slave.SupervisorReported((InstanceStatus(InstanceId(name, number), state, **more),))
+
+
+class Slave:
+    """A state and its clock."""
+
+    def __init__(self) -> None:
+        self.state = slave.SlaveState()
+        self.now = 100.0
+
+    def step(self, event, after=0.0):
+        self.now += after
+        return list(slave.step(self.state, event, self.now))
+
+    def of(self, name="p", number=1) -> slave.Held:
+        return self.state.held[InstanceId(name, number)]
+
+
+@pytest.fixture
+def one() -> Slave:
+    return Slave()
+
+
+def states(commands) -> list[InstanceState]:
+    """What is reported."""
+    return [s.state for c in commands if isinstance(c, slave.Report) for s in c.statuses]
+
+
+def test_an_assignment_is_launched_once(one) -> None:
+    """The same order twice starts nothing twice."""
+    assert [type(c) for c in one.step(assigned())] == [slave.Launch]
+    assert one.step(assigned()) == []
+    one.step(told(STATE.RUNNING, pid=5))
+    one.step(told(STATE.EXITED))
+    assert one.step(assigned()) == []
+
+
+def test_an_older_epoch_starts_nothing(one) -> None:
+    """A master that was replaced gives no orders; the refusal says which epochs."""
+    one.step(slave.Registered(3))
+    assert states(one.step(assigned(epoch=2))) == [STATE.REFUSED]
+    assert "epoch 2" in one.of().status.message
+
+
+def test_a_registration_sets_the_epoch(one) -> None:
+    """A master whose journal was lost begins at epoch 1 again, and this host works for it."""
+    one.step(slave.Registered(7))
+    one.step(slave.Registered(1))
+    assert [type(c) for c in one.step(assigned(epoch=1))] == [slave.Launch]
+
+
+def test_stopped_before_it_was_started(one) -> None:
+    """A stop that overtakes its start wins: what comes late is refused for good."""
+    assert states(one.step(slave.StopOrdered(InstanceId("p", 1)))) == [STATE.REFUSED]
+    assert one.step(assigned()) == []
+    one.step(slave.TimePassed(), after=slave.REMEMBER_END)
+    assert states(one.step(assigned())) == [STATE.REFUSED]
+
+
+@pytest.mark.parametrize("end", ["refused", "exited"])
+def test_a_dead_number_stays_dead(one, end) -> None:
+    """Also after its end was forgotten, a late order of the same instance starts nothing."""
+    one.step(assigned())
+    if end == "refused":
+        one.step(slave.LaunchRefused(InstanceId("p", 1), "no such package"))
+    else:
+        one.step(told(STATE.EXITED))
+    forgotten = one.step(slave.TimePassed(), after=slave.REMEMBER_END)
+    assert forgotten == [slave.Forget((InstanceId("p", 1),))]
+    assert states(one.step(assigned())) == [STATE.REFUSED]
+    assert [type(c) for c in one.step(assigned(number=2))] == [slave.Launch]
+
+
+def test_an_older_epoch_that_was_refused_may_come_anew(one) -> None:
+    """Only the order was too old: a newer master may still give the instance its own number."""
+    one.step(slave.Registered(3))
+    one.step(assigned(epoch=2, number=8))
+    assert states(one.step(assigned(epoch=3, number=9))) == []
+    assert one.of(number=9).status.state is STATE.STARTING
+
+
+def test_a_launch_that_is_refused_is_said(one) -> None:
+    """The reason reaches the master."""
+    one.step(assigned())
+    (report,) = one.step(slave.LaunchRefused(InstanceId("p", 1), "no such package"))
+    assert report.statuses[0].state is STATE.REFUSED
+    assert report.statuses[0].message == "no such package"
+
+
+def test_a_process_is_ready_as_soon_as_it_runs(one) -> None:
+    """Unless it is a ROS node."""
+    one.step(assigned())
+    assert states(one.step(told(STATE.RUNNING, pid=5))) == [STATE.READY]
+    assert one.step(told(STATE.RUNNING, pid=5)) == []
+
+
+def test_a_node_is_ready_when_it_is_seen(one) -> None:
+    """It is awaited under its qualified name, and ready once."""
+    one.step(assigned(NODE))
+    assert one.state.awaited_in_graph() == {}
+    assert states(one.step(told(STATE.RUNNING, "n", pid=5))) == [STATE.RUNNING]
+    assert [h.node_name for h in one.state.awaited_in_graph().values()] == ["/robot/n"]
+    assert states(one.step(slave.SeenInGraph(InstanceId("n", 1)))) == [STATE.READY]
+    assert one.step(slave.SeenInGraph(InstanceId("n", 1))) == []
+    assert one.state.awaited_in_graph() == {}
+
+
+def test_readiness_kinds(one) -> None:
+    """`running` makes a node ready at once, `graph` lets any process be awaited."""
+    running = replace(NODE, readiness=Readiness("running"))
+    graph = replace(PLAIN, readiness=Readiness("graph"))
+    assert not slave.awaits_graph(running)
+    assert slave.awaits_graph(graph)
+    assert slave.awaits_graph(NODE)
+    assert not slave.awaits_graph(PLAIN)
+
+
+def test_never_ready_is_stopped_and_has_failed(one) -> None:
+    """The reason is the time-out, whatever the process exits with."""
+    one.step(assigned(NODE))
+    one.step(told(STATE.RUNNING, "n", pid=5))
+    assert one.step(slave.TimePassed(), after=9.9) == []
+    assert one.step(slave.TimePassed(), after=0.2) == [slave.Stop(InstanceId("n", 1))]
+    assert one.step(slave.TimePassed(), after=1.0) == []
+    assert states(one.step(told(STATE.STOPPING, "n", pid=5))) == [STATE.STOPPING]
+    (report,) = one.step(told(STATE.EXITED, "n"))
+    assert report.statuses[0].state is STATE.FAILED
+    assert "not ready within 10 s" in report.statuses[0].message
+    assert "/robot/n" in report.statuses[0].message
+
+
+def test_each_run_has_its_own_time_to_become_ready(one) -> None:
+    """A node that crashed and was restarted must be seen anew."""
+    one.step(assigned(NODE))
+    one.step(told(STATE.RUNNING, "n", pid=5))
+    one.step(slave.SeenInGraph(InstanceId("n", 1)))
+    assert states(one.step(told(STATE.BACKOFF, "n"), after=60.0)) == [STATE.BACKOFF]
+    assert one.state.awaited_in_graph() == {}
+    assert states(one.step(told(STATE.STARTING, "n"))) == [STATE.STARTING]
+    assert states(one.step(told(STATE.RUNNING, "n", pid=6))) == [STATE.RUNNING]
+    assert one.step(slave.TimePassed(), after=9.0) == []
+    assert states(one.step(slave.SeenInGraph(InstanceId("n", 1)))) == [STATE.READY]
+
+
+def test_what_a_former_run_of_the_slave_left_is_ready(one) -> None:
+    """Its spec is not known any more, but it runs: nothing is stopped for that."""
+    assert states(one.step(told(STATE.RUNNING, "n", pid=5))) == [STATE.READY]
+    assert one.step(slave.TimePassed(), after=1000.0) == []
+    assert one.step(assigned(NODE)) == []
+
+
+def test_stop_and_restart_go_to_the_supervisor(one) -> None:
+    """Of what has ended the end is told again; of what is unknown a restart says nothing."""
+    instance = InstanceId("p", 1)
+    one.step(assigned())
+    one.step(told(STATE.RUNNING, pid=5))
+    assert one.step(slave.RestartOrdered(instance)) == [slave.Restart(instance)]
+    assert one.step(slave.StopOrdered(instance)) == [slave.Stop(instance)]
+    one.step(told(STATE.EXITED))
+    assert states(one.step(slave.StopOrdered(instance))) == [STATE.EXITED]
+    assert states(one.step(slave.RestartOrdered(instance))) == [STATE.EXITED]
+    assert one.step(slave.RestartOrdered(InstanceId("q", 2))) == []
+
+
+def test_a_complete_report_names_everything(one) -> None:
+    """Ended instances that are still remembered included."""
+    one.step(assigned())
+    one.step(assigned(number=2))
+    one.step(told(STATE.EXITED))
+    (report,) = one.step(slave.ReportRequested())
+    assert report.complete
+    assert {s.instance.number: s.state for s in report.statuses} == {
+        1: STATE.EXITED, 2: STATE.STARTING,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("usage", "present", "stale", "under"),
+    [
+        ([0.1, 0.2], 0b11, 0, True),
+        ([0.1, 0.9], 0b11, 0, False),  # over
+        ([0.1, 0.5], 0b11, 0, False),  # at the limit
+        ([0.1, np.nan], 0b11, 0, False),  # unknown
+        ([0.1, 0.2], 0b11, 0b10, False),  # stale, and limited
+        ([0.1, 0.2], 0b11, 0b01, True),  # stale, but without a limit
+        ([0.1, 0.9], 0b01, 0, True),  # not in use
+        ([], 0, 0, True),  # no probe at all
+    ],
+)
+def test_who_may_ask_for_work(usage, present, stale, under) -> None:
+    """Every reading that has a limit is fresh and under it."""
+    values = np.zeros(16, np.float32)
+    values[: len(usage)] = usage
+    limit = np.ones(16, np.float32)
+    limit[1] = 0.5
+    assert slave.under_limits(values, limit, present, stale) is under
+
+
+# --- any order of events ----------------------------------------------------------------------
+
+NUMBERS = st.integers(1, 4)
+SPECS = st.sampled_from([PLAIN, NODE])
+
+
+class AnySlave(RuleBasedStateMachine):
+    """The supervisor here is one that obeys: it tells of each launch and stop, sooner or later."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.state = slave.SlaveState()
+        self.now = 0.0
+        self.launched: list[InstanceId] = []
+        self.alive: dict[InstanceId, InstanceState] = {}
+        self.reported: dict[InstanceId, InstanceState] = {}
+        self.stopped: set[InstanceId] = set()
+
+    def feed(self, event) -> None:
+        for command in slave.step(self.state, event, self.now):
+            if isinstance(command, slave.Launch):
+                for assignment in command.assignments:
+                    self.launched.append(assignment.instance)
+                    self.alive[assignment.instance] = STATE.STARTING
+            elif isinstance(command, slave.Report):
+                for status in command.statuses:
+                    self.reported[status.instance] = status.state
+            elif isinstance(command, slave.Stop):
+                assert command.instance in self.alive, "a stop of what does not run"
+                self.stopped.add(command.instance)
+            elif isinstance(command, slave.Forget):
+                assert not self.alive.keys() & set(command.instances), "a live one forgotten"
+
+    @rule(spec=SPECS, number=NUMBERS, epoch=st.integers(1, 3))
+    def assign(self, spec, number, epoch) -> None:
+        self.feed(assigned(spec, number, epoch))
+
+    @rule(epoch=st.integers(1, 3))
+    def register(self, epoch) -> None:
+        self.feed(slave.Registered(epoch))
+
+    @rule(spec=SPECS, number=NUMBERS)
+    def stop(self, spec, number) -> None:
+        self.feed(slave.StopOrdered(InstanceId(spec.name, number)))
+
+    @rule(spec=SPECS, number=NUMBERS)
+    def restart(self, spec, number) -> None:
+        self.feed(slave.RestartOrdered(InstanceId(spec.name, number)))
+
+    @rule(spec=SPECS, number=NUMBERS)
+    def see(self, spec, number) -> None:
+        self.feed(slave.SeenInGraph(InstanceId(spec.name, number)))
+
+    @rule(seconds=st.sampled_from([0.1, 5.0, 11.0, 61.0]))
+    def wait(self, seconds) -> None:
+        self.now += seconds
+        self.feed(slave.TimePassed())
+
+    @rule()
+    def report(self) -> None:
+        self.feed(slave.ReportRequested())
+
+    @rule(data=st.data(), state=st.sampled_from(InstanceState))
+    def supervise(self, data, state) -> None:
+        if not self.alive or state is STATE.READY:
+            return
+        instance = data.draw(st.sampled_from(sorted(self.alive)))
+        if state.ended:
+            del self.alive[instance]
+        else:
+            self.alive[instance] = state
+        pid = 7 if state in (STATE.RUNNING, STATE.STOPPING) else 0
+        self.feed(slave.SupervisorReported((InstanceStatus(instance, state, pid),)))
+
+    @invariant()
+    def nothing_is_launched_twice(self) -> None:
+        assert len(self.launched) == len(set(self.launched))
+
+    @invariant()
+    def what_lives_is_held(self) -> None:
+        held = {i for i, h in self.state.held.items() if not h.status.state.ended}
+        assert held == set(self.alive)
+        assert self.state.live() == len(self.alive)
+
+    @invariant()
+    def the_master_knows(self) -> None:
+        """What was told of an instance is how it stands; a launch is told when it starts."""
+        for instance, held in self.state.held.items():
+            known = self.reported.get(instance, STATE.STARTING)
+            assert known is held.status.state
+
+    @invariant()
+    def only_running_ones_are_awaited(self) -> None:
+        for held in self.state.awaited_in_graph().values():
+            assert held.status.state is STATE.RUNNING
+            assert held.status.pid
+
+
+TestAnySlave = AnySlave.TestCase
+TestAnySlave.settings = settings(max_examples=150, stateful_step_count=40, deadline=None)

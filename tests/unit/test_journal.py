@@ -1,0 +1,259 @@
+"""The SQLite journal: what was answered is there after any death, and every fault says what to do."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import signal
+import sqlite3
+import subprocess
+import sys
+import textwrap
+
+import pytest
+
+from rosrm.errors import JournalError
+from rosrm.journal import SqliteJournal
+from rosrm.ports import Intent, Record
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "state" / "journal.sqlite"
+
+
+def fill(path, count=3) -> None:
+    journal = SqliteJournal(path)
+    for number in range(count):
+        journal.write([Record("n", str(number))], [Intent("process", "p", {"n": number})], 0.0)
+    journal.close()
+
+
+def run(code: str, path, **options) -> subprocess.Popen:
+    """A process that uses the journal."""
+    code = textwrap.dedent(code)
+    return subprocess.Popen(
+        [sys.executable, "-c", code, str(path)], stdout=subprocess.PIPE, text=True, **options
+    )
+
+
+WRITER = """
+    import sys
+    from pathlib import Path
+    from rosrm.journal import SqliteJournal
+    from rosrm.ports import Intent, Record
+
+    journal = SqliteJournal(Path(sys.argv[1]))
+    number = 0
+    while True:
+        number += 1
+        journal.write(
+            [Record("n", str(number), facts={"number": number}), Record("second", str(number))],
+            [Intent("process", "p", {"n": number}), Intent("host", f"h{number % 7}", {"n": number})],
+            0.0,
+        )
+        print(number, flush=True)
+"""
+
+
+@pytest.mark.parametrize("after", [1, 7, 150, 1200])
+def test_sigkill_loses_nothing_that_was_answered(path, after) -> None:
+    """Whatever `write` returned from is there, whole; of what it did not, all of it or nothing."""
+    writer = run(WRITER, path)
+    for _ in range(after):
+        answered = int(writer.stdout.readline())
+    writer.send_signal(signal.SIGKILL)
+    rest = writer.stdout.read()
+    writer.wait(30)
+    if lines := rest.split("\n")[:-1]:
+        answered = int(lines[-1])
+
+    journal = SqliteJournal(path)
+    records = journal.records(newest=10**6)
+    last = journal.intents("process")["p"]["n"]
+    journal.close()
+
+    assert answered <= last <= answered + 1
+    assert [r.sequence for r in records] == list(range(1, 2 * last + 1))
+    assert [r.record.kind for r in records[-2:]] == ["n", "second"]
+    assert records[-1].record.process == str(last)
+
+
+def test_a_group_is_whole_or_not_at_all(path) -> None:
+    """A group with something that cannot be kept changes nothing, and the next one goes on."""
+    journal = SqliteJournal(path)
+    journal.write([Record("a")], [Intent("host", "h", {"n": 1})], 0.0)
+    with pytest.raises(TypeError, match="no JSON"):
+        journal.write([Record("b")], [Intent("host", "h", {"n": object()})], 0.0)
+    stored = journal.write([Record("c")], [], 0.0)
+    assert [s.sequence for s in stored] == [2]
+    assert [s.record.kind for s in journal.records()] == ["a", "c"]
+    assert journal.intents("host") == {"h": {"n": 1}}
+    journal.close()
+
+
+def spoil_header(path):
+    path.write_bytes(b"this is no database at all, but text" * 100)
+
+
+def spoil_middle(path):
+    raw = bytearray(path.read_bytes())
+    raw[4096 : 2 * 4096] = os.urandom(4096)
+    path.write_bytes(raw)
+
+
+def spoil_end(path):
+    path.write_bytes(path.read_bytes()[:5000])
+
+
+def spoil_value(path):
+    with sqlite3.connect(path) as database:
+        database.execute("UPDATE intent SET value = '{'")
+
+
+@pytest.mark.parametrize("spoil", [spoil_header, spoil_middle, spoil_end, spoil_value])
+def test_a_damaged_file_is_refused(path, spoil) -> None:
+    """With its path and what to do; it is not repaired, overwritten or taken for an empty one."""
+    fill(path, 200)
+    spoil(path)
+    before = path.read_bytes()
+
+    with pytest.raises(JournalError) as refusal:
+        SqliteJournal(path).intents("process")
+
+    assert str(path) in str(refusal.value)
+    assert "move it away" in str(refusal.value)
+    assert path.read_bytes() == before
+
+
+def test_another_version_is_refused(path) -> None:
+    """A file of a later rosrm is not misread."""
+    fill(path)
+    with sqlite3.connect(path) as database:
+        database.execute("PRAGMA user_version = 99")
+    with pytest.raises(JournalError, match="tables 99, here 1"):
+        SqliteJournal(path)
+
+
+def test_a_stranger_s_database_is_refused(path) -> None:
+    """Somebody else's SQLite file is not made ours."""
+    path.parent.mkdir()
+    with sqlite3.connect(path) as database:
+        database.execute("CREATE TABLE record (something INTEGER)")
+    with pytest.raises(JournalError, match="cannot be used"):
+        SqliteJournal(path)
+
+
+def test_a_locked_file_is_refused(path) -> None:
+    """Somebody else writes to it: said within seconds, with whom to look for."""
+    fill(path)
+    holder = sqlite3.connect(path, isolation_level=None)
+    holder.execute("BEGIN EXCLUSIVE")
+    with pytest.raises(JournalError, match="another program holds it"):
+        SqliteJournal(path).write([Record("a")], [], 0.0)
+    holder.close()
+
+
+def test_a_full_disk_is_said(path) -> None:
+    """What was answered before stays; the message says what is full and what to do."""
+    code = """
+        import json, resource, sys
+        from pathlib import Path
+        from rosrm.errors import JournalError
+        from rosrm.journal import SqliteJournal
+        from rosrm.ports import Intent, Record
+
+        journal = SqliteJournal(Path(sys.argv[1]))
+        resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))
+        answered = 0
+        try:
+            while answered < 10_000:
+                journal.write([Record("n", "x" * 500)], [Intent("a", "b", {"n": answered + 1})], 0.0)
+                answered += 1
+        except JournalError as error:
+            print(json.dumps([answered, str(error)]))
+    """
+    writer = run(code, path)
+    output, _ = writer.communicate(timeout=60)
+    answered, message = json.loads(output)
+
+    assert str(path) in message
+    assert "make room" in message
+    assert "damaged" not in message
+    journal = SqliteJournal(path)
+    assert journal.intents("a") == {"b": {"n": answered}}
+    assert journal.last_sequence == answered
+    journal.close()
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root may mount a small file system")
+def test_a_full_file_system_is_said(tmp_path) -> None:
+    """The same on a file system that has no room left."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=400k", "tmpfs", disk], capture_output=True, check=False
+    )
+    if mounted.returncode:
+        pytest.skip(f"cannot mount here: {mounted.stderr.decode()}")
+    try:
+        journal, answered = SqliteJournal(disk / "journal.sqlite"), 0
+        with pytest.raises(JournalError, match="disk is full: make room"):
+            while answered < 10_000:
+                journal.write([Record("n", "x" * 500)], [Intent("a", "b", {"n": answered})], 0.0)
+                answered += 1
+        assert journal.intents("a") == {"b": {"n": answered - 1}}
+        journal._database.close()
+    finally:
+        subprocess.run(["umount", disk], check=True)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_folder_that_cannot_be_written_is_said(tmp_path) -> None:
+    """With the path."""
+    tmp_path.chmod(0o500)
+    with pytest.raises(JournalError, match="journal.sqlite"):
+        SqliteJournal(tmp_path / "state" / "journal.sqlite")
+
+
+def test_a_path_that_can_be_none_is_said(tmp_path) -> None:
+    """A file where the folder should be, or a folder where the file should be."""
+    (tmp_path / "file").write_text("")
+    (tmp_path / "folder.sqlite").mkdir()
+    for path in (tmp_path / "file" / "journal.sqlite", tmp_path / "folder.sqlite"):
+        with pytest.raises(JournalError, match=str(path)):
+            SqliteJournal(path)
+
+
+def test_old_events_are_pruned(path) -> None:
+    """The newest are kept, and the count goes on after a restart."""
+    journal = SqliteJournal(path, keep_events=50)
+    for _ in range(25):
+        journal.write([Record("n")] * 100, [], 0.0)
+    kept = journal.records(newest=10**6)
+    assert kept[-1].sequence == 2500
+    assert 50 <= len(kept) <= 50 + 1000
+    journal.close()
+    again = SqliteJournal(path, keep_events=50)
+    assert again.last_sequence == 2500
+    again.close()
+
+
+def test_the_folder_is_private(path) -> None:
+    """Specs may hold secrets in their environment: other users read nothing."""
+    fill(path)
+    assert path.parent.stat().st_mode & 0o077 == 0
+
+
+def test_full_sync_works_the_same(path) -> None:
+    """`sync: full` flushes to the disk with every group."""
+    journal = SqliteJournal(path, sync="full")
+    journal.write([Record("a")], [], 0.0)
+    assert journal._database.execute("PRAGMA synchronous").fetchone() == (2,)
+    journal.close()
+
+
+def test_a_limit_is_not_left_behind() -> None:
+    """The test of the full disk limits a process of its own, not this one."""
+    assert resource.getrlimit(resource.RLIMIT_FSIZE)[0] != 200_000
