@@ -137,18 +137,15 @@ def _said_when_slow(source: Source, after: float) -> Iterator[None]:
 def _load(loaded: Loaded, source: Source, load: Callable[[], object]) -> None:
     try:
         plugin = load()
+        marked = _marked(plugin)
     except FAULTS as fault:
         loaded.broken.append(Broken(source, f"does not import: {describe_fault(fault)}"))
         return
-    for reason in _misspelt(plugin):
+    for reason in _misspelt(plugin, marked):
         loaded.broken.append(Broken(source, reason))
-    for hook, function in _hooks_of(plugin).items():
-        _take(loaded, source, hook, function)
-
-
-def _hooks_of(plugin: object) -> Mapping[str, Callable[..., Any]]:
-    marked = _marked(plugin)
-    return {hook: marked[hook] for hook in HOOKS if hook in marked}
+    for hook in HOOKS:
+        if hook in marked:
+            _take(loaded, source, hook, marked[hook])
 
 
 def _marked(plugin: object) -> Mapping[str, Callable[..., Any]]:
@@ -162,8 +159,7 @@ def _marked(plugin: object) -> Mapping[str, Callable[..., Any]]:
     return marked
 
 
-def _misspelt(plugin: object) -> Iterable[str]:
-    marked = _marked(plugin)
+def _misspelt(plugin: object, marked: Mapping[str, Callable[..., Any]]) -> Iterable[str]:
     for hook, function in marked.items():
         if hook not in HOOKS:
             near = get_close_matches(hook, HOOKS, 1)

@@ -6,6 +6,7 @@ checked; `rosrm.config.options` checks those of a file against the same offers.
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -52,6 +53,8 @@ _SHIPPED_IN: Final[Mapping[str, str]] = {
     "scoring": "rosrm-scoring",
     "migration": "rosrm-migration",
 }
+
+_log = logging.getLogger("rosrm.plugins")
 
 Executor = Callable[[Mapping[str, Any]], Mapping[str, Any]]
 NameToOptions = Mapping[str, Mapping[str, Any]]
@@ -171,15 +174,20 @@ class Registry:
         }
 
     def executors(self) -> dict[str, Executor]:
-        """What the open steps of plans may name on this host, from all migration offers."""
-        executors: dict[str, Executor] = {}
+        """What the open steps of plans may name on this host, from all migration offers.
+
+        A name that two offers give belongs to neither, as with offers; it is logged.
+        """
+        given: dict[str, list[tuple[str, Executor]]] = {}
         for name in self.names("migration"):
             offer = cast(MigrationOffer, self.offer("migration", name))
             for executor, function in offer.executors.items():
-                if executor in executors:
-                    raise PluginError(f"two plugins register an executor {executor!r}")
-                executors[executor] = function
-        return executors
+                given.setdefault(executor, []).append((name, function))
+        for executor, offers in given.items():
+            if len(offers) > 1:
+                names = " and ".join(name for name, _ in offers)
+                _log.warning("the executor %r is left out: %s both register it", executor, names)
+        return {executor: offers[0][1] for executor, offers in given.items() if len(offers) == 1}
 
     def probes(self, chosen: NameToOptions | None, context: ProbeContext) -> Probes:
         """Make the probes of a host, the default ones for None.
@@ -234,6 +242,9 @@ class Registry:
             settings = from_plain(offer.options, options)
         except ValueError as wrong:
             raise ConfigError(f"options of {TITLES[kind]} {name!r}: {wrong}") from wrong
+        except FAULTS as fault:
+            reason = f"its options cannot be read: {describe_fault(fault)}"
+            raise self._fault(kind, name, reason) from fault
         create = cast(Callable[..., Any], offer.create)
         try:
             thing = create(settings, *more)

@@ -7,6 +7,10 @@ runs: `rosrm --help` is quick, and needs no ROS.
 from __future__ import annotations
 
 import sys
+import time
+
+#: When this process began, by the monotonic clock: what is promised to be quick counts from here.
+BEGUN = time.monotonic()
 
 #: What a shell gives for a program that Ctrl-C ended.
 INTERRUPTED = 130

@@ -5,6 +5,7 @@ from __future__ import annotations
 import getpass
 import os
 import socket
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 import typer
 
+from rosrm.cli.app import BEGUN
 from rosrm.cli.options import Common
 from rosrm.errors import RosrmError
 from rosrm.ros.settings import RosSettings
@@ -19,8 +21,11 @@ from rosrm.ros.settings import RosSettings
 if TYPE_CHECKING:
     from rosrm.ros.client import MasterClient
 
-#: Seconds to look for a master: with the imports, less than 3 s to the message that there is none.
-LOOK_FOR: Final = 2.4
+#: Seconds from the start of the command within which it says that there is no master: less than 3,
+#: for leaving ROS takes a moment too.
+SAID_WITHIN: Final = 2.6
+#: However long the imports took, a master on this machine is found in this time.
+LEAST: Final = 1.5
 
 
 def ros_settings(ctx: typer.Context, domain: int | None) -> RosSettings:
@@ -54,5 +59,6 @@ def connect(settings: RosSettings) -> MasterClient:
             f"ROS 2 cannot be imported ({reason}). Source your ROS 2 (and the workspace with "
             "rosrm_msgs), or install the wheels: pip install 'rosrm[ros]'"
         ) from None
+    timeout = max(LEAST, SAID_WITHIN - (time.monotonic() - BEGUN))
     who = f"{getpass.getuser()}@{socket.gethostname()}:{os.getpid()}"
-    return MasterClient.connect(settings, name=who, timeout=LOOK_FOR)
+    return MasterClient.connect(settings, name=who, timeout=round(timeout, 1))

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import builtins
+import os
+import sys
+import time
+from types import SimpleNamespace
 
 import pytest
 
@@ -33,6 +37,23 @@ def test_a_domain_outside_0_to_232_is_refused(rosrm, client):
     result = rosrm("ps", "--domain", 233)
     assert result.code == 2
     assert "Invalid value for '--domain'" in result.err
+
+
+@pytest.mark.parametrize(("elapsed", "least", "most"), [(0.2, 2.0, 2.6), (10.0, 1.5, 1.5)])
+def test_a_command_looks_for_a_master_until_3_s_after_its_start(monkeypatch, elapsed, least, most):
+    seen = {}
+
+    class MasterClient:
+        @staticmethod
+        def connect(settings, *, name, timeout):
+            seen.update(name=name, timeout=timeout)
+
+    module = SimpleNamespace(MasterClient=MasterClient)
+    monkeypatch.setitem(sys.modules, "rosrm.ros.client", module)
+    monkeypatch.setattr(connection, "BEGUN", time.monotonic() - elapsed)
+    connection.connect(RosSettings())
+    assert least <= seen["timeout"] <= most
+    assert str(os.getpid()) in seen["name"]
 
 
 def test_without_ros_a_command_says_how_to_get_it(monkeypatch):

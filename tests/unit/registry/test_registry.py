@@ -245,7 +245,7 @@ def test_a_probe_whose_resources_cannot_be_taken_is_closed_and_left_out(context,
     assert getattr(second, "closed", True)
 
 
-def test_executors_come_from_every_migration_offer_and_are_unique():
+def test_executors_come_from_every_migration_offer_and_a_shared_name_is_left_out(caplog):
     def run(arguments):
         return {}
 
@@ -256,6 +256,30 @@ def test_executors_come_from_every_migration_offer_and_are_unique():
         ours=plugin(register_migration_strategies=[offer("a", "x"), offer("b", "y")])
     )
     assert sorted(good.executors()) == ["x", "y"]
-    bad = Registry.of(ours=plugin(register_migration_strategies=[offer("a", "x"), offer("b", "x")]))
-    with pytest.raises(PluginError, match="two plugins register an executor 'x'"):
-        bad.executors()
+    both = Registry.of(
+        ours=plugin(register_migration_strategies=[offer("a", "x"), offer("b", "x")])
+    )
+    assert both.executors() == {}
+    assert "the executor 'x' is left out: a and b both register it" in caplog.text
+
+
+def test_options_that_cannot_be_read_are_the_plugins_fault():
+    @dataclass(frozen=True)
+    class Unreadable:
+        value: NoSuchType = 1  # noqa: F821 - this is what is wrong with it
+
+    offer = ScoringOffer("s", lambda options: None, Unreadable)
+    registry = Registry.of(ours=plugin(register_scoring_policies=[offer]))
+    with pytest.raises(PluginError, match="its options cannot be read: NameError: name 'NoSuchT"):
+        registry.scoring("s")
+
+
+def test_a_plugin_that_raises_when_it_is_looked_at_is_broken():
+    class Angry:
+        @property
+        def register_probes(self):
+            raise OSError("no")
+
+    registry = Registry.of(angry=Angry(), good=plugin(register_probes=[offered("fine")]))
+    assert registry.names("probe") == ("fine",)
+    assert registry.broken[0].reason == "does not import: OSError: no"
