@@ -177,12 +177,23 @@ class MasterRuntime:
     def _carry_out(self, commands: Sequence[Command], now: float) -> None:
         records = [command for command in commands if isinstance(command, Record)]
         intents = [command for command in commands if isinstance(command, Intent)]
-        if records or intents:
-            self._write(records, intents)
+        stored = self._write(records, intents) if records or intents else ()
+        # What a slave can begin with goes first, people's answers and the log come after.
+        # A registration opens the link that orders to this host need.
+        replies = [command for command in commands if isinstance(command, Reply)]
+        for reply in replies:
+            if reply.host_id:
+                self._endpoint.reply(reply)
+        self._act(commands, now)
+        self._endpoint.flush()
+        for reply in replies:
+            if not reply.host_id:
+                self._endpoint.reply(reply)
+        for one in stored:
+            _log.info("%s", one.record.message)
+
+    def _act(self, commands: Sequence[Command], now: float) -> None:
         endpoint = self._endpoint
-        for command in commands:
-            if isinstance(command, Reply):  # first: it opens the link to a host that registered
-                endpoint.reply(command)
         for command in commands:
             if isinstance(command, Assign):
                 endpoint.assign(command)
@@ -190,11 +201,11 @@ class MasterRuntime:
                 endpoint.order(command, now)
             elif isinstance(command, Withdraw):
                 endpoint.withdraw(command, now)
-        endpoint.flush()
 
-    def _write(self, records: Sequence[Record], intents: Sequence[Intent]) -> None:
-        for stored in self._journal.write(records, intents, self._now() - self._started):
-            _log.info("%s", stored.record.message)
+    def _write(
+        self, records: Sequence[Record], intents: Sequence[Intent]
+    ) -> Sequence[StoredRecord]:
+        return self._journal.write(records, intents, self._now() - self._started)
 
     # --- what may be read ----------------------------------------------------------------
 
@@ -213,8 +224,10 @@ class MasterRuntime:
         )
 
     def _processes(self, name: str, now: float) -> Sequence[Any]:
-        rows = listing.process_rows(self._state, now)
-        return [row for row in rows if row.name == name] if name else rows
+        if not name:
+            return listing.process_rows(self._state, now)
+        process = self._state.processes.get(name)
+        return [listing.process_row(self._state, process, now)] if process is not None else []
 
     def _events(self, request: Any) -> list[EventRow]:
         stored = self._journal.records(

@@ -269,7 +269,6 @@ class SlaveEndpoint:
             self._host.say(f"an assignment that makes no sense was refused: {refusal}")
             return
         self._host.take(core.AssignmentsReceived(work))
-        self.ask(time.monotonic())
 
     # --- orders --------------------------------------------------------------------------
 

@@ -74,6 +74,7 @@ class SlaveRuntime:
         self._config = config
         self._stopping = ""
         self._left = False
+        self._accepting = False
         self._state = core.SlaveState()
         self._events: deque[core.Event] = deque()
         self._from_threads: deque[Callable[[], None]] = deque()
@@ -165,6 +166,8 @@ class SlaveRuntime:
             self._participant.spin(max(0.0, wake - time.monotonic()))
             now = time.monotonic()
             self._work(now)
+            if self._accepting:  # what came with the last answer is under way: ask for more
+                self._endpoint.ask(now)
 
     def _stop(self, number: int, _frame: Any) -> None:
         self._stopping = self._stopping or signal.Signals(number).name
@@ -177,13 +180,11 @@ class SlaveRuntime:
             self.say(str(report))
         present = self._sampler.present
         under = core.under_limits(sample.usage, self._limit, present, sample.stale)
-        accepting = under and not self._stopping
+        self._accepting = under and not self._stopping
         self._endpoint.publish_reading(
-            sample.usage, self._limit, present, sample.stale, accepting=accepting,
+            sample.usage, self._limit, present, sample.stale, accepting=self._accepting,
             processes=self._state.live(),
         )  # fmt: skip
-        if accepting:
-            self._endpoint.ask(now)
         self.take(core.TimePassed())
 
     def _report_usage(self, now: float) -> None:
