@@ -109,10 +109,10 @@ class HostView:
     Attributes:
         names: N host names.
         resources: R resource names, the columns.
-        usage: (N, R) reading + in-flight load, fractions of the capacity; NaN where a host has no
+        usage: (N, R) reading + in-flight load, fractions of the capacity; 0 where a host has no
             such resource.
         limit: (N, R) upper limits, fractions; 1 where a host sets none.
-        capacity: (N, R) base units for usage 1.0; NaN where a host has no such resource.
+        capacity: (N, R) base units for usage 1.0; 0 where a host has no such resource.
         processes: (N,) processes held or promised.
     """
 
@@ -127,7 +127,7 @@ class HostView:
         """Usage of one resource, (N,): 0 where a host has no such resource."""
         if resource not in self.resources:
             return np.zeros(len(self.usage))
-        return np.nan_to_num(self.usage[:, self.resources.index(resource)], copy=True, nan=0.0)
+        return np.array(self.usage[:, self.resources.index(resource)])
 
 
 @dataclass(frozen=True)

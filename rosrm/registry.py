@@ -248,7 +248,7 @@ class Registry:
         create = cast(Callable[..., Any], offer.create)
         try:
             thing = create(settings, *more)
-        except SkipPlugin:
+        except (SkipPlugin, ConfigError):  # its own word on this host, or on its options
             raise
         except FAULTS as fault:
             reason = f"`create` ({definition(create)}) raised {describe_fault(fault)}"

@@ -80,7 +80,7 @@ class SlaveRuntime:
         self._from_threads: deque[Callable[[], None]] = deque()
         self._graph_before: dict[InstanceId, frozenset[bytes]] = {}
         self._executors: Mapping[str, Executor] = registry.executors()
-        self._leaders: dict[int, InstanceId] = {}
+        self._leaders: dict[InstanceId, int] = {}
         self._supervisor_state = config.state / "supervisor"
         self._closing = contextlib.ExitStack()
         with contextlib.ExitStack() as opened:
@@ -192,27 +192,18 @@ class SlaveRuntime:
             return
         self._sessions.refresh(now)
         usage = self._sessions.usage()
-        known = [leader for leader in self._leaders if leader in usage]
+        known = {one.number: usage[pid] for one, pid in self._leaders.items() if pid in usage}
         self._endpoint.publish_usage(
-            [self._leaders[leader].number for leader in known],
-            [usage[leader].cpu for leader in known],
-            [usage[leader].memory for leader in known],
+            list(known),
+            [used.cpu for used in known.values()],
+            [used.memory for used in known.values()],
         )
 
     def _look_at_graph(self, awaited: Mapping[InstanceId, core.Held]) -> None:
         for instance, held in awaited.items():
             before = self._graph_before.get(instance, frozenset())
-            if self._graph.sees(held.node_name, self._pids_of(held.status.pid), before):
+            if self._graph.sees(held.node_name, self._sessions.members(held.status.pid), before):
                 self.take(core.SeenInGraph(instance))
-
-    def _pids_of(self, leader: int) -> list[int]:
-        """The leader and the other members of its session, as far as they are known."""
-        members = [leader]
-        for pid in self._sessions.pids():
-            with contextlib.suppress(ProcessLookupError):
-                if pid != leader and os.getsid(pid) == leader:
-                    members.append(pid)
-        return members
 
     # --- core and supervisor -------------------------------------------------------------
 
@@ -298,14 +289,16 @@ class SlaveRuntime:
 
     def _follow_session(self, status: InstanceStatus) -> None:
         """Keep the table of sessions, for probes and usage."""
-        leader = next((pid for pid, one in self._leaders.items() if one == status.instance), 0)
+        leader = self._leaders.get(status.instance, 0)
         runs = status.state in (InstanceState.RUNNING, InstanceState.STOPPING) and status.pid
-        if leader and leader != status.pid or leader and not runs:
+        if leader and (leader != status.pid or not runs):
             self._sessions.remove(leader, status.cpu_time)
-            del self._leaders[leader]
-        if runs and status.pid not in self._leaders:
+            del self._leaders[status.instance]
+        elif status.state.ended:  # too short to have been seen running: its time counts all the same
+            self._sessions.remove(status.pid, status.cpu_time)
+        if runs and status.instance not in self._leaders:
             self._sessions.add(status.pid)
-            self._leaders[status.pid] = status.instance
+            self._leaders[status.instance] = status.pid
         if status.state.ended:
             self._graph_before.pop(status.instance, None)
 
