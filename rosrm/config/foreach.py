@@ -12,6 +12,7 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from typing import Final
 
 from rosrm.config.checking import described, near
@@ -25,6 +26,7 @@ Row = Mapping[str, Scalar]
 
 _RANGE: Final = re.compile(r"range\(\s*(-?\d+)\s*(?:,\s*(-?\d+)\s*)?(?:,\s*(-?\d+)\s*)?\)")
 _PIECE: Final = re.compile(r"\{\{|\}\}|\{([^{}]*)\}|[{}]")
+_TOO_WIDE: Final = re.compile(r"\d{4}")
 _WHOLE: Final = re.compile(r"\{([A-Za-z_]\w*)\}")
 
 
@@ -145,4 +147,11 @@ def _piece(found: re.Match[str], row: Row) -> str:
     if name not in row:
         hint = "" if name.isidentifier() else "; write {{ and }} for plain braces"
         raise ValueError(f"unknown name {name!r}{near(name, list(row))}{hint}")
-    return format(row[name], form)
+    return _formatted(row[name], form)
+
+
+def _formatted(value: Scalar, form: str) -> str:
+    if not _TOO_WIDE.search(form):
+        with suppress(ValueError):
+            return format(value, form)
+    raise ValueError(f"{form!r} is no format for {described(value)}")
