@@ -201,7 +201,7 @@ def under_limits(
         usage, limit: (slots,) fractions; 1 stands for no limit.
         present, stale: bit i speaks of slot i.
     """
-    used = bin(present).count("1")
+    used = present.bit_count()
     if stale & present:
         limited = sum(1 << slot for slot in range(used) if limit[slot] < 1.0)
         if stale & limited:

@@ -65,7 +65,8 @@ def newest_instance(state_directory: Path, process: str) -> InstanceId:
     name = paths.safe_name(process)
     found: list[tuple[str, int] | None] = []
     with contextlib.suppress(FileNotFoundError):
-        found = [paths.log_number(entry) for entry in os.listdir(paths.log_folder(state))]
+        folder = Path(paths.log_folder(state))
+        found = [paths.log_number(entry.name) for entry in folder.iterdir()]
     numbers = [one[1] for one in found if one is not None and one[0] == name]
     if not numbers:
         raise Refused(f"this host has no log of {process}", "unknown")

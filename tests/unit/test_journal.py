@@ -1,4 +1,4 @@
-"""The SQLite journal: what was answered is there after any death, and every fault says what to do."""
+"""The SQLite journal: what was answered is there after any death; a fault says what to do."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ WRITER = """
         number += 1
         journal.write(
             [Record("n", str(number), facts={"number": number}), Record("second", str(number))],
-            [Intent("process", "p", {"n": number}), Intent("host", f"h{number % 7}", {"n": number})],
+            [Intent("process", "p", {"n": number}), Intent("host", str(number % 7), {})],
             0.0,
         )
         print(number, flush=True)
@@ -169,7 +169,8 @@ def test_a_full_disk_is_said(path) -> None:
         answered = 0
         try:
             while answered < 10_000:
-                journal.write([Record("n", "x" * 500)], [Intent("a", "b", {"n": answered + 1})], 0.0)
+                intent = Intent("a", "b", {"n": answered + 1})
+                journal.write([Record("n", "x" * 500)], [intent], 0.0)
                 answered += 1
         except JournalError as error:
             print(json.dumps([answered, str(error)]))
@@ -197,13 +198,18 @@ def test_a_full_file_system_is_said(tmp_path) -> None:
     )
     if mounted.returncode:
         pytest.skip(f"cannot mount here: {mounted.stderr.decode()}")
+    answered = []
+
+    def fill_up(journal) -> None:
+        for number in range(10_000):
+            journal.write([Record("n", "x" * 500)], [Intent("a", "b", {"n": number})], 0.0)
+            answered.append(number)
+
     try:
-        journal, answered = SqliteJournal(disk / "journal.sqlite"), 0
+        journal = SqliteJournal(disk / "journal.sqlite")
         with pytest.raises(JournalError, match="disk is full: make room"):
-            while answered < 10_000:
-                journal.write([Record("n", "x" * 500)], [Intent("a", "b", {"n": answered})], 0.0)
-                answered += 1
-        assert journal.intents("a") == {"b": {"n": answered - 1}}
+            fill_up(journal)
+        assert journal.intents("a") == {"b": {"n": answered[-1]}}
         journal._database.close()
     finally:
         subprocess.run(["umount", disk], check=True)
@@ -213,7 +219,7 @@ def test_a_full_file_system_is_said(tmp_path) -> None:
 def test_a_folder_that_cannot_be_written_is_said(tmp_path) -> None:
     """With the path."""
     tmp_path.chmod(0o500)
-    with pytest.raises(JournalError, match="journal.sqlite"):
+    with pytest.raises(JournalError, match=r"journal\.sqlite"):
         SqliteJournal(tmp_path / "state" / "journal.sqlite")
 
 

@@ -1,0 +1,253 @@
+"""Real clusters for the tests, and proof that nothing of them is left when they have ended."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from rosrm.config.settings import ClusterConfig, HostConfig
+from rosrm.core.model import Kind, ProcessSpec, Readiness, StopPolicy
+from rosrm.core.views import ProcessRow, Snapshot
+from rosrm.local_cluster import LocalCluster, Part
+
+MIB = 2**20
+QUICK = StopPolicy(interrupt_grace=0.5, terminate_grace=0.5)
+#: Seconds for whatever a busy machine needs; nothing waits so long when all goes well.
+PATIENCE = 30.0
+
+
+def host(name: str, memory: float = 2048 * MIB, cpu: float = 16.0, **options) -> HostConfig:
+    """A slice: it sees only its own processes, whatever else this machine is doing."""
+    options.setdefault("probes", {"memory": {}, "cpu": {}})
+    return HostConfig(
+        host=name, scope="slice", budget={"memory": memory, "cpu": cpu}, **options
+    )  # fmt: skip
+
+
+def job(name: str, *command: str, **options) -> ProcessSpec:
+    """A process that runs to completion."""
+    options.setdefault("stop", QUICK)
+    return ProcessSpec(name, command=command, kind=Kind.JOB, **options)
+
+
+def service(name: str, *command: str, **options) -> ProcessSpec:
+    """A process that runs until it is stopped."""
+    options.setdefault("stop", QUICK)
+    return ProcessSpec(name, command=command or ("sleep", "1000"), **options)
+
+
+def python(name: str, code: str, **options) -> ProcessSpec:
+    """A process of a few lines."""
+    kind = options.pop("kind", Kind.SERVICE)
+    options.setdefault("stop", QUICK)
+    return ProcessSpec(name, command=(sys.executable, "-ISc", code), kind=kind, **options)
+
+
+#: A ROS node of a few lines; it says what it is, and ends with its context.
+NODE = """
+import json, sys, rclpy
+from rclpy.node import Node
+rclpy.init()
+node = Node("unnamed", automatically_declare_parameters_from_overrides=True)
+names = sorted(name for name in node._parameters if not name.startswith(("use_sim", "start_")))
+print(json.dumps({
+    "name": node.get_fully_qualified_name(),
+    "parameters": {name: node.get_parameter(name).value for name in names},
+    "topic": node.resolve_topic_name("chatter"),
+}), flush=True)
+try:
+    rclpy.spin(node)
+except BaseException:
+    pass
+"""
+
+
+def node(name: str, code: str = NODE, **options) -> ProcessSpec:
+    """A real ROS node."""
+    options.setdefault("stop", QUICK)
+    options.setdefault("readiness", Readiness(timeout=PATIENCE))
+    return ProcessSpec(name, command=(sys.executable, "-c", code), ros=True, **options)
+
+
+class Cluster(LocalCluster):
+    """With what the tests ask of it again and again."""
+
+    def submit(self, *specs: ProcessSpec) -> str:
+        return self.client.submit(list(specs))
+
+    def run(self, *specs: ProcessSpec, timeout: float = PATIENCE) -> list[ProcessRow]:
+        """Submit, and wait until all have ended."""
+        self.submit(*specs)
+        return [self.ended(spec.name, timeout) for spec in specs]
+
+    def wait(self, name: str, *states: str, timeout: float = PATIENCE) -> ProcessRow:
+        """The row of a process, once it is in one of these states."""
+
+        def there(view: Snapshot) -> bool:
+            return any(row.name == name and row.state in states for row in view.processes)
+
+        view = self.wait_until(f"{name} {' or '.join(states)}", there, timeout)
+        return next(row for row in view.processes if row.name == name)
+
+    def ended(self, name: str, timeout: float = PATIENCE) -> ProcessRow:
+        return self.wait(name, "finished", "failed", "cancelled", timeout=timeout)
+
+    def cancel(self, *names: str) -> None:
+        """Cancel, and wait until they have ended."""
+        self.client.cancel(names)
+        for name in names:
+            self.ended(name)
+
+    def log(self, name: str) -> str:
+        """All that the newest instance of a process wrote."""
+        for event in reversed(self.client.list(events=True, process=name).events):
+            if event.host:
+                part = self.client.read_log(event.host, name, 0, 0, 0)
+                return part.content.decode(errors="replace")
+        raise AssertionError(f"{name} was on no host")
+
+    def wait_for_log(self, name: str, text: str, timeout: float = PATIENCE) -> str:
+        deadline = time.monotonic() + timeout
+        while text not in (log := self.log(name)):
+            assert time.monotonic() < deadline, f"{name} did not say {text!r}: {log!r}"
+            self.client.spin(0.05)
+        return log
+
+    def kinds(self, name: str) -> list[str]:
+        """What happened to a process, oldest first."""
+        return [event.kind for event in self.client.list(events=True, process=name).events]
+
+    def events(self, kind: str = "", **narrow) -> list:
+        found = self.client.list(events=True, **narrow).events
+        return [event for event in found if kind in ("", event.kind)]
+
+    def wait_for_event(self, kind: str, timeout: float = PATIENCE, **narrow):
+        """The first event of a kind."""
+        deadline = time.monotonic() + timeout
+        while not (found := self.events(kind, **narrow)):
+            assert time.monotonic() < deadline, f"no {kind} in {timeout} s: {self.log_of('master')}"
+            self.client.spin(0.05)
+        return found[0]
+
+    def log_of(self, part: str) -> str:
+        """What the master or a slave said."""
+        return (self.directory / f"{part}.log").read_text(errors="replace")
+
+    def reconnect(self) -> None:
+        """After the master was started again."""
+        if self._client is not None:
+            self._client.close()
+            self._client = None
+
+    def add(self, config: HostConfig) -> Part:
+        part = self.start_slave(config)
+        self.wait_for_hosts()
+        return part
+
+    def parts(self) -> list[Part]:
+        return [part for part in (self.master, *self.slaves.values()) if part is not None]
+
+
+# --- the end ----------------------------------------------------------------------------------
+
+
+def pids_of(directory: Path) -> dict[int, str]:
+    """Processes whose command line or environment names the cluster's directory."""
+    mark = str(directory).encode()
+    found = {}
+    for entry in Path("/proc").iterdir():
+        if not entry.name.isdigit() or int(entry.name) == os.getpid():
+            continue
+        with contextlib.suppress(OSError):
+            command = (entry / "cmdline").read_bytes()
+            environment = (entry / "environ").read_bytes()
+            ours = [v for v in environment.split(b"\0") if v.startswith(b"ROSRM_SUPERVISOR=")]
+            if command and (mark in command or any(mark in value for value in ours)):
+                found[int(entry.name)] = command.replace(b"\0", b" ").decode(errors="replace")
+    return found
+
+
+def shared_memory_of(pid: int) -> set[str]:
+    """The files in /dev/shm that a process has mapped and that bear its participant's id."""
+    with contextlib.suppress(OSError):
+        lines = Path(f"/proc/{pid}/maps").read_text().splitlines()
+        paths = {line.split(None, 5)[5].removesuffix(" (deleted)") for line in lines if "/dev/shm/" in line}
+        return {path for path in paths if "fastrtps" in path and "port" not in path}
+    return set()
+
+
+def wait_gone(pid: int, timeout: float = PATIENCE) -> None:
+    deadline = time.monotonic() + timeout
+    while Path(f"/proc/{pid}").exists() and not zombie(pid):
+        assert time.monotonic() < deadline, f"process {pid} did not end within {timeout} s"
+        time.sleep(0.01)
+
+
+def zombie(pid: int) -> bool:
+    with contextlib.suppress(OSError):
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    return True
+
+
+def alive(pid: int) -> bool:
+    return Path(f"/proc/{pid}").exists() and not zombie(pid)
+
+
+def end_and_check(cluster: Cluster) -> None:
+    """End a cluster; what it leaves behind is ended too, and fails the test."""
+    codes = {part.name: part.process.poll() for part in cluster.parts()}
+    memory = {part.name: shared_memory_of(part.process.pid) for part in cluster.parts()}
+    cluster.close()
+    left = wait_until_none(cluster.directory)
+    for pid in left:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+    assert not left, f"left behind: {left}"
+    for part in cluster.parts():
+        assert "Traceback" not in (said := cluster.log_of(part.name)), said
+        if codes[part.name] is None:  # it lived, and was ended in good order
+            assert part.process.returncode == 0, f"{part.name}: {part.process.returncode}\n{said}"
+            files = {path for path in memory[part.name] if Path(path).exists()}
+            assert not files, f"{part.name} left {files}"
+
+
+def wait_until_none(directory: Path, timeout: float = 5.0) -> dict[int, str]:
+    """What is still there after a moment."""
+    deadline = time.monotonic() + timeout
+    while (left := pids_of(directory)) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    return left
+
+
+Make = Callable[..., Cluster]
+
+
+@contextlib.contextmanager
+def clusters(new_directory: Callable[[], Path]) -> Iterator[Make]:
+    """A factory of clusters that ends all that it made."""
+    made: list[Cluster] = []
+
+    def make(*hosts: HostConfig, **cluster) -> Cluster:
+        one = Cluster(new_directory(), ClusterConfig(**cluster), hosts)
+        made.append(one)
+        one.__enter__()
+        return one
+
+    faults = []
+    try:
+        yield make
+    finally:
+        for one in reversed(made):
+            try:
+                end_and_check(one)
+            except AssertionError as fault:
+                faults.append(str(fault))
+    if faults:
+        pytest.fail("\n".join(faults), pytrace=False)

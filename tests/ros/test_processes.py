@@ -1,0 +1,390 @@
+"""What becomes of processes on real hosts: started in every form, watched, logged, ended."""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+import subprocess
+import sys
+import time
+
+import pytest
+
+from rosrm.config.settings import LogSettings
+from rosrm.core.model import Kind, ProcessSpec, Readiness, RestartPolicy, StopPolicy
+from rosrm.errors import Refused
+from tests.ros.clusters import NODE, QUICK, alive, host, job, node, python, service, wait_gone
+
+
+@pytest.fixture(scope="module")
+def cluster(make_shared):
+    small_logs = LogSettings(max_bytes=20_000, keep=2)
+    return make_shared(
+        host("h0", logs=small_logs), host("h1", logs=small_logs, labels={"place": "lab"})
+    )
+
+
+@pytest.fixture
+def ament_prefix(tmp_path):
+    """A ROS package with a Python executable, as `colcon build` would install it."""
+    marker = tmp_path / "share/ament_index/resource_index/packages/fake_package"
+    marker.parent.mkdir(parents=True)
+    marker.write_text("")
+    program = tmp_path / "lib/fake_package/talker"
+    program.parent.mkdir(parents=True)
+    program.write_text(f"#!{sys.executable}\n{NODE}")
+    program.chmod(program.stat().st_mode | stat.S_IXUSR)
+    return tmp_path
+
+
+# --- forms ------------------------------------------------------------------------------------
+
+
+def test_a_command_runs_to_its_end(cluster) -> None:
+    """A job that exits with 0 has finished; its whole way is on record."""
+    row = cluster.run(job("echo", "echo", "hello there"))[0]
+    assert (row.state, row.exit_code) == ("finished", 0)
+    assert cluster.log("echo") == "hello there\n"
+    kinds = cluster.kinds("echo")
+    assert kinds[0] == "submitted"
+    assert kinds.index("assigned") < kinds.index("finished")
+
+
+def test_a_module_runs(cluster) -> None:
+    """As `python -m` would run it, with the slave's Python."""
+    spec = ProcessSpec(
+        "module", module="json.tool", arguments=("--help",), kind=Kind.JOB, stop=QUICK
+    )
+    assert cluster.run(spec)[0].state == "finished"
+    assert "usage: python" in cluster.log("module")
+
+
+def test_a_service_runs_until_it_is_cancelled(cluster) -> None:
+    """It has a process id, shows what it uses, and is gone afterwards."""
+    cluster.submit(service("sleeper"))
+    row = cluster.wait("sleeper", "running")
+    assert alive(row.pid)
+    seen = cluster.wait_until(
+        "usage of sleeper", lambda v: any(r.memory > 0 for r in v.processes if r.name == "sleeper")
+    )
+    assert next(r for r in seen.processes if r.name == "sleeper").memory < 50 * 2**20
+    cluster.cancel("sleeper")
+    assert not alive(row.pid)
+    assert cluster.process("sleeper").state == "cancelled"
+
+
+def test_a_service_that_exits_has_finished_or_failed(cluster) -> None:
+    """By its exit code; the code is kept."""
+    good, bad = cluster.run(service("good", "true"), service("bad", "sh", "-c", "exit 7"))
+    assert good.state == "finished"
+    assert (bad.state, bad.exit_code) == ("failed", 7)
+    assert "7" in bad.reason
+
+
+def test_a_process_killed_by_a_signal_has_failed(cluster) -> None:
+    """The reason names the signal."""
+    row = cluster.run(job("killed", "sh", "-c", "kill -SEGV $$"))[0]
+    assert row.state == "failed"
+    assert "SIGSEGV" in row.reason
+
+
+def test_a_program_that_is_not_there(cluster) -> None:
+    """It fails, and the reason names what was looked for."""
+    row = cluster.run(job("nothing", "no-such-program"))[0]
+    assert row.state == "failed"
+    assert "no-such-program" in row.reason
+
+
+# --- ROS nodes --------------------------------------------------------------------------------
+
+
+def said(cluster, name: str) -> dict:
+    log = cluster.wait_for_log(name, "}")
+    return json.loads(log.splitlines()[0])
+
+
+def test_name_parameters_and_remappings_reach_the_node(cluster, ament_prefix) -> None:
+    """A package's executable is found in the ament index, and is told all that the spec says."""
+    cluster.submit(
+        ProcessSpec(
+            "talker", package="fake_package", executable="talker", ros=True, namespace="/robot",
+            parameters={"rate": 2.5, "words": ["a", "b"], "nested.flag": True, "text": "10"},
+            remappings={"chatter": "/elsewhere"},
+            environment={"AMENT_PREFIX_PATH": str(ament_prefix)}, stop=QUICK,
+        )
+    )  # fmt: skip
+    cluster.wait("talker", "running")
+    assert said(cluster, "talker") == {
+        "name": "/robot/talker",
+        "parameters": {"rate": 2.5, "words": ["a", "b"], "nested.flag": True, "text": "10"},
+        "topic": "/elsewhere",
+    }
+    cluster.cancel("talker")
+
+
+def test_the_environment_is_clean(cluster) -> None:
+    """Nothing of the ROS wheels' bootstrapper is inherited; what the spec says and who it is, is."""
+    code = "import json, os; print(json.dumps(dict(os.environ)))"
+    cluster.run(python("environment", code, kind=Kind.JOB, environment={"MINE": "yes"}))
+    environment = json.loads(cluster.log("environment"))
+    assert "_ROS_WHEELS_BOOTSTRAP_COMPLETE" not in environment
+    assert "site-packages" not in environment.get("LD_LIBRARY_PATH", "")
+    assert environment["MINE"] == "yes"
+    assert environment["ROSRM_PROCESS"] == "environment"
+    assert environment["ROS_DOMAIN_ID"] == str(cluster.domain)
+    assert environment["ROSRM_HOST"] in ("h0", "h1")
+
+
+def test_no_descriptor_is_inherited(cluster) -> None:
+    """Standard input is empty, the outputs are the log, and there is nothing else."""
+    code = "import os; print(sorted(int(fd) for fd in os.listdir('/proc/self/fd'))[:4], os.read(0, 9))"
+    cluster.run(python("descriptors", code, kind=Kind.JOB))
+    assert cluster.log("descriptors") == "[0, 1, 2, 3] b''\n"
+
+
+def test_ready_is_this_instance_not_a_namesake(cluster, tmp_path) -> None:
+    """While a stranger of its name is in the graph, a node that is slow to come is not ready."""
+    environment = {**os.environ, **cluster.ros.environment()}
+    command = [sys.executable, "-c", NODE, "--ros-args", "-r", "__node:=twin"]
+    with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE) as stranger:
+        try:
+            stranger.stdout.readline()
+            go = tmp_path / "go"
+            slow = f"import os, time\nwhile not os.path.exists({str(go)!r}): time.sleep(0.01)\n{NODE}"
+            cluster.submit(node("twin", slow))
+            cluster.wait("twin", "starting")
+            deadline = time.monotonic() + 1.5
+            while time.monotonic() < deadline:
+                cluster.client.spin(0.1)
+                assert cluster.process("twin").state in ("starting", "assigned")
+            go.touch()
+            row = cluster.wait("twin", "running")
+            assert row.pid != stranger.pid
+        finally:
+            stranger.kill()
+    cluster.cancel("twin")
+
+
+def test_never_ready_is_stopped_and_has_failed(cluster) -> None:
+    """With the reason: what was awaited, and for how long."""
+    spec = ProcessSpec(
+        "mute", command=("sh", "-c", "sleep 1000"), ros=True, stop=QUICK, namespace="/deep",
+        readiness=Readiness(timeout=0.7),
+    )  # fmt: skip
+    cluster.submit(spec)
+    pid = cluster.wait("mute", "starting").pid
+    row = cluster.ended("mute")
+    assert row.state == "failed"
+    assert "not ready within 0.7 s" in row.reason
+    assert "/deep/mute" in row.reason
+    wait_gone(pid)
+
+
+# --- restarts ---------------------------------------------------------------------------------
+
+
+def test_restarts_with_back_off_until_the_attempts_are_used_up(cluster) -> None:
+    """Each pause is longer than the one before; then it has failed, saying how often."""
+    policy = RestartPolicy("on-failure", delay=0.1, max_delay=10.0, factor=2.0, attempts=3)
+    code = "import time; print(time.monotonic(), flush=True); raise SystemExit(3)"
+    row = cluster.run(python("crashes", code, restart=policy))[0]
+    assert (row.state, row.exit_code, row.restarts) == ("failed", 3, 3)
+    assert "restarts" in row.reason
+    times = [float(line) for line in cluster.log("crashes").split()]
+    pauses = [after - before for before, after in zip(times, times[1:], strict=False)]
+    assert len(pauses) == 3
+    for pause, least in zip(pauses, (0.1, 0.2, 0.4), strict=True):
+        assert pause >= least
+    assert "backoff" in cluster.kinds("crashes")
+
+
+def test_on_failure_leaves_a_success_alone(cluster) -> None:
+    """`on-failure` does not restart what exits with 0, `always` does."""
+    on_failure = RestartPolicy("on-failure", delay=0.05)
+    always = RestartPolicy("always", delay=0.05, attempts=2)
+    done, again = cluster.run(
+        service("done", "true", restart=on_failure), service("again", "true", restart=always)
+    )
+    assert (done.state, done.restarts) == ("finished", 0)
+    assert again.restarts == 2
+
+
+def test_restart_by_hand(cluster) -> None:
+    """What runs is restarted on its host under a new pid; what has ended is queued anew."""
+    cluster.submit(service("again-by-hand"))
+    before = cluster.wait("again-by-hand", "running")
+    cluster.client.restart(["again-by-hand"])
+    view = cluster.wait_until(
+        "another pid",
+        lambda v: any(
+            r.name == "again-by-hand" and r.state == "running" and r.pid not in (0, before.pid)
+            for r in v.processes
+        ),
+    )
+    after = next(r for r in view.processes if r.name == "again-by-hand")
+    assert after.host == before.host
+    cluster.cancel("again-by-hand")
+    cluster.client.restart(["again-by-hand"])
+    cluster.wait("again-by-hand", "running")
+    cluster.cancel("again-by-hand")
+
+
+# --- what cannot run --------------------------------------------------------------------------
+
+
+def test_a_missing_package_fails_naming_every_host(cluster) -> None:
+    """It is tried on each host; the reason says for each what was looked for and where."""
+    row = cluster.run(ProcessSpec("lost", package="no_such_package", executable="x", ros=True))[0]
+    assert row.state == "failed"
+    for name in ("h0", "h1"):
+        assert name in row.reason
+    assert "no_such_package" in row.reason
+    assert cluster.kinds("lost").count("assigned") == 2
+
+
+def test_what_one_host_lacks_goes_to_another(make_cluster, ament_prefix) -> None:
+    """Refused where the package is missing, it runs where it is."""
+    before = os.environ.get("AMENT_PREFIX_PATH")
+    cluster = make_cluster(host("bare"))
+    os.environ["AMENT_PREFIX_PATH"] = str(ament_prefix)
+    try:
+        cluster.add(host("full", labels={"has": "it"}))
+    finally:
+        os.environ.pop("AMENT_PREFIX_PATH")
+        if before is not None:
+            os.environ["AMENT_PREFIX_PATH"] = before
+    cluster.client.set_host_state("full", "cordon")
+    cluster.submit(
+        ProcessSpec("picky", package="fake_package", executable="talker", ros=True, stop=QUICK)
+    )
+    cluster.wait_for_event("queued", process="picky")
+    assert cluster.process("picky").state in ("queued", "set_aside")
+    cluster.client.set_host_state("full", "uncordon")
+    assert cluster.wait("picky", "running").host == "full"
+    cluster.cancel("picky")
+
+
+# --- stopping ---------------------------------------------------------------------------------
+
+STUBBORN = """
+import signal, time
+for number in (signal.SIGINT, signal.SIGTERM):
+    signal.signal(number, lambda number, frame: print(number, flush=True))
+print("ready", flush=True)
+while True: time.sleep(10)
+"""
+
+
+def test_what_ignores_signals_is_killed(cluster) -> None:
+    """SIGINT, SIGTERM, SIGKILL, in this order, each after its grace."""
+    stop = StopPolicy(interrupt_grace=0.3, terminate_grace=0.3)
+    cluster.submit(python("stubborn", STUBBORN, stop=stop))
+    pid = cluster.wait("stubborn", "running").pid
+    cluster.wait_for_log("stubborn", "ready")
+    began = time.monotonic()
+    cluster.cancel("stubborn")
+    assert time.monotonic() - began >= 0.6
+    assert not alive(pid)
+    assert cluster.log("stubborn").split() == ["ready", "2", "15"]
+
+
+def test_children_end_with_their_process(cluster) -> None:
+    """The whole family is stopped, grandchildren in sessions of their own included."""
+    script = "setsid sleep 1000 & sleep 1000 & echo $! ; wait"
+    cluster.submit(service("family", "sh", "-c", script))
+    child = int(cluster.wait_for_log("family", "\n"))
+    assert alive(child)
+    cluster.cancel("family")
+    wait_gone(child)
+
+
+# --- logs -------------------------------------------------------------------------------------
+
+
+def test_a_flood_of_output_is_bounded(cluster) -> None:
+    """A process that writes without end fills no disk and disturbs nobody."""
+    cluster.submit(service("flood", "sh", "-c", "while :; do echo 0123456789012345678901234; done"))
+    row = cluster.wait("flood", "running")
+    deadline = time.monotonic() + 2.0
+    while time.monotonic() < deadline:
+        assert cluster.run(job(f"beside-{time.monotonic()}", "true"))[0].state == "finished"
+    cluster.cancel("flood")
+    logs = cluster.directory / "hosts" / row.host / "supervisor" / "logs"
+    files = [path for path in logs.iterdir() if path.name.startswith("flood.")]
+    assert len(files) <= 3
+    assert sum(path.stat().st_size for path in files) < 3 * 25_000
+
+
+def test_reading_and_following_a_log(cluster) -> None:
+    """From the start, from the end, and on from where the last part ended, until it has ended."""
+    code = "import sys\nprint('first', flush=True)\nfor line in open(sys.argv[1]): print(line, end='', flush=True)"
+    fifo = cluster.directory / "fifo"
+    os.mkfifo(fifo)
+    spec = ProcessSpec(
+        "teller", command=(sys.executable, "-uISc", code, str(fifo)), kind=Kind.JOB, stop=QUICK
+    )
+    cluster.submit(spec)
+    row = cluster.wait("teller", "running")
+    with fifo.open("w") as pipe:
+        cluster.wait_for_log("teller", "first")
+        part = cluster.client.read_log(row.host, "teller", row.number, 0, 0)
+        assert (part.content, part.ended) == (b"first\n", False)
+        pipe.write("second\n")
+        pipe.flush()
+        cluster.wait_for_log("teller", "second")
+        after = cluster.client.read_log(row.host, "teller", row.number, part.next_offset, 0)
+        assert after.content == b"second\n"
+        assert cluster.client.read_log(row.host, "teller", 0, -4, 0).content == b"ond\n"
+    assert cluster.ended("teller").state == "finished"
+    last = cluster.client.read_log(row.host, "teller", row.number, after.next_offset, 0)
+    assert (last.content, last.ended) == (b"", True)
+
+
+def test_no_log_is_said(cluster) -> None:
+    """Of a process that never ran there."""
+    with pytest.raises(Refused, match="no log of nobody"):
+        cluster.client.read_log("h0", "nobody", 0, 0, 0)
+
+
+# --- names ------------------------------------------------------------------------------------
+
+
+def test_a_name_in_use_is_refused_with_nothing_queued(cluster) -> None:
+    """Of a batch with one taken name, none is queued; the message names it."""
+    cluster.submit(service("taken"))
+    with pytest.raises(Refused, match="taken") as refusal:
+        cluster.submit(job("fresh", "true"), service("taken"))
+    assert refusal.value.code == "name_taken"
+    with pytest.raises(Refused, match="twice"):
+        cluster.submit(job("double", "true"), job("double", "true"))
+    names = {row.name for row in cluster.client.list(processes=True).processes}
+    assert not names & {"fresh", "double"}
+    cluster.cancel("taken")
+    cluster.run(job("taken", "true"))
+
+
+def test_awkward_names_stay_where_they_belong(cluster) -> None:
+    """Whatever a process is called, its files lie in its host's folder."""
+    for name in ("../../escape", "/absolute", "with space", "ümläut", "a\nb", "."):
+        assert cluster.run(job(name, "echo", "fine"))[0].state == "finished", name
+        assert cluster.log(name) == "fine\n"
+    assert not list(cluster.directory.rglob("escape*"))
+
+
+def test_unknown_names_are_refused(cluster) -> None:
+    """Each says what there is not, and where to look."""
+    for ask in (
+        lambda: cluster.client.cancel(["nobody"]),
+        lambda: cluster.client.restart(["nobody"]),
+        lambda: cluster.client.migrate("nobody"),
+        lambda: cluster.client.explain("nobody"),
+        lambda: cluster.client.set_host_state("nowhere", "drain"),
+        lambda: cluster.client.set_host_state("h0", "explode"),
+    ):
+        with pytest.raises(Refused, match="nobody|nowhere|explode"):
+            ask()
+    with pytest.raises(Refused, match="teleport"):
+        from rosrm.core.model import MigrationPolicy
+
+        cluster.submit(service("moving", migration=MigrationPolicy("teleport")))
