@@ -1,15 +1,15 @@
 """Every error that rosrm raises on purpose.
 
-    RosrmError                  what a user reads: no traceback is shown for it
-    ├── ConfigError             a file or option that cannot be accepted: where, what, what is allowed
-    ├── PluginError             a plugin that does not import, raises, or answers nonsense
-    ├── Refused                 a request that was understood and turned down
-    ├── NoMaster                no master answered in time
-    ├── LaunchError             a process that cannot be started on this host
-    ├── JournalError            the durable record cannot be read or written
-    └── SupervisorError         the supervisor cannot be started or reached
+RosrmError                  what a user reads: no traceback is shown for it
+├── ConfigError             a file or option that cannot be accepted: where, what, what is allowed
+├── PluginError             a plugin that does not import, raises, or answers nonsense
+├── Refused                 a request that was understood and turned down
+├── NoMaster                no master answered in time
+├── LaunchError             a process that cannot be started on this host
+├── JournalError            the durable record cannot be read or written
+└── SupervisorError         the supervisor cannot be started or reached
 
-    SkipPlugin                  not an error: a plugin says that it is absent here, and why
+SkipPlugin                  not an error: a plugin says that it is absent here, and why
 """
 
 from __future__ import annotations
@@ -62,5 +62,5 @@ class SupervisorError(RosrmError):
     """The supervisor of this host cannot be started or reached."""
 
 
-class SkipPlugin(Exception):  # noqa: N818 - a signal, not an error: the plugin is absent here
+class SkipPlugin(Exception):
     """Raised by a plugin's `create` to say that it is absent on this host, and why."""

@@ -16,13 +16,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from rosrm.config.settings import ClusterConfig, HostConfig
 from rosrm.core.views import HostRow, ProcessRow, Snapshot
 from rosrm.errors import RosrmError
 from rosrm.ros.client import MasterClient
 from rosrm.ros.settings import RosSettings
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 #: Seconds in which a part must have ended after SIGINT; its processes have their own grace.
 _END: Final = 30.0
@@ -174,7 +177,7 @@ class LocalCluster:
 
     # --- begin and end -------------------------------------------------------------------
 
-    def __enter__(self) -> LocalCluster:
+    def __enter__(self) -> Self:
         """Start everything and wait until every host asks for work."""
         try:
             self.start_master()

@@ -82,7 +82,8 @@ class ProbeOffer:
 
     Attributes:
         name: by which the configuration chooses it.
-        create: makes it; raises `SkipPlugin` with the reason where the hardware or driver is absent.
+        create: makes it; raises `SkipPlugin` with the reason where its hardware or driver is
+            absent.
         options: a frozen dataclass of its settings, each with a default.
         summary: one line for `rosrm plugins`.
         period: seconds between reads.
@@ -156,8 +157,8 @@ class Scores:
 
     value: FloatArray
     veto: BoolArray | None = None
-    veto_reason: Callable[[int], str] = field(default=lambda row: "vetoed by the scoring policy")
-    reason: Callable[[int], str] = field(default=lambda row: "")
+    veto_reason: Callable[[int], str] = field(default=lambda _row: "vetoed by the scoring policy")
+    reason: Callable[[int], str] = field(default=lambda _row: "")
 
 
 class ScoringPolicy(Protocol):

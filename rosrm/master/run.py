@@ -17,13 +17,17 @@ import sys
 
 from rosrm.config.settings import ClusterConfig
 from rosrm.errors import RosrmError
+from rosrm.master.policy_guard import GuardedPolicy
+from rosrm.master.runtime import MasterRuntime
 from rosrm.registry import Registry
 
 
 def main() -> int:
     """Read the settings from an inherited file descriptor and serve; returns the exit code."""
     parser = argparse.ArgumentParser(prog="rosrm master")
-    parser.add_argument("--settings-fd", type=int, required=True, help="holds ClusterConfig as JSON")
+    parser.add_argument(
+        "--settings-fd", type=int, required=True, help="holds ClusterConfig as JSON"
+    )
     arguments = parser.parse_args()
     logging.basicConfig(
         level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(name)s: %(message)s",
@@ -34,14 +38,11 @@ def main() -> int:
     try:
         return _serve(config)
     except RosrmError as error:
-        print(f"rosrm master: {error}", file=sys.stderr)
+        sys.stderr.write(f"rosrm master: {error}\n")
         return error.exit_code
 
 
 def _serve(config: ClusterConfig) -> int:
-    from rosrm.master.policy_guard import GuardedPolicy
-    from rosrm.master.runtime import MasterRuntime
-
     registry = Registry.discover()
     name = config.scoring.policy or "weighted"
     policy = GuardedPolicy(name, registry.scoring(name, config.scoring.options))

@@ -97,7 +97,11 @@ class MasterRuntime:
         known = self._journal.intents("cluster").get("epoch", {"epoch": 0})
         epoch = int(known["epoch"]) + 1
         self._journal.write(
-            [Record("master_started", message=f"master {self._config.name} started, epoch {epoch}")],
+            [
+                Record(
+                    "master_started", message=f"master {self._config.name} started, epoch {epoch}"
+                )
+            ],
             [Intent("cluster", "epoch", {"epoch": epoch})],
             0.0,
         )
@@ -113,10 +117,7 @@ class MasterRuntime:
             int.from_bytes(os.urandom(7), "big") | 1,
         )  # fmt: skip
         control = self._config.control
-        return MasterEndpoint(
-            self._participant, identity, self, monotonic_ns, control.max_age, control.order_retry,
-            control.beat_period,
-        )  # fmt: skip
+        return MasterEndpoint(self._participant, identity, self, monotonic_ns, control)
 
     def _now(self) -> float:
         return time.monotonic()
@@ -241,7 +242,9 @@ class MasterRuntime:
         for host in self._state.hosts.hosts:
             described = host.description
             rows += [
-                PluginRow("probe", resource.name, "", "selected", f"scope {resource.scope}", host.name)
+                PluginRow(
+                    "probe", resource.name, "", "selected", f"scope {resource.scope}", host.name
+                )
                 for resource in described.resources
             ]
             rows += [

@@ -8,9 +8,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Any, Final
-
-from rosrm_msgs import srv
+from typing import TYPE_CHECKING, Any, Final
 
 from rosrm.core.model import ProcessSpec
 from rosrm.core.views import Snapshot
@@ -20,9 +18,15 @@ from rosrm.ros.control import ControlClient, check_answer
 from rosrm.ros.participant import Participant
 from rosrm.ros.settings import RosSettings
 from rosrm.version import PROTOCOL_VERSION, __version__
+from rosrm_msgs import srv
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 #: Seconds between two looks whether a service was discovered: rclpy has no event for it.
 _LOOK: Final = 0.005
+#: Seconds that a master which was found is given for a request, at least.
+_REQUEST: Final = 10.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +92,20 @@ def find_master(
         participant.node.destroy_client(client)
 
 
+def _greet(participant: Participant, name: str, timeout: float) -> srv.Handshake.Response:
+    """The master's greeting; raises `NoMaster` or `Refused`."""
+    hello = find_master(participant, f"client {name}", timeout)
+    settings = participant.settings
+    if hello is None:
+        raise NoMaster(
+            f"no master answered within {timeout:g} s ({settings.describe()}, namespace "
+            f"{settings.namespace}). Is `rosrm master` running there, with the same domain?"
+        )
+    if not hello.accepted:
+        raise Refused(hello.message, "version")
+    return hello
+
+
 class MasterClient:
     """A connection to the master; a context manager.
 
@@ -107,14 +125,12 @@ class MasterClient:
         self._clients: dict[str, Any] = {}
 
     @classmethod
-    def connect(
-        cls, settings: RosSettings, *, name: str, timeout: float = 3.0
-    ) -> MasterClient:
+    def connect(cls, settings: RosSettings, *, name: str, timeout: float = 3.0) -> MasterClient:
         """Find the master.
 
         Args:
             name: of this client, for the master's messages.
-            timeout: seconds, for finding it and for each request.
+            timeout: seconds for finding it; a request is given as many, or 10.
 
         Raises:
             NoMaster: none answered; the message says what was looked for.
@@ -122,18 +138,11 @@ class MasterClient:
         """
         participant = Participant(settings, f"rosrm_client_{os.getpid()}")
         try:
-            hello = find_master(participant, f"client {name}", timeout)
-            if hello is None:
-                raise NoMaster(
-                    f"no master answered within {timeout:g} s ({settings.describe()}, namespace "
-                    f"{settings.namespace}). Is `rosrm master` running there, with the same domain?"
-                )
-            if not hello.accepted:
-                raise Refused(hello.message, "version")
+            hello = _greet(participant, name, timeout)
         except BaseException:
             participant.close()
             raise
-        return cls(participant, hello, name, timeout)
+        return cls(participant, hello, name, max(timeout, _REQUEST))
 
     # --- requests ------------------------------------------------------------------------
 
@@ -220,9 +229,7 @@ class MasterClient:
         )  # fmt: skip
         path = self._names.of_host(host, names.READ_LOG)
         answer = self._call(srv.ReadLog, path, request, f"the slave of {host}")
-        return LogPart(
-            bytes(answer.content), answer.next_offset, answer.generation, answer.ended
-        )
+        return LogPart(bytes(answer.content), answer.next_offset, answer.generation, answer.ended)
 
     # --- how -----------------------------------------------------------------------------
 
@@ -265,7 +272,7 @@ class MasterClient:
         """Leave ROS."""
         self._participant.close()
 
-    def __enter__(self) -> MasterClient:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(

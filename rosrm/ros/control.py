@@ -13,11 +13,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from rosrm_msgs.msg import Answer, Envelope
-
 from rosrm.errors import Refused
 from rosrm.ros.participant import OpenRequest, Participant
 from rosrm.version import PROTOCOL_VERSION
+from rosrm_msgs.msg import Answer, Envelope
 
 #: Ids remembered: more than can arrive within the greatest age of a request.
 _REMEMBERED: Final = 10_000
@@ -36,9 +35,7 @@ def version_refusal(version: int, who: str) -> str:
 
 def accepted(message: str = "", epoch: int = 0) -> Answer:
     """The answer to a request that was carried out."""
-    return Answer(
-        protocol_version=PROTOCOL_VERSION, accepted=True, message=message, epoch=epoch
-    )
+    return Answer(protocol_version=PROTOCOL_VERSION, accepted=True, message=message, epoch=epoch)
 
 
 def refused(code: str, message: str, epoch: int = 0) -> Answer:
@@ -96,7 +93,7 @@ class Gate:
         return None
 
     def repeated(self, envelope: Envelope, request: OpenRequest) -> bool:
-        """True for a request that came before: it gets the same answer, or the one in the making."""
+        """True for a request that came before: it gets the same answer, once there is one."""
         known = self._answers.get(envelope.request_id)
         if known is None:
             self._answers[envelope.request_id] = _PENDING
@@ -198,9 +195,7 @@ class ControlClient:
             epoch=epoch, receiver_beat=receiver_beat,
         )  # fmt: skip
 
-    def call(
-        self, client: Any, request: Any, deadline: float, done: Callable[[Any], None]
-    ) -> None:
+    def call(self, client: Any, request: Any, deadline: float, done: Callable[[Any], None]) -> None:
         """Send a request.
 
         Args:

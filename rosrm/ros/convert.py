@@ -6,11 +6,10 @@ import json
 from collections.abc import Iterable, Mapping
 from typing import Any, Final
 
-from rosrm_msgs import msg
-
 from rosrm.core import model
 from rosrm.core.views import EventRow, HostRow, PluginRow, ProcessRow, ResourceRow
 from rosrm.errors import Refused
+from rosrm_msgs import msg
 
 _INFINITE: Final = float("inf")
 
@@ -209,7 +208,9 @@ def host_from_msg(message: msg.HostDescription) -> model.HostDescription:
         raise Refused(f"host {message.name!r}: no name, no incarnation or too many resources")
     for resource in resources:
         if not 0.0 < resource.capacity < _INFINITE:
-            raise Refused(f"host {message.name!r}: {resource.name} has capacity {resource.capacity}")
+            raise Refused(
+                f"host {message.name!r}: {resource.name} has capacity {resource.capacity}"
+            )
     if not 0.0 < message.period < _INFINITE:
         raise Refused(f"host {message.name!r}: it reports every {message.period} s")
     return model.HostDescription(

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from typing import Any, Final, Protocol
 
 import numpy as np
-from rosrm_msgs import msg, srv
 
+from rosrm.config.settings import ControlSettings
 from rosrm.core import events as happened
 from rosrm.core.commands import Assign, Order, Reply, Withdraw
 from rosrm.core.model import Assignment, HostDescription
@@ -28,6 +28,7 @@ from rosrm.ros.control import (
 from rosrm.ros.participant import OpenRequest, Participant
 from rosrm.ros.readings import decode
 from rosrm.version import PROTOCOL_VERSION, __version__
+from rosrm_msgs import msg, srv
 
 _ACTIONS = {
     "stop": srv.ControlHost.Request.STOP,
@@ -105,16 +106,14 @@ class MasterEndpoint:
         identity: Identity,
         queries: Queries,
         beat: Callable[[], int],
-        max_age: float,
-        order_timeout: float,
-        beat_period: float,
+        control: ControlSettings,
     ) -> None:
         self._participant = participant
         self._identity = identity
         self._queries = queries
         self._beat = beat
-        self._order_timeout = order_timeout
-        self._beat_period = beat_period
+        self._order_timeout = control.order_retry
+        self._beat_period = control.beat_period
         self.events: list[happened.Event] = []
         self.rival: msg.MasterBeat | None = None
         self._names = names.Names(participant.settings.namespace)
@@ -123,7 +122,7 @@ class MasterEndpoint:
         self._next_request = 1
         self._refused: dict[tuple[str, str], float] = {}
         self._client = ControlClient(participant, f"master {identity.name}")
-        self._server = ControlServer(participant, Gate(beat, max_age))
+        self._server = ControlServer(participant, Gate(beat, control.max_age))
         self._subscribe()
         self._offer()
 
@@ -228,9 +227,7 @@ class MasterEndpoint:
     # --- what is asked -------------------------------------------------------------------
 
     def _offer(self) -> None:
-        self._participant.serve(
-            srv.Handshake, self._names(names.HANDSHAKE), self._take_handshake
-        )
+        self._participant.serve(srv.Handshake, self._names(names.HANDSHAKE), self._take_handshake)
         self._participant.serve(srv.List, self._names(names.LIST), self._take_list)
         self._participant.serve(srv.Explain, self._names(names.EXPLAIN), self._take_explain)
         self._server.offer(
@@ -385,9 +382,7 @@ class MasterEndpoint:
             respond(self._response(srv.RequestProcess, reply))
 
         self._open[token] = turn_away
-        self.events.append(
-            happened.ProcessRequested(token, request.host_id, request.incarnation)
-        )
+        self.events.append(happened.ProcessRequested(token, request.host_id, request.incarnation))
 
     def _close_poll(self, link: _HostLink) -> None:
         self._open.pop(link.poll_token, None)

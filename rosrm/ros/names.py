@@ -32,6 +32,7 @@ class Names:
     namespace: str
 
     def __call__(self, name: str) -> str:
+        """A name that all parts share."""
         return f"{self.namespace}/{name}"
 
     def of_host(self, host: str, name: str) -> str:

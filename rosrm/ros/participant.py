@@ -11,7 +11,7 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import rclpy
 from rclpy.experimental import EventsExecutor
@@ -21,6 +21,9 @@ from rclpy.signals import SignalHandlerOptions
 
 from rosrm.ros import qos
 from rosrm.ros.settings import RosSettings
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 
 @dataclass(slots=True)
@@ -129,7 +132,7 @@ class Participant:
             node.destroy_node()
         self.context.try_shutdown()
 
-    def __enter__(self) -> Participant:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(

@@ -72,10 +72,10 @@ def decode(messages: Sequence[bytes]) -> Decoded:
         return Decoded(strangers=tuple(strangers))
     rows = np.frombuffer(b"".join(fit), LAYOUT)
     ours = rows["protocol_version"] == PROTOCOL_VERSION
-    for version in np.unique(rows["protocol_version"][~ours]):
-        strangers.append(
-            f"a resource_info of protocol version {version}; this side speaks {PROTOCOL_VERSION}"
-        )
+    strangers += [
+        f"a resource_info of protocol version {version}; this side speaks {PROTOCOL_VERSION}"
+        for version in np.unique(rows["protocol_version"][~ours])
+    ]
     rows = _newest_of_each_run(rows[ours])
     if not len(rows):
         return Decoded(strangers=tuple(strangers))

@@ -38,8 +38,11 @@ class RosSettings:
     def describe(self) -> str:
         """Domain, RMW and discovery in force, for messages."""
         joined = {**os.environ, **self.environment()}
+        discovery = joined.get("ROS_DISCOVERY_SERVER") or joined.get(
+            "ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET"
+        )
         return (
             f"domain {joined.get('ROS_DOMAIN_ID', '0')}, "
             f"RMW {joined.get('RMW_IMPLEMENTATION', 'rmw_fastrtps_cpp')}, "
-            f"discovery {joined.get('ROS_DISCOVERY_SERVER') or joined.get('ROS_AUTOMATIC_DISCOVERY_RANGE', 'SUBNET')}"
+            f"discovery {discovery}"
         )

@@ -11,7 +11,6 @@ from typing import Any, Final, Protocol
 
 import numpy as np
 import numpy.typing as npt
-from rosrm_msgs import msg, srv
 
 from rosrm.core import slave as core
 from rosrm.core.model import HostDescription, InstanceStatus
@@ -28,6 +27,7 @@ from rosrm.ros.control import (
 from rosrm.ros.participant import OpenRequest, Participant
 from rosrm.ros.readings import ACCEPTING, LAYOUT, encode
 from rosrm.version import PROTOCOL_VERSION, __version__
+from rosrm_msgs import msg, srv
 
 #: Seconds for one request to the master.
 _PATIENCE: Final = 3.0
@@ -74,7 +74,7 @@ class Host(Protocol):
     def execute(
         self, executor: str, arguments: dict[str, Any], done: Callable[[bool, str, str], None]
     ) -> None:
-        """Run an executor; `done(accepted, message, result JSON)` is called in the loop's thread."""
+        """Run an executor; `done(accepted, message, result)` is called in the loop's thread."""
 
     def say(self, message: str) -> None:
         """Tell the user."""
@@ -272,34 +272,19 @@ class SlaveEndpoint:
 
     # --- orders --------------------------------------------------------------------------
 
-    def _take_order(
-        self, request: srv.ControlHost.Request, respond: Callable[[Any], None]
-    ) -> None:
+    def _take_order(self, request: srv.ControlHost.Request, respond: Callable[[Any], None]) -> None:
         kind = srv.ControlHost.Request
-        instance = convert.instance_from_msg(request.instance)
         try:
             if request.action == kind.EXECUTE:
                 self._execute(request, respond)
                 return
-            if request.action == kind.START:
-                assignment = convert.assignment_from_msg(request.assignment)
-                self._host.take(core.AssignmentsReceived((assignment,)))
-            elif request.action == kind.STOP:
-                self._host.take(core.StopOrdered(instance))
-            elif request.action == kind.RESTART:
-                self._host.take(core.RestartOrdered(instance))
-            elif request.action == kind.REPORT:
-                self._host.take(core.ReportRequested())
-            else:
-                raise Refused(f"unknown action {request.action}")
+            self._host.take(_ordered(request))
         except Refused as refusal:
             respond(srv.ControlHost.Response(answer=refused(refusal.code, str(refusal))))
             return
         respond(srv.ControlHost.Response(answer=accepted()))
 
-    def _execute(
-        self, request: srv.ControlHost.Request, respond: Callable[[Any], None]
-    ) -> None:
+    def _execute(self, request: srv.ControlHost.Request, respond: Callable[[Any], None]) -> None:
         def done(good: bool, message: str, result: str) -> None:
             answer = accepted(message) if good else refused("failed", message)
             respond(srv.ControlHost.Response(answer=answer, result=result))
@@ -309,9 +294,10 @@ class SlaveEndpoint:
 
     def _take_log(self, request: srv.ReadLog.Request, open_request: OpenRequest) -> None:
         fault = version_refusal(request.protocol_version, "a reader of logs")
+        if fault:
+            open_request.answer(srv.ReadLog.Response(answer=refused("version", fault)))
+            return
         try:
-            if fault:
-                raise Refused(fault, "version")
             part = self._host.read_log(
                 request.process, request.number, request.offset, request.max_bytes
             )
@@ -373,7 +359,7 @@ class SlaveEndpoint:
             )  # fmt: skip
 
     def leave(self, done: Callable[[], None]) -> None:
-        """Say that this host stops in good order; `done` when the master knows, or did not answer."""
+        """Say that this host stops in good order; `done` when the master knows, or is silent."""
         if self.link is not Link.REGISTERED:
             done()
             return
@@ -384,6 +370,22 @@ class SlaveEndpoint:
         self._control.call(
             self._clients[srv.Leave], request, time.monotonic() + 1.0, lambda _: done()
         )
+
+
+def _ordered(request: srv.ControlHost.Request) -> core.Event:
+    """What an order means for the core; raises `Refused`."""
+    kind = srv.ControlHost.Request
+    if request.action == kind.START:
+        return core.AssignmentsReceived((convert.assignment_from_msg(request.assignment),))
+    instance = convert.instance_from_msg(request.instance)
+    orders: dict[int, core.Event] = {
+        kind.STOP: core.StopOrdered(instance),
+        kind.RESTART: core.RestartOrdered(instance),
+        kind.REPORT: core.ReportRequested(),
+    }
+    if request.action not in orders:
+        raise Refused(f"unknown action {request.action}")
+    return orders[request.action]
 
 
 def result_json(result: Any) -> str:

@@ -18,6 +18,7 @@ import sys
 from rosrm.config.settings import HostConfig
 from rosrm.errors import RosrmError
 from rosrm.registry import Registry
+from rosrm.slave.runtime import SlaveRuntime
 
 
 def main() -> int:
@@ -34,13 +35,11 @@ def main() -> int:
     try:
         return _serve(config)
     except RosrmError as error:
-        print(f"rosrm slave: {error}", file=sys.stderr)
+        sys.stderr.write(f"rosrm slave: {error}\n")
         return error.exit_code
 
 
 def _serve(config: HostConfig) -> int:
-    from rosrm.slave.runtime import SlaveRuntime
-
     return SlaveRuntime(config, Registry.discover()).run()
 
 

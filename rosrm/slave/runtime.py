@@ -116,7 +116,7 @@ class SlaveRuntime:
     def _description(self, absent: Mapping[str, str]) -> HostDescription:
         config = self._config
         return HostDescription(
-            name=config.host, incarnation=int.from_bytes(os.urandom(7), "big") | 1, hostname=socket.gethostname(),
+            name=config.host, incarnation=_random_number(), hostname=socket.gethostname(),
             pid=os.getpid(), software_version=__version__, labels=config.labels,
             resources=tuple(self._sampler.resources), max_processes=config.max_processes,
             period=config.period, executors=tuple(self._executors), absent=absent,
@@ -294,7 +294,7 @@ class SlaveRuntime:
         if leader and (leader != status.pid or not runs):
             self._sessions.remove(leader, status.cpu_time)
             del self._leaders[status.instance]
-        elif status.state.ended:  # too short to have been seen running: its time counts all the same
+        elif status.state.ended:  # too short to have been seen running: its time counts too
             self._sessions.remove(status.pid, status.cpu_time)
         if runs and status.instance not in self._leaders:
             self._sessions.add(status.pid)
@@ -374,6 +374,11 @@ class SlaveRuntime:
             if held.spec is not None and not held.status.state.ended
         ]
         return max(graces, default=10.0)
+
+
+def _random_number() -> int:
+    """Not 0; `secrets` would do the same and bring a MiB of modules along."""
+    return int.from_bytes(os.urandom(7), "big") | 1
 
 
 @contextlib.contextmanager
