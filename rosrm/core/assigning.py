@@ -19,7 +19,8 @@ def demand_of(state: MasterState, process: Process) -> Demand:
     if process.demand is None or process.demand[0] != version:
         estimate = state.learned.estimate(process.spec, state.settings.default_needs)
         demand = Demand(process.spec, estimate.amounts, estimate.estimated, dict(process.excluded))
-        process.demand = (version, demand)
+        # Equal processes share one: thousands of them may wait.
+        process.demand = (version, state.demands.setdefault(demand.key, demand))
     return process.demand[1]
 
 
@@ -38,6 +39,7 @@ def ranking_of(state: MasterState, demand: Demand) -> Ranking:
     """All hosts judged for a demand, up to date; kept while only assignments change it."""
     if state.rankings_version != state.hosts.version:
         state.rankings.clear()
+        state.demands.clear()
         state.rankings_version = state.hosts.version
     ranking = state.rankings.get(demand.key)
     if ranking is None:

@@ -180,10 +180,12 @@ class HostTable(HostColumns):
         `amount` is (R',) fractions, R' at most the resources known now.
         """
         column = host.column
-        load = self.cells[LOAD, : len(amount), column]
+        cell = self.cells[:, : len(amount), column]
+        load = cell[LOAD]
         load += amount
-        np.maximum(load, 0.0, out=load)
-        self.cells[BUSY, : len(amount), column] = self.cells[USAGE, : len(amount), column] + load
+        if processes <= 0:
+            np.maximum(load, 0.0, out=load)  # what is left of a sum may be below 0 by rounding
+        np.add(cell[USAGE], load, out=cell[BUSY])
         self.processes[column] += processes
         self.touched.append(column)
 

@@ -2,26 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 
 class Lazy(Mapping[str, Any]):
-    """Renders itself once, from values that do not change any more (a snapshot, a frozen spec).
+    """Renders itself once, from values that do not change any more (a snapshot, a frozen spec)."""
 
-    Args:
-        render: makes the mapping; must not look at anything that changes.
-    """
+    __slots__ = ("_rendered",)
 
-    __slots__ = ("_render", "_rendered")
+    def __init__(self) -> None:
+        self._rendered: Mapping[str, Any] | None = None
 
-    def __init__(self, render: Callable[[], Mapping[str, Any]]) -> None:
-        self._render: Callable[[], Mapping[str, Any]] | None = render
-        self._rendered: Mapping[str, Any] = {}
+    def render(self) -> Mapping[str, Any]:
+        """Make the mapping; must not look at anything that changes."""
+        raise NotImplementedError
 
     def _made(self) -> Mapping[str, Any]:
-        if self._render is not None:
-            self._rendered, self._render = self._render(), None
+        if self._rendered is None:
+            self._rendered = self.render()
         return self._rendered
 
     def __getitem__(self, key: str) -> Any:

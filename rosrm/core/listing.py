@@ -71,8 +71,9 @@ def explanation(state: MasterState, name: str, now: float) -> Mapping[str, Any] 
     row = process_row(state, process, now)
     decision, age = process.decision, now - process.decided_at
     if process.phase in (ProcessPhase.QUEUED, ProcessPhase.SET_ASIDE):
-        kind = "waits" if process.phase is ProcessPhase.QUEUED else "set_aside"
-        decision, age = decide_now(state, process).to_json(kind), 0.0
+        now_decided = decide_now(state, process)
+        now_decided.kind = "waits" if process.phase is ProcessPhase.QUEUED else "set_aside"
+        decision, age = now_decided, 0.0
     return {
         "process": name, "state": row.state, "host": row.host,
         "reason": _reason(state, process, row.queue_position),

@@ -16,7 +16,6 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 
 from rosrm.core.columns import BoolArray, FloatArray, IntArray
 from rosrm.core.hosts import HostTable
@@ -27,6 +26,9 @@ from rosrm.ports import HostView, ProcessView, Scores, ScoringPolicy
 TIE: Final = 1e-9
 #: Sums of fractions are compared with this much tolerance.
 CLOSE: Final = 1e-9
+
+#: Of many hosts, so many that were nearly chosen are named beside the one that was.
+RUNNERS_UP: Final = 3
 
 #: A scoring policy with its name.
 NamedPolicy = tuple[str, ScoringPolicy]
@@ -87,11 +89,14 @@ class Ranking:
         self.failure = ""
         self.version = table.version
         self.need = table.fractions(demand.amounts, demand.estimated)
+        self._view_need = self.need.T
+        self._view_need.flags.writeable = False
         self._left = list(policies)
         self._seen = len(table.touched)
         self._open = table.open() & eligible(table, demand)
         self._allowed = table.limit - (demand.headroom - CLOSE)
         self._tier = _tiers(table, demand.spec)
+        self._lowest: list[int] | None = None
         self.value = np.full(len(table), np.inf)
         self._judge(slice(0, len(table)))
 
@@ -123,24 +128,28 @@ class Ranking:
 
     def best(self) -> int:
         """The column with the lowest value; -1: none fits."""
-        best = self.lowest(1)
+        best = self.lowest()
         return best[0] if best else -1
 
-    def lowest(self, most: int) -> list[int]:
-        """The columns that fit with the lowest values, best first."""
-        if not len(self.value):
-            return []
+    def lowest(self) -> list[int]:
+        """The few columns that fit with the lowest values, best first."""
+        if self._lowest is None:
+            self._lowest = self._find_lowest() if len(self.value) else []
+        return self._lowest
+
+    def _find_lowest(self) -> list[int]:
         value = self._preferred()
-        found: list[tuple[int, float]] = []
-        for _ in range(most):
+        found, were = [], []
+        for _ in range(1 + RUNNERS_UP):
             column = int(value.argmin())
-            if value[column] == np.inf:
+            was = value[column]
+            if was == np.inf:
                 break
-            found.append((column, float(value[column])))
-            value[column] = np.inf
-        for column, was in found:
-            value[column] = was
-        return [column for column, _ in found]
+            found.append(column)
+            were.append(was)
+            value[column] = np.inf  # one more argmin costs less than a sort
+        value[found] = were
+        return found
 
     def fits(self, column: int) -> bool:
         """True: this host may take it now."""
@@ -149,15 +158,19 @@ class Ranking:
     def room(self, columns: Columns) -> BoolArray:
         """(n,) True where reading + in-flight load + need stays under every limit."""
         total = self.table.busy[:, columns] + self.need[:, columns]
+        over = total > self._allowed[:, columns]
         # A host without a resource has NaN there, which is over nothing.
-        return np.asarray(~(total > self._allowed[:, columns]).any(axis=0))
+        fits: BoolArray = ~np.logical_or.reduce(over)
+        return fits
 
     def _judge(self, columns: Columns) -> None:
         """Set `value` of some columns; a policy that raises or answers nonsense is left out."""
         table = self.table
-        fits = self._open[columns] & self.room(columns)
+        self._lowest = None
+        fits = self.room(columns)
+        fits &= self._open[columns]
         fits &= table.processes[columns] < table.bound[columns]
-        if not fits.any():
+        if not np.count_nonzero(fits):
             self.value[columns] = np.inf
             return
         try:
@@ -172,12 +185,12 @@ class Ranking:
 
     def _scores(self, columns: Columns, fits: BoolArray) -> FloatArray:
         """Scores with the tie-break; inf: vetoed."""
-        tie: FloatArray = TIE * self.table.processes[columns].astype(np.float64)
+        tie: FloatArray = np.multiply(self.table.processes[columns], TIE)
         if not self._left:
             return tie
         hosts = view_of(self.table, columns)
         scores = self._left[0][1].score(
-            hosts, ProcessView(self.demand.spec, _read_only(self.need[:, columns].T))
+            hosts, ProcessView(self.demand.spec, self._view_need[columns])
         )
         value, veto = sound(scores, hosts, fits)
         value = value + tie
@@ -200,14 +213,9 @@ def view_of(table: HostTable, columns: Columns) -> HostView:
     """What a scoring policy sees of some hosts; it cannot change the table."""
     return HostView(
         Names(table, columns), table.resources,
-        _read_only(table.busy[:, columns].T), _read_only(table.limit[:, columns].T),
-        _read_only(table.capacity[:, columns].T), _read_only(table.processes[columns]),
+        table.view_busy[columns], table.view_limit[columns], table.view_capacity[columns],
+        table.view_processes[columns],
     )  # fmt: skip
-
-
-def _read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    array.flags.writeable = False  # of this view; the standing array stays writable
-    return array
 
 
 def sound(scores: Scores, hosts: HostView, fits: BoolArray) -> tuple[FloatArray, BoolArray | None]:
@@ -223,7 +231,7 @@ def sound(scores: Scores, hosts: HostView, fits: BoolArray) -> tuple[FloatArray,
         if veto.shape != (size,):
             raise ValueError(f"vetoes of shape {veto.shape} for {size} hosts")
         asked = fits & ~veto
-    if not np.isfinite(value).all():
+    if np.count_nonzero(np.isfinite(value)) < size:
         wrong = np.flatnonzero(asked & ~np.isfinite(value))
         if len(wrong):
             name = hosts.names[int(wrong[0])]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
@@ -15,9 +14,6 @@ from rosrm.core.migration import Plan
 from rosrm.core.model import InstanceId, InstanceState, InstanceStatus, ProcessSpec
 from rosrm.core.placement import Demand
 from rosrm.core.specs import spec_to_dict
-
-#: Records of one process that `explain` tells.
-_HISTORY: Final = 12
 
 
 class ProcessPhase(str, Enum):
@@ -147,6 +143,20 @@ class Run:
     ended: dict[int, End] = field(default_factory=dict)
 
 
+class PlainSpec(Lazy):
+    """A spec as JSON has it: made once for all the intents that it is in."""
+
+    __slots__ = ("_spec",)
+
+    def __init__(self, spec: ProcessSpec) -> None:
+        super().__init__()
+        self._spec = spec
+
+    def render(self) -> Mapping[str, Any]:
+        """All fields of the spec."""
+        return spec_to_dict(self._spec)
+
+
 @dataclass(slots=True)
 class Process:
     """One submitted process.
@@ -175,13 +185,12 @@ class Process:
     restarts: int = 0
     decision: Mapping[str, Any] | None = None
     decided_at: float = 0.0
-    history: deque[tuple[float, str, str]] = field(default_factory=lambda: deque(maxlen=_HISTORY))
+    history: list[tuple[float, str, str]] = field(default_factory=list)
     demand: tuple[int, Demand] | None = None
-    plain: Mapping[str, Any] = field(init=False)
+    plain: PlainSpec = field(init=False)
 
     def __post_init__(self) -> None:
-        spec = self.spec
-        self.plain = Lazy(lambda: spec_to_dict(spec))
+        self.plain = PlainSpec(self.spec)
 
     @property
     def name(self) -> str:

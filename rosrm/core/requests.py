@@ -59,9 +59,10 @@ def _taken(state: MasterState, event: happened.SubmissionReceived) -> str:
             f"name. Nothing was queued"
         )
     for spec in event.specs:
-        left = _still_stopping(state, spec.name)
-        if left:
-            return f"{left}. Nothing was queued"
+        if spec.name in state.processes or spec.name in state.orphans:
+            left = _still_stopping(state, spec.name)
+            if left:
+                return f"{left}. Nothing was queued"
     return ""
 
 

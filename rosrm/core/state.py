@@ -12,13 +12,15 @@ from rosrm.core.commands import Command
 from rosrm.core.hosts import Host, HostTable
 from rosrm.core.model import EMPTY, Assignment, InstanceId, ProcessSpec
 from rosrm.core.needs import LearnedNeeds
-from rosrm.core.placement import NamedPolicy, Ranking
+from rosrm.core.placement import Demand, NamedPolicy, Ranking
 from rosrm.core.processes import Instance, Process, ProcessPhase, Run, Wanted
 from rosrm.core.queue import Queue
 from rosrm.core.settings import CoreSettings
 from rosrm.core.verdicts import Decision
 from rosrm.ports import Intent, MigrationStrategy, Record, ScoringPolicy
 
+#: Records of one process that `explain` tells.
+_HISTORY: Final = 12
 #: Instance numbers are made durable by so many at a time.
 _RESERVED: Final = 1000
 
@@ -64,7 +66,9 @@ class MasterState:
         self.missing_since: dict[int, float] = {}
         self.reviewed = float("-inf")
         self.policy_told = float("-inf")
+        self.demands: dict[Any, Demand] = {}
         self._out: list[Command] = []
+        self._unsaved: dict[str, Process] = {}
 
     # --- what handlers emit --------------------------------------------------------------
 
@@ -74,6 +78,9 @@ class MasterState:
 
     def take(self) -> list[Command]:
         """The commands so far; the next event begins with none."""
+        for process in self._unsaved.values():
+            self._out.append(self._intent_of(process))
+        self._unsaved.clear()
         out, self._out = self._out, []
         return out
 
@@ -86,26 +93,26 @@ class MasterState:
         known = self.processes.get(process)
         if known is not None:
             known.history.append((now, kind, message))
+            if len(known.history) > _HISTORY:
+                del known.history[0]
 
     def save(self, process: Process) -> None:
-        """Make what is intended with a process durable, with every instance that may run."""
+        """Make what is intended with a process durable, as it stands after the event in hand."""
+        self._unsaved[process.name] = process
+
+    def _intent_of(self, process: Process) -> Intent:
         owner = self.instances.get(process.owner)
-        self.emit(
-            Intent(
-                "process", process.name,
-                {
-                    "spec": process.plain, "order": process.order,
-                    "phase": process.phase.value, "wanted": process.wanted.value,
-                    "owner": process.owner, "host": owner.host.name if owner else "",
-                    "instances": {
-                        str(number): self.instances[number].host.name
-                        for number in process.instances
-                    },
-                    "reason": process.reason, "excluded": dict(process.excluded),
-                    "migrations": process.migrations, "exit_code": process.exit_code,
-                    "restarts": process.restarts,
-                },
-            )
+        held = {str(number): self.instances[number].host.name for number in process.instances}
+        return Intent(
+            "process", process.name,
+            {
+                "spec": process.plain, "order": process.order, "phase": process.phase.value,
+                "wanted": process.wanted.value, "owner": process.owner,
+                "host": owner.host.name if owner else "", "instances": held,
+                "reason": process.reason, "excluded": dict(process.excluded),
+                "migrations": process.migrations, "exit_code": process.exit_code,
+                "restarts": process.restarts,
+            },
         )  # fmt: skip
 
     def order_id(self) -> int:
@@ -171,7 +178,8 @@ class MasterState:
 
         `need`, (R,), is what `amounts` are of the host's capacity.
         """
-        charged = np.where(need < np.inf, need, 0.0)
+        charged = need.copy()
+        charged[charged == np.inf] = 0.0
         added = Instance(instance, host, now, amounts, estimated, charged)
         self.instances[instance.number] = added
         host.instances.add(instance.number)
@@ -197,7 +205,8 @@ class MasterState:
 
     def note_decision(self, process: Process, decision: Decision, kind: str, now: float) -> None:
         """Remember the newest decision about a process, for `explain`."""
-        process.decision = decision.to_json(kind)
+        decision.kind = kind
+        process.decision = decision
         process.decided_at = now
 
 

@@ -16,13 +16,11 @@ from rosrm.core.columns import BUSY, CAPACITY, LIMIT, LOAD, USAGE, BoolArray, Fl
 from rosrm.core.hosts import HostTable
 from rosrm.core.lazy import Lazy
 from rosrm.core.model import EMPTY
-from rosrm.core.placement import CLOSE, TIE, Demand, Ranking, eligible
+from rosrm.core.placement import CLOSE, TIE, Demand, Names, Ranking, eligible
 from rosrm.ports import HostView, ProcessView, Scores, ScoringPolicy
 
 #: An explanation names every host up to this many, else the best of those that fit.
 _NAMED_HOSTS: Final = 16
-#: Of more hosts, so many beside the chosen one.
-_RUNNERS_UP: Final = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,12 +44,13 @@ class Verdict:
         }  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)  # not frozen: that costs a microsecond for each of thousands
 class Moment:
     """What was known of n hosts when a decision was made; copies, which change no more.
 
     Attributes:
-        closed: why each could not be given work, its room aside; "" if it could.
+        columns: (n,) of the hosts; a column stays with its host.
+        closed: why each could not be given work, its room aside; "" if it could; (): all could.
         cells: (planes, R, n) as in `HostColumns`.
         need: (R, n) fractions.
         value: (n,) score plus tie-break; inf where it did not fit.
@@ -60,8 +59,9 @@ class Moment:
 
     demand: Demand
     policy: ScoringPolicy | None
+    table: HostTable
     resources: tuple[str, ...]
-    names: tuple[str, ...]
+    columns: IntArray
     closed: tuple[str, ...]
     cells: FloatArray
     need: FloatArray
@@ -70,11 +70,11 @@ class Moment:
 
     def scores(self) -> Scores | None:
         """The policy's judgement once more (it is pure), for its reasons; None: it has none."""
-        if self.policy is None or not self.names:
+        if self.policy is None or not len(self.columns):
             return None
         hosts = HostView(
-            self.names, self.resources, self.cells[BUSY].T, self.cells[LIMIT].T,
-            self.cells[CAPACITY].T, self.processes,
+            Names(self.table, self.columns), self.resources, self.cells[BUSY].T,
+            self.cells[LIMIT].T, self.cells[CAPACITY].T, self.processes,
         )  # fmt: skip
         try:
             return self.policy.score(hosts, ProcessView(self.demand.spec, self.need.T))
@@ -82,50 +82,52 @@ class Moment:
             return None
 
 
-class Decision:
-    """The outcome for one process.
+class Decision(Lazy):
+    """The outcome for one process; as a mapping, it is what stands in the event record.
 
     Attributes:
+        kind: "assigned", "waits", "migrated", ...
         column: of the chosen host; -1: none fits now.
         policy: name of the policy that decided, and which was left out.
         needs: base units by resource.
         omitted: how many hosts had which verdict beside those that are named.
     """
 
-    __slots__ = ("_moment", "_verdicts", "column", "needs", "omitted", "policy")
+    __slots__ = ("_moment", "column", "kind", "omitted", "policy")
 
     def __init__(
         self, column: int, policy: str, moment: Moment, omitted: Mapping[str, int]
     ) -> None:
+        super().__init__()
+        self.kind = ""
         self.column = column
         self.policy = policy
-        self.needs = moment.demand.amounts
         self.omitted = omitted
         self._moment = moment
-        self._verdicts: tuple[Verdict, ...] | None = None
+
+    @property
+    def needs(self) -> Mapping[str, float]:
+        """Base units by resource."""
+        return self._moment.demand.amounts
 
     @property
     def verdicts(self) -> tuple[Verdict, ...]:
         """Of up to 16 hosts; the chosen one first."""
-        if self._verdicts is None:
-            scores = self._moment.scores()
-            self._verdicts = tuple(
-                _verdict(self._moment, scores, at, chosen=self.column >= 0 and at == 0)
-                for at in range(len(self._moment.names))
-            )
-        return self._verdicts
+        scores = self._moment.scores()
+        return tuple(
+            _verdict(self._moment, scores, at, chosen=self.column >= 0 and at == 0)
+            for at in range(len(self._moment.columns))
+        )
 
-    def to_json(self, kind: str) -> Mapping[str, Any]:
-        """As it stands in the event record; rendered when it is read."""
-        return Lazy(lambda: self._rendered(kind))
-
-    def _rendered(self, kind: str) -> Mapping[str, Any]:
+    def render(self) -> Mapping[str, Any]:
+        """As it stands in the event record."""
+        verdicts = self.verdicts
         return {
-            "kind": kind,
+            "kind": self.kind,
             "policy": self.policy,
-            "chosen": self.verdicts[0].host if self.column >= 0 else None,
+            "chosen": verdicts[0].host if self.column >= 0 else None,
             "need": dict(self.needs),
-            "hosts": [verdict.to_json() for verdict in self.verdicts],
+            "hosts": [verdict.to_json() for verdict in verdicts],
             "omitted": dict(self.omitted),
         }
 
@@ -140,38 +142,46 @@ def decide(ranking: Ranking, *, chosen: int | None = None) -> Decision:
     column = ranking.best() if chosen is None else chosen
     hosts = len(ranking.value)
     if hosts <= _NAMED_HOSTS:
-        return Decision(column, ranking.policy_name, _moment(ranking, column, range(hosts)), EMPTY)
+        moment = _moment(ranking, _first(column, range(hosts)))
+        return Decision(column, ranking.policy_name, moment, EMPTY)
     # Of many hosts only those that were nearly chosen are of interest, and time is short.
-    nearly = ranking.lowest(_RUNNERS_UP + 1) if column >= 0 else range(_NAMED_HOSTS)
-    moment = _moment(ranking, column, nearly[: _RUNNERS_UP + 1] if column >= 0 else nearly)
-    fitting = int((ranking.value < np.inf).sum())
-    named = int((moment.value < np.inf).sum())
+    nearly = ranking.lowest() if column >= 0 else range(_NAMED_HOSTS)
+    moment = _moment(ranking, _first(column, nearly))
+    named, fitting = len(moment.columns), int(np.count_nonzero(ranking.value < np.inf))
+    named_fitting = sum(value < np.inf for value in moment.value.tolist())
     omitted = {
-        "fits with a higher score": fitting - named,
-        "does not fit now": hosts - fitting - (len(moment.names) - named),
+        "fits with a higher score": fitting - named_fitting,
+        "does not fit now": hosts - fitting - (named - named_fitting),
     }
     return Decision(column, ranking.policy_name, moment, omitted)
 
 
+def _first(column: int, columns: Sequence[int]) -> list[int]:
+    """The columns, the chosen one first; one that is none of them takes the last one's place."""
+    if column < 0:
+        return list(columns)
+    others = [other for other in columns if other != column]
+    return [column, *(others[:-1] if len(others) == len(columns) else others)]
+
+
 def verdict_of(ranking: Ranking, column: int) -> Verdict:
     """What is found of one host."""
-    moment = _moment(ranking, -1, [column])
+    moment = _moment(ranking, [column])
     return _verdict(moment, moment.scores(), 0, chosen=False)
 
 
-def _moment(ranking: Ranking, first: int, columns: Sequence[int]) -> Moment:
-    at = [column for column in columns if column != first]
-    if first >= 0:
-        at.insert(0, first)
-    table, value = ranking.table, ranking.value[at]
-    closed = tuple(
-        "" if fits else _why_closed(table, ranking.demand, column)
-        for column, fits in zip(at, (value < np.inf).tolist(), strict=True)
-    )
+def _moment(ranking: Ranking, columns: list[int]) -> Moment:
+    table, at = ranking.table, np.array(columns, np.int64)
+    value = ranking.value[at]
+    closed: tuple[str, ...] = ()
+    if np.inf in value.tolist():
+        closed = tuple(
+            "" if ranking.fits(column) else _why_closed(table, ranking.demand, column)
+            for column in columns
+        )
     return Moment(
-        ranking.demand, ranking.policy, table.resources,
-        tuple([table.hosts[column].name for column in at]), closed, table.cells[:, :, at],
-        ranking.need[:, at], value, table.processes[at],
+        ranking.demand, ranking.policy, table, table.resources, at, closed,
+        table.cells[:, :, at], ranking.need[:, at], value, table.processes[at],
     )  # fmt: skip
 
 
@@ -195,7 +205,7 @@ def _exclusion(table: HostTable, demand: Demand, column: int) -> str:
 
 
 def _verdict(moment: Moment, scores: Scores | None, at: int, *, chosen: bool) -> Verdict:
-    name, value = moment.names[at], float(moment.value[at])
+    name, value = moment.table.hosts[moment.columns[at]].name, float(moment.value[at])
     if value < np.inf:
         score = value - TIE * float(moment.processes[at])
         return Verdict(name, "chosen" if chosen else "fits", score, _said(scores, at, veto=False))
