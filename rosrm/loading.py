@@ -12,8 +12,8 @@ import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import MISSING, dataclass, fields, is_dataclass
-from difflib import get_close_matches
-from importlib.metadata import EntryPoint, entry_points
+from functools import partial
+from pkgutil import resolve_name
 from types import SimpleNamespace
 from typing import Any, Final, TypeAlias
 
@@ -21,6 +21,7 @@ import pluggy
 
 from rosrm import hookspecs
 from rosrm.ports import CheckpointOffer, MigrationOffer, ProbeOffer, ScoringOffer
+from rosrm.spelling import get_close_matches
 
 Offer: TypeAlias = "ProbeOffer | ScoringOffer | MigrationOffer | CheckpointOffer"
 
@@ -53,6 +54,21 @@ class Source:
 
 
 @dataclass(frozen=True)
+class PluginAddress:
+    """Where an installed plugin is.
+
+    Attributes:
+        name: of its entry point.
+        target: "module" or "module:object".
+        distribution: name and version of the package that brings it.
+    """
+
+    name: str
+    target: str
+    distribution: str = ""
+
+
+@dataclass(frozen=True)
 class Offered:
     """One offer: its kind is "probe", "scoring", "migration" or "checkpoint"."""
 
@@ -79,12 +95,13 @@ class Loaded:
     broken: list[Broken]
 
 
-def load_installed(slow_after: float = SLOW_LOADING) -> Loaded:
-    """Load every plugin under the entry-point group."""
+def load_addresses(addresses: Iterable[PluginAddress], slow_after: float = SLOW_LOADING) -> Loaded:
+    """Load every plugin of an installation."""
     loaded = Loaded([], [])
-    for source, point in _installed():
+    for address in addresses:
+        source = Source(address.name, address.distribution)
         with _said_when_slow(source, slow_after):
-            _load(loaded, source, point.load)
+            _load(loaded, source, partial(resolve_name, address.target))
     return loaded
 
 
@@ -109,15 +126,6 @@ def definition(function: object) -> str:
         return f"{inspect.getsourcefile(target)}:{inspect.getsourcelines(target)[1]}"
     except (TypeError, OSError):
         return ""
-
-
-def _installed() -> Iterable[tuple[Source, EntryPoint]]:
-    """Each entry point once, in the order of names, even where a folder is twice on the path."""
-    found: dict[tuple[str, str], tuple[Source, EntryPoint]] = {}
-    for point in entry_points(group=hookspecs.GROUP):
-        distribution = f"{point.dist.name} {point.dist.version}" if point.dist else ""
-        found.setdefault((distribution, point.name), (Source(point.name, distribution), point))
-    return [found[key] for key in sorted(found)]
 
 
 @contextmanager

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Final
 from rosrm.config.settings import ClusterConfig, HostConfig
 from rosrm.core.views import HostRow, ProcessRow, Snapshot
 from rosrm.errors import RosrmError
+from rosrm.handover import arguments, hand_over
 from rosrm.ros.client import MasterClient
 from rosrm.ros.settings import RosSettings
 
@@ -108,13 +109,11 @@ class LocalCluster:
     def _start(self, name: str, module: str, settings: str) -> Part:
         self.directory.mkdir(parents=True, exist_ok=True)
         log = self.directory / f"{name}.log"
-        holder = os.memfd_create(f"rosrm-{name}")
+        holder = hand_over(settings)
         try:
-            os.write(holder, settings.encode())
-            os.lseek(holder, 0, os.SEEK_SET)
             with log.open("ab") as sink:
                 process = subprocess.Popen(
-                    [sys.executable, "-m", module, "--settings-fd", str(holder)],
+                    [sys.executable, "-m", module, *arguments(holder)],
                     pass_fds=[holder], stdin=subprocess.DEVNULL, stdout=sink, stderr=sink,
                     start_new_session=True,
                 )  # fmt: skip

@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from difflib import get_close_matches
 from typing import Any, Final, TypeVar, cast
 
 from rosrm.config.plain import from_plain
@@ -24,9 +23,10 @@ from rosrm.loading import (
     Loaded,
     Offer,
     Offered,
+    PluginAddress,
     definition,
     describe_fault,
-    load_installed,
+    load_addresses,
     load_objects,
 )
 from rosrm.ports import (
@@ -38,6 +38,7 @@ from rosrm.ports import (
     ProbeOffer,
     ScoringPolicy,
 )
+from rosrm.spelling import get_close_matches
 
 #: What the kinds of offers are called in messages.
 TITLES: Final[Mapping[str, str]] = {
@@ -96,12 +97,21 @@ class Registry:
 
     @classmethod
     def discover(cls, slow_after: float = SLOW_LOADING) -> Registry:
-        """Load the installed plugins; what is broken is kept with its reason, and raises nothing.
+        """Find and load the installed plugins.
+
+        What is broken is kept with its reason, and raises nothing.
 
         Args:
             slow_after: seconds after which a plugin that is still being loaded is logged by name.
         """
-        return cls(load_installed(slow_after))
+        from rosrm.installed import installed_plugins  # noqa: PLC0415 - not for the runtimes
+
+        return cls.load(installed_plugins(), slow_after)
+
+    @classmethod
+    def load(cls, addresses: Iterable[PluginAddress], slow_after: float = SLOW_LOADING) -> Registry:
+        """Load plugins that were found before; otherwise as `discover`."""
+        return cls(load_addresses(addresses, slow_after))
 
     @classmethod
     def of(cls, **plugins: object) -> Registry:

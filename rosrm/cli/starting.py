@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from rosrm.cli.options import Common, Domain
+from rosrm.handover import arguments, hand_over
 
 if TYPE_CHECKING:
     from rosrm.config.settings import ClusterConfig, HostConfig
@@ -73,14 +74,12 @@ def slave(
 
 def become(module: str, settings: str) -> None:
     """Put a runtime in this process's place."""
-    descriptor = os.memfd_create("rosrm-settings", 0)
-    os.write(descriptor, settings.encode())
-    os.lseek(descriptor, 0, os.SEEK_SET)
+    descriptor = hand_over(settings)
     sys.stdout.flush()
     sys.stderr.flush()
     interpreter = [sys.executable, *_without_this_folder()]
     os.execv(  # noqa: S606 - no shell is wanted
-        sys.executable, [*interpreter, "-m", module, "--settings-fd", str(descriptor)]
+        sys.executable, [*interpreter, "-m", module, *arguments(descriptor)]
     )
 
 

@@ -6,7 +6,6 @@ import json
 import types
 from collections.abc import Iterator, Mapping
 from dataclasses import fields, is_dataclass
-from difflib import get_close_matches
 from functools import cache
 from typing import (
     Annotated,
@@ -24,6 +23,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError, create_model
 
 from rosrm.config.documents import Node, Problems
 from rosrm.config.units import UnfitAmount
+from rosrm.spelling import get_close_matches
 
 T = TypeVar("T")
 

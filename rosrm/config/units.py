@@ -17,8 +17,9 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from difflib import get_close_matches
 from typing import Annotated, Any, Final
+
+from rosrm.spelling import get_close_matches
 
 _SIZES: Final = {
     "B": 1.0,

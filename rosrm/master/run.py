@@ -10,13 +10,12 @@ import signal
 
 signal.signal(signal.SIGINT, signal.SIG_DFL)
 
-import argparse
 import logging
-import os
 import sys
 
 from rosrm.config.settings import ClusterConfig
 from rosrm.errors import RosrmError
+from rosrm.handover import take_over
 from rosrm.master.policy_guard import GuardedPolicy
 from rosrm.master.runtime import MasterRuntime
 from rosrm.registry import Registry
@@ -24,26 +23,20 @@ from rosrm.registry import Registry
 
 def main() -> int:
     """Read the settings from an inherited file descriptor and serve; returns the exit code."""
-    parser = argparse.ArgumentParser(prog="rosrm master")
-    parser.add_argument(
-        "--settings-fd", type=int, required=True, help="holds ClusterConfig as JSON"
-    )
-    arguments = parser.parse_args()
+    handover = take_over(sys.argv[1:])
     logging.basicConfig(
         level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(name)s: %(message)s",
         datefmt="%H:%M:%S",
     )  # fmt: skip
-    with os.fdopen(arguments.settings_fd) as settings:
-        config = ClusterConfig.from_json(settings.read())
+    config = ClusterConfig.from_json(handover.settings)
     try:
-        return _serve(config)
+        return _serve(config, Registry.load(handover.plugins))
     except RosrmError as error:
         sys.stderr.write(f"rosrm master: {error}\n")
         return error.exit_code
 
 
-def _serve(config: ClusterConfig) -> int:
-    registry = Registry.discover()
+def _serve(config: ClusterConfig, registry: Registry) -> int:
     name = config.scoring.policy or "weighted"
     policy = GuardedPolicy(name, registry.scoring(name, config.scoring.options))
     strategies = registry.migrations(config.migration.strategies)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
 import re
+import zlib
 from dataclasses import dataclass
 from typing import Final
 
@@ -13,14 +13,14 @@ _LONGEST: Final = 64
 
 
 def token(name: str) -> str:
-    """A host's name as one token of a ROS name ("robot-1" -> "robot_1_8e1a36f3").
+    """A host's name as one token of a ROS name ("robot-1" -> "robot_1_bd82fad2").
 
     Different names stay different, by a digest where one must be changed: in DDS all servers of a
     name execute a request, so that robot-1 would do what robot_1 is told.
     """
     if _FIT.fullmatch(name) and len(name) <= _LONGEST:
         return name
-    digest = hashlib.sha256(name.encode("utf-8", "surrogatepass")).hexdigest()[:8]
+    digest = f"{zlib.crc32(name.encode('utf-8', 'surrogatepass')):08x}"
     fit = _UNFIT.sub("_", name)[:_LONGEST].strip("_")
     return f"{fit}_{digest}" if fit[:1].isalpha() else f"host_{fit}_{digest}".replace("__", "_")
 

@@ -7,12 +7,12 @@ set none at all (their packages lie in the prefix of their Python).
 
 from __future__ import annotations
 
-import difflib
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from rosrm.errors import LaunchError
+from rosrm.spelling import get_close_matches
 
 _PACKAGES = "share/ament_index/resource_index/packages"
 
@@ -67,5 +67,5 @@ def _near(name: str, known: Sequence[str]) -> str:
     """What the user may have meant; "" where nothing is known."""
     if not known:
         return ""
-    close = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
+    close = get_close_matches(name, known, n=3, cutoff=0.5)
     return f"; did you mean {', '.join(close)}?" if close else f"; it has {', '.join(known[:5])}"

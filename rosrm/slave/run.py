@@ -10,37 +10,33 @@ import signal
 
 signal.signal(signal.SIGINT, signal.SIG_DFL)
 
-import argparse
 import logging
-import os
 import sys
 
 from rosrm.config.settings import HostConfig
 from rosrm.errors import RosrmError
+from rosrm.handover import take_over
 from rosrm.registry import Registry
 from rosrm.slave.runtime import SlaveRuntime
 
 
 def main() -> int:
     """Read the settings from an inherited file descriptor and serve; returns the exit code."""
-    parser = argparse.ArgumentParser(prog="rosrm slave")
-    parser.add_argument("--settings-fd", type=int, required=True, help="holds HostConfig as JSON")
-    arguments = parser.parse_args()
+    handover = take_over(sys.argv[1:])
     logging.basicConfig(
         level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(name)s: %(message)s",
         datefmt="%H:%M:%S",
     )  # fmt: skip
-    with os.fdopen(arguments.settings_fd) as settings:
-        config = HostConfig.from_json(settings.read())
+    config = HostConfig.from_json(handover.settings)
     try:
-        return _serve(config)
+        return _serve(config, Registry.load(handover.plugins))
     except RosrmError as error:
         sys.stderr.write(f"rosrm slave: {error}\n")
         return error.exit_code
 
 
-def _serve(config: HostConfig) -> int:
-    return SlaveRuntime(config, Registry.discover()).run()
+def _serve(config: HostConfig, registry: Registry) -> int:
+    return SlaveRuntime(config, registry).run()
 
 
 if __name__ == "__main__":

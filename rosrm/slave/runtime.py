@@ -39,8 +39,13 @@ from rosrm.ros.slave_endpoint import Link, LogSlice, SlaveEndpoint, result_json
 from rosrm.slave.launch import launch_order
 from rosrm.slave.log_reading import newest_instance, read_log
 from rosrm.slave.sampling import Sampler
-from rosrm.slave.sessions import SessionTable
-from rosrm.supervisor.client import LogLimits, SupervisorClient, SupervisorEnded
+from rosrm.slave.sessions import SessionTable, SessionUsage
+from rosrm.supervisor.client import (
+    LogLimits,
+    SupervisorClient,
+    SupervisorEnded,
+    SupervisorGone,
+)
 from rosrm.version import __version__
 
 _log = logging.getLogger("rosrm.slave")
@@ -53,7 +58,12 @@ _USAGE_PERIOD: Final = 1.0
 _PATIENCE_TOLD: Final = 10.0
 #: Seconds beyond the processes' own grace that a stop may take before it is said.
 _STOP_MARGIN: Final = 5.0
+#: Age of a request that is still meant, seconds; at slow rates so many of our own beats.
 _MAX_AGE: Final = 5.0
+_BEATS_MISSED: Final = 3
+#: Readings that go out between looking at what each instance uses and saying it: so the master
+#: never takes a need for met that does not show in the readings which it has.
+_READINGS_FIRST: Final = 3
 
 Executor = Callable[[Mapping[str, Any]], Mapping[str, Any]]
 
@@ -74,6 +84,7 @@ class SlaveRuntime:
         self._config = config
         self._stopping = ""
         self._left = False
+        self._shutting_down = False
         self._accepting = False
         self._state = core.SlaveState()
         self._events: deque[core.Event] = deque()
@@ -81,6 +92,8 @@ class SlaveRuntime:
         self._graph_before: dict[InstanceId, frozenset[bytes]] = {}
         self._executors: Mapping[str, Executor] = registry.executors()
         self._leaders: dict[InstanceId, int] = {}
+        self._seen: Mapping[int, SessionUsage] = {}
+        self._say_usage_in = 0
         self._supervisor_state = config.state / "supervisor"
         self._closing = contextlib.ExitStack()
         with contextlib.ExitStack() as opened:
@@ -91,21 +104,28 @@ class SlaveRuntime:
             self._sampler = Sampler(probes.made)
             opened.callback(self._sampler.close)
             self._sampler.first()
-            self._supervisor = SupervisorClient.connect(
-                self._supervisor_state,
-                log=LogLimits(config.logs.max_bytes, config.logs.keep),
-            )
-            opened.callback(self._supervisor.close)
+            # From here on Ctrl-C ends what was begun in good order; before, it ends us at once.
+            for number in (signal.SIGINT, signal.SIGTERM):
+                signal.signal(number, self._stop)
+            self._supervisor = self._connect()
+            opened.callback(lambda: self._supervisor.close())
             self._participant = Participant(config.ros, f"rosrm_slave_{token(config.host)}")
             opened.callback(self._participant.close)
             self._graph = GraphWatch(self._participant.node)
             self._limit = self._limits()
             self._environment = {**os.environ, **config.ros.environment()}
             self._endpoint = SlaveEndpoint(
-                self._participant, self, self._description(probes.absent), _MAX_AGE
+                self._participant, self, self._description(probes.absent),
+                max(_MAX_AGE, _BEATS_MISSED * config.period),
             )
             self._closing = opened.pop_all()
         self._adopt()
+
+    def _connect(self) -> SupervisorClient:
+        logs = self._config.logs
+        return SupervisorClient.connect(
+            self._supervisor_state, log=LogLimits(logs.max_bytes, logs.keep)
+        )
 
     def _limits(self) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
         limit = np.ones(RESOURCE_SLOTS, np.float32)
@@ -124,21 +144,16 @@ class SlaveRuntime:
 
     def _adopt(self) -> None:
         """Take over what a former run of this slave left with the supervisor."""
-        for note in self._supervisor.notes:
-            self.say(note)
         if self._supervisor.instances:
             self.say(f"{len(self._supervisor.instances)} processes were found with the supervisor")
-            self._take_statuses(self._supervisor.instances)
-            self._work(time.monotonic())
+        self._take_over()
+        self._work(time.monotonic())
 
     # --- the loop ------------------------------------------------------------------------
 
     def run(self) -> int:
         """Serve until SIGINT or SIGTERM; returns the exit code."""
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._stop)
-        reader = threading.Thread(target=self._read_supervisor, name="supervisor", daemon=True)
-        reader.start()
+        self._listen()
         with self._closing:
             self._serve(lambda: not self._stopping and not self._endpoint.failure)
             return self._end()
@@ -153,7 +168,7 @@ class SlaveRuntime:
                 self._cycle(now)
             if now >= next_usage:
                 next_usage = now + _USAGE_PERIOD
-                self._report_usage(now)
+                self._look_at_usage(now)
             awaited = self._state.awaited_in_graph()
             if awaited and now >= next_graph:
                 next_graph = now + _LOOK_AT_GRAPH
@@ -185,18 +200,27 @@ class SlaveRuntime:
             sample.usage, self._limit, present, sample.stale, accepting=self._accepting,
             processes=self._state.live(),
         )  # fmt: skip
+        self._say_usage()
         self.take(core.TimePassed())
 
-    def _report_usage(self, now: float) -> None:
-        if not self._leaders:
+    def _look_at_usage(self, now: float) -> None:
+        """What each instance uses; it is said when enough readings have gone out."""
+        if not self._leaders or self._seen:
             return
         self._sessions.refresh(now)
         usage = self._sessions.usage()
-        known = {one.number: usage[pid] for one, pid in self._leaders.items() if pid in usage}
+        self._seen = {one.number: usage[pid] for one, pid in self._leaders.items() if pid in usage}
+        self._say_usage_in = _READINGS_FIRST
+
+    def _say_usage(self) -> None:
+        self._say_usage_in -= 1
+        if not self._seen or self._say_usage_in > 0:
+            return
+        seen, self._seen = self._seen, {}
         self._endpoint.publish_usage(
-            list(known),
-            [used.cpu for used in known.values()],
-            [used.memory for used in known.values()],
+            list(seen),
+            [used.cpu for used in seen.values()],
+            [used.memory for used in seen.values()],
         )
 
     def _look_at_graph(self, awaited: Mapping[InstanceId, core.Held]) -> None:
@@ -223,7 +247,9 @@ class SlaveRuntime:
                 if isinstance(command, core.Report) and not command.complete:
                     reported += command.statuses
                 else:
-                    self._carry_out(command)
+                    # One that was killed takes no order; its reader says so, and it is replaced.
+                    with contextlib.suppress(SupervisorGone):
+                        self._carry_out(command)
             if reported:
                 self._endpoint.publish_statuses(reported, complete=False)
 
@@ -258,15 +284,16 @@ class SlaveRuntime:
         if orders:
             self._supervisor.start(orders)
 
+    def _listen(self) -> None:
+        threading.Thread(target=self._read_supervisor, name="supervisor", daemon=True).start()
+
     def _read_supervisor(self) -> None:
         """Runs in a thread of its own: the supervisor's words, into the loop."""
         while True:
             try:
                 statuses = self._supervisor.receive(None)
             except SupervisorError as error:
-                ended = isinstance(error, SupervisorEnded)
-                reason = "" if ended else str(error)
-                self._from_threads.append(partial(self._supervisor_gone, reason))
+                self._from_threads.append(partial(self._supervisor_gone, error))
                 self._wake()
                 return
             self._from_threads.append(partial(self._take_statuses, statuses))
@@ -277,10 +304,30 @@ class SlaveRuntime:
         with contextlib.suppress(Exception):
             self._participant.wake()
 
-    def _supervisor_gone(self, reason: str) -> None:
+    def _supervisor_gone(self, error: SupervisorError) -> None:
+        """It has ended as it was told to; or it was killed, and another one takes over."""
+        if isinstance(error, SupervisorGone) and not self._shutting_down:
+            self.say(f"{error}; starting another one")
+            try:
+                self._supervisor.close()
+                self._supervisor = self._connect()
+            except SupervisorError as failure:
+                error = failure
+            else:
+                self._listen()
+                self._take_over()
+                return
         self._left = True
-        if reason:
-            self._endpoint.failure = f"the supervisor of this host is gone: {reason}"
+        if not isinstance(error, SupervisorEnded):
+            self._endpoint.failure = f"the supervisor of this host is gone: {error}"
+
+    def _take_over(self) -> None:
+        """Take over what the supervisor knows; what it does not know does not run."""
+        for note in self._supervisor.notes:
+            self.say(note)
+        for status in self._supervisor.instances:
+            self._follow_session(status)
+        self.take(core.SupervisorReplaced(tuple(self._supervisor.instances)))
 
     def _take_statuses(self, statuses: Sequence[InstanceStatus]) -> None:
         for status in statuses:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import os
 import select
 import socket
@@ -237,8 +235,7 @@ class SupervisorClient:
     def _choose_base(self, environment: Mapping[str, str]) -> None:
         """Environments differ little: send one whole, and of the others what differs from it."""
         self._base = dict(environment)
-        text = json.dumps(self._base, sort_keys=True).encode()
-        self._base_id = hashlib.sha256(text).hexdigest()[:16]
+        self._base_id = os.urandom(8).hex()
         self._send(protocol.encode_order(protocol.Environment(self._base_id, self._base)))
 
     def _order(self, order: protocol.Order) -> None:
