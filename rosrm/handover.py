@@ -13,9 +13,22 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from rosrm.loading import PluginAddress
-
 _OPTION: Final = "--settings-fd"
+
+
+@dataclass(frozen=True, slots=True)
+class PluginAddress:
+    """Where an installed plugin is.
+
+    Attributes:
+        name: of its entry point.
+        target: "module" or "module:object".
+        distribution: name and version of the package that brings it.
+    """
+
+    name: str
+    target: str
+    distribution: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib.metadata import entry_points
 
 from rosrm import hookspecs
-from rosrm.loading import PluginAddress
+from rosrm.handover import PluginAddress
 
 
 def installed_plugins() -> list[PluginAddress]:

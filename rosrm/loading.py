@@ -20,6 +20,7 @@ from typing import Any, Final, TypeAlias
 import pluggy
 
 from rosrm import hookspecs
+from rosrm.handover import PluginAddress
 from rosrm.ports import CheckpointOffer, MigrationOffer, ProbeOffer, ScoringOffer
 from rosrm.spelling import get_close_matches
 
@@ -51,21 +52,6 @@ class Source:
 
     def __str__(self) -> str:
         return f"plugin {self.plugin!r}" + (f" of {self.distribution}" if self.distribution else "")
-
-
-@dataclass(frozen=True)
-class PluginAddress:
-    """Where an installed plugin is.
-
-    Attributes:
-        name: of its entry point.
-        target: "module" or "module:object".
-        distribution: name and version of the package that brings it.
-    """
-
-    name: str
-    target: str
-    distribution: str = ""
 
 
 @dataclass(frozen=True)

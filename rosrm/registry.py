@@ -16,6 +16,7 @@ from rosrm.config.plain import from_plain
 from rosrm.core.model import EMPTY, RESOURCE_SLOTS, ResourceDescription
 from rosrm.core.views import PluginRow
 from rosrm.errors import ConfigError, PluginError, SkipPlugin
+from rosrm.handover import PluginAddress
 from rosrm.loading import (
     FAULTS,
     SLOW_LOADING,
@@ -23,7 +24,6 @@ from rosrm.loading import (
     Loaded,
     Offer,
     Offered,
-    PluginAddress,
     definition,
     describe_fault,
     load_addresses,
