@@ -9,7 +9,9 @@ import pytest
 
 from rosrm.cli import starting
 from rosrm.config import ClusterConfig, HostConfig
+from rosrm.handover import take_over
 from rosrm.hookspecs import hookimpl
+from rosrm.installed import installed_plugins
 from rosrm.ports import MigrationOffer, ProbeOffer, ScoringOffer
 from rosrm.registry import Registry
 
@@ -87,17 +89,17 @@ def test_a_wrong_file_or_unknown_plugin_starts_nothing(rosrm, becomes, tmp_path)
     assert becomes == []
 
 
-def test_the_runtime_inherits_the_settings_in_a_file(monkeypatch):
+def test_the_runtime_inherits_the_settings_and_where_the_plugins_are(monkeypatch):
+    """What the runtime begins with is on a descriptor that outlives the exec."""
     seen = {}
 
     def execv(program, words):
-        descriptor = int(words[-1])
         seen["words"] = words
-        seen["inherited"] = os.get_inheritable(descriptor)
-        seen["text"] = os.read(descriptor, 10_000).decode()
-        os.close(descriptor)
+        seen["inherited"] = os.get_inheritable(int(words[-1]))
+        seen["handover"] = take_over(words[-2:])
 
     monkeypatch.setattr(os, "execv", execv)
     starting.become("rosrm.slave.run", '{"host": "h"}')
     assert seen["words"][-4:-1] == ["-m", "rosrm.slave.run", "--settings-fd"]
-    assert (seen["inherited"], seen["text"]) == (True, '{"host": "h"}')
+    assert (seen["inherited"], seen["handover"].settings) == (True, '{"host": "h"}')
+    assert list(seen["handover"].plugins) == installed_plugins()
