@@ -272,7 +272,6 @@ def test_dead_numbers_are_bounded():
 
 # --- what holds in every order of events ------------------------------------------------------
 
-KEYS = st.sampled_from([("a", 1), ("a", 2), ("b", 3)])
 POLICIES = st.builds(
     sv.RestartRule,
     st.sampled_from(["never", "on-failure", "always"]),
@@ -295,12 +294,15 @@ class Host(RuleBasedStateMachine):
         super().__init__()
         self.core = sv.Supervision()
         self.now = 0.0
+        self.newest = 0
         self.queue: list[sv.Key] = []
+        self.in_hand: list[sv.Key] = []
         self.leaders: set[sv.Key] = set()
         self.strays: set[sv.Key] = set()
         self.killed: set[sv.Key] = set()
         self.final: dict[sv.Key, protocol.Status] = {}
         self.policy_restarts: dict[sv.Key, list[float]] = {}
+        self.stopped: set[sv.Key] = set()
         self.left = False
 
     def happens(self, event):
@@ -310,22 +312,24 @@ class Host(RuleBasedStateMachine):
 
     def carry_out(self, command, event, before):
         if isinstance(command, sv.Leave):
-            assert not self.leaders, "it leaves while something runs"
-            assert not self.strays, "it leaves while something is left over"
+            for key in self.leaders | self.strays:
+                kills = self.core.instances[key].kills
+                assert kills > sv.MOST_KILLS, f"it leaves while {key} is alive"
             self.left = True
             return
         key = command.instance
         if isinstance(command, sv.Spawn):
             assert key not in self.leaders | self.strays, "started twice"
-            assert key not in self.queue, "ordered twice"
+            assert key not in self.queue + self.in_hand, "ordered twice"
             assert key not in self.final, "started after its end"
+            assert key not in self.stopped, "started after the user's stop"
             self.queue.append(key)
             if isinstance(event, sv.TimePassed) and before[key] == sv.BACKOFF:
                 self.policy_restarts.setdefault(key, []).append(self.now)
         elif isinstance(command, sv.Unspawn):
-            assert key in self.queue
-            self.queue.remove(key)
-            self.happens(sv.SpawnFailed(key, ""))
+            if key in self.queue:
+                self.queue.remove(key)
+                self.happens(sv.SpawnFailed(key, ""))
         elif isinstance(command, sv.Signal):
             assert key in self.leaders | self.strays, "a signal after the end"
             if command.number == signal.SIGKILL:
@@ -343,46 +347,44 @@ class Host(RuleBasedStateMachine):
         elif status.state in sv.ENDED:
             self.final[key] = status
 
-    @rule(key=KEYS, restart=POLICIES, stop=GRACES)
-    def start(self, key, restart, stop):
-        self.happens(sv.StartOrdered(key, restart, stop))
+    @precondition(lambda self: sum(not i.ended for i in self.core.instances.values()) < 2)
+    @rule(restart=POLICIES, stop=GRACES)
+    def start(self, restart, stop):
+        self.newest += 1
+        self.happens(sv.StartOrdered(("a", self.newest), restart, stop))
 
-    @rule(key=KEYS)
-    def stop(self, key):
-        self.happens(sv.StopOrdered(key))
-
-    @rule(key=KEYS)
-    def restart(self, key):
-        self.policy_restarts.pop(key, None)
-        self.happens(sv.RestartOrdered(key))
-
-    @rule(key=KEYS)
-    def forget(self, key):
-        self.happens(sv.Forgotten(key))
-
-    @rule()
-    def client_dies(self):
-        self.happens(sv.ClientLost())
-
-    @rule()
-    def shut_down(self):
-        self.happens(sv.ShutdownOrdered())
+    @precondition(lambda self: self.core.instances)
+    @rule(data=st.data(), kind=st.sampled_from(["stop", "stop", "restart", "start", "forget"]))
+    def order(self, data, kind):
+        """About one that is known, or now and then one that is not (any more)."""
+        known = [number for _, number in self.core.instances]
+        key = ("a", data.draw(st.sampled_from([*known, *known, *known, 0, self.newest])))
+        if kind == "stop":
+            self.stopped.add(key)
+            self.happens(sv.StopOrdered(key))
+        elif kind == "restart":
+            self.policy_restarts.pop(key, None)
+            self.happens(sv.RestartOrdered(key))
+        elif kind == "forget":
+            self.happens(sv.Forgotten(key))
+        else:
+            self.happens(sv.StartOrdered(key, sv.RestartRule("always"), sv.StopRule()))
 
     @precondition(lambda self: self.queue)
-    @rule(data=st.data())
-    def spawn_succeeds(self, data):
-        key = data.draw(st.sampled_from(self.queue))
-        self.queue.remove(key)
-        self.leaders.add(key)
-        self.killed.discard(key)
-        self.happens(sv.Spawned(key, 100))
+    @rule()
+    def spawn_begins(self):
+        self.in_hand.append(self.queue.pop(0))
 
-    @precondition(lambda self: self.queue)
-    @rule(data=st.data(), transient=st.booleans())
-    def spawn_fails(self, data, transient):
-        key = data.draw(st.sampled_from(self.queue))
-        self.queue.remove(key)
-        self.happens(sv.SpawnFailed(key, "no memory", transient))
+    @precondition(lambda self: self.in_hand)
+    @rule(fails=st.sampled_from([None, None, None, False, True]))
+    def spawn_is_done(self, fails):
+        key = self.in_hand.pop(0)
+        if fails is None:
+            self.leaders.add(key)
+            self.killed.discard(key)
+            self.happens(sv.Spawned(key, 100))
+        else:
+            self.happens(sv.SpawnFailed(key, "no memory", transient=fails))
 
     @precondition(lambda self: self.leaders)
     @rule(data=st.data(), code=st.sampled_from([0, 1]), leaves=st.booleans())
@@ -400,7 +402,8 @@ class Host(RuleBasedStateMachine):
         self.strays.discard(key)
         self.happens(sv.Cleared(key))
 
-    @rule(seconds=st.sampled_from([0.0, 0.5, 1.0, 6.0, 60.0]))
+    @precondition(lambda self: self.core.deadline() is not None)
+    @rule(seconds=st.sampled_from([0.0, 0.5, 1.0, 1.0, 6.0, 60.0]))
     def time_passes(self, seconds):
         self.now += seconds
         self.happens(sv.TimePassed())
@@ -411,11 +414,18 @@ class Host(RuleBasedStateMachine):
             alive = key in self.leaders or key in self.strays
             assert alive == (instance.phase in (sv.RUNNING, sv.STOPPING)), key
             assert (key in self.leaders) == (instance.pid > 0), key
-            assert (key in self.queue) == (instance.phase == sv.STARTING), key
+            waits_for_spawn = key in self.queue or key in self.in_hand
+            assert waits_for_spawn == (instance.phase == sv.STARTING), key
             assert instance.ended == (key in self.final), key
             waits = instance.phase in (sv.STOPPING, sv.BACKOFF)
             assert (instance.deadline is not None) == waits, key
-        assert self.leaders | self.strays | set(self.queue) <= set(self.core.instances)
+        unknown = {*self.leaders, *self.strays, *self.queue, *self.in_hand} - {*self.core.instances}
+        assert not unknown
+
+    @invariant()
+    def what_was_stopped_is_on_its_way_out(self):
+        for key in self.stopped & set(self.core.instances):
+            assert self.core.instances[key].phase not in (sv.RUNNING, sv.BACKOFF), key
 
     @invariant()
     def restarts_stay_within_the_policy(self):
@@ -427,12 +437,12 @@ class Host(RuleBasedStateMachine):
 
     def teardown(self):
         """From wherever it stands, a shutdown ends: what gets SIGKILL dies, in bounded time."""
-        self.shut_down()
+        self.happens(sv.ShutdownOrdered())
         for _ in range(100):
             if self.left:
                 break
-            for key in list(self.queue):
-                self.queue.remove(key)
+            for key in list(self.in_hand):
+                self.in_hand.remove(key)
                 self.happens(sv.SpawnFailed(key, "no memory", transient=True))
             for key in sorted(self.leaders & self.killed):
                 self.leaders.discard(key)
@@ -445,5 +455,5 @@ class Host(RuleBasedStateMachine):
         assert self.left
 
 
-Host.TestCase.settings = settings(max_examples=150, stateful_step_count=40, deadline=None)
+Host.TestCase.settings = settings(max_examples=300, stateful_step_count=50, deadline=None)
 TestHost = Host.TestCase
