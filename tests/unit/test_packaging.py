@@ -1,0 +1,95 @@
+"""What is installed is pinned, and what is pinned is allowed."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+from packaging.version import Version
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+ROOT = Path(__file__).resolve().parents[2]
+PROJECTS = [
+    path.relative_to(ROOT)
+    for folder in (".", "rosrm_msgs", "examples", "plugins/*")
+    for path in sorted(ROOT.glob(f"{folder}/pyproject.toml"))
+]
+PYTHONS = ("3.10", "3.11", "3.12", "3.13")
+
+
+def read(project: Path) -> dict[str, Any]:
+    return tomllib.loads((ROOT / project).read_text())
+
+
+def requirements(project: Path) -> Iterator[Requirement]:
+    settings = read(project)
+    lines = [
+        *settings["build-system"]["requires"],
+        *settings["project"].get("dependencies", ()),
+        *(
+            r
+            for extra in settings["project"].get("optional-dependencies", {}).values()
+            for r in extra
+        ),
+    ]
+    yield from map(Requirement, lines)
+
+
+def pins(python: str) -> dict[str, Version]:
+    """The exact version of each constrained package on one Python."""
+    environment = {"python_version": python, "python_full_version": f"{python}.0"}
+    found: dict[str, Version] = {}
+    for line in (ROOT / "constraints.txt").read_text().splitlines():
+        text = line.partition("#")[0].strip()
+        if not text:
+            continue
+        requirement = Requirement(text)
+        if requirement.marker and not requirement.marker.evaluate(environment):
+            continue
+        (specifier,) = requirement.specifier
+        assert specifier.operator == "==", line
+        assert found.setdefault(canonicalize_name(requirement.name), Version(specifier.version))
+    return found
+
+
+OWN = {canonicalize_name(read(project)["project"]["name"]) for project in PROJECTS}
+
+
+def test_every_distribution_is_looked_at() -> None:
+    assert {
+        "rosrm",
+        "rosrm-examples",
+        "rosrm-migration",
+        "rosrm-msgs",
+        "rosrm-resources",
+        "rosrm-scoring",
+    } <= OWN
+
+
+@pytest.mark.parametrize("python", PYTHONS)
+@pytest.mark.parametrize("project", PROJECTS, ids=str)
+def test_every_requirement_has_an_exact_version_that_it_allows(project: Path, python: str) -> None:
+    exact = pins(python)
+
+    for requirement in requirements(project):
+        name = canonicalize_name(requirement.name)
+        if name not in OWN:
+            assert name in exact, f"{requirement} is not in constraints.txt"
+            assert exact[name] in requirement.specifier, f"{requirement}: {exact[name]}"
+
+
+@pytest.mark.parametrize("project", PROJECTS, ids=str)
+def test_every_distribution_runs_on_the_same_pythons_under_the_same_licence(project: Path) -> None:
+    settings = read(project)["project"]
+
+    assert settings["requires-python"] == ">=3.10"
+    assert settings["license"] == "Apache-2.0"
