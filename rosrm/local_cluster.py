@@ -35,15 +35,22 @@ _DOMAINS: Final = range(1, 101)
 _LOOK: Final = 0.02
 
 
-def free_domain() -> int:
-    """A ROS domain in which nobody on this machine listens now."""
+def claim_domain() -> tuple[int, socket.socket]:
+    """A ROS domain in which nobody on this machine listens, and the claim to it.
+
+    Until DDS binds its ports nothing shows that a domain is taken: who was given it holds a name
+    among the machine's abstract sockets, which frees itself when the claim is closed or we die.
+    """
     for domain in sorted(_DOMAINS, key=lambda number: (number * 37 + os.getpid()) % 101):
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            try:
+        claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        try:
+            claim.bind(f"\0rosrm-domain-{domain}")
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
                 probe.bind(("127.0.0.1", 7410 + 250 * domain))
-            except OSError:
-                continue
-            return domain
+        except OSError:
+            claim.close()
+            continue
+        return domain, claim
     raise RosrmError("every ROS domain from 1 to 100 is in use on this machine")
 
 
@@ -83,11 +90,12 @@ class LocalCluster:
     master: Part | None = None
     slaves: dict[str, Part] = field(default_factory=dict)
     _client: MasterClient | None = None
+    _claim: socket.socket | None = None
 
     def __post_init__(self) -> None:
         """Choose the domain."""
         if self.domain is None:
-            self.domain = free_domain()
+            self.domain, self._claim = claim_domain()
         self.ros = RosSettings(domain=self.domain, discovery_range="localhost")
 
     # --- parts ---------------------------------------------------------------------------
@@ -197,6 +205,9 @@ class LocalCluster:
         _end_all(list(self.slaves.values()))
         if self.master is not None:
             _end_all([self.master])
+        if self._claim is not None:
+            self._claim.close()
+            self._claim = None
 
     def __exit__(
         self,

@@ -10,6 +10,7 @@ StopOrdered             has it stopped; one never heard of will never be started
 RestartOrdered          has it stopped and started again here
 ReportRequested         reports everything
 SupervisorReported      follows the instance; a new run must become ready anew
+SupervisorReplaced      the same; what the new one does not know is gone; reports everything
 SeenInGraph             the instance is ready
 TimePassed              an instance that is not ready in time is stopped; old ends are forgotten
 ======================  =========================================================================
@@ -86,6 +87,13 @@ class ReportRequested:
 @dataclass(frozen=True, slots=True)
 class SupervisorReported:
     """The supervisor says what became of instances."""
+
+    statuses: tuple[InstanceStatus, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class SupervisorReplaced:
+    """Another supervisor took over; `statuses`: all that it knows."""
 
     statuses: tuple[InstanceStatus, ...]
 
@@ -314,6 +322,17 @@ def _supervisor_reported(state: SlaveState, event: SupervisorReported, now: floa
     return [Report(tuple(changed))] if changed else []
 
 
+def _supervisor_replaced(state: SlaveState, event: SupervisorReplaced, now: float) -> _Commands:
+    known = {status.instance for status in event.statuses}
+    for instance, held in list(state.held.items()):
+        if instance not in known and not held.status.state.ended:
+            del state.held[instance]
+            _bury(state, instance)
+    for status in event.statuses:
+        _follow(state, status, now)
+    return [Report(state.statuses(), complete=True)]
+
+
 def _follow(state: SlaveState, reported: InstanceStatus, now: float) -> InstanceStatus | None:
     """Take over what the supervisor says; None: that is known."""
     held = state.held.get(reported.instance)
@@ -389,6 +408,7 @@ HANDLERS: Final[Mapping[type, _Handler]] = MappingProxyType(
         RestartOrdered: _restart_ordered,
         ReportRequested: _report_requested,
         SupervisorReported: _supervisor_reported,
+        SupervisorReplaced: _supervisor_replaced,
         SeenInGraph: _seen,
         TimePassed: _time_passed,
     }
@@ -402,6 +422,7 @@ Event = (
     | RestartOrdered
     | ReportRequested
     | SupervisorReported
+    | SupervisorReplaced
     | SeenInGraph
     | TimePassed
 )

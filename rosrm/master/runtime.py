@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import json
 import logging
 import os
 import signal
 import socket
 import time
-from collections.abc import Iterator, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any, Final
 
 from rosrm.config.settings import ClusterConfig
@@ -27,6 +25,7 @@ from rosrm.ports import Intent, MigrationStrategy, Record, ScoringPolicy, Stored
 from rosrm.ros.client import find_master
 from rosrm.ros.master_endpoint import Identity, MasterEndpoint
 from rosrm.ros.participant import Participant
+from rosrm.state_directory import only_one
 
 _log = logging.getLogger("rosrm.master")
 
@@ -35,6 +34,8 @@ _TICK: Final = 0.02
 #: Seconds in which a master that runs already would be discovered.
 _DISCOVERY: Final = 1.0
 _DEFAULT_EVENTS: Final = 1000
+#: Seconds within which two masters came up at once.
+_AT_ONCE: Final = 1.0
 
 
 def monotonic_ns() -> int:
@@ -69,12 +70,17 @@ class MasterRuntime:
         self._stopping = ""
         self._closing = contextlib.ExitStack()
         with contextlib.ExitStack() as opened:
-            opened.enter_context(_only_one(config.state))
+            opened.enter_context(
+                only_one(config.state, "master", code="second_master", remedy="another `state:`")
+            )
             self._journal = SqliteJournal(
                 config.state / "journal.sqlite",
                 sync=config.journal.sync, keep_events=config.journal.keep_events,
             )  # fmt: skip
             opened.callback(self._journal.close)
+            # From here on Ctrl-C ends what was begun in good order; before, it ends us at once.
+            for number in (signal.SIGINT, signal.SIGTERM):
+                signal.signal(number, self._stop)
             self._participant = Participant(config.ros, "rosrm_master")
             opened.callback(self._participant.close)
             self._refuse_second()
@@ -126,8 +132,6 @@ class MasterRuntime:
 
     def run(self) -> int:
         """Serve until SIGINT or SIGTERM; returns the exit code."""
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._stop)
         next_tick = next_beat = self._now()
         with self._closing:
             while not self._stopping:
@@ -156,8 +160,14 @@ class MasterRuntime:
             self._judge_rival(rival, now)
 
     def _judge_rival(self, rival: Any, now: float) -> None:
-        """Two masters that came up at once: the younger gives way."""
-        if rival.uptime <= now - self._started:
+        """Two masters that came up unseen: the younger gives way.
+
+        Of two that came up at once both may think so, or neither: then a number decides.
+        """
+        older_by = now - self._started - rival.uptime
+        if abs(older_by) < _AT_ONCE:
+            older_by = self._endpoint.incarnation - rival.incarnation
+        if older_by > 0:
             return
         reason = (
             f"refused: a master runs already: {rival.name!r}, pid {rival.pid} on {rival.hostname}"
@@ -265,23 +275,3 @@ def _event_row(stored: StoredRecord) -> EventRow:
         stored.sequence, stored.wall_time, stored.elapsed, record.kind, record.process,
         record.host, record.message, record.facts,
     )  # fmt: skip
-
-
-@contextlib.contextmanager
-def _only_one(directory: Path) -> Iterator[None]:
-    """Hold the state directory for one master of this machine."""
-    directory.mkdir(parents=True, exist_ok=True, mode=0o700)
-    with (directory / "master.lock").open("a+") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            lock.seek(0)
-            raise Refused(
-                f"a master runs already on {directory}: pid {lock.read().strip() or 'unknown'}. "
-                f"Stop it first, or give this one another `state:`",
-                "second_master",
-            ) from error
-        lock.truncate(0)
-        lock.write(str(os.getpid()))
-        lock.flush()
-        yield

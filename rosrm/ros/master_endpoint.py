@@ -98,6 +98,7 @@ class MasterEndpoint:
 
     Attributes:
         events: what happened since the runtime took them last.
+        incarnation: random number of this run of the master.
     """
 
     def __init__(
@@ -116,6 +117,7 @@ class MasterEndpoint:
         self._beat_period = control.beat_period
         self.events: list[happened.Event] = []
         self.rival: msg.MasterBeat | None = None
+        self.incarnation = identity.incarnation
         self._names = names.Names(participant.settings.namespace)
         self._links: dict[int, _HostLink] = {}
         self._open: dict[int, Callable[[Reply], None]] = {}
@@ -167,7 +169,8 @@ class MasterEndpoint:
         for stranger in batch.strangers:
             self._refuse_peer("resource_info", stranger)
         if batch.readings is not None:
-            self.events.append(batch.readings)
+            # Before all else: a usage must not be judged by readings that are older than it.
+            self.events.insert(0, batch.readings)
 
     def _send_unheard(self, link: _HostLink) -> None:
         waiting, link.unheard = link.unheard, []

@@ -86,6 +86,7 @@ class SlaveEndpoint:
     Attributes:
         link: how far it is with its master.
         failure: why it must give up; "" while it need not.
+        superseded: it must because another slave lives under its name.
     """
 
     def __init__(
@@ -96,6 +97,7 @@ class SlaveEndpoint:
         self._description = description
         self.link = Link.SEARCHING
         self.failure = ""
+        self.superseded = False
         self.host_id = 0
         self._epoch = 0
         self._master_beat = 0
@@ -217,6 +219,7 @@ class SlaveEndpoint:
             self._taken_since = now
         if answer.code != "name_taken" or now - self._taken_since >= _NAME_TAKEN:
             self.failure = answer.message
+            self.superseded = answer.code == "name_taken"
             return
         self.link = Link.SEARCHING
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import logging
 import os
 import signal
@@ -12,9 +11,8 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -28,6 +26,7 @@ from rosrm.core.model import (
     InstanceId,
     InstanceState,
     InstanceStatus,
+    StopPolicy,
 )
 from rosrm.errors import LaunchError, Refused, SupervisorError
 from rosrm.ports import ProbeContext
@@ -40,6 +39,7 @@ from rosrm.slave.launch import launch_order
 from rosrm.slave.log_reading import newest_instance, read_log
 from rosrm.slave.sampling import Sampler
 from rosrm.slave.sessions import SessionTable, SessionUsage
+from rosrm.state_directory import only_one
 from rosrm.supervisor.client import (
     LogLimits,
     SupervisorClient,
@@ -97,7 +97,11 @@ class SlaveRuntime:
         self._supervisor_state = config.state / "supervisor"
         self._closing = contextlib.ExitStack()
         with contextlib.ExitStack() as opened:
-            opened.enter_context(_only_one(config.state, config.host))
+            opened.enter_context(
+                only_one(
+                    config.state, "slave", code="name_taken", remedy="another `host:` and `state:`"
+                )
+            )
             self._sessions = SessionTable()
             context = ProbeContext(config.scope, config.budget, config.state, self._sessions)
             probes = registry.probes(config.probes, context)
@@ -108,14 +112,16 @@ class SlaveRuntime:
             for number in (signal.SIGINT, signal.SIGTERM):
                 signal.signal(number, self._stop)
             self._supervisor = self._connect()
-            opened.callback(lambda: self._supervisor.close())
+            opened.callback(self._close_supervisor)
             self._participant = Participant(config.ros, f"rosrm_slave_{token(config.host)}")
             opened.callback(self._participant.close)
             self._graph = GraphWatch(self._participant.node)
             self._limit = self._limits()
             self._environment = {**os.environ, **config.ros.environment()}
             self._endpoint = SlaveEndpoint(
-                self._participant, self, self._description(probes.absent),
+                self._participant,
+                self,
+                self._description(probes.absent),
                 max(_MAX_AGE, _BEATS_MISSED * config.period),
             )
             self._closing = opened.pop_all()
@@ -126,6 +132,9 @@ class SlaveRuntime:
         return SupervisorClient.connect(
             self._supervisor_state, log=LogLimits(logs.max_bytes, logs.keep)
         )
+
+    def _close_supervisor(self) -> None:
+        self._supervisor.close()  # the one that is connected by then
 
     def _limits(self) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
         limit = np.ones(RESOURCE_SLOTS, np.float32)
@@ -400,12 +409,20 @@ class SlaveRuntime:
         if self._left or self._config.on_stop == "keep":
             return 1 if failure else 0
         live = self._state.live()
+        if live and failure and not self._endpoint.superseded:
+            _log.error("its %d processes go on; start the slave again when that is mended", live)
+            return 1
         if live:
             self.say(f"stopping {live} processes ({self._stopping or 'refused'})")
-        self._endpoint.leave(self._supervisor.shutdown)
+        self._shutting_down = True
+        self._endpoint.leave(self._shut_down)
         deadline = time.monotonic() + self._longest_stop() + _STOP_MARGIN
         self._serve(lambda: not self._left and time.monotonic() < deadline)
         return self._ended(failure)
+
+    def _shut_down(self) -> None:
+        with contextlib.suppress(SupervisorGone):  # its reader says so
+            self._supervisor.shutdown()
 
     def _ended(self, failure: str) -> int:
         if not self._left:
@@ -415,35 +432,11 @@ class SlaveRuntime:
         return 1 if failure else 0
 
     def _longest_stop(self) -> float:
-        graces = [
-            held.spec.stop.interrupt_grace + held.spec.stop.terminate_grace
-            for held in self._state.held.values()
-            if held.spec is not None and not held.status.state.ended
-        ]
-        return max(graces, default=10.0)
+        live = [held for held in self._state.held.values() if not held.status.state.ended]
+        rules = [StopPolicy() if held.spec is None else held.spec.stop for held in live]
+        return max((rule.interrupt_grace + rule.terminate_grace for rule in rules), default=0.0)
 
 
 def _random_number() -> int:
     """Not 0; `secrets` would do the same and bring a MiB of modules along."""
     return int.from_bytes(os.urandom(7), "big") | 1
-
-
-@contextlib.contextmanager
-def _only_one(directory: Path, host: str) -> Iterator[None]:
-    """Hold the state directory for one slave of this machine."""
-    directory.mkdir(parents=True, exist_ok=True, mode=0o700)
-    with (directory / "slave.lock").open("a+") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            lock.seek(0)
-            raise Refused(
-                f"a slave of host {host!r} runs already on {directory}: pid "
-                f"{lock.read().strip() or 'unknown'}. Stop it first, or give this one another "
-                f"`host:` and `state:`",
-                "name_taken",
-            ) from None
-        lock.truncate(0)
-        lock.write(str(os.getpid()))
-        lock.flush()
-        yield

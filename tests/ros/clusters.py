@@ -178,7 +178,11 @@ def shared_memory_of(pid: int) -> set[str]:
     """The files in /dev/shm that a process has mapped and that bear its participant's id."""
     with contextlib.suppress(OSError):
         lines = Path(f"/proc/{pid}/maps").read_text().splitlines()
-        paths = {line.split(None, 5)[5].removesuffix(" (deleted)") for line in lines if "/dev/shm/" in line}
+        paths = {
+            line.split(None, 5)[5].removesuffix(" (deleted)")
+            for line in lines
+            if "/dev/shm/" in line
+        }
         return {path for path in paths if "fastrtps" in path and "port" not in path}
     return set()
 

@@ -138,7 +138,9 @@ def test_the_environment_is_clean(cluster) -> None:
 
 def test_no_descriptor_is_inherited(cluster) -> None:
     """Standard input is empty, the outputs are the log, and there is nothing else."""
-    code = "import os; print(sorted(int(fd) for fd in os.listdir('/proc/self/fd'))[:4], os.read(0, 9))"
+    code = (
+        "import os; print(sorted(int(fd) for fd in os.listdir('/proc/self/fd'))[:4], os.read(0, 9))"
+    )
     cluster.run(python("descriptors", code, kind=Kind.JOB))
     assert cluster.log("descriptors") == "[0, 1, 2, 3] b''\n"
 
@@ -151,7 +153,9 @@ def test_ready_is_this_instance_not_a_namesake(cluster, tmp_path) -> None:
         try:
             stranger.stdout.readline()
             go = tmp_path / "go"
-            slow = f"import os, time\nwhile not os.path.exists({str(go)!r}): time.sleep(0.01)\n{NODE}"
+            slow = (
+                f"import os, time\nwhile not os.path.exists({str(go)!r}): time.sleep(0.01)\n{NODE}"
+            )
             cluster.submit(node("twin", slow))
             cluster.wait("twin", "starting")
             deadline = time.monotonic() + 1.5
