@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 import xml.etree.ElementTree as ET
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -72,17 +73,18 @@ def run(layer: str, for_pytest: list[str]) -> Outcome:
     if status == NO_TESTS:
         return Outcome(layer, status, seconds=seconds)
     try:
-        suites = ET.parse(result).getroot().iter("testsuite")  # noqa: S314 - pytest wrote it just now
-        counts = [
-            {k: int(s.get(k, "0")) for k in ("tests", "failures", "errors", "skipped")}
-            for s in suites
-        ]
+        cases = list(ET.parse(result).getroot().iter("testcase"))  # noqa: S314 - pytest wrote it
     except (OSError, ET.ParseError):
         return Outcome(layer, status or 1, failed=1, seconds=seconds)
-    failed = sum(c["failures"] + c["errors"] for c in counts)
-    skipped = sum(c["skipped"] for c in counts)
-    passed = sum(c["tests"] for c in counts) - failed - skipped
-    return Outcome(layer, status, passed, failed, skipped, seconds)
+    # A test that fails, and again in a fixture's clean-up, has two entries and failed once.
+    tests = {(c.get("classname"), c.get("name")): "passed" for c in cases}
+    for kind in ("skipped", "failure", "error"):
+        tests |= {
+            (c.get("classname"), c.get("name")): kind for c in cases if c.find(kind) is not None
+        }
+    count = Counter(tests.values())
+    failed = count["failure"] + count["error"]
+    return Outcome(layer, status, count["passed"], failed, count["skipped"], seconds)
 
 
 def report(outcomes: list[Outcome]) -> int:
