@@ -22,6 +22,10 @@ COMMANDS = {
 @pytest.mark.parametrize("what", COMMANDS)
 @pytest.mark.timeout(300)
 def test_repository_keeps(what: str) -> None:
+    if what == "types" and sys.version_info < (3, 11):
+        pytest.skip(
+            "Python 3.10 has no newer numpy than 2.2, whose types are not those checked with"
+        )
     tool, *arguments = COMMANDS[what]
 
     run = subprocess.run(
