@@ -1,0 +1,204 @@
+"""Draws what was seen of a demo: memory over time, where each process went, what waited.
+
+python -m rosrm_examples.demo_plots out/demo      draws usage.png anew
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import matplotlib as mpl
+import numpy as np
+
+from rosrm_examples.arrays import Floats
+from rosrm_examples.demo_job import kind_of
+from rosrm_examples.demo_record import Record
+
+mpl.use("Agg")
+from matplotlib import pyplot as plt  # after the backend is chosen
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
+
+USAGE_FILE: Final = "usage.png"
+
+_PAPER, _INK, _QUIET, _FAINT = "#fbfaf7", "#22303c", "#8b949c", "#e4e2db"
+_COLOURS: Final = ("#00798c", "#d1495b", "#c98a1b")
+_WAITING: Final = "#b9c3cc"
+#: Marker, size, width of its lines and words for an assignment of each kind of process.
+_MARKS: Final = {
+    "piece": ("s", 22, 0.0, "SLAM piece"),
+    "holder": ("|", 48, 1.5, "holder"),
+    "recorder": ("D", 30, 0.0, "recorder"),
+}
+#: Marks of one lane that are nearer to each other, seconds, stand in rows.
+_TOGETHER_S: Final = 0.4
+_ROWS: Final = (0.0, 0.32, -0.32)
+
+
+def draw_usage(path: Path, record: Record, title: str) -> None:
+    """Draw the record as a .png: utilisation of memory, assignments and moves, and the queue."""
+    figure, (usage, lanes, queue) = plt.subplots(
+        3, 1, figsize=(11, 8.2), sharex=True, layout="constrained", facecolor=_PAPER,
+        height_ratios=(5, 2.2, 1.1),
+    )  # fmt: skip
+    _draw_memory(usage, record)
+    _draw_lanes(lanes, record)
+    _draw_queue(queue, record)
+    for axes in (usage, lanes, queue):
+        _dress(axes)
+    figure.suptitle(title, color=_INK, x=0.056, ha="left")
+    queue.set_xlabel("elapsed time (s)", color=_INK)
+    queue.set_xlim(-1, max(_times(record)[-1], 1.0))
+    figure.align_ylabels()
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
+
+
+def colour_of(record: Record, host: str) -> str:
+    """The colour that a host has in every part of the picture."""
+    return _COLOURS[record.hosts.index(host) % len(_COLOURS)]
+
+
+def memory_of(record: Record, host: str) -> Floats:
+    """(S,) utilisation of a host's memory, percent; NaN where it is not known."""
+    seen = (sample.usage.get("memory", {}).get(host) for sample in record.samples)
+    return 100 * np.array([np.nan if value is None else value for value in seen])
+
+
+def _times(record: Record) -> Floats:
+    """(S,) seconds since the first process was submitted."""
+    return np.array([sample.elapsed for sample in record.samples]) - record.start
+
+
+def _draw_memory(axes: Axes, record: Record) -> None:
+    times, limit = _times(record), 100 * record.limits["memory"]
+    for host in record.hosts:
+        axes.plot(times, memory_of(record, host), color=colour_of(record, host), lw=1.9, label=host)
+    axes.axhline(limit, color=_INK, lw=1.1, ls=(0, (6, 4)), label=f"limit {limit:.0f} %")
+    _mark_limit_reached(axes, record, limit)
+    for move in record.moves():
+        axes.axvline(move.elapsed - record.start, color=_QUIET, lw=0.9, ls=":")
+    axes.set_ylim(0, 100)
+    axes.set_ylabel("memory utilisation (%)", color=_INK)
+    handles, _ = axes.get_legend_handles_labels()
+    handles += [
+        Line2D([], [], ls="", marker="v", color=_INK, label="limit reached"),
+        Line2D([], [], color=_QUIET, lw=0.9, ls=":", label="migration"),
+    ]
+    _legend(axes, handles=handles)
+
+
+def _mark_limit_reached(axes: Axes, record: Record, limit: float) -> None:
+    for event in record.of_kind("over_limit"):
+        if event.facts.get("resource") == "memory":
+            axes.plot(
+                event.elapsed - record.start, limit + 5.5, marker="v", ms=6.5, mew=0,
+                color=colour_of(record, event.host), zorder=4,
+            )  # fmt: skip
+
+
+def _draw_lanes(axes: Axes, record: Record) -> None:
+    """A lane for each host: every assignment in it, every migration from lane to lane."""
+    lane = {host: -1.25 * number for number, host in enumerate(record.hosts)}
+    for host, y in lane.items():
+        _draw_lane(axes, record, host, y)
+    for move in record.moves():
+        at = move.elapsed - record.start
+        axes.annotate(
+            "", (at, lane[move.destination]), (at, lane[move.source]),
+            arrowprops={"arrowstyle": "-|>", "color": _INK, "lw": 1.3, "shrinkA": 0, "shrinkB": 0},
+        )  # fmt: skip
+    axes.set_ylim(min(lane.values()) - 0.75, 0.75)
+    axes.set_yticks([])
+    handles: list[Line2D] = [
+        Line2D([], [], ls="", marker=marker, ms=size**0.5, mew=mew, color=_INK, label=words)
+        for marker, size, mew, words in _MARKS.values()
+    ]
+    handles.append(
+        Line2D([], [], ls="", marker=r"$\downarrow$", ms=9, color=_INK, label="migration")
+    )
+    _legend(axes, handles=handles, handletextpad=0.3, title="assignments")
+
+
+def _draw_lane(axes: Axes, record: Record, host: str, y: float) -> None:
+    colour = colour_of(record, host)
+    axes.axhspan(y - 0.5, y + 0.5, color=_FAINT, alpha=0.55, zorder=0, linewidth=0)
+    axes.text(
+        -0.008, y, host, color=colour, ha="right", va="center",
+        transform=axes.get_yaxis_transform(),
+    )  # fmt: skip
+    events = [event for event in record.of_kind("assigned") if event.host == host]
+    times = [event.elapsed - record.start for event in events]
+    for event, at, row in zip(events, times, stacked(times), strict=True):
+        marker, size, mew, _ = _MARKS[kind_of(event.process)]
+        axes.scatter(
+            at, y + _ROWS[row % len(_ROWS)], marker=marker, s=size, linewidths=mew, color=colour
+        )
+
+
+def stacked(times: Sequence[float]) -> list[int]:
+    """The row of each mark, so that those that come together do not cover each other."""
+    rows: list[int] = []
+    for number, at in enumerate(times):
+        together = number > 0 and at - times[number - 1] < _TOGETHER_S
+        rows.append(rows[-1] + 1 if together else 0)
+    return rows
+
+
+def _draw_queue(axes: Axes, record: Record) -> None:
+    waiting = [sample.waiting for sample in record.samples]
+    axes.fill_between(_times(record), waiting, color=_WAITING, step="post", linewidth=0)
+    axes.set_ylim(0, max(4, *waiting) * 1.15)
+    axes.set_ylabel("queue", color=_INK)
+    axes.yaxis.set_major_locator(MaxNLocator(nbins=3, integer=True))
+
+
+def _legend(axes: Axes, **options: Any) -> None:
+    """Above the axes, to the left."""
+    legend = axes.legend(
+        frameon=False, labelcolor=_INK, ncols=7, loc="lower left", bbox_to_anchor=(-0.01, 0.985),
+        columnspacing=1.6, alignment="left", **{"handlelength": 1.8, **options},
+    )  # fmt: skip
+    legend.get_title().set_color(_INK)
+
+
+def _dress(axes: Axes) -> None:
+    axes.set_facecolor(_PAPER)
+    axes.tick_params(colors=_QUIET, length=3)
+    axes.spines[["top", "right", "left"]].set_visible(False)
+    axes.spines["bottom"].set_color(_FAINT)
+    axes.set_axisbelow(True)
+    axes.grid(axis="y", color=_FAINT, lw=0.7)
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Draws usage.png from samples.json and events.jsonl in a folder."""
+    if len(arguments) != 1:
+        print("usage: python -m rosrm_examples.demo_plots FOLDER", file=sys.stderr)
+        return 2
+    folder = Path(arguments[0])
+    try:
+        record = Record.read(folder)
+        draw_usage(folder / USAGE_FILE, record, title_of(record))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        print(f"demo_plots: {folder} holds no record of a demo: {error}", file=sys.stderr)
+        return 2
+    print(folder / USAGE_FILE)
+    return 0
+
+
+def title_of(record: Record) -> str:
+    """One line above the picture."""
+    processes = sum(1 for _ in record.of_kind("submitted"))
+    return (
+        f"{processes} processes on {len(record.hosts)} hosts of {record.budget / 2**20:.0f} MiB, "
+        f"{len(record.moves())} migrations"
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,111 @@
+"""What the demo shows while it runs: a live table in a terminal, else a line now and then."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Final, Protocol
+
+from rich.console import Console
+from rich.live import Live
+
+from rosrm.cli.live import render
+from rosrm.core.views import EventRow, ProcessRow, Snapshot
+from rosrm_examples.demo_job import count_by_kind
+from rosrm_examples.demo_record import RUNNING, sample_of
+
+_EVENTS: Final = 5
+#: Lines of the table beside those of the processes: title, hosts, events, and gaps.
+_OTHER_LINES: Final = 13 + _EVENTS
+_FEWEST_ROWS: Final = 4
+_LINE_EVERY_S: Final = 3.0
+
+
+class Screen(Protocol):
+    """Shows how the demo is getting on."""
+
+    def show(self, view: Snapshot, elapsed: float) -> None:
+        """Show a snapshot, `elapsed` seconds after the beginning."""
+
+    def close(self) -> None:
+        """Leave the terminal as it was."""
+
+
+def screen_for(console: Console) -> Screen:
+    """The live table where there is a terminal that can show it, else lines."""
+    return LiveScreen(console) if console.is_terminal else LineScreen(console)
+
+
+class LiveScreen:
+    """The table of `rosrm top`, renewed in place."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._live = Live(console=console, auto_refresh=False, transient=True)
+        self._events: deque[EventRow] = deque(maxlen=_EVENTS)
+
+    def show(self, view: Snapshot, elapsed: float) -> None:  # noqa: ARG002 - the table has a clock
+        """Renew the table."""
+        self._events.extend(view.events)
+        rows = max(_FEWEST_ROWS, self._console.height - _OTHER_LINES)
+        shown = replace(view, events=list(self._events))
+        table = render(shown, rows=rows, events=_EVENTS, note=note_of(view))
+        self._live.start()
+        self._live.update(table, refresh=True)
+
+    def close(self) -> None:
+        """Take the table away."""
+        self._live.stop()
+
+
+class LineScreen:
+    """A line every few seconds, and one for each migration."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._next = 0.0
+
+    def show(self, view: Snapshot, elapsed: float) -> None:
+        """Print what there is to say now."""
+        for event in view.events:
+            if event.kind in ("migration_begun", "over_limit"):
+                self._print(f"        {event.message}")
+        if elapsed >= self._next:
+            self._next = elapsed + _LINE_EVERY_S
+            self._print(f"{elapsed:5.0f} s  {line_of(view)}")
+
+    def _print(self, text: str) -> None:
+        self._console.print(text, highlight=False, markup=False, soft_wrap=True)
+
+    def close(self) -> None:
+        """What was printed stays."""
+
+
+def note_of(view: Snapshot) -> str:
+    """What is going on, in a few words."""
+    runs = count_by_kind([row.name for row in view.processes if row.state in RUNNING])
+    if runs["piece"]:
+        return "the pieces are mapped"
+    if any(row.state == "queued" for row in view.processes):
+        return "the hosts are full: the queue waits"
+    if runs["recorder"]:
+        return "the recorder grows"
+    return ""
+
+
+def line_of(view: Snapshot) -> str:
+    """`memory 41 40 42 %   9 pieces and 8 holders run, 3 wait, 12 finished`."""
+    memory = sample_of(view).usage.get("memory", {})
+    used = " ".join("  ?" if value is None else f"{100 * value:3.0f}" for value in memory.values())
+    waiting = sum(row.state == "queued" for row in view.processes)
+    finished = sum(row.state == "finished" for row in view.processes)
+    return f"memory {used} %   {_run(view.processes)}, {waiting} wait, {finished} finished"
+
+
+def _run(rows: Sequence[ProcessRow]) -> str:
+    counts = count_by_kind([row.name for row in rows if row.state in RUNNING])
+    parts = [f"{n} {kind}{'s' if n > 1 else ''}" for kind, n in counts.items() if n]
+    if not parts:
+        return "nothing runs"
+    return f"{' and '.join(parts)} run{'s' if sum(counts.values()) == 1 else ''}"
