@@ -1,0 +1,206 @@
+"""The demo as a user runs it: what it leaves, and that it leaves nothing else."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+import uuid
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from rosrm_examples.street import Street
+
+MARK = "ROSRM_TEST_OF_THE_DEMO"
+SHARED_MEMORY = re.compile(r"/dev/shm/\S+")
+
+
+class Run:
+    """A demo that was started; everything that comes of it carries a mark in its environment."""
+
+    def __init__(self, out: Path, *arguments: str) -> None:
+        self.out = out
+        self.mark = f"{MARK}={uuid.uuid4()}".encode()
+        name, _, value = self.mark.decode().partition("=")
+        self.demo = subprocess.Popen(
+            [sys.executable, "-m", "rosrm_examples.demo", "--out", str(out), *arguments],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env={**os.environ, name: value},
+        )
+        self.shared: set[str] = set()
+        self.began = time.time()
+
+    def processes(self) -> list[int]:
+        """All that live, the demo itself included."""
+        found = []
+        for entry in Path("/proc").iterdir():
+            if entry.name.isdigit():
+                try:
+                    if self.mark in (entry / "environ").read_bytes().split(b"\0"):
+                        found.append(int(entry.name))
+                except OSError:  # it has ended meanwhile
+                    continue
+        return found
+
+    def look(self) -> None:
+        """Note the shared memory that our processes have mapped."""
+        for pid in self.processes():
+            try:
+                self.shared.update(SHARED_MEMORY.findall(Path(f"/proc/{pid}/maps").read_text()))
+            except OSError:
+                continue
+
+    def wait_for(self, what: str, seconds: float = 40.0) -> None:
+        """Wait until a line of the progress says something."""
+        assert self.demo.stdout is not None
+        deadline = time.monotonic() + seconds
+        for line in self.demo.stdout:
+            if what in line:
+                return
+            assert time.monotonic() < deadline, f"{what!r} did not come in time"
+        pytest.fail(f"the demo ended before {what!r}: {self.demo.communicate()[1]}")
+
+    def end(self, seconds: float) -> tuple[int, str, str]:
+        """Wait for its end; exit status, standard output, standard error."""
+        deadline = time.monotonic() + seconds
+        while self.demo.poll() is None and time.monotonic() < deadline:
+            self.look()
+            time.sleep(1.0)
+        output, errors = self.demo.communicate(timeout=1.0)
+        return self.demo.returncode, output, errors
+
+    def check_clean(self) -> None:
+        """No process and no shared memory is left."""
+        assert self.processes() == []
+        assert [path for path in sorted(self.shared) if self.left(Path(path))] == []
+
+    def left(self, path: Path) -> bool:
+        """A file of ours alone, and newer than the demo.
+
+        The tracing of ROS keeps its own on purpose, and the ports from 7000 on are shared by all
+        DDS participants of the machine, whatever their domain.
+        """
+        if re.match("lttng|fastrtps_port70", path.name) or not path.exists():
+            return False
+        return path.stat().st_ctime > self.began
+
+    def kill(self) -> None:
+        for pid in self.processes():
+            try:
+                os.kill(pid, signal.SIGKILL)
+            except ProcessLookupError:
+                continue
+        self.demo.communicate()
+
+
+Start = Callable[..., Run]
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Iterator[Start]:
+    started: list[Run] = []
+
+    def run(*arguments: str) -> Run:
+        started.append(Run(tmp_path / "out", *arguments))
+        return started[-1]
+
+    yield run
+    for one in started:
+        one.kill()
+
+
+def read_lines(path: Path) -> list[dict]:
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+@pytest.mark.slow
+def test_a_short_demo_fills_the_hosts_maps_the_drive_and_migrates(start: Start) -> None:
+    run = start("--drive", "street:36", "--pieces", "3", "--pace", "3")
+    status, output, errors = run.end(seconds=90.0)
+    assert (status, errors) == (0, ""), output
+    run.check_clean()
+
+    summary = json.loads((run.out / "summary.json").read_text())
+    processes = summary["processes"]
+    assert processes["submitted"] == processes["finished"] > 3
+    assert processes["failed"] == 0
+    assert summary["hosts"] == 3
+    assert summary["assignments"] >= processes["submitted"]
+    assert 0 < summary["makespan_s"] < 90
+    assert summary["map_points"] > 1000
+    assert 0 <= summary["end_error_percent"] < 1.5
+    assert "summary.json" in output
+
+    events = read_lines(run.out / "events.jsonl")
+    assert [event["sequence"] for event in events] == sorted(event["sequence"] for event in events)
+    assert sum(event["kind"] == "migrated" for event in events) == summary["migrations"]
+    assert summary["migrations"] >= 1
+    assert any(event["kind"] == "waits" for event in events), "the hosts were never full"
+    assert {event["host"] for event in events if event["kind"] == "assigned"} == {
+        "host1", "host2", "host3",
+    }  # fmt: skip
+
+    for name in ("map.png", "usage.png"):
+        assert (run.out / name).read_bytes().startswith(b"\x89PNG")
+    assert (run.out / "map.ply").read_bytes().startswith(b"ply\n")
+    assert len(json.loads((run.out / "samples.json").read_text())["samples"]) > 20
+
+
+def test_ctrl_c_ends_everything_and_says_nothing_but_so(start: Start) -> None:
+    run = start("--drive", "street:40", "--pieces", "4")
+    run.wait_for("pieces")  # the first line
+    run.wait_for("holder")  # they run
+    run.look()
+    run.demo.send_signal(signal.SIGINT)
+    status, _, errors = run.end(seconds=30.0)
+    assert status == 130
+    assert errors == "demo: stopped by SIGINT\n"
+    run.check_clean()
+    assert not (run.out / "summary.json").exists()
+
+
+def test_ctrl_c_while_the_cluster_comes_up(start: Start) -> None:
+    run = start("--drive", "street:40", "--pieces", "4")
+    run.wait_for("rosrm demo")
+    run.demo.send_signal(signal.SIGINT)
+    status, _, errors = run.end(seconds=30.0)
+    assert (status, errors) == (130, "demo: stopped by SIGINT\n")
+    run.check_clean()
+
+
+def test_a_piece_that_fails_ends_the_demo_and_names_its_log(start: Start, tmp_path: Path) -> None:
+    drive = tmp_path / "drive.npz"
+    write_thinned(drive, Street(12))
+    run = start("--drive", str(drive), "--pieces", "2")
+    run.wait_for("rosrm demo")
+    drive.unlink()  # the demo has read it, the pieces have not
+    status, _, errors = run.end(seconds=40.0)
+    assert status == 1
+    assert re.match(r"demo: piece_0\d failed on host\d: .*; see \S+\.log\n", errors), errors
+    assert "no such file" in errors  # the last line of that log
+    assert "Traceback" not in errors
+    log = Path(errors.split("; see ")[1].split("\n")[0])
+    assert "no such file" in log.read_text()
+    run.check_clean()
+
+
+def write_thinned(path: Path, street: Street) -> None:
+    """A drive as the thinned archives of KITTI have it."""
+    import numpy as np
+
+    scans = [street.scan(number) for number in range(len(street.times))]
+    np.savez(
+        path,
+        xyz_cm=np.round(100 * np.concatenate(scans)).astype(np.int16),
+        count=np.array([len(scan) for scan in scans]),
+        t=street.times,
+        T_world_velo=street.truth,
+    )
