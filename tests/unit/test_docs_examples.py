@@ -1,0 +1,182 @@
+"""What the pages show is right: files load, links lead somewhere, commands and names exist."""
+
+from __future__ import annotations
+
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import typer.main
+
+from rosrm.cli.commands import app
+from rosrm.config import load_cluster, load_host, load_work
+from rosrm.registry import Registry
+from rosrm.ros import names
+
+ROOT = Path(__file__).resolve().parents[2]
+DOCS = ROOT / "docs"
+PAGES = sorted([*ROOT.glob("*.md"), *DOCS.rglob("*.md"), *ROOT.glob("*/README.md")])
+#: `make demo` makes them; they are put there by hand from its output.
+FROM_THE_DEMO = {DOCS / "pictures" / "demo-usage.png", DOCS / "pictures" / "demo-map.png"}
+
+_FENCE = re.compile(
+    r"(?:^<!-- ([^\n]*) -->\n)?^```(\w+)([^\n]*)\n(.*?)^```$", re.MULTILINE | re.DOTALL
+)
+_LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
+
+
+def name_of(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
+def blocks(page: Path, language: str) -> Iterator[tuple[str, str, str]]:
+    """The mark before each fenced block of a language, its title and its text."""
+    for mark, found, info, text in _FENCE.findall(page.read_text(encoding="utf-8")):
+        if found == language:
+            title = re.search(r'title="([^"]+)"', info)
+            yield mark, title[1] if title else "", text
+
+
+# --- files ------------------------------------------------------------------------------------
+
+
+def loader_of(title: str):
+    """A file is told by the end of its name."""
+    if title.endswith("cluster.yaml"):
+        return load_cluster
+    return load_work if title.endswith("work.yaml") else load_host
+
+
+FILES = [
+    pytest.param(title, text, id=f"{name_of(page)}:{title}:{number}")
+    for page in PAGES
+    for number, (_, title, text) in enumerate(blocks(page, "yaml"))
+    if title
+]
+
+
+@pytest.fixture(scope="module")
+def registry() -> Registry:
+    return Registry.discover()
+
+
+@pytest.mark.parametrize(("title", "text"), FILES)
+def test_every_file_that_is_shown_loads(title, text, tmp_path, registry):
+    file = tmp_path / title
+    file.write_text(text, encoding="utf-8")
+    loader_of(title)(file, registry)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_every_yaml_block_says_what_it_is(page):
+    """By a title, which is loaded here, or by a mark, for which another test loads it."""
+    unmarked = [text for mark, title, text in blocks(page, "yaml") if not (mark or title)]
+    assert not unmarked
+
+
+# --- links ------------------------------------------------------------------------------------
+
+
+def links(page: Path) -> Iterator[str]:
+    """The relative links of a page, code left out."""
+    text = _FENCE.sub("", page.read_text(encoding="utf-8"))
+    for target in _LINK.findall(re.sub(r"`[^`\n]*`", "`code`", text)):
+        if not re.match(r"[a-z]+:", target):
+            yield target
+
+
+def anchors(page: Path) -> set[str]:
+    """The anchors of the headings of a page, as GitHub makes them."""
+    text = _FENCE.sub("", page.read_text(encoding="utf-8"))
+    headings = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_every_link_leads_somewhere(page):
+    for link in links(page):
+        path, _, anchor = link.partition("#")
+        target = (page.parent / path).resolve() if path else page
+        assert target.exists() or target in FROM_THE_DEMO, link
+        if anchor and target.suffix == ".md":
+            assert anchor in anchors(target), link
+
+
+def test_every_file_of_the_documentation_is_reached_from_its_index():
+    reached, ahead = set(), [DOCS / "README.md"]
+    while ahead:
+        page = ahead.pop()
+        if page in reached:
+            continue
+        reached.add(page)
+        if page.suffix == ".md" and page.exists():
+            ahead += [(page.parent / link.partition("#")[0]).resolve() for link in links(page)]
+    there = {file for file in DOCS.rglob("*") if file.is_file()}
+    assert sorted(map(name_of, there - reached)) == []
+
+
+# --- commands ---------------------------------------------------------------------------------
+
+TREE = typer.main.get_command(app)
+
+
+def shown_commands(page: Path) -> Iterator[list[str]]:
+    """The words of each `rosrm` command line in the console blocks of a page."""
+    for _, _, text in blocks(page, "console"):
+        for line in re.findall(r"^[\w-]*\$ (?:\w+=\S+ )*rosrm ([^#|\n]+)", text, re.MULTILINE):
+            yield line.split()
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_every_command_that_is_shown_exists(page):
+    for words in shown_commands(page):
+        group, here = TREE, list(words)
+        options = {opt for parameter in group.params for opt in parameter.opts}
+        while here and here[0].startswith("-"):
+            option = here.pop(0)
+            assert option in options, words
+            if option not in ("--version", "--help"):
+                here.pop(0)
+        while here and hasattr(group, "commands"):
+            word = here.pop(0)
+            assert word in group.commands, words
+            group = group.commands[word]
+        known = {opt for parameter in group.params for opt in parameter.opts}
+        assert {word for word in here if word.startswith("-")} <= known, words
+
+
+# --- names ------------------------------------------------------------------------------------
+
+TOPICS = {"resource_info", "process_status", "process_usage", "master_beat"}
+NAMES = {value for name, value in vars(names).items() if name.isupper() and isinstance(value, str)}
+OF_A_HOST = {names.CONTROL, names.READ_LOG}
+
+
+def test_the_protocol_page_has_every_name():
+    text = (DOCS / "reference" / "protocol.md").read_text(encoding="utf-8")
+    assert all(re.search(rf"`(host/HOST/)?{name}`", text) for name in NAMES)
+    assert names.token("robot-1") in text
+
+
+def test_the_security_policy_has_every_name_and_no_other():
+    root = ET.parse(DOCS / "how-to" / "rosrm.policy.xml").getroot()
+    topics = {one.text for one in root.iter("topic")} - {"/parameter_events"}
+    services = {one.text for one in root.iter("service")}
+    assert topics == TOPICS
+    assert {re.sub(r"^host/[^/]+/", "", service) for service in services} == NAMES - TOPICS
+    for service in services:
+        assert service.startswith("host/") == (service.rsplit("/", 1)[-1] in OF_A_HOST)
+
+
+@pytest.mark.parametrize("kind", ["reply", "request"])
+def test_what_one_part_serves_another_may_call(kind):
+    root = ET.parse(DOCS / "how-to" / "rosrm.policy.xml").getroot()
+    found = {
+        re.sub(r"^host/[^/]+/", "", one.text)
+        for services in root.iter("services")
+        if services.get(kind) == "ALLOW"
+        for one in services.iter("service")
+    }
+    assert found == NAMES - TOPICS
