@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
+from dataclasses import replace
 
 import pytest
 
@@ -26,11 +27,7 @@ def holder(name: str, mib: int, **options):
     """A process that uses so much memory."""
     options.setdefault("needs", {"memory": (mib + 10.0) * MIB, "cpu": 0.0})
     spec = python(name, HOLD, **options)
-    return spec.__class__(**{**fields(spec), "arguments": (str(mib * MIB),)})
-
-
-def fields(spec) -> dict:
-    return {name: getattr(spec, name) for name in spec.__slots__}
+    return replace(spec, arguments=(str(mib * MIB),))
 
 
 def on(view, name: str) -> int:

@@ -1,0 +1,283 @@
+"""Processes that move between real hosts: by hand, because a limit is reached, because a host closes."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import pytest
+
+from rosrm.config.settings import MigrationSettings, ProcessDefaults
+from rosrm.core.model import MigrationPolicy, Readiness
+from rosrm.errors import Refused
+from tests.ros.clusters import MIB, NODE, alive, host, node, python, service, wait_gone
+
+MOVES = MigrationPolicy("relaunch")
+STOPS_FIRST = MigrationPolicy("relaunch", overlap=False)
+
+
+@pytest.fixture(scope="module")
+def cluster(make_shared):
+    """Two hosts; nothing moves by itself."""
+    return make_shared(
+        host("left"), host("right"),
+        migration=MigrationSettings(automatic=False),
+        defaults=ProcessDefaults(needs={"memory": MIB}),
+    )  # fmt: skip
+
+
+def other(name: str) -> str:
+    return {"left": "right", "right": "left"}[name]
+
+
+def moved(cluster, name: str, times: int = 1):
+    view = cluster.wait_until(
+        f"{name} moved {times} times",
+        lambda v: any(
+            r.name == name and r.migrations == times and r.state == "running" for r in v.processes
+        ),
+    )
+    return next(row for row in view.processes if row.name == name)
+
+
+def spans(folder) -> list[tuple[float, float]]:
+    """When each run that wrote its beginning and end there lived."""
+    runs = []
+    for path in folder.iterdir():
+        times = [float(line) for line in path.read_text().split()]
+        runs.append((times[0], times[-1]))
+    return sorted(runs)
+
+
+#: Writes the time at its start and then every 10 ms; ends at once when it is told to.
+RECORDER = """
+import os, signal, sys, time
+log = os.open(os.path.join(sys.argv[1], str(os.getpid())), os.O_WRONLY | os.O_CREAT)
+def say(*_):
+    os.write(log, b"%f\\n" % time.monotonic())
+def end(*_):
+    say(); os._exit(0)
+signal.signal(signal.SIGINT, end)
+while True:
+    say(); time.sleep(0.01)
+"""
+
+
+def recorder(cluster, name: str, migration: MigrationPolicy):
+    folder = cluster.directory / name
+    folder.mkdir()
+    spec = python(name, RECORDER, migration=migration)
+    return replace(spec, arguments=(str(folder),)), folder
+
+
+def test_start_first_has_never_none(cluster) -> None:
+    """By default the new instance is ready before the old one is stopped; then only it runs."""
+    spec, folder = recorder(cluster, "overlapping", MOVES)
+    cluster.submit(spec)
+    before = cluster.wait("overlapping", "running")
+    assert "moves to" in cluster.client.migrate("overlapping")
+    after = moved(cluster, "overlapping")
+    assert after.host == other(before.host)
+    wait_gone(before.pid)
+    assert alive(after.pid)
+    cluster.cancel("overlapping")
+    (_, first_end), (second_begin, _) = spans(folder)
+    assert second_begin < first_end
+    kinds = cluster.kinds("overlapping")
+    assert kinds.index("migration_begun") < kinds.index("migrated")
+
+
+def test_stop_first_has_never_two(cluster) -> None:
+    """`overlap: false`: the old instance has ended before the new one begins."""
+    spec, folder = recorder(cluster, "apart", STOPS_FIRST)
+    cluster.submit(spec)
+    before = cluster.wait("apart", "running")
+    cluster.client.migrate("apart", other(before.host))
+    after = moved(cluster, "apart")
+    assert after.host == other(before.host)
+    cluster.cancel("apart")
+    (_, first_end), (second_begin, _) = spans(folder)
+    assert first_end < second_begin
+
+
+def test_a_ros_node_moves_under_its_own_name(cluster) -> None:
+    """The new instance is told apart from the source, its namesake, and counts when it is seen."""
+    cluster.submit(node("walker", migration=MOVES))
+    before = cluster.wait("walker", "running")
+    cluster.client.migrate("walker")
+    after = moved(cluster, "walker")
+    assert after.pid != before.pid
+    wait_gone(before.pid)
+    assert "/walker" in cluster.log("walker")
+    cluster.cancel("walker")
+
+
+@pytest.mark.parametrize("overlap", [True, False], ids=["start first", "stop first"])
+def test_a_destination_that_never_gets_ready_changes_nothing(cluster, overlap) -> None:
+    """The process stays, or is started again, where it was; what was begun is undone and said."""
+    name = "loyal_first" if overlap else "loyal_after"
+    # A node at home; where a marker says so, one that never comes into the graph.
+    marker = cluster.directory / f"{name}-home"
+    code = (
+        "import os, sys, time\n"
+        f"if os.path.exists({str(marker)!r}) and os.environ['ROSRM_HOST'] != "
+        f"open({str(marker)!r}).read(): time.sleep(1000)\n"
+    )
+    cluster.submit(
+        node(
+            name, code + NODE, readiness=Readiness(timeout=6.0),
+            migration=MigrationPolicy("relaunch", overlap=overlap),
+        )
+    )  # fmt: skip
+    before = cluster.wait(name, "running")
+    marker.write_text(before.host)
+    cluster.client.migrate(name)
+    stayed = cluster.wait_for_event("stayed", process=name, timeout=40.0)
+    assert stayed.host == before.host
+    after = cluster.wait(name, "running")
+    assert after.host == before.host
+    assert after.migrations == 0
+    assert (after.pid == before.pid) == overlap
+    cluster.cancel(name)
+
+
+def test_what_cannot_move_is_refused(cluster) -> None:
+    """Without a strategy, while it waits, to where it is, to a host that there is not."""
+    cluster.submit(service("rooted"), service("mobile", migration=MOVES))
+    cluster.wait("rooted", "running")
+    here = cluster.wait("mobile", "running").host
+    with pytest.raises(Refused, match="no migration strategy"):
+        cluster.client.migrate("rooted")
+    with pytest.raises(Refused, match="there already"):
+        cluster.client.migrate("mobile", here)
+    with pytest.raises(Refused, match="nowhere"):
+        cluster.client.migrate("mobile", "nowhere")
+    cluster.client.set_host_state(other(here), "cordon")
+    with pytest.raises(Refused, match="cordoned"):
+        cluster.client.migrate("mobile", other(here))
+    cluster.client.set_host_state(other(here), "uncordon")
+    cluster.cancel("rooted", "mobile")
+
+
+def test_drain_empties_a_host(cluster) -> None:
+    """What can move leaves, what cannot stays and is named; uncordon opens it again."""
+    cluster.client.set_host_state("right", "cordon")
+    cluster.submit(*(service(f"d{n}", migration=MOVES) for n in range(3)), service("fixed"))
+    for name in ("d0", "d1", "d2", "fixed"):
+        assert cluster.wait(name, "running").host == "left"
+    cluster.client.set_host_state("right", "uncordon")
+    cluster.client.set_host_state("left", "drain")
+    for name in ("d0", "d1", "d2"):
+        assert moved(cluster, name).host == "right"
+    assert cluster.process("fixed").host == "left"
+    assert "fixed" in cluster.wait_for_event("nothing_moves", host="left").message
+    row = cluster.host("left")
+    assert (row.draining, row.cordoned) == (True, True)
+    cluster.client.set_host_state("left", "uncordon")
+    row = cluster.host("left")
+    assert (row.draining, row.cordoned) == (False, False)
+    cluster.cancel("d0", "d1", "d2", "fixed")
+
+
+def test_cancel_during_a_move(cluster) -> None:
+    """Nothing of either instance is left."""
+    cluster.submit(node("fleeting", migration=MOVES))
+    before = cluster.wait("fleeting", "running")
+    cluster.client.migrate("fleeting")
+    cluster.client.cancel(["fleeting"])
+    assert cluster.ended("fleeting").state == "cancelled"
+    wait_gone(before.pid)
+    view = cluster.wait_until(
+        "both hosts empty", lambda v: all(row.processes == 0 for row in v.hosts)
+    )
+    assert not [row for row in view.processes if row.state == "migrating"]
+
+
+# --- by a limit -------------------------------------------------------------------------------
+
+#: Holds 50 MiB, and MIB more as soon as the file is there.
+GROWS = """
+import mmap, os, sys, time
+def hold(mib):
+    block = mmap.mmap(-1, mib << 20)
+    for at in range(0, len(block), 4096): block[at] = 1
+    return block
+first = hold(50)
+while not os.path.exists(sys.argv[1]): time.sleep(0.02)
+if os.environ["ROSRM_HOST"] == sys.argv[2]: second = hold(int(sys.argv[3]))
+time.sleep(1000)
+"""
+
+
+def grower(cluster, name: str, where: str, mib: int, **options):
+    go = cluster.directory / f"{name}-go"
+    spec = python(name, GROWS, needs={"memory": 60.0 * MIB}, **options)
+    return replace(spec, arguments=(str(go), where, str(mib))), go
+
+
+def test_a_host_over_its_limit_is_relieved(make_cluster) -> None:
+    """What relieves it most and fits elsewhere leaves, after the hysteresis; the rest stays."""
+    hysteresis = 2.0
+    limits = {"memory": 0.5, "cpu": 1.0}
+    cluster = make_cluster(
+        host("full", memory=1000 * MIB, limits=limits),
+        host("free", memory=1000 * MIB, limits=limits),
+        migration=MigrationSettings(hysteresis=hysteresis, cooldown=60.0),
+        defaults=ProcessDefaults(needs={"memory": MIB}),
+    )
+    cluster.client.set_host_state("free", "cordon")
+    big, go = grower(cluster, "big", "full", 460, migration=MOVES)
+    small, _ = grower(cluster, "small", "nowhere", 1, migration=MOVES)
+    rooted, _ = grower(cluster, "rooted", "nowhere", 1)
+    cluster.submit(big, small, rooted)
+    for name in ("big", "small", "rooted"):
+        assert cluster.wait(name, "running").host == "full"
+    cluster.client.set_host_state("free", "uncordon")
+    go.touch()
+    over = cluster.wait_for_event("over_limit", host="full")
+    # 510 MiB would put the other host over as well: the small one goes, being all that fits.
+    begun = cluster.wait_for_event("migration_begun")
+    assert begun.elapsed - over.elapsed >= hysteresis - 0.05
+    assert begun.process == "small"
+    assert moved(cluster, "small").host == "free"
+    assert cluster.process("big").host == "full"
+    assert cluster.process("rooted").host == "full"
+    told = cluster.wait_for_event("nothing_moves", host="full")
+    assert "rooted has no migration strategy" in told.message
+    assert "small" not in {e.process for e in cluster.events("migration_begun")[1:]}
+    cluster.cancel("big", "small", "rooted")
+
+
+def test_nothing_moves_when_every_host_is_full(make_cluster) -> None:
+    """Both hosts over their limits: nothing is assigned, nothing migrates, the queue waits."""
+    limits = {"memory": 0.5, "cpu": 1.0}
+    cluster = make_cluster(
+        host("a", memory=400 * MIB, limits=limits), host("b", memory=400 * MIB, limits=limits),
+        migration=MigrationSettings(hysteresis=0.2, cooldown=0.0),
+        defaults=ProcessDefaults(needs={"memory": MIB}),
+    )  # fmt: skip
+    specs = []
+    for where in ("a", "b"):
+        spec, go = grower(cluster, f"on-{where}", where, 200, migration=MOVES, preferred_labels={})
+        go.touch()
+        specs.append(spec)
+    cluster.client.set_host_state("b", "cordon")
+    cluster.submit(specs[0])
+    assert cluster.wait("on-a", "running").host == "a"
+    cluster.client.set_host_state("b", "uncordon")
+    cluster.submit(specs[1])
+    assert cluster.wait("on-b", "running").host == "b"
+    cluster.wait_until(
+        "both over", lambda v: not any(row.accepting for row in v.hosts) and bool(v.hosts)
+    )
+    cluster.submit(service("waits"))
+    deadline = time.monotonic() + 1.5
+    while time.monotonic() < deadline:
+        cluster.client.spin(0.1)
+        rows = {row.name: row for row in cluster.client.list(processes=True).processes}
+        assert rows["waits"].state == "queued"
+        assert rows["on-a"].state == rows["on-b"].state == "running"
+    assert not cluster.events("migration_begun")
+    cluster.cancel("on-a")
+    assert cluster.wait("waits", "running").host == "a"
+    cluster.cancel("on-b", "waits")
