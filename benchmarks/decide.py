@@ -127,7 +127,7 @@ def rate(hosts: int, runs: int, needs_of: Callable[[int], dict[str, float]]) -> 
     return median(rates)
 
 
-def equal(number: int) -> dict[str, float]:
+def equal(_number: int) -> dict[str, float]:
     return {"memory": 2.0**26, "cpu": 0.1}
 
 

@@ -12,6 +12,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from rosrm.version import __version__
+
 #: Distributions whose versions may matter, where they are installed.
 _DISTRIBUTIONS = (
     "numpy",
@@ -37,8 +39,6 @@ def machine() -> dict[str, Any]:
 
 def versions() -> dict[str, str]:
     """Python, rosrm and what it rests on."""
-    from rosrm.version import __version__
-
     found = {"python": platform.python_version(), "rosrm": __version__}
     for name in _DISTRIBUTIONS:
         try:

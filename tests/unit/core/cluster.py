@@ -330,6 +330,8 @@ class Machine:
         self.incarnation += 1000
         self.sequence = self.batches = 0
         self.said.clear()
+        self.ordered.clear()
+        self.polled.clear()
         self.slave = slave.SlaveState()
         found = [
             InstanceStatus(instance, program.state, pid=program.pid)

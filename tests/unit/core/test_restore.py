@@ -1,0 +1,168 @@
+"""A master that comes up again from its journal: the same intent, and nothing started twice."""
+
+from __future__ import annotations
+
+import pytest
+
+from rosrm.core import events as happened
+from tests.unit.core.cluster import MIB, Cluster, Machine, job, movable, process
+
+
+def test_the_queue_keeps_its_order() -> None:
+    """Priorities and places in the line, also of those that were set aside."""
+    cluster = Cluster(Machine("a", memory=1000 * MIB, busy={"memory": 0.79}))
+    cluster.submit(process("aside", required_labels={"x": "y"}), process("p", memory=100))
+    cluster.submit(process("urgent", memory=100, priority=3), process("q", memory=100))
+    before = cluster.queue()
+    cluster.kill_master()
+    assert cluster.queue() == before == ["urgent", "p", "q"]
+    assert cluster.phase("aside") == "set_aside"
+    cluster.machines["a"].busy["memory"] = 0.1
+    cluster.restart_master()
+    assert cluster.assigned() == ["urgent", "p", "q"]
+    cluster.add(Machine("b", labels={"x": "y"}))
+    assert cluster.where("aside") == ["b"]
+
+
+def test_what_runs_runs_on_and_is_not_started_twice() -> None:
+    """A process is expected on its host, and found there."""
+    cluster = Cluster("a", "b")
+    cluster.submit(process("p"), process("q"))
+    pids = {n: m.programs[next(iter(m.programs))].pid for n, m in cluster.machines.items()}
+    cluster.kill_master()
+    assert cluster.phase("p") == "unreachable"
+    assert "has not come back since the master started" in cluster["p"].reason
+    cluster.restart_master()
+    assert (cluster.phase("p"), cluster.phase("q")) == ("running", "running")
+    assert {n: m.programs[next(iter(m.programs))].pid for n, m in cluster.machines.items()} == pids
+    assert len(cluster.assigned()) == 2
+
+
+def test_what_ended_meanwhile_is_heard_of() -> None:
+    """Its slave tells when it registers."""
+    cluster = Cluster("a")
+    cluster.submit(job("good"), job("bad"))
+    cluster.kill_master()
+    cluster.machines["a"].finish("good", cluster.now)
+    cluster.machines["a"].finish("bad", cluster.now, code=4)
+    cluster.restart_master()
+    assert (cluster.phase("good"), cluster.phase("bad")) == ("finished", "failed")
+
+
+def test_an_assignment_that_was_not_delivered_is_given_again() -> None:
+    """It was made durable and never sent: its host knows nothing of it."""
+    cluster = Cluster("a")
+    commands = cluster.decide(happened.SubmissionReceived(1, (process("p"),)))
+    cluster.journal(commands)
+    cluster.restart_master()
+    assert cluster.phase("p") == "running"
+    assert cluster["p"].owner == 1001  # numbers are reserved by the thousand, none is used again
+
+
+def test_an_outcome_that_was_not_made_durable_never_was() -> None:
+    """Killed before the journal was written: nothing had been answered either."""
+    cluster = Cluster("a")
+    cluster.decide(happened.SubmissionReceived(1, (process("p"),)))
+    cluster.restart_master()
+    assert not cluster.state.processes
+    assert cluster.submit(process("p")).accepted
+
+
+def test_hosts_keep_their_number_and_what_people_decided_about_them() -> None:
+    """Cordoned stays cordoned, drained stays drained."""
+    cluster = Cluster("a", "b", "c")
+    cluster.set_host("b", "cordon")
+    cluster.set_host("c", "drain")
+    ids = {name: machine.host_id for name, machine in cluster.machines.items()}
+    cluster.restart_master()
+    assert {name: machine.host_id for name, machine in cluster.machines.items()} == ids
+    hosts = cluster.state.hosts.by_name
+    assert [(h.cordoned, h.draining) for h in hosts.values()] == [
+        (False, False), (True, False), (True, True),
+    ]  # fmt: skip
+
+
+def test_what_was_learned_is_known() -> None:
+    """Needs of earlier runs outlive the master."""
+    cluster = Cluster("a")
+    cluster.machines["a"].shown["first"] = {"memory": 160 * MIB}
+    cluster.submit(job("first"))
+    cluster.machines["a"].finish("first", cluster.now)
+    cluster.settle()
+    cluster.restart_master()
+    cluster.submit(process("second"))
+    assert cluster.explain("second")["decision"]["need"]["memory"] == 160 * MIB
+
+
+def test_a_cancel_that_was_answered_is_carried_out() -> None:
+    """Of one that runs, and of one that waits."""
+    cluster = Cluster("a")
+    cluster.submit(process("runs"), process("waits", memory=1e6))
+    commands = cluster.decide(happened.CancelRequested(9, ("runs", "waits")))
+    cluster.journal(commands)
+    cluster.restart_master()
+    cluster.wait(1.0)
+    assert (cluster.phase("runs"), cluster.phase("waits")) == ("cancelled", "cancelled")
+    assert cluster.where("runs") == []
+
+
+def test_a_host_that_never_comes_back_is_lost_after_its_lease() -> None:
+    """And who can only go there does not block the queue for ever."""
+    cluster = Cluster("a", Machine("b", labels={"x": "y"}))
+    cluster.submit(process("p", required_labels={"x": "y"}))
+    cluster.machines["b"].connected = False
+    cluster.restart_master()
+    cluster.submit(process("special", required_labels={"x": "y"}), process("plain"))
+    assert cluster.queue() == ["special", "plain"]
+    cluster.wait(11.0)
+    assert len(cluster.told("host_lost")) == 1
+    assert (cluster.phase("p"), cluster["p"].reason) == ("unreachable", "b is lost")
+    assert (cluster.phase("special"), cluster.where("plain")) == ("set_aside", ["a"])
+
+
+@pytest.mark.parametrize("overlap", [True, False])
+@pytest.mark.parametrize("first", ["a", "b"])
+@pytest.mark.parametrize("ready", [True, False])
+def test_a_move_that_was_under_way_leaves_one_instance(
+    overlap: bool, first: str, ready: bool
+) -> None:
+    """Whoever registers first, before or after the commit: one owner, and it runs."""
+    cluster = Cluster("a", Machine("b", busy={"memory": 0.5}))
+    cluster.submit(movable("p", overlap=overlap, ros=True))
+    cluster.machines["a"].seen_in_graph("p", cluster.now)
+    cluster.settle()
+    cluster.machines["a"].stubborn.add("p")
+    cluster.migrate("p")
+    if not overlap:
+        cluster.machines["a"].let_go("p", cluster.now)
+        cluster.settle()
+    if ready:
+        cluster.machines["b"].seen_in_graph("p", cluster.now)
+        cluster.settle()
+    cluster.machines["a"].stubborn.clear()
+    cluster.kill_master()
+    second = "b" if first == "a" else "a"
+    for name in (first, second):
+        cluster.register(cluster.machines[name])
+        cluster.wait(3.0)
+        assert len(cluster.where("p")) <= 1 + overlap
+    (host,) = cluster.where("p")
+    cluster.machines[host].seen_in_graph("p", cluster.now)
+    cluster.settle()
+    assert cluster.phase("p") == "running"
+    assert cluster.where("p") == [cluster.state.instances[cluster["p"].owner].host.name]
+    assert not cluster.intents["migration"]
+
+
+def test_a_source_that_was_told_to_stop_has_not_finished() -> None:
+    """The master died after the order: that the source exits with 0 is not its own end."""
+    cluster = Cluster("a", Machine("b", busy={"memory": 0.5}))
+    cluster.submit(movable("p", overlap=False))
+    cluster.machines["a"].stubborn.add("p")
+    cluster.migrate("p")
+    cluster.kill_master()
+    cluster.machines["a"].let_go("p", cluster.now)
+    cluster.restart_master()
+    cluster.wait(1.0)
+    assert cluster.phase("p") == "running"
+    assert len(cluster.where("p")) == 1

@@ -1,0 +1,536 @@
+"""Whatever happens, in whatever order: the promises of the master's core hold.
+
+Hypothesis plays users, machines, processes and the network: it submits, cancels, moves, cuts wires,
+loses, repeats and delays what travels, kills slaves and the master. What really runs is kept by
+`Machine`, apart from the books of the core; after every step the two are held against the promises.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+
+import numpy as np
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
+
+from rosrm.core import events as happened
+from rosrm.core import slave
+from rosrm.core.assigning import demand_of
+from rosrm.core.commands import Assign, Command
+from rosrm.core.model import Kind, MigrationPolicy, ProcessSpec, Readiness
+from rosrm.core.state import ProcessPhase, Wanted
+from tests.unit.core.cluster import MIB, Cluster, Machine
+
+NAMES = [f"p{i}" for i in range(5)]
+HOSTS = ["a", "b", "c"]
+LABELLED = "c"
+
+# Few of them are met often: so that much befalls the same one.
+names = st.sampled_from([*NAMES[:1] * 4, *NAMES[:2] * 2, *NAMES])
+hosts = st.sampled_from(HOSTS)
+chance = st.booleans()
+#: Which of the things that are there at the moment; `Play.pick` takes it modulo their number.
+which_one = st.integers(0, 11)
+
+
+def spec(
+    name: str, kind: str, memory: int, moves: str, special: bool, priority: int
+) -> ProcessSpec:
+    """One of a few sorts of process."""
+    migration = MigrationPolicy("relaunch", overlap=moves == "overlap") if moves else None
+    return ProcessSpec(
+        name, command=("run",), ros=kind == "node", priority=priority,
+        kind=Kind.JOB if kind == "job" else Kind.SERVICE,
+        needs={"memory": memory * MIB} if memory else {},
+        required_labels={"arm": "yes"} if special else {},
+        migration=migration or MigrationPolicy(), readiness=Readiness(timeout=4.0),
+    )  # fmt: skip
+
+
+class Play(RuleBasedStateMachine):
+    """The rules of the play; the promises are its invariants."""
+
+    @initialize(backfill=chance, most=st.integers(1, 2), slots=st.integers(0, 2))
+    def begin(self, backfill: bool, most: int, slots: int) -> None:
+        self.cluster = Cluster(
+            backfill=backfill, max_migrations=most, settle=3.0, suspect=1.0, lease=5.0,
+            delivery_timeout=2.0, cooldown=2.0, hysteresis=0.4, order_retry=1.0,
+        )  # fmt: skip
+        for name in HOSTS:
+            labels = {"arm": "yes"} if name == LABELLED else {}
+            machine = Machine(
+                name, memory=1000 * MIB, cpu=4.0, labels=labels,
+                max_processes=slots if name == "b" else 0,
+            )  # fmt: skip
+            self.cluster.add(machine)
+        #: Names whose newest process has come to its end by itself, well or badly.
+        self.completed: set[str] = set()
+        self.failed: set[str] = set()
+        self.late: list[happened.Event] = []
+        self.prompt = True
+        # Something to play with from the beginning.
+        for name, moves in (("p0", "overlap"), ("p1", "stop first")):
+            self.cluster.submit(spec(name, "node", 100, moves, special=False, priority=0))
+            for machine, running in self.programs():
+                machine.seen_in_graph(running, self.cluster.now)
+        self.cluster.settle()
+
+    # --- carrying out --------------------------------------------------------------------
+
+    def tell(self, event: happened.Event) -> list[Command]:
+        """One step of the core, looked at closely."""
+        commands = self.cluster.decide(event)
+        self.cluster.journal(commands)
+        self.look_at_assignments(commands)
+        self.cluster.carry_out(commands)
+        return commands
+
+    def ask(self, kind: type, *fields: object) -> bool:
+        self.cluster._requests += 1
+        request = self.cluster._requests
+        self.tell(kind(request, *fields))
+        return self.cluster.replies[request].accepted
+
+    def look_at_assignments(self, commands: list[Command]) -> None:
+        state = self.cluster.state
+        given = [command for command in commands if isinstance(command, Assign)]
+        for assign in given:
+            column = assign.host_id - 1
+            over = state.hosts.busy[:, column] - state.hosts.limit[:, column]
+            assert not (over > 1e-6).any(), "assigned over a limit"
+            assert state.hosts.open()[column], "assigned to a host that is closed"
+            assert state.hosts.processes[column] <= state.hosts.bound[column]
+        self.look_at_order(given)
+
+    def look_at_order(self, given: list[Assign]) -> None:
+        """Nobody was passed by one of its equals (without backfill: by anybody)."""
+        state = self.cluster.state
+        for assign in given:
+            chosen = state.processes[assign.assignment.instance.process]
+            for name in state.queue:
+                waits = state.processes[name]
+                ahead = (-waits.spec.priority, waits.order) < (-chosen.spec.priority, chosen.order)
+                alike = demand_of(state, waits).key[4:] == demand_of(state, chosen).key[4:]
+                assert not (ahead and (alike or not state.settings.backfill)), "passed"
+
+    def machine(self, name: str) -> Machine:
+        return self.cluster.machines[name]
+
+    def register(self, machine: Machine) -> None:
+        if not machine.connected:
+            return
+        event = (happened.HostRegistered, machine.description(), machine.slave.statuses())
+        if self.ask(*event):
+            machine.host_id = self.cluster.replies[self.cluster._requests].host_id
+            machine.polled.clear()
+            machine.tell(slave.Registered(self.cluster.state.epoch), self.cluster.now)
+
+    def pick(self, things: list, which: int) -> object:
+        return things[which % len(things)]
+
+    def movable(self) -> list[str]:
+        """Processes that run and have a strategy."""
+        return [
+            process.name
+            for process in self.cluster.state.processes.values()
+            if process.phase is ProcessPhase.RUNNING and process.spec.migration.strategy
+        ]
+
+    def programs(self) -> list[tuple[Machine, str]]:
+        """What really runs, with its machine."""
+        return [
+            (machine, instance.process)
+            for machine in self.cluster.machines.values()
+            for instance in machine.programs
+        ]
+
+    def with_orders(self) -> list[Machine]:
+        return [one for one in self.cluster.machines.values() if one.ordered and one.connected]
+
+    def with_statuses(self) -> list[Machine]:
+        return [one for one in self.cluster.machines.values() if one.said and one.connected]
+
+    def flow(self) -> None:
+        """While the network is prompt, all that was said arrives at once."""
+        if self.prompt:
+            self.everything_arrives()
+
+    def known(self, machine: Machine) -> bool:
+        """The master knows this run of the slave."""
+        find = self.cluster.state.hosts.find
+        return machine.connected and find(machine.host_id, machine.incarnation) is not None
+
+    # --- users ---------------------------------------------------------------------------
+
+    @rule(
+        name=names, kind=st.sampled_from(["service", "job", "node", "node"]),
+        memory=st.sampled_from([0, 100, 100, 300]),
+        moves=st.sampled_from(["overlap", "stop first", "overlap", "stop first", ""]),
+        special=chance, urgent=chance, twin=names,
+    )  # fmt: skip
+    def submit(
+        self, name: str, kind: str, memory: int, moves: str, special: bool, urgent: bool, twin: str
+    ) -> None:
+        special = special and memory == 300
+        specs = [spec(one, kind, memory, moves, special, int(urgent)) for one in (name, twin)]
+        before = set(self.cluster.state.processes)
+        if self.ask(happened.SubmissionReceived, tuple(specs)):
+            for one in (name, twin):
+                self.completed.discard(one)
+                self.failed.discard(one)
+        else:
+            assert set(self.cluster.state.processes) == before
+        self.flow()
+
+    @rule(name=names)
+    def cancel(self, name: str) -> None:
+        self.ask(happened.CancelRequested, (name,))
+        self.flow()
+
+    @rule(name=names)
+    def restart(self, name: str) -> None:
+        process = self.cluster.state.processes.get(name)
+        ended = process is not None and process.phase.over
+        if self.ask(happened.RestartRequested, (name,)) and ended:
+            self.completed.discard(name)
+            self.failed.discard(name)
+        self.flow()
+
+    @precondition(lambda self: self.movable())
+    @rule(which=which_one, host=st.none() | hosts)
+    def migrate(self, which: int, host: str | None) -> None:
+        self.ask(happened.MigrationRequested, self.pick(self.movable(), which), host)
+        self.flow()
+
+    @rule(host=hosts, action=st.sampled_from(["cordon", "uncordon", "uncordon", "drain"]))
+    def set_host(self, host: str, action: str) -> None:
+        self.ask(happened.HostStateRequested, host, action)
+        self.flow()
+
+    # --- the network ---------------------------------------------------------------------
+
+    def ask_for_work(self, machine: Machine) -> None:
+        self.cluster._requests += 1
+        self.tell(
+            happened.ProcessRequested(self.cluster._requests, machine.host_id, machine.incarnation)
+        )
+
+    @rule(host=hosts)
+    def slave_fetches(self, host: str) -> None:
+        machine = self.machine(host)
+        if machine.connected:
+            machine.fetch(self.cluster.now)
+
+    @precondition(lambda self: self.with_orders())
+    @rule(at=which_one, which=which_one, fate=st.sampled_from(["", "", "", "lost", "twice"]))
+    def order_arrives(self, at: int, which: int, fate: str) -> None:
+        machine = self.pick(self.with_orders(), at)
+        which %= len(machine.ordered)
+        order = machine.ordered[which]
+        if fate != "twice":
+            del machine.ordered[which]
+        if fate == "lost":
+            self.tell(happened.OrderAnswered(order.order, accepted=False, code="timeout"))
+        else:
+            self.tell(machine.obey(order, self.cluster.now))
+        self.flow()
+
+    @precondition(lambda self: self.with_statuses())
+    @rule(
+        at=which_one, which=st.sampled_from([0, 0, 0, 1, 2]),
+        fate=st.sampled_from(["", "", "", "lost", "twice"]),
+    )  # fmt: skip
+    def statuses_arrive(self, at: int, which: int, fate: str) -> None:
+        machine = self.pick(self.with_statuses(), at)
+        which %= len(machine.said)
+        batch = machine.said[which]
+        if fate != "twice":
+            del machine.said[which]
+        if fate != "lost":
+            self.tell(batch)
+        self.flow()
+
+    @rule(host=hosts, keep=chance)
+    def reading_arrives(self, host: str, keep: bool) -> None:
+        machine = self.machine(host)
+        if self.known(machine):
+            readings = self.cluster.readings([machine])
+            if keep:
+                self.late.append(readings)
+            else:
+                self.tell(readings)
+                self.tell(machine.usages())
+        self.flow()
+
+    @precondition(lambda self: self.late)
+    @rule()
+    def late_reading_arrives(self) -> None:
+        self.tell(self.late.pop(0))
+
+    @rule(prompt=chance)
+    def network_is(self, prompt: bool) -> None:
+        self.prompt = prompt
+        self.flow()
+
+    # --- machines and processes ----------------------------------------------------------
+
+    @precondition(lambda self: self.programs())
+    @rule(which=which_one, code=st.sampled_from([0, 0, 3]))
+    def process_ends(self, which: int, code: int) -> None:
+        machine, name = self.pick(self.programs(), which)
+        machine.finish(name, self.cluster.now, code=code)
+        (self.failed if code else self.completed).add(name)
+        self.flow()
+
+    @precondition(lambda self: self.programs())
+    @rule(which=which_one)
+    def node_is_seen(self, which: int) -> None:
+        machine, name = self.pick(self.programs(), which)
+        machine.seen_in_graph(name, self.cluster.now)
+        self.flow()
+
+    @rule(
+        host=hosts, name=names,
+        what=st.sampled_from(["stubborn", "tame", "missing", "there", "large", "small"]),
+    )  # fmt: skip
+    def program_changes(self, host: str, name: str, what: str) -> None:
+        """It ignores signals or not, is installed there or not, uses much or little."""
+        machine = self.machine(host)
+        if what == "stubborn":
+            machine.stubborn.add(name)
+        elif what == "tame":
+            self.tame(machine, {name})
+        elif what == "missing":
+            machine.refuses[name] = "no such executable"
+        elif what == "there":
+            machine.refuses.pop(name, None)
+        else:
+            memory = 400.0 if what == "large" else 50.0
+            machine.shown[name] = {"memory": memory * MIB, "cpu": 0.1}
+        self.flow()
+
+    def tame(self, machine: Machine, names: set[str]) -> None:
+        machine.stubborn -= names
+        for instance in list(machine.programs):
+            stopping = machine.programs[instance].state.value == "stopping"
+            if stopping and instance.process in names:
+                machine._stop(instance, self.cluster.now)
+
+    @rule(
+        host=hosts,
+        what=st.sampled_from(
+            ["cut", "cut", "mended", "killed", "killed", "leaves", "loses a poll", "full", "empty"]
+        ),
+    )
+    def host_changes(self, host: str, what: str) -> None:
+        """Its wire, its slave, or how busy others keep it."""
+        machine = self.machine(host)
+        if what in ("cut", "mended"):
+            machine.connected = what == "mended"
+        elif what == "killed":
+            machine.restart_slave(self.cluster.now)
+            self.register(machine)
+        elif what == "leaves" and self.known(machine):
+            self.ask(happened.HostLeft, machine.host_id, machine.incarnation)
+            for instance in list(machine.programs):
+                machine.tell(slave.StopOrdered(instance), self.cluster.now)
+        elif what == "loses a poll":
+            machine.polled.clear()
+        elif what in ("full", "empty"):
+            machine.busy["memory"] = 0.79 if what == "full" else 0.1
+        self.flow()
+
+    @rule()
+    def all_is_well(self) -> None:
+        """Every host is connected, up, open, and asks for work."""
+        for machine in self.cluster.machines.values():
+            machine.connected = True
+            machine.busy["memory"] = 0.1
+            if not self.known(machine) or not self.is_up(machine):
+                machine.restart_slave(self.cluster.now)
+                self.cluster.now += 1.5
+                self.tell(happened.TimePassed())
+                self.register(machine)
+            self.ask(happened.HostStateRequested, machine.name, "uncordon")
+        self.time_passes(0.05, quiet=False)
+
+    def is_up(self, machine: Machine) -> bool:
+        table = self.cluster.state.hosts
+        return table.condition_of(table.by_name[machine.name]).name == "UP"
+
+    # --- time and the master -------------------------------------------------------------
+
+    @rule(seconds=st.sampled_from([0.05, 0.3, 0.3, 1.0, 2.5, 6.0]), quiet=chance)
+    def time_passes(self, seconds: float, quiet: bool) -> None:
+        self.cluster.now += seconds
+        for machine in self.cluster.machines.values():
+            machine.tell(slave.TimePassed(), self.cluster.now)
+            if self.known(machine) and not quiet:
+                self.tell(self.cluster.readings([machine]))
+                self.tell(machine.usages())
+                if machine.accepts():
+                    self.ask_for_work(machine)
+        self.tell(happened.TimePassed())
+        self.flow()
+
+    @precondition(lambda self: not self.prompt)
+    @rule()
+    def all_arrives(self) -> None:
+        self.everything_arrives()
+
+    def everything_arrives(self) -> None:
+        for _ in range(3):
+            for machine in self.cluster.machines.values():
+                if not machine.connected:
+                    continue
+                machine.fetch(self.cluster.now)
+                while machine.ordered:
+                    self.tell(machine.obey(machine.ordered.popleft(), self.cluster.now))
+                while machine.said:
+                    self.tell(machine.said.popleft())
+
+    @rule(registering=st.lists(hosts, unique=True, max_size=3))
+    def master_is_killed(self, registering: list[str]) -> None:
+        """It comes up again from its journal, and some slaves register."""
+        self.late.clear()
+        self.cluster.kill_master()
+        for host in registering:
+            self.register(self.machine(host))
+
+    @rule(name=names, durable=chance)
+    def master_is_killed_in_the_act(self, name: str, durable: bool) -> None:
+        """After the core decided: before or after its outcome became durable."""
+        one = spec(name, "service", 100, "", False, 0)
+        commands = self.cluster.decide(happened.SubmissionReceived(0, (one,)))
+        if durable:
+            self.cluster.journal(commands)
+            if any(isinstance(command, Assign) for command in commands):
+                self.completed.discard(name)
+                self.failed.discard(name)
+        self.master_is_killed([])
+
+    # --- promises ------------------------------------------------------------------------
+
+    @invariant()
+    def no_process_is_lost(self) -> None:
+        """Each is in exactly one place, and its phase says which."""
+        if not hasattr(self, "cluster"):
+            return
+        state = self.cluster.state
+        queued = set(state.queue)
+        for process in state.processes.values():
+            name, phase = process.name, process.phase
+            assert (phase is ProcessPhase.QUEUED) == (name in queued), (name, phase)
+            assert (phase is ProcessPhase.SET_ASIDE) == (name in state.set_aside), (name, phase)
+            moving = name in state.runs
+            assert moving or phase not in (ProcessPhase.MIGRATING, ProcessPhase.STUCK)
+            if phase.over or name in queued or name in state.set_aside:
+                assert not process.owner, (name, phase)
+                assert not moving
+                assert phase.over or not process.instances
+            elif not moving:
+                waits_for_an_end = process.wanted is Wanted.REQUEUE and process.instances
+                assert process.owner in state.instances or waits_for_an_end, (name, phase)
+        assert queued <= set(state.processes)
+
+    @invariant()
+    def the_books_balance(self) -> None:
+        """What counts against a host is the sum over its instances, and never negative."""
+        if not hasattr(self, "cluster"):
+            return
+        state = self.cluster.state
+        of_process = defaultdict(set)
+        for number, instance in state.instances.items():
+            of_process[instance.id.process].add(number)
+            assert number in instance.host.instances
+        for process in state.processes.values():
+            assert process.instances == of_process.pop(process.name, set())
+        assert {name: numbers for name, numbers in state.orphans.items() if numbers} == of_process
+        for host in state.hosts.hosts:
+            held = [state.instances[number] for number in host.instances]
+            assert all(instance.host is host for instance in held)
+            assert state.hosts.processes[host.column] == len(held)
+            total = np.zeros(len(state.hosts.resources))
+            for instance in held:
+                assert (instance.charged >= 0.0).all()
+                total[: len(instance.charged)] += instance.charged
+            assert np.allclose(state.hosts.load[:, host.column], total, atol=1e-6)
+            assert (state.hosts.load[:, host.column] >= 0.0).all()
+
+    @invariant()
+    def never_two_active(self) -> None:
+        """In truth: one instance of a process, two only where its spec declares an overlap."""
+        if not hasattr(self, "cluster"):
+            return
+        for name in NAMES:
+            running = [
+                program.assignment
+                for machine in self.cluster.machines.values()
+                for program in machine.programs.values()
+                if program.assignment.instance.process == name
+            ]
+            overlap = all(one.spec.migration.overlap and one.spec.migration.strategy
+                          for one in running)  # fmt: skip
+            assert len(running) <= (2 if overlap else 1), [str(one.instance) for one in running]
+
+    @invariant()
+    def an_end_is_told_as_it_was(self) -> None:
+        """Nothing has finished or failed that did not end so by itself."""
+        if not hasattr(self, "cluster"):
+            return
+        for process in self.cluster.state.processes.values():
+            if process.phase is ProcessPhase.FINISHED:
+                assert process.name in self.completed
+
+    def teardown(self) -> None:
+        """Once everything works again, everything that was asked for comes to its end."""
+        if not hasattr(self, "cluster"):
+            return
+        cluster = self.cluster
+        for machine in cluster.machines.values():
+            machine.connected = True
+            machine.refuses.clear()
+            machine.shown.clear()
+            machine.busy["memory"] = 0.05
+            self.tame(machine, set(NAMES))
+            machine.restart_slave(cluster.now)
+        cluster.now += 2.0
+        cluster.tell(happened.TimePassed())
+        for machine in cluster.machines.values():
+            cluster.register(machine)
+        for name in HOSTS:
+            cluster.set_host(name, "uncordon")
+        self._let_nodes_come_up(40)
+        calm = {"queued", "set_aside", "running", "finished", "failed", "cancelled"}
+        for process in cluster.state.processes.values():
+            assert process.phase.value in calm, (process.name, process.phase, process.reason)
+            where = cluster.where(process.name)
+            assert len(where) == (process.phase is ProcessPhase.RUNNING), (process.name, where)
+        self._cancel_all()
+
+    def _let_nodes_come_up(self, times: int) -> None:
+        for _ in range(times):
+            for machine in self.cluster.machines.values():
+                for instance in list(machine.programs):
+                    machine.tell(slave.SeenInGraph(instance), self.cluster.now)
+            self.cluster.wait(1.0, tick=0.5)
+            self.no_process_is_lost()
+            self.the_books_balance()
+            self.never_two_active()
+
+    def _cancel_all(self) -> None:
+        cluster = self.cluster
+        live = [p.name for p in cluster.state.processes.values() if not p.phase.over]
+        if live:
+            assert cluster.cancel(*live).accepted
+        cluster.wait(5.0, tick=0.5)
+        assert all(process.phase.over for process in cluster.state.processes.values())
+        assert not any(machine.programs for machine in cluster.machines.values())
+        assert not cluster.state.instances
+        assert not cluster.state.runs
+        assert not len(cluster.state.queue)
+        assert np.allclose(cluster.state.hosts.load, 0.0, atol=1e-6)
+        assert not cluster.intents["migration"]
+
+
+TestPlay = Play.TestCase
