@@ -178,11 +178,8 @@ def shared_memory_of(pid: int) -> set[str]:
     """The files in /dev/shm that a process has mapped and that bear its participant's id."""
     with contextlib.suppress(OSError):
         lines = Path(f"/proc/{pid}/maps").read_text().splitlines()
-        paths = {
-            line.split(None, 5)[5].removesuffix(" (deleted)")
-            for line in lines
-            if "/dev/shm/" in line
-        }
+        mapped = [line.split(None, 5)[5] for line in lines if "/dev/shm/" in line]
+        paths = {path.removesuffix(" (deleted)") for path in mapped}
         return {path for path in paths if "fastrtps" in path and "port" not in path}
     return set()
 
@@ -191,6 +188,14 @@ def wait_gone(pid: int, timeout: float = PATIENCE) -> None:
     deadline = time.monotonic() + timeout
     while Path(f"/proc/{pid}").exists() and not zombie(pid):
         assert time.monotonic() < deadline, f"process {pid} did not end within {timeout} s"
+        time.sleep(0.01)
+
+
+def wait_until(condition: Callable[[], object], what: str, timeout: float = PATIENCE) -> None:
+    """For what cannot be awaited: a file of another process."""
+    deadline = time.monotonic() + timeout
+    while not condition():
+        assert time.monotonic() < deadline, f"not within {timeout} s: {what}"
         time.sleep(0.01)
 
 

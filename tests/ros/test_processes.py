@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import stat
@@ -12,7 +13,14 @@ import time
 import pytest
 
 from rosrm.config.settings import LogSettings
-from rosrm.core.model import Kind, ProcessSpec, Readiness, RestartPolicy, StopPolicy
+from rosrm.core.model import (
+    Kind,
+    MigrationPolicy,
+    ProcessSpec,
+    Readiness,
+    RestartPolicy,
+    StopPolicy,
+)
 from rosrm.errors import Refused
 from tests.ros.clusters import NODE, QUICK, alive, host, job, node, python, service, wait_gone
 
@@ -124,7 +132,7 @@ def test_name_parameters_and_remappings_reach_the_node(cluster, ament_prefix) ->
 
 
 def test_the_environment_is_clean(cluster) -> None:
-    """Nothing of the ROS wheels' bootstrapper is inherited; what the spec says and who it is, is."""
+    """Nothing of the bootstrapper of the wheels; who it is, and what its spec says."""
     code = "import json, os; print(json.dumps(dict(os.environ)))"
     cluster.run(python("environment", code, kind=Kind.JOB, environment={"MINE": "yes"}))
     environment = json.loads(cluster.log("environment"))
@@ -196,7 +204,7 @@ def test_restarts_with_back_off_until_the_attempts_are_used_up(cluster) -> None:
     assert (row.state, row.exit_code, row.restarts) == ("failed", 3, 3)
     assert "restarts" in row.reason
     times = [float(line) for line in cluster.log("crashes").split()]
-    pauses = [after - before for before, after in zip(times, times[1:], strict=False)]
+    pauses = [after - before for before, after in itertools.pairwise(times)]
     assert len(pauses) == 3
     for pause, least in zip(pauses, (0.1, 0.2, 0.4), strict=True):
         assert pause >= least
@@ -322,7 +330,7 @@ def test_a_flood_of_output_is_bounded(cluster) -> None:
 
 def test_reading_and_following_a_log(cluster) -> None:
     """From the start, from the end, and on from where the last part ended, until it has ended."""
-    code = "import sys\nprint('first', flush=True)\nfor line in open(sys.argv[1]): print(line, end='', flush=True)"
+    code = "import sys\nprint('first')\nfor line in open(sys.argv[1]): print(line, end='')"
     fifo = cluster.directory / "fifo"
     os.mkfifo(fifo)
     spec = ProcessSpec(
@@ -386,9 +394,7 @@ def test_unknown_names_are_refused(cluster) -> None:
         lambda: cluster.client.set_host_state("nowhere", "drain"),
         lambda: cluster.client.set_host_state("h0", "explode"),
     ):
-        with pytest.raises(Refused, match="nobody|nowhere|explode"):
+        with pytest.raises(Refused, match=r"nobody|nowhere|explode"):
             ask()
     with pytest.raises(Refused, match="teleport"):
-        from rosrm.core.model import MigrationPolicy
-
         cluster.submit(service("moving", migration=MigrationPolicy("teleport")))
