@@ -1,0 +1,397 @@
+"""What strangers, late and mad messages do to a real cluster: nothing, and it is said."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rosrm.core.model import HostDescription, ResourceDescription
+from rosrm.errors import NoMaster, Refused
+from rosrm.local_cluster import claim_domain
+from rosrm.ros import convert, names, qos
+from rosrm.ros.client import MasterClient, find_master, wait_for, wait_for_service
+from rosrm.ros.control import ControlClient
+from rosrm.ros.participant import Participant
+from rosrm.ros.readings import LAYOUT, encode
+from rosrm.ros.settings import RosSettings
+from rosrm.version import PROTOCOL_VERSION
+from rosrm_msgs import msg, srv
+from tests.ros.clusters import PATIENCE, host, job, service
+
+path = names.Names("/rosrm")
+
+
+@pytest.fixture(scope="module")
+def cluster(make_shared):
+    return make_shared(host("h0"))
+
+
+class Stranger:
+    """A participant that says what rosrm's own parts never would."""
+
+    def __init__(self, participant: Participant):
+        self.participant = participant
+        self.control = ControlClient(participant, "stranger test")
+        self.clients = {}
+
+    def client(self, kind, name: str):
+        if name not in self.clients:
+            client = self.participant.node.create_client(kind, name, qos_profile=qos.SERVICE)
+            assert wait_for_service(self.participant, client, time.monotonic() + PATIENCE), name
+            self.clients[name] = client
+        return self.clients[name]
+
+    def ask(self, kind, name: str, request):
+        future = self.client(kind, name).call_async(request)
+        response = wait_for(self.participant, future, time.monotonic() + PATIENCE)
+        assert response is not None, f"no answer of {name}"
+        return response
+
+    def hello(self, **changes):
+        fields = {
+            "protocol_version": PROTOCOL_VERSION, "software_version": "x", "role": "client",
+            "name": "stranger",
+        }  # fmt: skip
+        request = srv.Handshake.Request(**{**fields, **changes})
+        return self.ask(srv.Handshake, path(names.HANDSHAKE), request)
+
+    def envelope(self, **changes):
+        hello = self.hello()
+        envelope = self.control.envelope(hello.beat, hello.epoch)
+        for name, value in changes.items():
+            setattr(envelope, name, value)
+        return envelope
+
+    def submit(self, *specs, envelope=None):
+        request = srv.Submit.Request(
+            envelope=envelope or self.envelope(),
+            processes=[convert.spec_to_msg(spec) for spec in specs],
+        )
+        return self.ask(srv.Submit, path(names.SUBMIT), request).answer
+
+    def publisher(self, kind, name: str, profile):
+        publisher = self.participant.node.create_publisher(kind, path(name), profile)
+        deadline = time.monotonic() + PATIENCE
+        while publisher.get_subscription_count() == 0:
+            assert time.monotonic() < deadline, f"nobody listens to {name}"
+            self.participant.spin(0.02)
+        return publisher
+
+
+@pytest.fixture(scope="module")
+def stranger(cluster):
+    with Participant(cluster.ros, "rosrm_test_stranger") as participant:
+        yield Stranger(participant)
+
+
+# --- versions ---------------------------------------------------------------------------------
+
+
+def test_a_client_of_another_version_is_refused(cluster, stranger) -> None:
+    """The master says so to it, and keeps a record."""
+    answer = stranger.hello(protocol_version=99, name="from-the-future")
+    assert not answer.accepted
+    assert "version 99" in answer.message
+    assert str(PROTOCOL_VERSION) in answer.message
+    said = cluster.wait_for_event("peer_refused").message
+    assert "from-the-future" in said
+
+
+@pytest.mark.parametrize("kind", ["submit", "list", "explain", "read_log"])
+def test_a_request_of_another_version_is_refused(cluster, stranger, kind) -> None:
+    """Also by the services that need no handshake; nothing is done."""
+    if kind == "submit":
+        answer = stranger.submit(
+            job("futuristic", "true"), envelope=stranger.envelope(protocol_version=99)
+        )
+        assert "futuristic" not in {r.name for r in cluster.client.list(processes=True).processes}
+    elif kind == "list":
+        answer = stranger.ask(
+            srv.List, path(names.LIST), srv.List.Request(protocol_version=99, hosts=True)
+        ).answer
+    elif kind == "explain":
+        answer = stranger.ask(
+            srv.Explain, path(names.EXPLAIN), srv.Explain.Request(protocol_version=99)
+        ).answer
+    else:
+        request = srv.ReadLog.Request(protocol_version=99, process="x")
+        answer = stranger.ask(srv.ReadLog, path.of_host("h0", names.READ_LOG), request).answer
+    assert (answer.accepted, answer.code) == (False, "version")
+    assert "99" in answer.message
+
+
+class OtherMaster:
+    """Answers handshakes as a master of another version would."""
+
+    def __init__(self, settings: RosSettings):
+        self.participant = Participant(settings, "rosrm_test_master")
+        self.participant.serve(srv.Handshake, path(names.HANDSHAKE), self.answer)
+        self.asked = []
+
+    def answer(self, request, open_request) -> None:
+        self.asked.append(request)
+        open_request.answer(
+            srv.Handshake.Response(
+                protocol_version=99, accepted=True, master="other", hostname="robot-9", epoch=1,
+                beat=time.monotonic_ns(),
+            )
+        )  # fmt: skip
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.participant.close()
+
+
+def test_a_slave_refuses_a_master_of_another_version(make_cluster, tmp_path) -> None:
+    """It says which versions, ends with 1, and leaves nothing behind."""
+    cluster = make_cluster()
+    domain, claim = claim_domain()
+    with claim, OtherMaster(RosSettings(domain=domain, discovery_range="localhost")) as other:
+        cluster.ros = replace(cluster.ros, domain=domain)
+        part = cluster.start_slave(host("lonely"))
+        deadline = time.monotonic() + PATIENCE
+        while part.process.poll() is None:
+            assert time.monotonic() < deadline, "the slave did not end"
+            other.participant.spin(0.05)
+    assert part.process.returncode == 1
+    said = cluster.log_of("lonely")
+    assert "version 99" in said
+    assert "robot-9" in said
+    assert [request.role for request in other.asked][:1] == ["slave"]
+
+
+# --- age and repetition -----------------------------------------------------------------------
+
+
+def test_a_late_request_is_refused(cluster, stranger) -> None:
+    """By the master's own clock; and one that knows nothing of it as well."""
+    beat = stranger.hello().beat
+    for receiver_beat in (beat - 6 * 10**9, beat + 10**12, 0):
+        envelope = stranger.envelope(receiver_beat=receiver_beat)
+        answer = stranger.submit(job("late", "true"), envelope=envelope)
+        assert (answer.accepted, answer.code) == (False, "stale")
+    assert "late" not in {row.name for row in cluster.client.list(processes=True).processes}
+
+
+def test_a_repeated_request_is_done_once_and_answered_again(cluster, stranger) -> None:
+    """The same id twice: the same answer twice, one process."""
+    envelope = stranger.envelope()
+    answers = [stranger.submit(job("once", "true"), envelope=envelope) for _ in range(2)]
+    assert all(answer.accepted for answer in answers)
+    assert answers[0] == answers[1]
+    cluster.ended("once")
+    assert cluster.kinds("once").count("submitted") == 1
+
+
+def test_a_slave_judges_its_orders(cluster, stranger) -> None:
+    """Late, of an older epoch, of another version, unknown: refused, and the process runs on."""
+    cluster.submit(service("target"))
+    row = cluster.wait("target", "running")
+    control = path.of_host("h0", names.CONTROL)
+    epoch = stranger.hello().epoch
+    now = time.monotonic_ns()  # of this machine, and so the slave's own
+
+    def order(**changes):
+        envelope = stranger.control.envelope(now, epoch)
+        action = changes.pop("action", srv.ControlHost.Request.STOP)
+        for name, value in changes.items():
+            setattr(envelope, name, value)
+        request = srv.ControlHost.Request(
+            envelope=envelope, action=action,
+            instance=msg.InstanceId(process="target", number=row.number),
+        )  # fmt: skip
+        return stranger.ask(srv.ControlHost, control, request).answer
+
+    assert order(receiver_beat=now - 10**10).code == "stale"
+    assert order(receiver_beat=0).code == "stale"
+    assert order(epoch=epoch - 1).code == "stale"
+    assert order(protocol_version=99).code == "version"
+    assert not order(action=99).accepted
+    assert not order(action=srv.ControlHost.Request.START).accepted
+    assert not order(action=srv.ControlHost.Request.EXECUTE).accepted
+    assert cluster.process("target").pid == row.pid
+    cluster.cancel("target")
+
+
+# --- many at once -----------------------------------------------------------------------------
+
+
+def test_three_hundred_requests_at_once_are_all_answered(cluster, stranger) -> None:
+    """The default depth of a service would drop most of them silently."""
+    envelopes = [stranger.envelope() for _ in range(3)]
+    client = stranger.client(srv.Submit, path(names.SUBMIT))
+    futures = []
+    for number in range(300):
+        envelope = stranger.control.envelope(envelopes[-1].receiver_beat, envelopes[-1].epoch)
+        spec = convert.spec_to_msg(job(f"burst-{number:03}", "true"))
+        futures.append(client.call_async(srv.Submit.Request(envelope=envelope, processes=[spec])))
+    deadline = time.monotonic() + PATIENCE
+    for number, future in enumerate(futures):
+        response = wait_for(stranger.participant, future, deadline)
+        assert response is not None, f"request {number} of 300 was not answered"
+        assert response.answer.accepted, response.answer.message
+    cluster.wait_until(
+        "300 finished",
+        lambda v: sum(
+            r.state == "finished" for r in v.processes if r.name.startswith("burst")
+        ) == 300,
+        timeout=60.0,
+    )  # fmt: skip
+    order = [e.process for e in cluster.events("assigned", newest=5000) if "burst" in e.process]
+    assert order == [f"burst-{number:03}" for number in range(300)]
+
+
+# --- nonsense ---------------------------------------------------------------------------------
+
+
+def test_a_submission_that_makes_no_sense_is_refused(cluster, stranger) -> None:
+    """With the reason; the master goes on."""
+    spec = convert.spec_to_msg(job("mad", "true"))
+    for name, value, said in (
+        ("kind", "daemon", "daemon"),
+        ("command", [], "exactly one"),
+        ("needs", [msg.ResourceAmount(resource="memory", amount=float("nan"))], "memory"),
+        ("parameters", [msg.KeyValue(key="deep", value="[" * 50_000)], "deep"),
+    ):
+        request = srv.Submit.Request(
+            envelope=stranger.envelope(), processes=[convert.spec_to_msg(job("fine", "true")), spec]
+        )
+        setattr(request.processes[1], name, value)
+        answer = stranger.ask(srv.Submit, path(names.SUBMIT), request).answer
+        assert not answer.accepted
+        assert said in answer.message
+        spec = convert.spec_to_msg(job("mad", "true"))
+    assert "fine" not in {row.name for row in cluster.client.list(processes=True).processes}
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"name": ""},
+        {"incarnation": 0},
+        {"capacity": float("nan")},
+        {"capacity": -1.0},
+    ],
+    ids=str,
+)
+def test_a_host_that_makes_no_sense_is_refused(cluster, stranger, changes) -> None:
+    """It is not taken in."""
+    capacity = changes.pop("capacity", 1.0)
+    description = convert.host_to_msg(
+        HostDescription(
+            "mad-host", 77, resources=(ResourceDescription("memory", "B", 1.0),), period=0.1
+        )
+    )
+    description.resources[0].capacity = capacity
+    for name, value in changes.items():
+        setattr(description, name, value)
+    request = srv.RegisterHost.Request(envelope=stranger.envelope(), host=description)
+    answer = stranger.ask(srv.RegisterHost, path(names.REGISTER_HOST), request).answer
+    assert not answer.accepted
+    assert [row.description.name for row in cluster.client.list(hosts=True).hosts] == ["h0"]
+
+
+def reading(cluster, **changes):
+    row = cluster.host("h0")
+    record = np.zeros((), LAYOUT)
+    record["protocol_version"] = PROTOCOL_VERSION
+    record["host_id"], record["incarnation"] = row.host_id, row.description.incarnation
+    record["sequence"], record["beat"] = 2**40, time.monotonic_ns()
+    record["present"], record["flags"] = 0b11, 1
+    record["limit"] = 1.0
+    for name, value in changes.items():
+        record[name] = value
+    return encode(record)
+
+
+@pytest.mark.parametrize("usage", [float("nan"), -0.5, 1e30, float("inf")])
+def test_a_reading_that_makes_no_sense_is_refused(cluster, stranger, usage) -> None:
+    """It is said, the numbers are not taken over, and what the slave itself says counts next."""
+    publisher = stranger.publisher(msg.ResourceInfo, names.RESOURCE_INFO, qos.READING_OUT)
+    before = len(cluster.events("reading_refused"))
+    values = np.zeros(16, np.float32)
+    values[0] = usage
+    deadline = time.monotonic() + PATIENCE
+    publisher.publish(reading(cluster, usage=values))
+    while not cluster.events("reading_refused") and time.monotonic() < deadline:
+        cluster.client.spin(0.05)
+    assert cluster.events("reading_refused")
+    assert len(cluster.events("reading_refused")) <= before + 1
+    for resource in cluster.host("h0").resources:
+        assert 0.0 <= resource.usage <= 2.0
+    cluster.run(job(f"after-{usage}", "true"))
+
+
+def test_a_reading_of_another_version_is_refused(cluster, stranger) -> None:
+    """Of another version, and of another size; told once, not ten times a second."""
+    publisher = stranger.publisher(msg.ResourceInfo, names.RESOURCE_INFO, qos.READING_OUT)
+    for _ in range(20):
+        publisher.publish(reading(cluster, protocol_version=99))
+        stranger.participant.spin(0.02)
+    cluster.wait_for_event("peer_refused")
+
+    def told() -> list[str]:
+        return [
+            event.message for event in cluster.events("peer_refused")
+            if "resource_info" in event.message
+        ]  # fmt: skip
+
+    deadline = time.monotonic() + PATIENCE
+    while not told():
+        assert time.monotonic() < deadline, "the stranger was not noticed"
+        publisher.publish(reading(cluster, protocol_version=99))
+        cluster.client.spin(0.05)
+    assert len(told()) == 1
+    assert "version 99" in told()[0]
+
+
+def test_a_status_that_makes_no_sense_is_refused(cluster, stranger) -> None:
+    """A state that nobody knows, from whoever says it."""
+    publisher = stranger.publisher(msg.ProcessStatusBatch, names.PROCESS_STATUS, qos.STATUSES)
+    row = cluster.host("h0")
+    batch = msg.ProcessStatusBatch(
+        protocol_version=PROTOCOL_VERSION, host_id=row.host_id, sequence=10**9,
+        incarnation=row.description.incarnation, statuses=[msg.ProcessStatus(state="flying")],
+    )  # fmt: skip
+    publisher.publish(batch)
+    deadline = time.monotonic() + PATIENCE
+    while not any("flying" in event.message for event in cluster.events("peer_refused")):
+        assert time.monotonic() < deadline, "it was not noticed"
+        cluster.client.spin(0.05)
+    cluster.run(job("after-the-flight", "true"))
+
+
+# --- nobody there -----------------------------------------------------------------------------
+
+
+def test_no_master_is_said_in_time() -> None:
+    """Within the time that was given, with domain, RMW and namespace."""
+    domain, claim = claim_domain()
+    settings = RosSettings(domain=domain, discovery_range="localhost")
+    began = time.monotonic()
+    with claim, pytest.raises(NoMaster) as nobody:
+        MasterClient.connect(settings, name="test", timeout=1.0)
+    assert time.monotonic() - began < 2.5
+    for word in (f"domain {domain}", "rmw_", "/rosrm", "1 s"):
+        assert word in str(nobody.value)
+
+
+def test_clusters_of_different_namespaces_do_not_meet(cluster) -> None:
+    """Two masters may share a domain in different namespaces."""
+    settings = replace(cluster.ros, namespace="/elsewhere")
+    with Participant(settings, "rosrm_test_elsewhere") as participant:
+        assert find_master(participant, "client test", 1.0) is None
+
+
+def test_a_slave_that_is_not_there_is_said(cluster) -> None:
+    """Asking for a log of a host that nobody serves ends in time."""
+    client = MasterClient.connect(cluster.ros, name="test", timeout=PATIENCE)
+    with client:
+        client._timeout = 1.0
+        with pytest.raises((NoMaster, Refused), match="nowhere"):
+            client.read_log("nowhere", "p", 0, 0, 0)
