@@ -24,6 +24,7 @@ def lean_node(name: str, arguments: list[str]) -> Iterator[Node]:
         args=[*arguments, *_WITHOUT_TYPE_SERVICE], signal_handler_options=SignalHandlerOptions.NO
     )
     try:
-        yield Node(name, enable_rosout=False, start_parameter_services=False)
+        node = Node(name, enable_rosout=False, start_parameter_services=False)
+        yield node  # held here too: a caller need not name it to keep it in the graph
     finally:
         rclpy.shutdown()

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 _LOOK: Final = 0.005
 #: Seconds that a master which was found is given for a request, at least.
 _REQUEST: Final = 10.0
+#: Seconds after which a request without an answer is sent again.
+_AGAIN: Final = 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,14 +57,29 @@ def wait_for_service(participant: Participant, client: Any, deadline: float) -> 
     return True
 
 
-def wait_for(participant: Participant, future: Any, deadline: float) -> Any:
-    """The result of a call; None when `deadline` (monotonic seconds) has passed."""
-    while not future.done():
+def wait_until(participant: Participant, done: Callable[[], bool], deadline: float) -> bool:
+    """Whether something is done before `deadline` (monotonic seconds)."""
+    while not done():
         left = deadline - time.monotonic()
         if left <= 0.0:
-            return None
+            return False
         participant.spin(min(left, 0.1))
-    return future.result()
+    return True
+
+
+def wait_for(participant: Participant, future: Any, deadline: float) -> Any:
+    """The result of a call; None when `deadline` (monotonic seconds) has passed."""
+    return future.result() if wait_until(participant, future.done, deadline) else None
+
+
+@dataclass(slots=True)
+class _Answers:
+    """The first answer to a request that may have been sent more than once."""
+
+    first: tuple[Any, ...] = ()
+
+    def take(self, future: Any) -> None:
+        self.first = self.first or (future.result(),)
 
 
 def find_master(
@@ -257,14 +274,23 @@ class MasterClient:
         return client
 
     def _call(self, kind: Any, path: str, request: Any, who: str) -> Any:
+        """Ask until there is an answer: a lost one is given again to a repeated request.
+
+        Every request may be repeated: it reads only, or carries an id by which it is known.
+        """
         client = self._client(kind, path)
         deadline = time.monotonic() + self._timeout
-        response = wait_for(self._participant, client.call_async(request), deadline)
-        if response is None:
-            raise NoMaster(
-                f"{who} did not answer {path} within {self._timeout:g} s "
-                f"({self._participant.settings.describe()})"
-            )
+        answers = _Answers()
+        while not answers.first:
+            now = time.monotonic()
+            if now >= deadline:
+                raise NoMaster(
+                    f"{who} did not answer {path} within {self._timeout:g} s "
+                    f"({self._participant.settings.describe()})"
+                )
+            client.call_async(request).add_done_callback(answers.take)
+            wait_until(self._participant, lambda: bool(answers.first), min(deadline, now + _AGAIN))
+        (response,) = answers.first
         check_answer(response.answer, who)
         return response
 

@@ -92,6 +92,10 @@ class Gate:
             )
         return None
 
+    def knows(self, envelope: Envelope) -> bool:
+        """Whether a request of this id was let through before; then its age matters no more."""
+        return envelope.request_id in self._answers
+
     def repeated(self, envelope: Envelope, request: OpenRequest) -> bool:
         """True for a request that came before: it gets the same answer, once there is one."""
         known = self._answers.get(envelope.request_id)
@@ -150,7 +154,8 @@ class ControlServer:
         gate = self._gate
 
         def take(request: Any, open_request: OpenRequest) -> None:
-            answer = gate.refusal(request.envelope, self._epoch())
+            known = gate.knows(request.envelope)
+            answer = None if known else gate.refusal(request.envelope, self._epoch())
             if answer is not None:
                 open_request.answer(service_type.Response(answer=answer))
                 return

@@ -7,11 +7,13 @@ therefore defers every response, so that a request may stay open until there is 
 
 from __future__ import annotations
 
+import contextlib
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import rclpy
 from rclpy.experimental import EventsExecutor
@@ -24,6 +26,10 @@ from rosrm.ros.settings import RosSettings
 
 if TYPE_CHECKING:
     from typing_extensions import Self
+
+
+#: The first is the one that Fast DDS 2.14 (Jazzy) reads.
+_PROFILE_VARIABLES: Final = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 
 
 @dataclass(slots=True)
@@ -44,18 +50,20 @@ class Participant:
     Args:
         settings: applied to the environment before the context is made.
         name: of the node.
+        pace: how often it announces itself: "eager" or "steady" (docs/decisions/0009).
     """
 
-    def __init__(self, settings: RosSettings, name: str) -> None:
+    def __init__(self, settings: RosSettings, name: str, *, pace: str = "eager") -> None:
         os.environ.update(settings.environment())
         self.settings = settings
         self.context = rclpy.Context()
-        rclpy.init(
-            context=self.context,
-            domain_id=settings.domain,
-            signal_handler_options=SignalHandlerOptions.NO,
-        )
-        self.node = self._lean_node(name)
+        with _announcing(pace):
+            rclpy.init(
+                context=self.context,
+                domain_id=settings.domain,
+                signal_handler_options=SignalHandlerOptions.NO,
+            )
+            self.node = self._lean_node(name)
         self.executor = EventsExecutor(context=self.context)
         self.executor.add_node(self.node)
         self._executed = 0
@@ -142,6 +150,19 @@ class Participant:
         trace: TracebackType | None,
     ) -> None:
         self.close()
+
+
+@contextlib.contextmanager
+def _announcing(pace: str) -> Iterator[None]:
+    """Give Fast DDS a profile while a participant is made, unless the user has given one."""
+    if any(variable in os.environ for variable in _PROFILE_VARIABLES):
+        yield
+        return
+    os.environ[_PROFILE_VARIABLES[0]] = str(Path(__file__).parent / "profiles" / f"{pace}.xml")
+    try:
+        yield
+    finally:
+        del os.environ[_PROFILE_VARIABLES[0]]
 
 
 def _nothing() -> None:

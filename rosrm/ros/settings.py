@@ -31,6 +31,8 @@ class RosSettings:
             "ROS_DOMAIN_ID": "" if self.domain is None else str(self.domain),
             "ROS_AUTOMATIC_DISCOVERY_RANGE": self.discovery_range.upper(),
             "ROS_DISCOVERY_SERVER": self.discovery_server,
+            # A plain client of a server is told only what it asked for: too little to see nodes.
+            "ROS_SUPER_CLIENT": "TRUE" if self.discovery_server else "",
             "FASTDDS_BUILTIN_TRANSPORTS": self.transports,
         }
         return {name: value for name, value in variables.items() if value}

@@ -208,7 +208,6 @@ class SlaveEndpoint:
         self._beat_period = response.beat_period
         self._beat_at = now
         self._row["host_id"] = self.host_id
-        self._status_sequence = 0
         self.link = Link.REGISTERED
         self._host.take(core.Registered(answer.epoch))
         self._host.say(f"registered with master {self._master[0]} as host {self.host_id}")

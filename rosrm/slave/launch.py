@@ -46,10 +46,20 @@ def launch_order(
         instance=assignment.instance,
         argv=(*command, *arguments),
         environment=environment,
-        working_directory=spec.working_directory,
+        working_directory=_working_directory(spec),
         restart=spec.restart,
         stop=spec.stop,
     )
+
+
+def _working_directory(spec: ProcessSpec) -> str | None:
+    """Where it runs, "~" being the home of the slave's user on this host."""
+    if spec.working_directory is None:
+        return None
+    try:
+        return str(Path(spec.working_directory).expanduser())
+    except RuntimeError as error:
+        raise LaunchError(f"working_directory {spec.working_directory!r}: {error}") from None
 
 
 def _command(spec: ProcessSpec, environment: Mapping[str, str], python: str) -> tuple[str, ...]:

@@ -113,7 +113,9 @@ class SlaveRuntime:
                 signal.signal(number, self._stop)
             self._supervisor = self._connect()
             opened.callback(self._close_supervisor)
-            self._participant = Participant(config.ros, f"rosrm_slave_{token(config.host)}")
+            self._participant = Participant(
+                config.ros, f"rosrm_slave_{token(config.host)}", pace="steady"
+            )
             opened.callback(self._participant.close)
             self._graph = GraphWatch(self._participant.node)
             self._limit = self._limits()
