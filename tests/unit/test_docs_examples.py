@@ -18,8 +18,6 @@ from rosrm.ros import names
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
 PAGES = sorted([*ROOT.glob("*.md"), *DOCS.rglob("*.md"), *ROOT.glob("*/README.md")])
-#: `make demo` makes them; they are put there by hand from its output.
-FROM_THE_DEMO = {DOCS / "pictures" / "demo-usage.png", DOCS / "pictures" / "demo-map.png"}
 
 _FENCE = re.compile(
     r"(?:^<!-- ([^\n]*) -->\n)?^```(\w+)([^\n]*)\n(.*?)^```$", re.MULTILINE | re.DOTALL
@@ -99,7 +97,7 @@ def test_every_link_leads_somewhere(page):
     for link in links(page):
         path, _, anchor = link.partition("#")
         target = (page.parent / path).resolve() if path else page
-        assert target.exists() or target in FROM_THE_DEMO, link
+        assert target.exists(), link
         if anchor and target.suffix == ".md":
             assert anchor in anchors(target), link
 
