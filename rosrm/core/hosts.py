@@ -174,6 +174,12 @@ class HostTable(HostColumns):
         self.closed[host.column] = cordoned or draining
         self.changed()
 
+    def set_bound(self, host: Host, bound: int) -> None:
+        """How many processes a host may hold or be promised from now on."""
+        if int(self.bound[host.column]) != bound:
+            self.bound[host.column] = bound
+            self.touched.append(host.column)
+
     def charge(self, host: Host, amount: FloatArray, processes: int = 0) -> None:
         """Add to (or, negative, take from) the in-flight load and process count of one host.
 

@@ -9,6 +9,7 @@ from rosrm.core import events as happened
 from rosrm.core.charges import learn_from
 from rosrm.core.commands import Order
 from rosrm.core.hosts import Host, HostCondition
+from rosrm.core.lookahead import learn_run_time, review_slots
 from rosrm.core.model import EMPTY, InstanceId, InstanceState, InstanceStatus, Kind
 from rosrm.core.processes import End, Run
 from rosrm.core.state import Instance, MasterState, Process, ProcessPhase, Wanted
@@ -16,6 +17,7 @@ from rosrm.core.state import Instance, MasterState, Process, ProcessPhase, Wante
 #: What the state of the owning instance means for the process.
 _PHASE: Final = {
     None: ProcessPhase.ASSIGNED,
+    InstanceState.HELD: ProcessPhase.ASSIGNED,
     InstanceState.STARTING: ProcessPhase.STARTING,
     InstanceState.RUNNING: ProcessPhase.STARTING,
     InstanceState.READY: ProcessPhase.RUNNING,
@@ -72,6 +74,8 @@ def take_status(state: MasterState, host: Host, status: InstanceStatus, now: flo
     instance.state, instance.pid, instance.restarts = status.state, status.pid, status.restarts
     if status.state.ended:
         _ended(state, instance, status, before, now)
+    review_slots(state, host, now)
+    if status.state.ended:
         return
     if status.state in _ALIVE:
         instance.recalled = False
@@ -161,6 +165,7 @@ def _ended(
     if process is None:
         return
     learn_from(state, process.spec, instance, status)
+    learn_run_time(state, process.spec, status)
     end = _end(process, instance, status, before)
     run = state.runs.get(process.name)
     if run is not None:

@@ -174,6 +174,7 @@ class Assignment:
 class InstanceState(str, Enum):
     """What a slave says of an instance that it holds."""
 
+    HELD = "held"
     STARTING = "starting"
     RUNNING = "running"
     READY = "ready"

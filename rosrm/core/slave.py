@@ -4,7 +4,8 @@
 what happened           what the core does
 ======================  =========================================================================
 Registered              remembers the master's epoch; older ones are refused from now on
-AssignmentsReceived     has them launched, once; one that was stopped before is refused
+AssignmentsReceived     has them launched, once, or holds them until a slot is free; one that was
+                        stopped before is refused
 LaunchRefused           reports that the host cannot run it, and why
 StopOrdered             has it stopped; one never heard of will never be started
 RestartOrdered          has it stopped and started again here
@@ -177,15 +178,26 @@ class Held:
 
 @dataclass(slots=True)
 class SlaveState:
-    """All that the slave's core knows."""
+    """All that the slave's core knows.
 
+    Attributes:
+        max_processes: most that run at a time; 0: no bound.
+        waiting: assignments that are started as soon as a slot is free, in order.
+    """
+
+    max_processes: int = 0
     epoch: int = 0
     held: dict[InstanceId, Held] = field(default_factory=dict)
+    waiting: dict[InstanceId, Assignment] = field(default_factory=dict)
     tombstones: dict[InstanceId, None] = field(default_factory=dict)
 
     def statuses(self) -> tuple[InstanceStatus, ...]:
         """Of every instance, ended ones that are still remembered included."""
         return tuple(held.status for held in self.held.values())
+
+    def has_slot(self) -> bool:
+        """Whether one more process may run."""
+        return not self.max_processes or self.live() - len(self.waiting) < self.max_processes
 
     def live(self) -> int:
         """How many instances have not ended."""
@@ -235,7 +247,7 @@ def _registered(state: SlaveState, event: Registered, now: float) -> _Commands:
 
 
 def _assigned(state: SlaveState, event: AssignmentsReceived, now: float) -> _Commands:
-    launches, refusals = [], []
+    refusals = []
     for assignment in event.assignments:
         instance = assignment.instance
         if instance in state.held:
@@ -247,17 +259,30 @@ def _assigned(state: SlaveState, event: AssignmentsReceived, now: float) -> _Com
             _bury(state, instance)
             refusals.append(status)
             continue
-        name = _qualified(assignment) if awaits_graph(assignment.spec) else ""
-        state.held[instance] = Held(
-            InstanceStatus(instance, InstanceState.STARTING), assignment.spec, name
-        )
-        launches.append(assignment)
-    commands: _Commands = []
-    if launches:
-        commands.append(Launch(tuple(launches)))
-    if refusals:
-        commands.append(Report(tuple(refusals)))
-    return commands
+        state.waiting[instance] = assignment
+        state.held[instance] = _waiting(assignment)
+    launches = _start_waiting(state)
+    held = [state.held[one.instance].status for one in event.assignments]
+    reports = refusals + [status for status in held if status.state is InstanceState.HELD]
+    return [*launches, Report(tuple(reports))] if reports else launches
+
+
+def _waiting(assignment: Assignment) -> Held:
+    name = _qualified(assignment) if awaits_graph(assignment.spec) else ""
+    status = InstanceStatus(
+        assignment.instance, InstanceState.HELD, message="waits for a free slot there"
+    )
+    return Held(status, assignment.spec, name)
+
+
+def _start_waiting(state: SlaveState) -> _Commands:
+    """Launch what waits, as far as there are slots."""
+    launches = []
+    while state.waiting and state.has_slot():
+        instance = next(iter(state.waiting))
+        launches.append(state.waiting.pop(instance))
+        state.held[instance].status = InstanceStatus(instance, InstanceState.STARTING)
+    return [Launch(tuple(launches))] if launches else []
 
 
 def _why_not(state: SlaveState, assignment: Assignment) -> str:
@@ -278,15 +303,16 @@ def _launch_refused(state: SlaveState, event: LaunchRefused, now: float) -> _Com
     held.status = InstanceStatus(event.instance, InstanceState.REFUSED, message=event.reason)
     held.ready_by, held.ended_at = None, now
     _bury(state, event.instance)
-    return [Report((held.status,))]
+    return [*_start_waiting(state), Report((held.status,))]
 
 
 def _stop_ordered(state: SlaveState, event: StopOrdered, now: float) -> _Commands:
     held = state.held.get(event.instance)
     if held is not None and held.status.state.ended:
         return [Report((held.status,))]
-    if held is not None:
+    if held is not None and event.instance not in state.waiting:
         return [Stop(event.instance)]
+    state.waiting.pop(event.instance, None)
     _bury(state, event.instance)
     status = InstanceStatus(
         event.instance, InstanceState.REFUSED, message="it was stopped before it was started"
@@ -305,6 +331,8 @@ def _restart_ordered(state: SlaveState, event: RestartOrdered, now: float) -> _C
     held = state.held.get(event.instance)
     if held is None or held.status.state.ended:
         return [] if held is None else [Report((held.status,))]
+    if event.instance in state.waiting:
+        return []  # it starts as soon as it can
     held.ready_by, held.unready = None, ""
     return [Restart(event.instance)]
 
@@ -319,18 +347,20 @@ def _supervisor_reported(state: SlaveState, event: SupervisorReported, now: floa
         for reported in event.statuses
         if (status := _follow(state, reported, now)) is not None
     ]
-    return [Report(tuple(changed))] if changed else []
+    # The next one first: the master hears of an end soon enough.
+    return [*_start_waiting(state), *([Report(tuple(changed))] if changed else [])]
 
 
 def _supervisor_replaced(state: SlaveState, event: SupervisorReplaced, now: float) -> _Commands:
     known = {status.instance for status in event.statuses}
     for instance, held in list(state.held.items()):
-        if instance not in known and not held.status.state.ended:
+        lost = instance not in known and instance not in state.waiting
+        if lost and not held.status.state.ended:
             del state.held[instance]
             _bury(state, instance)
     for status in event.statuses:
         _follow(state, status, now)
-    return [Report(state.statuses(), complete=True)]
+    return [*_start_waiting(state), Report(state.statuses(), complete=True)]
 
 
 def _follow(state: SlaveState, reported: InstanceStatus, now: float) -> InstanceStatus | None:

@@ -53,6 +53,7 @@ class MasterState:
         self.runs: dict[str, Run] = {}
         self.runs_by_order: dict[int, str] = {}
         self.learned = LearnedNeeds()
+        self.run_times: dict[str, float] = {}
         self.set_aside: set[str] = set()
         self.orphans: dict[str, set[int]] = {}
         self.rankings: dict[Any, Ranking] = {}

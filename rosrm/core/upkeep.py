@@ -10,6 +10,7 @@ from rosrm.core.charges import settle_charge
 from rosrm.core.commands import Order, Withdraw
 from rosrm.core.lifecycle import stop_instance
 from rosrm.core.liveness import review_liveness
+from rosrm.core.lookahead import review_slots, waits_too_long
 from rosrm.core.relief import relieve_hosts
 from rosrm.core.state import Instance, MasterState, ProcessPhase, Wanted
 
@@ -36,10 +37,22 @@ def _review_instance(state: MasterState, instance: Instance, now: float) -> None
     age = now - instance.since
     if instance.state is None and age >= state.settings.delivery_timeout:
         _withdraw(state, instance, now)
+    if waits_too_long(instance, now):
+        _take_back(state, instance, now)
     if instance.stopping and now - instance.order_at >= state.settings.order_retry:
         stop_instance(state, instance, now)
     if not instance.settled and age >= state.settings.settle:
         settle_charge(state, instance, now)
+
+
+def _take_back(state: MasterState, instance: Instance, now: float) -> None:
+    """An assignment ahead waits for the wrong job: its process goes back to its place."""
+    review_slots(state, instance.host, now)
+    process = state.owned_by(instance)
+    if process is not None and process.wanted is Wanted.RUN and process.name not in state.runs:
+        process.wanted = Wanted.REQUEUE
+        state.save(process)
+        stop_instance(state, instance, now)
 
 
 def _withdraw(state: MasterState, instance: Instance, now: float) -> None:

@@ -86,7 +86,7 @@ class SlaveRuntime:
         self._left = False
         self._shutting_down = False
         self._accepting = False
-        self._state = core.SlaveState()
+        self._state = core.SlaveState(max_processes=config.max_processes)
         self._events: deque[core.Event] = deque()
         self._from_threads: deque[Callable[[], None]] = deque()
         self._graph_before: dict[InstanceId, frozenset[bytes]] = {}

@@ -159,6 +159,7 @@ class Machine:
     pids: int = 100
 
     def __post_init__(self) -> None:
+        self.slave.max_processes = self.max_processes
         if not self.resources:
             self.resources = (
                 ResourceDescription("memory", "B", self.memory),
@@ -332,7 +333,7 @@ class Machine:
         self.said.clear()
         self.ordered.clear()
         self.polled.clear()
-        self.slave = slave.SlaveState()
+        self.slave = slave.SlaveState(max_processes=self.max_processes)
         found = [
             InstanceStatus(instance, program.state, pid=program.pid)
             for instance, program in self.programs.items()

@@ -1,0 +1,53 @@
+"""A short job ahead: what may wait on a host whose slots are taken, and for how long."""
+
+from __future__ import annotations
+
+from rosrm.core.lookahead import PROVED_LONG
+from tests.unit.core.cluster import Cluster, Machine, job
+
+
+def cluster_of_one_slot(run_time: float) -> Cluster:
+    """One host with one slot, on which a job has run once."""
+    cluster = Cluster(Machine("a", max_processes=1))
+    cluster.submit(job("first"))
+    cluster.machines["a"].finish("first", cluster.now, run_time=run_time)
+    cluster.settle()
+    return cluster
+
+
+def test_one_short_job_waits_on_the_host_that_runs_another() -> None:
+    """Its slave holds it, and starts it by itself when the slot is free."""
+    cluster = cluster_of_one_slot(run_time=0.1)
+    cluster.submit(job("p"), job("q"), job("r"))
+    assert [cluster.phase(name) for name in "pqr"] == ["running", "assigned", "queued"]
+    cluster.machines["a"].finish("p", cluster.now, run_time=0.1)
+    assert "q" in {i.process for i in cluster.machines["a"].programs}
+    cluster.settle()
+    assert [cluster.phase(name) for name in "pqr"] == ["finished", "running", "assigned"]
+
+
+def test_nothing_waits_behind_a_job_that_is_long_or_unknown() -> None:
+    """Only what earlier runs of the same program took allows an assignment ahead."""
+    cluster = cluster_of_one_slot(run_time=60.0)
+    cluster.submit(job("p"), job("q"))
+    assert [cluster.phase(name) for name in "pq"] == ["running", "queued"]
+
+
+def test_what_waits_behind_a_job_that_proves_long_goes_back_to_its_place() -> None:
+    """It is not started there, and goes to a host that has become free."""
+    cluster = cluster_of_one_slot(run_time=0.1)
+    cluster.submit(job("p"), job("q"), job("r"))
+    assert cluster.phase("q") == "assigned"
+    cluster.wait(PROVED_LONG + 1.0)
+    assert [cluster.phase(name) for name in "pqr"] == ["running", "queued", "queued"]
+    assert cluster.queue() == ["q", "r"]
+    cluster.add(Machine("b", max_processes=1))
+    assert cluster.where("q") == ["b"]
+
+
+def test_a_job_that_waits_ahead_can_be_cancelled() -> None:
+    """It never starts."""
+    cluster = cluster_of_one_slot(run_time=0.1)
+    cluster.submit(job("p"), job("q"))
+    cluster.cancel("q")
+    assert [cluster.phase(name) for name in "pq"] == ["running", "cancelled"]
