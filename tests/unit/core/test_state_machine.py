@@ -19,9 +19,10 @@ from rosrm.core.assigning import demand_of
 from rosrm.core.commands import Assign, Command
 from rosrm.core.model import Kind, MigrationPolicy, ProcessSpec, Readiness
 from rosrm.core.state import ProcessPhase, Wanted
-from tests.unit.core.cluster import MIB, Cluster, Machine
+from tests.unit.core.cluster import MIB, Cluster, Machine, StartFirstOrStopFirst
 
 NAMES = [f"p{i}" for i in range(5)]
+TWINS = [f"{name}x" for name in NAMES]
 HOSTS = ["a", "b", "c"]
 LABELLED = "c"
 
@@ -55,6 +56,7 @@ class Play(RuleBasedStateMachine):
         self.cluster = Cluster(
             backfill=backfill, max_migrations=most, settle=3.0, suspect=1.0, lease=5.0,
             delivery_timeout=2.0, cooldown=2.0, hysteresis=0.4, order_retry=1.0,
+            strategies={"relaunch": StartFirstOrStopFirst(timeout=3.0)},
         )  # fmt: skip
         for name in HOSTS:
             labels = {"arm": "yes"} if name == LABELLED else {}
@@ -66,6 +68,8 @@ class Play(RuleBasedStateMachine):
         #: Names whose newest process has come to its end by itself, well or badly.
         self.completed: set[str] = set()
         self.failed: set[str] = set()
+        #: Process and host where it could not be started at some time.
+        self.missing: set[tuple[str, str]] = set()
         self.late: list[happened.Event] = []
         self.prompt = True
         # Something to play with from the beginning.
@@ -197,6 +201,25 @@ class Play(RuleBasedStateMachine):
         self.flow()
 
     @precondition(lambda self: self.movable())
+    @rule(which=which_one, seconds=st.sampled_from([1.0, 2.5, 3.5, 7.0]))
+    def migrate_what_does_not_stop(self, which: int, seconds: float) -> None:
+        name = self.pick(self.movable(), which)
+        for machine, running in self.programs():
+            if running == name:
+                machine.stubborn.add(name)
+        self.ask(happened.MigrationRequested, name, None)
+        self.flow()
+        self.time_passes(seconds, quiet=False)
+
+    @rule(name=names, seconds=st.sampled_from([1.0, 2.5, 3.5]))
+    def submit_and_lose_the_answer_to_the_poll(self, name: str, seconds: float) -> None:
+        self.prompt = False
+        self.submit(name, "service", 100, "", special=False, urgent=False, twin=f"{name}x")
+        for machine in self.cluster.machines.values():
+            machine.polled.clear()
+        self.time_passes(seconds, quiet=False)
+
+    @precondition(lambda self: self.movable())
     @rule(which=which_one, host=st.none() | hosts)
     def migrate(self, which: int, host: str | None) -> None:
         self.ask(happened.MigrationRequested, self.pick(self.movable(), which), host)
@@ -244,8 +267,9 @@ class Play(RuleBasedStateMachine):
         machine = self.pick(self.with_statuses(), at)
         which %= len(machine.said)
         batch = machine.said[which]
-        if fate != "twice":
-            del machine.said[which]
+        del machine.said[which]
+        if fate == "twice":
+            self.late.append(batch)
         if fate != "lost":
             self.tell(batch)
         self.flow()
@@ -263,9 +287,18 @@ class Play(RuleBasedStateMachine):
         self.flow()
 
     @precondition(lambda self: self.late)
-    @rule()
-    def late_reading_arrives(self) -> None:
-        self.tell(self.late.pop(0))
+    @rule(which=which_one)
+    def something_arrives_late(self, which: int) -> None:
+        """A reading that was overtaken, or a status batch once more."""
+        self.tell(self.late.pop(which % len(self.late)))
+
+    @rule(host=hosts)
+    def everything_is_asked_for(self, host: str) -> None:
+        """A report that arrives now, and perhaps late once more."""
+        machine = self.machine(host)
+        if self.known(machine):
+            machine.tell(slave.ReportRequested(), self.cluster.now)
+            self.late.append(machine.said[-1])
 
     @rule(prompt=chance)
     def network_is(self, prompt: bool) -> None:
@@ -275,10 +308,10 @@ class Play(RuleBasedStateMachine):
     # --- machines and processes ----------------------------------------------------------
 
     @precondition(lambda self: self.programs())
-    @rule(which=which_one, code=st.sampled_from([0, 0, 3]))
-    def process_ends(self, which: int, code: int) -> None:
+    @rule(which=which_one, code=st.sampled_from([0, 0, 3]), run_time=st.sampled_from([0.1, 9.0]))
+    def process_ends(self, which: int, code: int, run_time: float) -> None:
         machine, name = self.pick(self.programs(), which)
-        machine.finish(name, self.cluster.now, code=code)
+        machine.finish(name, self.cluster.now, code=code, run_time=run_time)
         (self.failed if code else self.completed).add(name)
         self.flow()
 
@@ -290,18 +323,21 @@ class Play(RuleBasedStateMachine):
         self.flow()
 
     @rule(
-        host=hosts, name=names,
+        which=which_one, host=hosts, name=names,
         what=st.sampled_from(["stubborn", "tame", "missing", "there", "large", "small"]),
     )  # fmt: skip
-    def program_changes(self, host: str, name: str, what: str) -> None:
+    def program_changes(self, which: int, host: str, name: str, what: str) -> None:
         """It ignores signals or not, is installed there or not, uses much or little."""
         machine = self.machine(host)
+        if self.programs() and what != "missing":
+            machine, name = self.pick(self.programs(), which)
         if what == "stubborn":
             machine.stubborn.add(name)
         elif what == "tame":
             self.tame(machine, {name})
         elif what == "missing":
             machine.refuses[name] = "no such executable"
+            self.missing.add((name, machine.name))
         elif what == "there":
             machine.refuses.pop(name, None)
         else:
@@ -319,7 +355,7 @@ class Play(RuleBasedStateMachine):
     @rule(
         host=hosts,
         what=st.sampled_from(
-            ["cut", "cut", "mended", "killed", "killed", "leaves", "loses a poll", "full", "empty"]
+            ["cut", "mended", "killed", "killed", "leaves", "loses a poll", "full", "over", "empty"]
         ),
     )
     def host_changes(self, host: str, what: str) -> None:
@@ -336,8 +372,8 @@ class Play(RuleBasedStateMachine):
                 machine.tell(slave.StopOrdered(instance), self.cluster.now)
         elif what == "loses a poll":
             machine.polled.clear()
-        elif what in ("full", "empty"):
-            machine.busy["memory"] = 0.79 if what == "full" else 0.1
+        elif what in ("full", "over", "empty"):
+            machine.busy["memory"] = {"full": 0.75, "over": 0.85, "empty": 0.1}[what]
         self.flow()
 
     @rule()
@@ -462,7 +498,7 @@ class Play(RuleBasedStateMachine):
         """In truth: one instance of a process, two only where its spec declares an overlap."""
         if not hasattr(self, "cluster"):
             return
-        for name in NAMES:
+        for name in (*NAMES, *TWINS):
             running = [
                 program.assignment
                 for machine in self.cluster.machines.values()
@@ -481,6 +517,11 @@ class Play(RuleBasedStateMachine):
         for process in self.cluster.state.processes.values():
             if process.phase is ProcessPhase.FINISHED:
                 assert process.name in self.completed
+            for host in process.excluded:
+                assert (process.name, host) in self.missing
+            if process.phase is ProcessPhase.FAILED and not process.spec.ros:
+                missing = {name for name, _ in self.missing}
+                assert process.name in self.failed | missing
 
     def teardown(self) -> None:
         """Once everything works again, everything that was asked for comes to its end."""
@@ -492,7 +533,7 @@ class Play(RuleBasedStateMachine):
             machine.refuses.clear()
             machine.shown.clear()
             machine.busy["memory"] = 0.05
-            self.tame(machine, set(NAMES))
+            self.tame(machine, {*NAMES, *TWINS})
             machine.restart_slave(cluster.now)
         cluster.now += 2.0
         cluster.tell(happened.TimePassed())
