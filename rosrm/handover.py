@@ -13,6 +13,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
+from rosrm.errors import ConfigError
+
 _OPTION: Final = "--settings-fd"
 
 
@@ -65,9 +67,9 @@ def arguments(descriptor: int) -> list[str]:
 
 
 def take_over(command_line: Sequence[str]) -> Handover:
-    """Read what the command handed over; raises `ValueError` for another command line."""
+    """Read what the command handed over; raises `ConfigError` for another command line."""
     if len(command_line) != 2 or command_line[0] != _OPTION:
-        raise ValueError(f"usage: {_OPTION} N; use `rosrm master` or `rosrm slave` to start one")
+        raise ConfigError(f"usage: {_OPTION} N; use `rosrm master` or `rosrm slave` to start one")
     with os.fdopen(int(command_line[1])) as source:
         told = json.load(source)
     plugins = tuple(PluginAddress(*address) for address in told["plugins"])

@@ -10,34 +10,21 @@ import signal
 
 signal.signal(signal.SIGINT, signal.SIG_DFL)
 
-import logging
 import sys
 
 from rosrm.config.settings import ClusterConfig
-from rosrm.errors import RosrmError
-from rosrm.handover import take_over
+from rosrm.entry import run
+from rosrm.handover import Handover
 from rosrm.master.policy_guard import GuardedPolicy
 from rosrm.master.runtime import MasterRuntime
 from rosrm.registry import Registry
 
 
-def main() -> int:
-    """Read the settings from an inherited file descriptor and serve; returns the exit code."""
-    handover = take_over(sys.argv[1:])
-    logging.basicConfig(
-        level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(name)s: %(message)s",
-        datefmt="%H:%M:%S",
-    )  # fmt: skip
+def serve(handover: Handover) -> int:
+    """Make what the configuration names, and be the master."""
     config = ClusterConfig.from_json(handover.settings)
-    try:
-        return _serve(config, Registry.load(handover.plugins))
-    except RosrmError as error:
-        sys.stderr.write(f"rosrm master: {error}\n")
-        return error.exit_code
-
-
-def _serve(config: ClusterConfig, registry: Registry) -> int:
-    name = config.scoring.policy or "weighted"
+    registry = Registry.load(handover.plugins)
+    name = config.scoring.policy
     policy = GuardedPolicy(name, registry.scoring(name, config.scoring.options))
     strategies = registry.migrations(config.migration.strategies)
     registry.checkpoint(config.checkpoint.policy, config.checkpoint.options)
@@ -46,4 +33,4 @@ def _serve(config: ClusterConfig, registry: Registry) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run("master", serve))

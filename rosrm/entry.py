@@ -1,0 +1,28 @@
+"""What the entry modules of both runtimes share: logging, the handover, how errors are told."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Callable
+
+from rosrm.errors import RosrmError
+from rosrm.handover import Handover, take_over
+
+
+def run(role: str, serve: Callable[[Handover], int]) -> int:
+    """Take over what the command handed over, and serve; returns the exit code.
+
+    Args:
+        role: "master" or "slave".
+        serve: runs until it is told to stop; what it raises for the user is printed.
+    """
+    logging.basicConfig(
+        level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(name)s: %(message)s",
+        datefmt="%H:%M:%S",
+    )  # fmt: skip
+    try:
+        return serve(take_over(sys.argv[1:]))
+    except RosrmError as error:
+        sys.stderr.write(f"rosrm {role}: {error}\n")
+        return error.exit_code
