@@ -11,6 +11,7 @@ from typing import Any, Final, Protocol
 
 import numpy as np
 import numpy.typing as npt
+from rclpy.duration import Duration
 
 from rosrm.core import slave as core
 from rosrm.core.model import HostDescription, InstanceStatus
@@ -36,6 +37,8 @@ _POLL_ANEW: Final = 30.0
 #: Seconds for which a name that is taken is asked for again: the former run of this slave may
 #: have been killed a moment ago.
 _NAME_TAKEN: Final = 5.0
+#: Seconds for the last statuses to reach the master.
+_LAST_WORDS: Final = 2.0
 #: Beats of a master in its silence before it counts as gone.
 _MISSED_BEATS: Final = 10
 
@@ -359,6 +362,11 @@ class SlaveEndpoint:
                     memory=memory,
                 )
             )  # fmt: skip
+
+    def wait_until_heard(self) -> None:
+        """Give the last words time to arrive: what is not acknowledged is lost when we leave."""
+        if self.link is Link.REGISTERED:
+            self._statuses.wait_for_all_acked(Duration(seconds=_LAST_WORDS))
 
     def leave(self, done: Callable[[], None]) -> None:
         """Say that this host stops in good order; `done` when the master knows, or is silent."""

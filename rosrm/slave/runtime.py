@@ -431,6 +431,7 @@ class SlaveRuntime:
             _log.error("the supervisor did not end in time; it goes on stopping the processes")
             return 1
         self._work(time.monotonic())
+        self._endpoint.wait_until_heard()
         return 1 if failure else 0
 
     def _longest_stop(self) -> float:

@@ -77,7 +77,20 @@ def node(name: str, code: str = NODE, **options) -> ProcessSpec:
 
 
 class Cluster(LocalCluster):
-    """With what the tests ask of it again and again."""
+    """With what the tests ask of it again and again.
+
+    Attributes:
+        started: every part that was ever started.
+    """
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.started: list[Part] = []
+
+    def _start(self, name: str, module: str, settings: str) -> Part:
+        part = super()._start(name, module, settings)
+        self.started.append(part)
+        return part
 
     def submit(self, *specs: ProcessSpec) -> str:
         return self.client.submit(list(specs))
@@ -223,8 +236,13 @@ def end_and_check(cluster: Cluster) -> None:
         assert "Traceback" not in (said := cluster.log_of(part.name)), said
         if codes[part.name] is None:  # it lived, and was ended in good order
             assert part.process.returncode == 0, f"{part.name}: {part.process.returncode}\n{said}"
-            files = {path for path in memory[part.name] if Path(path).exists()}
-            assert not files, f"{part.name} left {files}"
+    files = {path for paths in memory.values() for path in paths if Path(path).exists()}
+    if any(part.process.returncode == -signal.SIGKILL for part in cluster.started):
+        for path in files:  # it had no chance to do this itself
+            for name in (path, f"{path}_el"):
+                Path(name).unlink(missing_ok=True)
+    else:
+        assert not files, f"left in shared memory: {files}"
 
 
 def wait_until_none(directory: Path, timeout: float = 5.0) -> dict[int, str]:

@@ -1,0 +1,371 @@
+"""Ctrl-C, SIGTERM, a second master, a second slave: everybody ends in good order and says why."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from rosrm.core.model import RestartPolicy
+from tests.ros.clusters import (
+    PATIENCE,
+    alive,
+    host,
+    job,
+    pids_of,
+    service,
+    wait_gone,
+    wait_until,
+    wait_until_none,
+)
+
+
+def end(part, number) -> int:
+    part.process.send_signal(number)
+    return part.process.wait(PATIENCE)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_slave_that_is_stopped_stops_its_processes(make_cluster, number) -> None:
+    """Exit code 0, no traceback, no process left; what it ran is queued for another host."""
+    cluster = make_cluster(host("h0"))
+    restart = RestartPolicy("always", delay=0.1)
+    cluster.submit(*(service(f"p{n}", restart=restart) for n in range(4)))
+    pids = [cluster.wait(f"p{n}", "running").pid for n in range(4)]
+
+    assert end(cluster.slaves["h0"], number) == 0
+
+    assert not [pid for pid in pids if alive(pid)]
+    assert wait_until_none(cluster.directory / "hosts") == {}
+    assert "Traceback" not in cluster.log_of("h0")
+    view = cluster.wait_until(
+        "all queued", lambda v: all(row.state == "queued" for row in v.processes)
+    )
+    assert [row.name for row in view.processes] == ["p0", "p1", "p2", "p3"]
+    assert [row.state for row in view.hosts] == ["left"]
+    cluster.add(host("h0"))
+    assert cluster.wait("p3", "running").host == "h0"
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_master_that_is_stopped_touches_no_process(make_cluster, number) -> None:
+    """Exit code 0, no traceback; started again it goes on with the same processes."""
+    cluster = make_cluster(host("h0"))
+    cluster.submit(service("p"))
+    before = cluster.wait("p", "running")
+
+    assert end(cluster.master, number) == 0
+    assert "Traceback" not in cluster.log_of("master")
+    assert alive(before.pid)
+
+    cluster.reconnect()
+    cluster.start_master()
+    after = cluster.wait("p", "running")
+    assert (after.pid, after.number, after.host) == (before.pid, before.number, before.host)
+
+
+def test_keep_leaves_the_processes_running(make_cluster) -> None:
+    """`on_stop: keep`: they go on with the supervisor, and the next slave takes them over."""
+    cluster = make_cluster(host("h0", on_stop="keep"))
+    go = cluster.directory / "go"
+    script = f"while [ ! -e {go} ]; do sleep 0.05; done; exit 3"
+    cluster.submit(service("p"), job("short", "sh", "-c", script))
+    before = cluster.wait("p", "running")
+    cluster.wait("short", "running")
+
+    assert end(cluster.slaves["h0"], signal.SIGINT) == 0
+    assert alive(before.pid)
+    go.touch()  # it ends while no slave is there
+
+    cluster.start_slave(host("h0"))
+    after = cluster.wait("p", "running")
+    assert after.pid == before.pid
+    row = cluster.ended("short")
+    assert (row.state, row.exit_code) == ("failed", 3)
+
+
+@pytest.mark.parametrize("role", ["master", "slave"])
+def test_interrupted_while_it_starts(make_cluster, role) -> None:
+    """At whatever instant Ctrl-C comes, there is no traceback and nothing is left."""
+    cluster = make_cluster()
+    if role == "master":
+        cluster.close()
+    for delay in (0.05, 0.15, 0.3, 0.5, 0.8, 1.2):
+        part = cluster.start_master() if role == "master" else cluster.start_slave(host("h0"))
+        time.sleep(delay)  # the instants between are what is tested
+        code = end(part, signal.SIGINT)
+        assert code in (0, -signal.SIGINT), cluster.log_of(part.name)
+        assert "Traceback" not in cluster.log_of(part.name)
+        left = wait_until_none(cluster.directory / "hosts")
+        assert not left, f"after {delay} s: {left}"
+    if role == "slave":
+        del cluster.slaves["h0"]
+
+
+# --- second ones ------------------------------------------------------------------------------
+
+
+def test_a_second_master_is_refused_naming_the_first(make_cluster) -> None:
+    """On the same state directory, and on the same domain with another one."""
+    cluster = make_cluster(host("h0"))
+    first = cluster.master
+    same = cluster.start_master()
+    assert same.process.wait(PATIENCE) == 1
+    cluster.master = first
+    said = cluster.log_of("master")
+    assert f"a master runs already on {cluster.directory / 'master'}" in said
+    assert f"pid {first.process.pid}" in said
+
+    other = replace(cluster.cluster, name="rival", ros=cluster.ros, state=cluster.directory / "m2")
+    second = cluster._start("master2", "rosrm.master.run", other.to_json())
+    assert second.process.wait(PATIENCE) == 1
+    said = cluster.log_of("master2")
+    assert "a master runs already" in said
+    assert f"pid {first.process.pid}" in said
+    assert "Traceback" not in said
+    assert cluster.run(job("undisturbed", "true"))[0].state == "finished"
+
+
+def test_of_two_masters_at_once_one_stays(make_cluster) -> None:
+    """While they start they cannot see each other: then one gives way, and names the other."""
+    cluster = make_cluster()
+    cluster.close()
+    domain_settings = [
+        replace(
+            cluster.cluster, name=f"twin{n}", ros=cluster.ros, state=cluster.directory / f"twin{n}"
+        )
+        for n in range(2)
+    ]
+    parts = [cluster._start(one.name, "rosrm.master.run", one.to_json()) for one in domain_settings]
+    try:
+        wait_until(lambda: any(p.process.poll() is not None for p in parts), "one has given way")
+        ended = next(part for part in parts if part.process.poll() is not None)
+        stays = next(part for part in parts if part is not ended)
+        assert ended.process.returncode == 1
+        assert f"pid {stays.process.pid}" in cluster.log_of(ended.name)
+        deadline = time.monotonic() + 1.0
+        while time.monotonic() < deadline:
+            assert stays.process.poll() is None, cluster.log_of(stays.name)
+            time.sleep(0.05)
+    finally:
+        for part in parts:
+            part.end(signal.SIGINT)
+            part.process.wait(PATIENCE)
+
+
+def test_a_second_slave_of_a_name_is_refused(make_cluster) -> None:
+    """On the same state directory at once; on another one by the master, after a moment."""
+    cluster = make_cluster(host("h0"))
+    cluster.submit(service("p"))
+    before = cluster.wait("p", "running")
+    first = cluster.slaves["h0"]
+
+    same = cluster.start_slave(host("h0"))
+    assert same.process.wait(PATIENCE) == 1
+    cluster.slaves["h0"] = first
+    said = cluster.log_of("h0")
+    assert f"a slave runs already on {cluster.directory / 'hosts' / 'h0'}" in said
+    assert f"pid {first.process.pid}" in said
+
+    state = cluster.directory / "hosts" / "impostor"
+    settings = replace(host("h0"), ros=cluster.ros, state=state)
+    second = cluster._start("impostor", "rosrm.slave.run", settings.to_json())
+    assert second.process.wait(PATIENCE) == 1
+    said = cluster.log_of("impostor")
+    assert "a live slave has the name 'h0' already" in said
+    assert f"pid {first.process.pid}" in said
+    assert "Traceback" not in said
+    wait_until(lambda: not pids_of(state), "no supervisor of the impostor")
+    assert cluster.process("p").pid == before.pid
+    assert first.process.poll() is None
+
+
+def test_a_state_directory_that_cannot_be_used_is_said(make_cluster, tmp_path) -> None:
+    """With its path; no traceback."""
+    cluster = make_cluster()
+    (tmp_path / "file").write_text("")
+    state = tmp_path / "file" / "state"
+    for module, settings in (
+        ("rosrm.master.run", replace(cluster.cluster, ros=cluster.ros, state=state)),
+        ("rosrm.slave.run", replace(host("h9"), ros=cluster.ros, state=state)),
+    ):
+        part = cluster._start("unusable", module, settings.to_json())
+        assert part.process.wait(PATIENCE) == 2
+    said = cluster.log_of("unusable")
+    assert said.count(f"the state directory {state} cannot be used") == 2
+    assert "Traceback" not in said
+
+
+# --- killed -----------------------------------------------------------------------------------
+
+
+def test_a_master_that_is_killed(make_cluster) -> None:
+    """Restarted: same pids, nothing started twice, the queue in order, nothing lost."""
+    cluster = make_cluster(host("h0", max_processes=3), host("h1", max_processes=3))
+    cluster.submit(*(service(f"s{n}") for n in range(6)))
+    for n in range(6):
+        cluster.wait(f"s{n}", "running")
+    before = {row.name: row for row in cluster.client.list(processes=True).processes}
+    cluster.submit(*(job(f"q{n}", "true") for n in range(5)), job("first", "true", priority=3))
+    epoch = cluster.events("master_started")[-1].message
+
+    end(cluster.master, signal.SIGKILL)
+    # While it is away one ends.
+    os.kill(before["s5"].pid, signal.SIGKILL)
+    cluster.reconnect()
+    cluster.start_master()
+    for n in range(5):
+        row = cluster.wait(f"s{n}", "running")
+        assert (row.pid, row.number, row.host) == (
+            before[row.name].pid, before[row.name].number, before[row.name].host,
+        )  # fmt: skip
+    assert cluster.ended("s5").state == "failed"
+    for name in ("first", "q0", "q1", "q2", "q3", "q4"):
+        assert cluster.ended(name).state == "finished"
+    assert cluster.events("master_started")[-1].message != epoch
+    order = [e.process for e in cluster.events("assigned") if not e.process.startswith("s")]
+    assert order == ["first", "q0", "q1", "q2", "q3", "q4"]
+    assert all(cluster.kinds(f"s{n}").count("assigned") == 1 for n in range(6))
+
+
+def test_a_master_that_is_killed_again_and_again(make_cluster) -> None:
+    """Whatever was answered is done exactly once, whenever the kill comes."""
+    cluster = make_cluster(host("h0", max_processes=4), host("h1", max_processes=4))
+    folder = cluster.directory / "ran"
+    folder.mkdir()
+    answered = []
+    for round_number in range(4):
+        specs = [
+            job(f"r{round_number}-{n:02}", "sh", "-c", f"echo x >> {folder}/r{round_number}-{n:02}")
+            for n in range(25)
+        ]
+        cluster.submit(*specs)
+        answered += [spec.name for spec in specs]
+        time.sleep(0.02 * round_number)  # another instant each time
+        end(cluster.master, signal.SIGKILL)
+        cluster.reconnect()
+        cluster.start_master()
+    for name in answered:
+        assert cluster.ended(name, timeout=60.0).state == "finished", name
+    runs = {path.name: path.read_text().count("x") for path in folder.iterdir()}
+    assert runs == dict.fromkeys(answered, 1)
+
+
+def test_a_slave_that_is_killed(make_cluster) -> None:
+    """Restarted: same pids; what ended meanwhile is reported with its exit code; work goes on."""
+    cluster = make_cluster(host("h0"))
+    go = cluster.directory / "go"
+    script = f"while [ ! -e {go} ]; do sleep 0.05; done; exit 5"
+    cluster.submit(service("stays"), job("ends", "sh", "-c", script))
+    before = cluster.wait("stays", "running")
+    cluster.wait("ends", "running")
+
+    end(cluster.slaves["h0"], signal.SIGKILL)
+    assert alive(before.pid)
+    go.touch()
+    cluster.start_slave(host("h0"))
+    row = cluster.ended("ends")
+    assert (row.state, row.exit_code) == ("failed", 5)
+    after = cluster.wait("stays", "running")
+    assert (after.pid, after.number) == (before.pid, before.number)
+    assert cluster.run(job("more", "true"))[0].state == "finished"
+    cluster.cancel("stays")
+    assert not alive(before.pid)
+
+
+def test_a_supervisor_that_is_killed(make_cluster) -> None:
+    """The slave starts another one: same pids, exits are seen, and work goes on."""
+    cluster = make_cluster(host("h0"))
+    cluster.submit(service("p"))
+    before = cluster.wait("p", "running")
+    lock = cluster.directory / "hosts" / "h0" / "supervisor" / "supervisor.lock"
+    supervisor = int(lock.read_text())
+
+    os.kill(supervisor, signal.SIGKILL)
+    wait_gone(supervisor)
+    wait_until(lambda: lock.read_text() not in ("", str(supervisor)), "another supervisor")
+
+    assert cluster.run(job("more", "true"))[0].state == "finished"
+    assert cluster.process("p").pid == before.pid
+    assert cluster.process("p").state == "running"
+    os.kill(before.pid, signal.SIGKILL)
+    assert cluster.ended("p").state == "failed"
+    assert cluster.slaves["h0"].process.poll() is None
+
+
+def test_both_killed_at_once(make_cluster) -> None:
+    """Master and slave die together and come back: the process never notices."""
+    cluster = make_cluster(host("h0"))
+    cluster.submit(service("p"))
+    before = cluster.wait("p", "running")
+    for part in cluster.parts():
+        part.process.kill()
+        part.process.wait(PATIENCE)
+    cluster.reconnect()
+    cluster.start_slave(host("h0"))
+    cluster.start_master()
+    after = cluster.wait("p", "running")
+    assert (after.pid, after.number) == (before.pid, before.number)
+
+
+def test_a_lost_journal(make_cluster) -> None:
+    """Moved away, as the message about a damaged one advises, it leaves the master with nothing.
+
+    What ran is stopped as unknown, and the same slaves take new work under the same names.
+    """
+    cluster = make_cluster(host("h0"))
+    cluster.submit(service("p"))
+    before = cluster.wait("p", "running")
+    end(cluster.master, signal.SIGKILL)
+    journal = cluster.directory / "master" / "journal.sqlite"
+    journal.write_bytes(b"garbage" * 1000)
+    for name in ("journal.sqlite-wal", "journal.sqlite-shm"):
+        (journal.parent / name).unlink(missing_ok=True)
+
+    refused = cluster.start_master()
+    assert refused.process.wait(PATIENCE) == 1
+    assert "move it away" in cluster.log_of("master")
+
+    journal.rename(journal.with_name("old"))
+    cluster.reconnect()
+    cluster.start_master()
+    cluster.wait_for_hosts()
+    wait_gone(before.pid)
+    for number in range(3):
+        assert cluster.run(job(f"new{number}", "true"))[0].state == "finished"
+    cluster.submit(service("p"))
+    assert cluster.wait("p", "running").pid != before.pid
+
+
+# --- the shell --------------------------------------------------------------------------------
+
+
+def test_ctrl_c_in_a_terminal(make_cluster) -> None:
+    """A process group is interrupted, as a terminal does: the processes end with their slave."""
+    cluster = make_cluster()
+    state = cluster.directory / "hosts" / "t"
+    config = cluster.directory / "host.yaml"
+    config.write_text(
+        f"host: t\nscope: slice\nbudget: {{memory: 1GiB, cpu: 4}}\nstate: {state}\n"
+        "probes: {memory: {}, cpu: {}}\n"
+        f"ros: {{domain: {cluster.domain}, discovery: {{range: localhost}}}}\n"
+    )
+    log = cluster.directory / "terminal.log"
+    with log.open("wb") as sink, subprocess.Popen(
+        [sys.executable, "-m", "rosrm.cli", "slave", "--config", str(config)],
+        stdin=subprocess.DEVNULL, stdout=sink, stderr=sink, start_new_session=True,
+    ) as slave:  # fmt: skip
+        cluster.wait_until("host t", lambda v: any(row.accepting for row in v.hosts))
+        cluster.submit(service("p"))
+        pid = cluster.wait("p", "running").pid
+        os.killpg(slave.pid, signal.SIGINT)
+        assert slave.wait(PATIENCE) == 0
+    assert not alive(pid)
+    assert "Traceback" not in Path(log).read_text()
+    assert wait_until_none(state) == {}
