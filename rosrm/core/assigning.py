@@ -111,6 +111,7 @@ def _assign(
     state.charge_instance(
         instance, host, now, demand.amounts, demand.estimated, ranking.need[:, column]
     )
+    ranking.took()
     process.owner = instance.number
     state.set_phase(process, ProcessPhase.ASSIGNED, now)
     state.note_decision(process, decision, "assigned", now)

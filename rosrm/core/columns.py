@@ -45,8 +45,6 @@ class HostColumns:
         incarnation, sequence: (H,) of the slave's run; of its newest reading.
         reported: (H,) sequence of the newest status batch that it says it has sent.
         status_sequence: (H,) sequence of the newest status batch that has come.
-        view_busy, view_limit, view_capacity: (H, R) the same, read-only, for scoring policies.
-        view_processes: (H,) likewise.
         row_of_slot: (H, RESOURCE_SLOTS) slot of a message -> row here; -1: not in use.
     """
 
@@ -106,10 +104,6 @@ class HostColumns:
         self.limit: FloatArray = self.cells[LIMIT]
         self.capacity: FloatArray = self.cells[CAPACITY]
         self.busy: FloatArray = self.cells[BUSY]
-        # (H, R) and read-only: what a scoring policy sees cannot be changed by it.
-        self.view_busy = _read_only(self.busy.T)
-        self.view_limit = _read_only(self.limit.T)
-        self.view_capacity = _read_only(self.capacity.T)
         used = {name: line[: self._count] for name, line in self._lines.items()}
         self.condition: npt.NDArray[np.int8] = used["condition"]
         self.asking: BoolArray = used["asking"]
@@ -125,16 +119,8 @@ class HostColumns:
         self.status_sequence: npt.NDArray[np.uint64] = used["status_sequence"]
         self.row_of_slot: IntArray = used["row_of_slot"]
 
-        self.view_processes = _read_only(self.processes[:])
-
     def clear_column(self, column: int) -> None:
         """The host of a column tells anew which resources it has; what is promised to it stays."""
         for plane in (USAGE, LIMIT, CAPACITY, BUSY):
             self.cells[plane, :, column] = _ABSENT[plane]
         self.row_of_slot[column] = -1
-
-
-def _read_only(view: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Closes a view; the array behind it stays writable."""
-    view.flags.writeable = False
-    return view

@@ -32,7 +32,7 @@ from rosrm.core.migration import (
     Stop,
     plan_fault,
 )
-from rosrm.core.model import InstanceId
+from rosrm.core.model import InstanceId, InstanceState
 from rosrm.core.placement import Ranking
 from rosrm.core.state import MasterState, Process, ProcessPhase, Run, Wanted
 from rosrm.core.steps import DONE, give_order, give_order_again, outcome_of, title
@@ -214,6 +214,17 @@ def _next(state: MasterState, run: Run, step: Step, now: float) -> None:
     _go_on(state, run, now)
 
 
+def _cannot_be_done(state: MasterState, run: Run, step: Step, now: float) -> bool:
+    """Trying again would never help: the instance has ended, or its slot was given away."""
+    if not isinstance(step, (Start, AwaitReady)):
+        return False
+    instance = state.instances.get(step.instance.number)
+    if instance is not None and instance.state is InstanceState.HELD:
+        lifecycle.stop_instance(state, instance, now)
+        return True
+    return step.instance.number in run.ended
+
+
 def _go_on(state: MasterState, run: Run, now: float) -> None:
     """To the next step, or the next undo."""
     run.index += 1
@@ -235,7 +246,7 @@ def _failed(state: MasterState, run: Run, step: Step, reason: str, now: float) -
     if run.undo is None and not run.committed:
         _turn_back(state, run, reason, now)
         return
-    if isinstance(step, (Start, AwaitReady)) and step.instance.number in run.ended:
+    if _cannot_be_done(state, run, step, now):
         _go_on(state, run, now)
         return
     run.begun = False

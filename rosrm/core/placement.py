@@ -16,8 +16,9 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
+import numpy.typing as npt
 
-from rosrm.core.columns import BoolArray, FloatArray, IntArray
+from rosrm.core.columns import BUSY, CAPACITY, LIMIT, BoolArray, FloatArray, IntArray
 from rosrm.core.hosts import HostTable
 from rosrm.core.model import EMPTY, ProcessSpec
 from rosrm.ports import HostView, ProcessView, Scores, ScoringPolicy
@@ -29,6 +30,9 @@ CLOSE: Final = 1e-9
 
 #: Of many hosts, so many that were nearly chosen are named beside the one that was.
 RUNNERS_UP: Final = 3
+
+#: Equal processes that a host may take one after the other are judged so many at a time.
+_AT_A_TIME: Final = 8
 
 #: A scoring policy with its name.
 NamedPolicy = tuple[str, ScoringPolicy]
@@ -89,14 +93,13 @@ class Ranking:
         self.failure = ""
         self.version = table.version
         self.need = table.fractions(demand.amounts, demand.estimated)
-        self._view_need = self.need.T
-        self._view_need.flags.writeable = False
         self._left = list(policies)
         self._seen = len(table.touched)
         self._open = table.open() & eligible(table, demand)
-        self._allowed = table.limit - (demand.headroom - CLOSE)
         self._tier = _tiers(table, demand.spec)
         self._lowest: list[int] | None = None
+        self._own = -1
+        self._ahead: dict[int, list[float]] = {}
         self.value = np.full(len(table), np.inf)
         self._judge(slice(0, len(table)))
 
@@ -113,18 +116,24 @@ class Ranking:
             return name
         return f"{name} ({self.failure})" if name else self.failure
 
+    def took(self) -> None:
+        """The newest change of the table was an assignment of this very demand."""
+        self._own = len(self.table.touched)
+
     def refresh(self) -> None:
         """Judge anew the columns that assignments have changed since."""
         touched = self.table.touched
         if len(touched) == self._seen:
             return
         columns = set(touched[self._seen :])
+        alone = self._seen == len(touched) - 1
         self._seen = len(touched)
-        if len(columns) == 1:
-            (only,) = columns
-            self._judge(slice(only, only + 1))
-        else:
-            self._judge(np.fromiter(columns, np.int64, len(columns)))
+        if alone and self._own == len(touched):
+            self._judge_ahead(columns.pop())
+            return
+        for column in columns & self._ahead.keys():
+            del self._ahead[column]
+        self._judge(np.fromiter(columns, np.int64, len(columns)))
 
     def best(self) -> int:
         """The column with the lowest value; -1: none fits."""
@@ -155,48 +164,73 @@ class Ranking:
         """True: this host may take it now."""
         return bool(self.value[column] < np.inf)
 
-    def room(self, columns: Columns) -> BoolArray:
-        """(n,) True where reading + in-flight load + need stays under every limit."""
-        total = self.table.busy[:, columns] + self.need[:, columns]
-        over = total > self._allowed[:, columns]
-        # A host without a resource has NaN there, which is over nothing.
-        fits: BoolArray = ~np.logical_or.reduce(over)
-        return fits
-
     def _judge(self, columns: Columns) -> None:
-        """Set `value` of some columns; a policy that raises or answers nonsense is left out."""
-        table = self.table
+        """Set `value` of some columns."""
         self._lowest = None
-        fits = self.room(columns)
-        fits &= self._open[columns]
-        fits &= table.processes[columns] < table.bound[columns]
-        if not np.count_nonzero(fits):
-            self.value[columns] = np.inf
-            return
-        try:
-            score = self._scores(columns, fits)
-        except Exception as error:  # noqa: BLE001 - a third party's code: anything may come
-            name, _ = self._left.pop(0)
-            reason = f"left out: {name!r}, {type(error).__name__}: {error}"
-            self.failure = f"{self.failure}; {reason}" if self.failure else reason
-            self._judge(slice(0, len(table)))  # scores of two policies do not compare
-            return
-        self.value[columns] = np.where(fits, score, np.inf)
+        value = self._value(columns)
+        if value is None:
+            self._judge(slice(0, len(self.table)))  # scores of two policies do not compare
+        else:
+            self.value[columns] = value
 
-    def _scores(self, columns: Columns, fits: BoolArray) -> FloatArray:
-        """Scores with the tie-break; inf: vetoed."""
-        tie: FloatArray = np.multiply(self.table.processes[columns], TIE)
+    def _judge_ahead(self, column: int) -> None:
+        """Set `value` of a column that just took a process of this demand.
+
+        Thousands of equal processes may be waiting, so what the host will be worth with the next
+        few of them is judged in one go, as if it were several hosts.
+        """
+        values = self._ahead.get(column)
+        if not values:
+            judged = self._value(np.full(_AT_A_TIME, column), np.arange(_AT_A_TIME))
+            if judged is None:
+                self._judge(slice(0, len(self.table)))
+                return
+            values = self._ahead[column] = judged[::-1].tolist()
+        self._lowest = None
+        self.value[column] = values.pop()
+
+    def _value(self, columns: Columns, more: IntArray | None = None) -> FloatArray | None:
+        """What some hosts are worth; None: the policy was left out, all are to be judged anew.
+
+        `more`, (n,), supposes so many further processes of this demand on each host.
+        """
+        table = self.table
+        need, processes = self.need[:, columns], table.processes[columns]
+        cells = table.cells[:, :, columns]  # all planes at once: one copy costs less than three
+        busy, limit = cells[BUSY], cells[LIMIT]
+        if more is not None:
+            busy, processes = busy + need * more, processes + more
+        # A host without a resource has NaN there, which is over nothing.
+        over = busy + need > limit - (self.demand.headroom - CLOSE)
+        fits: BoolArray = ~np.logical_or.reduce(over)
+        fits &= self._open[columns]
+        fits &= processes < table.bound[columns]
+        if not np.count_nonzero(fits):
+            return np.full(len(fits), np.inf)
+        tie = TIE * processes
         if not self._left:
-            return tie
-        hosts = view_of(self.table, columns)
-        scores = self._left[0][1].score(
-            hosts, ProcessView(self.demand.spec, self._view_need[columns])
-        )
-        value, veto = sound(scores, hosts, fits)
-        value = value + tie
+            return np.where(fits, tie, np.inf)
+        hosts = HostView(
+            Names(table, columns), table.resources, _read_only(busy.T), _read_only(limit.T),
+            _read_only(cells[CAPACITY].T), _read_only(processes[:]),
+        )  # fmt: skip
+        process = ProcessView(self.demand.spec, _read_only(need.T))
+        try:
+            scores = self._left[0][1].score(hosts, process)
+            value, veto = sound(scores, hosts, fits)
+        except Exception as error:  # noqa: BLE001 - a third party's code: anything may come
+            self._leave_out(error)
+            return None
         if veto is not None:
-            value[veto] = np.inf
-        return value
+            fits &= ~veto
+        return np.where(fits, value + tie, np.inf)
+
+    def _leave_out(self, error: Exception) -> None:
+        """The policy raised or answered nonsense: the next one decides, or none, and it is said."""
+        name, _ = self._left.pop(0)
+        reason = f"left out: {name!r}, {type(error).__name__}: {error}"
+        self.failure = f"{self.failure}; {reason}" if self.failure else reason
+        self._ahead.clear()
 
     def _preferred(self) -> FloatArray:
         """The values, only those of the best tier of labels that any fitting host is in."""
@@ -209,13 +243,10 @@ class Ranking:
         return np.where(self._tier == best, self.value, np.inf)
 
 
-def view_of(table: HostTable, columns: Columns) -> HostView:
-    """What a scoring policy sees of some hosts; it cannot change the table."""
-    return HostView(
-        Names(table, columns), table.resources,
-        table.view_busy[columns], table.view_limit[columns], table.view_capacity[columns],
-        table.view_processes[columns],
-    )  # fmt: skip
+def _read_only(view: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Closes a view of a standing array to a policy that would write into it."""
+    view.flags.writeable = False
+    return view
 
 
 def sound(scores: Scores, hosts: HostView, fits: BoolArray) -> tuple[FloatArray, BoolArray | None]:

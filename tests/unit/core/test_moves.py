@@ -196,6 +196,21 @@ def test_a_source_whose_host_forgot_it_returns_to_the_queue() -> None:
     assert len(cluster.where("p")) == 1
 
 
+def test_a_fallback_whose_slot_was_given_away_returns_to_the_queue() -> None:
+    """While it was between two hosts another process took its place: it is placed anew."""
+    cluster = Cluster(
+        Machine("a", max_processes=1, labels={"x": "y"}), Machine("b", busy={"memory": 0.5})
+    )
+    cluster.submit(movable("p", overlap=False), process("q", required_labels={"x": "y"}))
+    assert (cluster.where("p"), cluster.queue()) == (["a"], ["q"])
+    cluster.machines["b"].refuses["p"] = "no such executable"
+    cluster.add(Machine("c", busy={"memory": 0.6}))
+    cluster.migrate("p")
+    assert cluster.where("q") == ["a"]
+    cluster.wait(12.0)
+    assert (cluster.phase("p"), cluster.where("p")) == ("running", ["c"])
+
+
 # --- stuck ------------------------------------------------------------------------------------
 
 
