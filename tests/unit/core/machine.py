@@ -1,0 +1,263 @@
+"""One host on a table: what really runs there, its slave, and the wires to and from it."""
+
+from __future__ import annotations
+
+from collections import defaultdict, deque
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from rosrm.core import events as happened
+from rosrm.core import slave
+from rosrm.core.commands import Order
+from rosrm.core.model import (
+    EMPTY,
+    Assignment,
+    HostDescription,
+    InstanceId,
+    InstanceState,
+    InstanceStatus,
+    ResourceDescription,
+)
+
+MIB = 2.0**20
+GIB = 2.0**30
+
+
+@dataclass
+class Program:
+    """One instance that really runs."""
+
+    assignment: Assignment
+    state: InstanceState = InstanceState.RUNNING
+    pid: int = 0
+
+
+@dataclass
+class Machine:
+    """One host: what runs there, its slave, and the wires from and to it.
+
+    Attributes:
+        programs: what really runs, by instance; outlives the slave.
+        ends: of instances that the supervisor remembers.
+        refuses: process name to the reason why it cannot be started here.
+        stubborn: process names that do not end when they are told to.
+        busy: usage of each resource without our processes, fraction.
+        shown: base units that each process uses, by name; shows in readings and usages.
+        polled: assignments that wait for the slave's next request, in the master's hands.
+        ordered: orders on their way to the slave.
+        said: status batches on their way to the master.
+        connected: the wires work.
+    """
+
+    name: str
+    memory: float = 16 * GIB
+    cpu: float = 8.0
+    limits: Mapping[str, float] = field(default_factory=lambda: {"memory": 0.8, "cpu": 0.9})
+    labels: Mapping[str, str] = field(default_factory=lambda: EMPTY)
+    max_processes: int = 0
+    resources: tuple[ResourceDescription, ...] = ()
+    executors: dict[str, Callable[[Mapping[str, Any]], Any]] = field(default_factory=dict)
+
+    host_id: int = 0
+    incarnation: int = 0
+    slave: slave.SlaveState = field(default_factory=slave.SlaveState)
+    programs: dict[InstanceId, Program] = field(default_factory=dict)
+    ends: dict[InstanceId, InstanceStatus] = field(default_factory=dict)
+    refuses: dict[str, str] = field(default_factory=dict)
+    stubborn: set[str] = field(default_factory=set)
+    busy: dict[str, float] = field(default_factory=lambda: {"memory": 0.1, "cpu": 0.1})
+    shown: dict[str, dict[str, float]] = field(default_factory=lambda: defaultdict(dict))
+    polled: list[Assignment] = field(default_factory=list)
+    ordered: deque[Order] = field(default_factory=deque)
+    said: deque[happened.StatusesReceived] = field(default_factory=deque)
+    connected: bool = True
+    takes: bool = True
+    stale: set[str] = field(default_factory=set)
+    sequence: int = 0
+    batches: int = 0
+    pids: int = 100
+
+    def __post_init__(self) -> None:
+        self.slave.max_processes = self.max_processes
+        if not self.resources:
+            self.resources = (
+                ResourceDescription("memory", "B", self.memory),
+                ResourceDescription("cpu", "core", self.cpu),
+            )
+
+    # --- what it says --------------------------------------------------------------------
+
+    def description(self) -> HostDescription:
+        return HostDescription(
+            self.name, self.incarnation, hostname=f"{self.name}.local", pid=7, labels=self.labels,
+            resources=self.resources, max_processes=self.max_processes,
+            executors=tuple(self.executors),
+        )  # fmt: skip
+
+    def usage(self) -> dict[str, float]:
+        """Fraction of each resource, our running processes included."""
+        usage = dict(self.busy)
+        for program in self.programs.values():
+            for resource in self.resources:
+                amount = self.shown[program.assignment.instance.process].get(resource.name, 0.0)
+                usage[resource.name] = usage.get(resource.name, 0.0) + amount / resource.capacity
+        return usage
+
+    def limit(self, resource: str) -> float:
+        return self.limits.get(resource, 1.0)
+
+    def accepts(self) -> bool:
+        """Under all its limits, as the slave judges it."""
+        usage = self.usage()
+        return self.takes and all(
+            usage.get(one.name, 0.0) < self.limit(one.name) for one in self.resources
+        )
+
+    def usages(self) -> happened.UsagesReceived:
+        """What each of its instances uses."""
+        held = list(self.programs)
+        used = [self.shown[one.process] for one in held]
+        return happened.UsagesReceived(
+            self.host_id, self.incarnation,
+            np.array([one.number for one in held], np.uint64),
+            np.array([one.get("cpu", 0.0) for one in used]),
+            np.array([one.get("memory", 0.0) for one in used]),
+        )  # fmt: skip
+
+    def _report(self, commands: Iterable[slave.Command], now: float) -> None:
+        for command in commands:
+            if isinstance(command, slave.Report):
+                self.batches += 1
+                self.said.append(
+                    happened.StatusesReceived(
+                        self.host_id, self.incarnation, self.batches, command.complete,
+                        command.statuses,
+                    )
+                )  # fmt: skip
+            elif isinstance(command, slave.Launch):
+                for assignment in command.assignments:
+                    self._launch(assignment, now)
+            elif isinstance(command, slave.Stop):
+                self._stop(command.instance, now)
+            elif isinstance(command, slave.Restart):
+                self._restart(command.instance, now)
+            elif isinstance(command, slave.Forget):
+                for instance in command.instances:
+                    self.ends.pop(instance, None)
+
+    def tell(self, event: slave.Event, now: float) -> None:
+        """Something happens to the slave."""
+        self._report(slave.step(self.slave, event, now), now)
+
+    def _supervisor_says(self, status: InstanceStatus, now: float) -> None:
+        self.tell(slave.SupervisorReported((status,)), now)
+
+    # --- what it does --------------------------------------------------------------------
+
+    def _launch(self, assignment: Assignment, now: float) -> None:
+        instance = assignment.instance
+        reason = self.refuses.get(instance.process)
+        if reason is not None:
+            self.tell(slave.LaunchRefused(instance, reason), now)
+            return
+        self.pids += 1
+        self.programs[instance] = Program(assignment, pid=self.pids)
+        status = InstanceStatus(instance, InstanceState.RUNNING, pid=self.pids)
+        self._supervisor_says(status, now)
+
+    def _stop(self, instance: InstanceId, now: float) -> None:
+        program = self.programs.get(instance)
+        if program is None:
+            return
+        if program.state is not InstanceState.STOPPING:
+            program.state = InstanceState.STOPPING
+            status = InstanceStatus(instance, InstanceState.STOPPING, pid=program.pid)
+            self._supervisor_says(status, now)
+        if instance.process not in self.stubborn:
+            self._end(instance, InstanceState.EXITED, now, signal=2)
+
+    def _restart(self, instance: InstanceId, now: float) -> None:
+        program = self.programs[instance]
+        self.pids += 1
+        program.pid = self.pids
+        for state, pid in ((InstanceState.STOPPING, 0), (InstanceState.RUNNING, self.pids)):
+            self._supervisor_says(InstanceStatus(instance, state, pid=pid, restarts=1), now)
+
+    def _end(
+        self, instance: InstanceId, state: InstanceState, now: float, *, code: int = 0,
+        signal: int = 0, run_time: float = 10.0,
+    ) -> None:  # fmt: skip
+        used = self.shown[instance.process]
+        del self.programs[instance]
+        status = InstanceStatus(
+            instance, state, exit_code=code, exit_signal=signal, run_time=run_time,
+            peak_memory=used.get("memory", 0.0), cpu_time=run_time * used.get("cpu", 0.0),
+            message=f"exit code {code}" if code else "",
+        )  # fmt: skip
+        self.ends[instance] = status
+        self._supervisor_says(status, now)
+
+    def find(self, name: str) -> InstanceId:
+        """The newest running instance of a process."""
+        return max(one for one in self.programs if one.process == name)
+
+    def finish(self, name: str, now: float, *, code: int = 0, run_time: float = 10.0) -> None:
+        """A process ends by itself."""
+        state = InstanceState.EXITED if code == 0 else InstanceState.FAILED
+        self._end(self.find(name), state, now, code=code, run_time=run_time)
+
+    def let_go(self, name: str, now: float) -> None:
+        """A stubborn process ends at last."""
+        self.stubborn.discard(name)
+        self._end(self.find(name), InstanceState.EXITED, now, signal=9)
+
+    def seen_in_graph(self, name: str, now: float) -> None:
+        """The node of the newest instance comes up."""
+        self.tell(slave.SeenInGraph(self.find(name)), now)
+
+    def obey(self, order: Order, now: float) -> happened.OrderAnswered:
+        """The slave takes an order."""
+        if order.action == "execute":
+            accepted, message = True, ""
+            try:
+                self.executors[order.executor](order.arguments)
+            except Exception as error:  # noqa: BLE001 - what a test's executor does
+                accepted, message = False, str(error)
+            return happened.OrderAnswered(
+                order.order, accepted, "" if accepted else "failed", message
+            )
+        event: slave.Event
+        if order.action == "report":
+            event = slave.ReportRequested()
+        elif order.action == "start":
+            assert order.assignment is not None
+            event = slave.AssignmentsReceived((order.assignment,))
+        else:
+            assert order.instance is not None
+            kinds = {"stop": slave.StopOrdered, "restart": slave.RestartOrdered}
+            event = kinds[order.action](order.instance)
+        self.tell(event, now)
+        return happened.OrderAnswered(order.order, accepted=True)
+
+    def fetch(self, now: float) -> None:
+        """The slave's open request is answered with what waits for it."""
+        batch, self.polled = self.polled, []
+        if batch:
+            self.tell(slave.AssignmentsReceived(tuple(batch)), now)
+
+    def restart_slave(self, now: float) -> None:
+        """The slave is killed and comes up again; what runs, runs on."""
+        self.incarnation += 1000
+        self.sequence = self.batches = 0
+        self.said.clear()
+        self.ordered.clear()
+        self.polled.clear()
+        self.slave = slave.SlaveState(max_processes=self.max_processes)
+        found = [
+            InstanceStatus(instance, program.state, pid=program.pid)
+            for instance, program in self.programs.items()
+        ]
+        slave.step(self.slave, slave.SupervisorReported((*self.ends.values(), *found)), now)
