@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Final
 
 from rosrm.config.settings import ClusterConfig, HostConfig
 from rosrm.core.views import HostRow, ProcessRow, Snapshot
-from rosrm.errors import RosrmError
+from rosrm.errors import NoMaster, RosrmError
 from rosrm.handover import arguments, hand_over
 from rosrm.ros.client import MasterClient
 from rosrm.ros.settings import RosSettings
@@ -33,6 +33,8 @@ _END: Final = 30.0
 #: Domains that DDS maps to ports below the ephemeral range.
 _DOMAINS: Final = range(1, 101)
 _LOOK: Final = 0.02
+#: Seconds for a master to come up and to be found.
+_FIND: Final = 15.0
 
 
 def claim_domain() -> tuple[int, socket.socket]:
@@ -134,8 +136,14 @@ class LocalCluster:
     @property
     def client(self) -> MasterClient:
         """A connection to the master."""
-        if self._client is None:
-            self._client = MasterClient.connect(self.ros, name="local cluster", timeout=15.0)
+        deadline = time.monotonic() + _FIND
+        while self._client is None:
+            self._check_parts()
+            try:
+                self._client = MasterClient.connect(self.ros, name="local cluster", timeout=3.0)
+            except NoMaster:
+                if time.monotonic() >= deadline:
+                    raise
         return self._client
 
     def wait_until(

@@ -28,6 +28,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rosrm.core.model import (
+    RESOURCE_SLOTS,
     Assignment,
     InstanceId,
     InstanceState,
@@ -37,6 +38,7 @@ from rosrm.core.model import (
 
 #: Seconds for which the end of an instance is kept for a master that did not hear of it.
 REMEMBER_END: Final = 60.0
+_SLOTS: Final = np.left_shift(np.uint32(1), np.arange(RESOURCE_SLOTS, dtype=np.uint32))
 #: Orders to stop what was never heard of that are remembered.
 _TOMBSTONES: Final = 10_000
 
@@ -221,12 +223,11 @@ def under_limits(
         usage, limit: (slots,) fractions; 1 stands for no limit.
         present, stale: bit i speaks of slot i.
     """
-    used = present.bit_count()
-    if stale & present:
-        limited = sum(1 << slot for slot in range(used) if limit[slot] < 1.0)
-        if stale & limited:
-            return False
-    return bool((usage[:used] < limit[:used]).all())
+    limited = limit < 1.0
+    used = limited & ((present & _SLOTS) != 0)
+    if stale & present and ((stale & _SLOTS) != 0)[used].any():
+        return False
+    return bool((usage < limit)[used].all())
 
 
 def awaits_graph(spec: ProcessSpec) -> bool:

@@ -216,6 +216,8 @@ def test_a_complete_report_names_everything(one) -> None:
         ([0.1, np.nan], 0b11, 0, False),  # unknown
         ([0.1, 0.2], 0b11, 0b10, False),  # stale, and limited
         ([0.1, 0.2], 0b11, 0b01, True),  # stale, but without a limit
+        ([1.0, 0.2], 0b11, 0b01, True),  # never read, but without a limit
+        ([1.5, 0.2], 0b11, 0, True),  # used up, but without a limit
         ([0.1, 0.9], 0b01, 0, True),  # not in use
         ([], 0, 0, True),  # no probe at all
     ],

@@ -1,0 +1,242 @@
+"""A third party's plugin that raises, hangs or answers nonsense: named, left out, and survived."""
+
+from __future__ import annotations
+
+import os
+import textwrap
+import time
+from pathlib import Path
+
+import pytest
+
+from rosrm.config.settings import MigrationSettings, ScoringChoice
+from rosrm.core.model import MigrationPolicy
+from rosrm.errors import Refused
+from tests.ros.clusters import PATIENCE, host, job, service, wait_until
+
+PLUGIN = """
+import os, time
+import numpy as np
+from rosrm.core.model import Reading, ResourceDescription
+from rosrm.hookspecs import hookimpl
+from rosrm.errors import SkipPlugin
+from rosrm.ports import MigrationOffer, ProbeOffer, ScoringOffer, Scores
+
+class Policy:
+    def __init__(self, act): self.act = act
+    def score(self, hosts, process):
+        if process.spec.name.startswith("fine"): return Scores(np.zeros(len(hosts.names)))
+        return Scores(self.act(len(hosts.names)))
+
+def raises(count): raise RuntimeError("the policy is out of order")
+def hangs(count):
+    while True: pass
+
+@hookimpl
+def register_scoring_policies():
+    return [
+        ScoringOffer("raises", lambda options: Policy(raises)),
+        ScoringOffer("nan", lambda options: Policy(lambda count: np.full(count, np.nan))),
+        ScoringOffer("wrong_size", lambda options: Policy(lambda count: np.zeros(count + 1))),
+        ScoringOffer("hangs", lambda options: Policy(hangs)),
+    ]
+
+class Probe:
+    def __init__(self, name, act):
+        self.resources = [ResourceDescription(name, "1", 1.0)]
+        self.name, self.act = name, act
+    def read(self):
+        return [Reading(self.name, self.act())]
+    def close(self): pass
+
+def fails(): raise OSError("no such sensor")
+def sleeps():
+    time.sleep(1000)
+def absent(options, context): raise SkipPlugin("no such hardware here")
+def broken(options, context): raise ValueError("cannot be made")
+def probe(name, act):
+    return ProbeOffer(name, lambda options, context: Probe(name, act), deadline=0.3)
+
+@hookimpl
+def register_probes():
+    return [
+        probe("battery", lambda: 0.25), probe("fails", fails), probe("sleeps", sleeps),
+        probe("nan_probe", lambda: float("nan")),
+        ProbeOffer("absent_one", absent), ProbeOffer("broken_one", broken),
+    ]
+
+class Strategy:
+    def propose(self, move): raise ValueError("not on a Sunday")
+
+@hookimpl
+def register_migration_strategies():
+    return [MigrationOffer("never_plans", lambda options: Strategy())]
+"""
+
+
+@pytest.fixture(scope="module")
+def third_party(tmp_path_factory):
+    """A folder that pip could have made: a module and its entry point."""
+    site = tmp_path_factory.mktemp("site")
+    (site / "odd_plugin.py").write_text(PLUGIN)
+    (site / "bad_import.py").write_text("import no_such_module_at_all\n")
+    info = site / "odd_plugin-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: odd-plugin\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(
+        textwrap.dedent("""\
+        [rosrm]
+        odd = odd_plugin
+        bad = bad_import
+        """)
+    )
+    # Who starts a part finds the plugins; the part itself imports them.
+    before = os.environ.get("PYTHONPATH", "")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", os.pathsep.join([str(site), *([before] if before else [])]))
+        patch.syspath_prepend(site)
+        yield site
+
+
+# --- scoring ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("policy", "said"),
+    [("raises", "out of order"), ("nan", "nan"), ("wrong_size", "wrong_size"), ("hangs", "1 s")],
+)
+def test_a_policy_that_fails_is_left_out_and_named(make_cluster, third_party, policy, said) -> None:
+    """What it was to judge is placed without it, and the record says so; the master goes on."""
+    cluster = make_cluster(host("h0"), scoring=ScoringChoice(policy))
+    cluster.submit(job("judged", "true"))
+    event = cluster.wait_for_event("plugin_failed")
+    assert policy in event.message
+    assert said in event.message
+    assert cluster.ended("judged").state == "finished"
+    assert policy in str(cluster.client.explain("judged"))
+    began = time.monotonic()
+    for number in range(5):
+        assert cluster.run(job(f"more{number}", "true"))[0].state == "finished"
+    assert time.monotonic() - began < 10.0
+    assert cluster.host("h0").state == "up"
+
+
+# --- probes -----------------------------------------------------------------------------------
+
+
+def probes(*names: str) -> dict:
+    return {"memory": {}, "cpu": {}, **{name: {} for name in names}}
+
+
+def test_a_third_party_s_probe_is_read(make_cluster, third_party) -> None:
+    """Its resource is one like any other: with a limit, in the rows, in what a process needs."""
+    cluster = make_cluster(host("h0", probes=probes("battery"), limits={"battery": 0.5}))
+
+    def shown(view) -> bool:
+        battery = next(r for row in view.hosts for r in row.resources if r.name == "battery")
+        return (battery.usage, battery.limit) == (0.25, 0.5)
+
+    cluster.wait_until("a reading of the battery", shown)
+    assert cluster.run(job("light", "true", needs={"battery": 0.1}))[0].state == "finished"
+    cluster.submit(service("heavy", needs={"battery": 0.4}))
+    cluster.wait_for_event("waits", process="heavy")
+    assert "battery" in str(cluster.client.explain("heavy"))
+    cluster.cancel("heavy")
+
+
+@pytest.mark.parametrize("name", ["fails", "sleeps", "nan_probe"])
+def test_a_probe_that_fails_is_stale_never_zero(make_cluster, third_party, name) -> None:
+    """Without a limit on it the host works on; with one it takes nothing until it is mended."""
+    cluster = make_cluster(host("h0", probes=probes(name)))
+    assert cluster.run(job("works", "true"))[0].state == "finished"
+    wait_until(lambda: name in cluster.log_of("h0"), f"a word of h0 about {name}")
+    assert "Traceback" not in cluster.log_of("h0")
+
+    cluster.start_slave(host("h1", probes=probes(name), limits={name: 0.9}))
+
+    def stale(view) -> bool:
+        rows = [row for row in view.hosts if row.description.name == "h1"]
+        return any(r.stale and r.usage > 0.0 for row in rows for r in row.resources)
+
+    cluster.wait_until(f"{name} stale on h1", stale)
+    cluster.client.set_host_state("h0", "cordon")
+    cluster.submit(job("waits", "true"))
+    deadline = time.monotonic() + 1.0
+    while time.monotonic() < deadline:
+        cluster.client.spin(0.1)
+        assert cluster.process("waits").state in ("queued", "set_aside")
+    assert not cluster.host("h1").accepting
+    cluster.cancel("waits")
+
+
+def test_a_probe_that_is_absent_or_broken_is_listed(make_cluster, third_party) -> None:
+    """With its reason; the host works with the others."""
+    cluster = make_cluster(host("h0", probes=probes("absent_one", "broken_one")))
+    rows = {row.name: row for row in cluster.client.list(plugins=True).plugins if row.host}
+    assert (rows["absent_one"].state, rows["absent_one"].reason) == (
+        "absent", "no such hardware here",
+    )  # fmt: skip
+    assert "cannot be made" in rows["broken_one"].reason
+    assert rows["memory"].state == "selected"
+    assert cluster.run(job("works", "true"))[0].state == "finished"
+
+
+# --- migration --------------------------------------------------------------------------------
+
+
+def test_a_strategy_that_gives_no_plan(make_cluster, third_party) -> None:
+    """The move is refused with the strategy's name and its reason; the process stays."""
+    cluster = make_cluster(
+        host("h0"), host("h1"),
+        migration=MigrationSettings({"never_plans": {}, "relaunch": {}}),
+    )  # fmt: skip
+    cluster.submit(service("p", migration=MigrationPolicy("never_plans")))
+    before = cluster.wait("p", "running")
+    with pytest.raises(Refused, match=r"never_plans.*not on a Sunday"):
+        cluster.client.migrate("p")
+    assert cluster.wait("p", "running").pid == before.pid
+    cluster.cancel("p")
+
+
+# --- at start ---------------------------------------------------------------------------------
+
+
+def test_a_plugin_that_does_not_import_is_listed_as_broken(make_cluster, third_party) -> None:
+    """With what is missing; everything else works."""
+    cluster = make_cluster(host("h0"))
+    broken = [row for row in cluster.client.list(plugins=True).plugins if row.state == "broken"]
+    assert any("no_such_module_at_all" in row.reason for row in broken)
+
+
+@pytest.mark.parametrize(
+    ("cluster_settings", "said"),
+    [
+        ({"scoring": ScoringChoice("wieghted")}, ["wieghted", "weighted", "threshold"]),
+        ({"scoring": ScoringChoice("weighted", {"w_memory": 0.1})}, ["w_memory"]),
+        ({"migration": MigrationSettings({"teleport": {}})}, ["teleport", "relaunch"]),
+    ],
+    ids=["policy", "option", "strategy"],
+)
+def test_an_unknown_name_is_refused_at_start(make_cluster, cluster_settings, said) -> None:
+    """With what was given and what there is; exit code 2, no traceback."""
+    cluster = make_cluster()
+    cluster.close()
+    cluster.cluster = type(cluster.cluster)(**cluster_settings)
+    part = cluster.start_master()
+    assert part.process.wait(PATIENCE) == 2
+    log = Path(part.log).read_text()
+    for word in said:
+        assert word in log
+    assert "Traceback" not in log
+
+
+def test_an_unknown_probe_is_refused_at_start(make_cluster) -> None:
+    """Likewise by the slave, and no supervisor is left."""
+    cluster = make_cluster()
+    part = cluster.start_slave(host("h0", probes={"memery": {}}))
+    assert part.process.wait(PATIENCE) == 2
+    del cluster.slaves["h0"]
+    log = cluster.log_of("h0")
+    assert "memery" in log
+    assert "memory" in log
+    assert "Traceback" not in log
