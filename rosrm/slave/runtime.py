@@ -107,7 +107,8 @@ class SlaveRuntime:
             probes = registry.probes(config.probes, context)
             self._sampler = Sampler(probes.made)
             opened.callback(self._sampler.close)
-            self._sampler.first()
+            for report in self._sampler.first().reports:
+                self.say(str(report))
             # From here on Ctrl-C ends what was begun in good order; before, it ends us at once.
             for number in (signal.SIGINT, signal.SIGTERM):
                 signal.signal(number, self._stop)
