@@ -237,6 +237,9 @@ def end_and_check(cluster: Cluster) -> None:
         if codes[part.name] is None:  # it lived, and was ended in good order
             assert part.process.returncode == 0, f"{part.name}: {part.process.returncode}\n{said}"
     files = {path for paths in memory.values() for path in paths if Path(path).exists()}
+    if files:  # a peer's are mapped too, and this peer may live
+        live = [int(entry.name) for entry in Path("/proc").iterdir() if entry.name.isdigit()]
+        files -= set().union(*map(shared_memory_of, live))
     if any(part.process.returncode == -signal.SIGKILL for part in cluster.started):
         for path in files:  # it had no chance to do this itself
             for name in (path, f"{path}_el"):
