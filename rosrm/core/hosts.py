@@ -151,10 +151,9 @@ class HostTable(HostColumns):
         self.touched.clear()
 
     def ask(self, host: Host) -> None:
-        """The host asked for work; a request also says that it is under its limits."""
-        column = host.column
-        if not (self.asking[column] and self.accepting[column]):
-            self.asking[column] = self.accepting[column] = True
+        """The host asked for work. Its readings say how much: before the first it is given none."""
+        if not self.asking[host.column]:
+            self.asking[host.column] = True
             self.changed()
 
     def set_condition(self, host: Host, condition: HostCondition) -> None:

@@ -4,6 +4,7 @@
 what happened           what the core does
 ======================  =========================================================================
 Registered              remembers the master's epoch; older ones are refused from now on
+MasterLost              forgets no end until a master has taken this host in again
 AssignmentsReceived     has them launched, once, or holds them until a slot is free; one that was
                         stopped before is refused
 LaunchRefused           reports that the host cannot run it, and why
@@ -51,6 +52,11 @@ class Registered:
     """The master took this host in."""
 
     epoch: int
+
+
+@dataclass(frozen=True, slots=True)
+class MasterLost:
+    """No master is heard, or another one: what ends now it may not have been told."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,6 +195,7 @@ class SlaveState:
 
     max_processes: int = 0
     epoch: int = 0
+    registered: bool = False
     held: dict[InstanceId, Held] = field(default_factory=dict)
     waiting: dict[InstanceId, Assignment] = field(default_factory=dict)
     tombstones: dict[InstanceId, None] = field(default_factory=dict)
@@ -244,6 +251,14 @@ _Commands = list[Command]
 def _registered(state: SlaveState, event: Registered, now: float) -> _Commands:
     # Not the highest that was ever heard: a master whose journal was lost begins at 1 again.
     state.epoch = event.epoch
+    state.registered = True
+    for held in state.held.values():
+        held.ended_at = max(held.ended_at, now)  # told with the registration, not before
+    return []
+
+
+def _master_lost(state: SlaveState, event: MasterLost, now: float) -> _Commands:
+    state.registered = False
     return []
 
 
@@ -407,6 +422,10 @@ def _seen(state: SlaveState, event: SeenInGraph, now: float) -> _Commands:
     return [Report((held.status,))]
 
 
+def _may_be_forgotten(state: SlaveState, held: Held, now: float) -> bool:
+    return state.registered and now - held.ended_at >= REMEMBER_END
+
+
 def _time_passed(state: SlaveState, event: TimePassed, now: float) -> _Commands:
     commands: _Commands = []
     forgotten = []
@@ -418,7 +437,7 @@ def _time_passed(state: SlaveState, event: TimePassed, now: float) -> _Commands:
                 f"this instance was seen in the ROS graph"
             )
             commands.append(Stop(instance))
-        elif held.status.state.ended and now - held.ended_at >= REMEMBER_END:
+        elif held.status.state.ended and _may_be_forgotten(state, held, now):
             forgotten.append(instance)
     if forgotten:
         for instance in forgotten:
@@ -433,6 +452,7 @@ _Handler = Callable[[SlaveState, Any, float], _Commands]
 HANDLERS: Final[Mapping[type, _Handler]] = MappingProxyType(
     {
         Registered: _registered,
+        MasterLost: _master_lost,
         AssignmentsReceived: _assigned,
         LaunchRefused: _launch_refused,
         StopOrdered: _stop_ordered,
@@ -447,6 +467,7 @@ HANDLERS: Final[Mapping[type, _Handler]] = MappingProxyType(
 
 Event = (
     Registered
+    | MasterLost
     | AssignmentsReceived
     | LaunchRefused
     | StopOrdered

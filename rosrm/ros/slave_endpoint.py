@@ -229,6 +229,7 @@ class SlaveEndpoint:
         self.link = Link.SEARCHING
         self._poll_open = False
         self._control.forget()
+        self._host.take(core.MasterLost())
         self._host.say(reason)
 
     def _take_beat(self, beat: msg.MasterBeat) -> None:

@@ -130,6 +130,19 @@ def test_one_more_goes_when_usage_falls() -> None:
     assert cluster.where("p") == ["a"]
 
 
+def test_a_host_that_has_told_no_reading_yet_is_given_nothing(monkeypatch) -> None:
+    """Until the first reading its usage and its limits are not known."""
+    cluster = Cluster()
+    with monkeypatch.context() as silent:
+        silent.setattr(cluster, "read", lambda *machines: None)
+        cluster.add(machine("a"))
+        cluster.submit(process("p"))
+    assert cluster.phase("p") == "queued"
+    cluster.read()
+    cluster.settle()
+    assert cluster.where("p") == ["a"]
+
+
 def test_max_processes_is_the_most_that_a_host_holds() -> None:
     """Slots are counted from the assignment to the end."""
     cluster = Cluster(Machine("a", max_processes=2), Machine("b", max_processes=1))

@@ -38,7 +38,7 @@ class Slave:
     """A state and its clock."""
 
     def __init__(self) -> None:
-        self.state = slave.SlaveState()
+        self.state = slave.SlaveState(registered=True)
         self.now = 100.0
 
     def step(self, event, after=0.0):
@@ -102,6 +102,17 @@ def test_a_dead_number_stays_dead(one, end) -> None:
     assert forgotten == [slave.Forget((InstanceId("p", 1),))]
     assert states(one.step(assigned())) == [STATE.REFUSED]
     assert [type(c) for c in one.step(assigned(number=2))] == [slave.Launch]
+
+
+def test_an_end_is_kept_while_no_master_is_heard(one) -> None:
+    """However long the master is away, it is told of a job that finished meanwhile."""
+    one.step(assigned())
+    one.step(slave.MasterLost())
+    one.step(told(STATE.EXITED))
+    assert one.step(slave.TimePassed(), after=10 * slave.REMEMBER_END) == []
+    one.step(slave.Registered(2))
+    assert one.step(slave.TimePassed(), after=slave.REMEMBER_END / 2) == []
+    assert len(one.step(slave.TimePassed(), after=slave.REMEMBER_END)) == 1
 
 
 def test_an_older_epoch_that_was_refused_may_come_anew(one) -> None:
