@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -66,11 +67,17 @@ class Queries(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class _Unheard:
-    """An order for a slave whose first beat has not come."""
+    """An order for a slave, or a request of one, whose first reading has not come.
+
+    Attributes:
+        deadline: monotonic seconds.
+        send: carries it out.
+        done: called with None when the deadline has passed.
+    """
 
     deadline: float
     send: Callable[[], None]
-    done: Callable[[Any], None]
+    done: Callable[[None], None] = lambda _: None
 
 
 @dataclass(slots=True)
@@ -80,7 +87,7 @@ class _HostLink:
     Attributes:
         incarnation: of the run that registered last; what a former run says is not heard.
         beat: its newest; 0: none was heard yet, so that it would refuse every order.
-        unheard: orders that wait for its first beat.
+        unheard: what waits for its first beat.
     """
 
     name: str
@@ -376,6 +383,17 @@ class MasterEndpoint:
             answer = refused("unknown", "register first", self._identity.epoch)
             respond(srv.RequestProcess.Response(answer=answer))
             return
+        if not link.beat:  # its limits are not known yet, and so not what it may be given
+            link.unheard.append(_Unheard(math.inf, lambda: self._open_poll(link, request, respond)))
+            return
+        self._open_poll(link, request, respond)
+
+    def _open_poll(
+        self,
+        link: _HostLink,
+        request: srv.RequestProcess.Request,
+        respond: Callable[[Any], None],
+    ) -> None:
         token = self._new_token()
         self._close_poll(link)  # a newer request replaces one whose answer can reach nobody
         link.poll, link.poll_token = respond, token

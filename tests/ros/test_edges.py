@@ -366,6 +366,48 @@ def test_a_status_that_makes_no_sense_is_refused(cluster, stranger) -> None:
     cluster.run(job("after-the-flight", "true"))
 
 
+def test_a_host_that_has_told_no_limits_gets_no_work(cluster, stranger) -> None:
+    """A slave that asks before its first reading waits until it has said what it may be given."""
+    description = HostDescription(
+        "fake", 4242, labels={"who": "fake"}, period=0.1,
+        resources=(ResourceDescription("memory", "B", 1000.0),),
+    )  # fmt: skip
+    request = srv.RegisterHost.Request(
+        envelope=stranger.envelope(), host=convert.host_to_msg(description)
+    )
+    answer = stranger.ask(srv.RegisterHost, path(names.REGISTER_HOST), request)
+    assert answer.answer.accepted
+    cluster.submit(
+        *(job(f"fake-{n}", "true", required_labels={"who": "fake"}, needs={"memory": 300.0})
+          for n in range(3))
+    )  # fmt: skip
+    poll = stranger.client(srv.RequestProcess, path(names.REQUEST_PROCESS)).call_async(
+        srv.RequestProcess.Request(
+            envelope=stranger.envelope(), host_id=answer.host_id, incarnation=4242
+        )
+    )
+    assert wait_for(stranger.participant, poll, time.monotonic() + 0.5) is None
+    assert cluster.process("fake-0").state == "queued"
+
+    publisher = stranger.publisher(msg.ResourceInfo, names.RESOURCE_INFO, qos.READING_OUT)
+    limits = np.ones(16, np.float32)
+    limits[0] = 0.65  # two of 300 B fit, not three
+    row = {"host_id": answer.host_id, "incarnation": 4242, "present": 1, "limit": limits}
+    for sequence in range(1, 100):
+        publisher.publish(reading(cluster, sequence=sequence, **row))
+        if (work := wait_for(stranger.participant, poll, time.monotonic() + 0.1)) is not None:
+            break
+    assert [one.instance.process for one in work.assignments] == ["fake-0", "fake-1"]
+    assert cluster.process("fake-2").state == "queued"
+    stranger.ask(
+        srv.Leave, path(names.LEAVE),
+        srv.Leave.Request(
+            envelope=stranger.envelope(), host_id=answer.host_id, incarnation=4242
+        ),
+    )  # fmt: skip
+    cluster.client.cancel([f"fake-{n}" for n in range(3)])
+
+
 # --- nobody there -----------------------------------------------------------------------------
 
 
