@@ -105,7 +105,6 @@ class SlaveEndpoint:
         self._epoch = 0
         self._master_beat = 0
         self._beat_at = 0.0
-        self._incarnation = 0  # of the master; 0: no beat of it was heard yet
         self._beat_period = 1.0
         self._master: tuple[str, int] = ("", 0)
         self._taken_since: float | None = None
@@ -181,7 +180,6 @@ class SlaveEndpoint:
             self.failure = fault or answer.message
             return
         self._note_beat(answer.beat, time.monotonic())
-        self._incarnation = 0
         self._master = (f"{answer.master} (pid {answer.pid} on {answer.hostname})", answer.epoch)
         self._register()
 
@@ -237,13 +235,10 @@ class SlaveEndpoint:
     def _take_beat(self, beat: msg.MasterBeat) -> None:
         if version_refusal(beat.protocol_version, "the master"):
             return  # the handshake says it clearly
-        if self.link is Link.REGISTERED:
+        if self.link is Link.REGISTERED and beat.epoch != self._epoch:
             if beat.epoch < self._epoch:
                 return
-            # The epoch alone does not tell: a master that lost its journal begins at 1 again.
-            if beat.epoch > self._epoch or self._incarnation not in (0, beat.incarnation):
-                self._lose_master(f"the master has started again (epoch {beat.epoch})")
-        self._incarnation = beat.incarnation
+            self._lose_master(f"the master has started again (epoch {beat.epoch})")
         self._note_beat(beat.beat, time.monotonic())
 
     def _note_beat(self, beat: int, now: float) -> None:

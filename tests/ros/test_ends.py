@@ -335,7 +335,7 @@ def test_a_lost_journal(make_cluster) -> None:
     journal.rename(journal.with_name("old"))
     cluster.reconnect()
     cluster.start_master()
-    cluster.wait_for_hosts(timeout=15.0)  # not only when the long poll is asked anew
+    cluster.wait_for_hosts()
     wait_gone(before.pid)
     for number in range(3):
         assert cluster.run(job(f"new{number}", "true"))[0].state == "finished"
