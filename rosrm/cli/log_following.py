@@ -92,7 +92,8 @@ def _next_holder(client: MasterClient, name: str, before: Holder) -> Holder | No
 def _copy_instance(
     client: MasterClient, name: str, holder: Holder, tail: int | None, *, follow: bool
 ) -> None:
-    part = client.read_log(holder.host, name, holder.number, -tail if tail else 0, _CHUNK)
+    start = -tail if tail else 0
+    part = _first_part(client, name, holder, start, follow=follow and not holder.over)
     while True:
         _write(part.content)
         before = part
@@ -103,6 +104,24 @@ def _copy_instance(
             if part.ended or not follow:
                 return
             time.sleep(PERIOD)
+
+
+def _first_part(
+    client: MasterClient, name: str, holder: Holder, start: int, *, follow: bool
+) -> LogPart:
+    """With `follow`, of an assigned process that its host is only about to start, too."""
+    while True:
+        try:
+            return client.read_log(holder.host, name, holder.number, start, _CHUNK)
+        except Refused as refusal:
+            if not follow or refusal.code != "unknown" or _no_longer(client, name, holder):
+                raise
+            time.sleep(PERIOD)
+
+
+def _no_longer(client: MasterClient, name: str, holder: Holder) -> bool:
+    now = find_holder(client, name, "")
+    return now.over or (now.host, now.number) != (holder.host, holder.number)
 
 
 def _write(content: bytes) -> None:

@@ -15,6 +15,8 @@ from rosrm.supervisor.client import log_path
 
 #: Most bytes in one answer.
 _MOST: Final = 1 << 20
+#: Of an instance that is being started: its file is opened with it.
+NOTHING_YET: Final = LogSlice(b"", 0, 0, False)
 
 
 def read_log(

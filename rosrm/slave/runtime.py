@@ -36,7 +36,7 @@ from rosrm.ros.names import token
 from rosrm.ros.participant import Participant
 from rosrm.ros.slave_endpoint import Link, LogSlice, SlaveEndpoint, result_json
 from rosrm.slave.launch import launch_order
-from rosrm.slave.log_reading import newest_instance, read_log
+from rosrm.slave.log_reading import NOTHING_YET, newest_instance, read_log
 from rosrm.slave.sampling import Sampler
 from rosrm.slave.sessions import SessionTable, SessionUsage
 from rosrm.state_directory import only_one
@@ -373,14 +373,21 @@ class SlaveRuntime:
 
     def read_log(self, process: str, number: int, offset: int, max_bytes: int) -> LogSlice:
         """A part of a log; raises `Refused`."""
-        instance = (
-            InstanceId(process, number)
-            if number
-            else newest_instance(self._supervisor_state, process)
-        )
+        instance = InstanceId(process, number) if number else self._newest_instance(process)
         held = self._state.held.get(instance)
         ended = held is None or held.status.state.ended
-        return read_log(self._supervisor_state, instance, offset, max_bytes, ended=ended)
+        try:
+            return read_log(self._supervisor_state, instance, offset, max_bytes, ended=ended)
+        except Refused:
+            if ended:
+                raise
+            return NOTHING_YET
+
+    def _newest_instance(self, process: str) -> InstanceId:
+        held = [one.number for one in self._state.held if one.process == process]
+        if held:
+            return InstanceId(process, max(held))
+        return newest_instance(self._supervisor_state, process)
 
     def execute(
         self, executor: str, arguments: dict[str, Any], done: Callable[[bool, str, str], None]

@@ -15,6 +15,7 @@ import pytest
 from rosrm.config.settings import ClusterConfig, HostConfig
 from rosrm.core.model import Kind, ProcessSpec, Readiness, StopPolicy
 from rosrm.core.views import ProcessRow, Snapshot
+from rosrm.errors import Refused
 from rosrm.local_cluster import LocalCluster, Part
 
 MIB = 2**20
@@ -128,10 +129,18 @@ class Cluster(LocalCluster):
 
     def wait_for_log(self, name: str, text: str, timeout: float = PATIENCE) -> str:
         deadline = time.monotonic() + timeout
-        while text not in (log := self.log(name)):
+        while text not in (log := self._log_so_far(name)):
             assert time.monotonic() < deadline, f"{name} did not say {text!r}: {log!r}"
             self.client.spin(0.05)
         return log
+
+    def _log_so_far(self, name: str) -> str:
+        try:
+            return self.log(name)
+        except Refused as refusal:
+            if refusal.code != "unknown":
+                raise
+            return ""  # assigned, and its host has not begun it
 
     def kinds(self, name: str) -> list[str]:
         """What happened to a process, oldest first."""

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import pytest
 
+from rosrm.errors import Refused
+
 from .conftest import event, process
 
 
@@ -113,3 +115,22 @@ def test_follow_goes_on_where_the_process_moves_to(rosrm, client, slave, monkeyp
     result = rosrm("logs", "talker", "-f")
     assert (result.code, result.out) == (0, "on alpha\non beta\n")
     assert "--- talker now runs on beta ---" in result.err
+
+
+def test_follow_waits_for_a_log_that_its_host_is_about_to_begin(rosrm, client, slave, monkeypatch):
+    there = client.read_log
+
+    def read_log(host, process, number, offset, max_bytes):
+        if not slave:
+            raise Refused("this host has no log of talker", "unknown")
+        return there(host, process, number, offset, max_bytes)
+
+    def later(seconds):
+        slave["alpha", 1] = Log(b"begun\n")
+        client.processes = [process("talker", "finished")]
+
+    client.read_log = read_log
+    assert rosrm("logs", "talker").code == 1
+    monkeypatch.setattr("time.sleep", later)
+    result = rosrm("logs", "talker", "-f")
+    assert (result.code, result.out) == (0, "begun\n")
