@@ -10,7 +10,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from rosrm.core.model import EMPTY, Assignment, InstanceId
+from rosrm.core.migration import HandoffPhase
+from rosrm.core.model import EMPTY, Assignment, InstanceId, RestartPolicy
 from rosrm.ports import Intent, Record
 
 
@@ -40,8 +41,9 @@ class Order:
     """Ask one slave for something; `OrderAnswered` follows, also when no answer comes.
 
     Attributes:
-        action: "stop", "restart", "start", "execute" or "report".
+        action: "stop", "restart", "start", "execute", "report" or "set_restart".
         assignment: for "start".
+        restart: for "set_restart".
         executor, arguments, timeout: for "execute".
     """
 
@@ -53,6 +55,24 @@ class Order:
     executor: str = ""
     arguments: Mapping[str, Any] = field(default_factory=lambda: EMPTY)
     timeout: float = 0.0
+    restart: RestartPolicy | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class PublishStateConfig:
+    """Tell the source and the destination of a handoff where it stands, on `state_config`.
+
+    Attributes:
+        source, destination: instance numbers.
+        source_node, destination_node: fully qualified names of their nodes.
+    """
+
+    process: str
+    phase: HandoffPhase
+    source: int
+    destination: int
+    source_node: str
+    destination_node: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,4 +87,4 @@ class Reply:
     host: str = ""
 
 
-Command = Assign | Withdraw | Order | Reply | Record | Intent
+Command = Assign | Withdraw | Order | PublishStateConfig | Reply | Record | Intent

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from rosrm.core.migration import ReportPhase
 from rosrm.core.model import HostDescription, InstanceId, InstanceStatus, ProcessSpec
 
 
@@ -143,6 +144,25 @@ class AssignmentWithdrawn:
 
 
 @dataclass(frozen=True, slots=True)
+class HandoffReported:
+    """The source or the destination of a handoff says how far it is.
+
+    Attributes:
+        destination: instance number of the destination; it names the handoff.
+        instance: number of the one that says it.
+        sequence: cycles that its newest state covers.
+        message: for people.
+    """
+
+    process: str
+    destination: int
+    instance: int
+    phase: ReportPhase
+    sequence: int = 0
+    message: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class PeerRefused:
     """Somebody was turned away at the edge: another version, a message that makes no sense."""
 
@@ -169,6 +189,7 @@ Event = (
     | HostStateRequested
     | OrderAnswered
     | AssignmentWithdrawn
+    | HandoffReported
     | PeerRefused
     | TimePassed
 )

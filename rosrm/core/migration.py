@@ -9,10 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from enum import IntEnum
 from math import inf
 from typing import Any
 
-from rosrm.core.model import EMPTY, InstanceId, ProcessSpec
+from rosrm.core.model import EMPTY, InstanceId, ProcessSpec, RestartPolicy
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,6 +28,7 @@ class Move:
         destination_host: where it goes.
         fallback: an instance for starting again at the source, should a stop be undone.
         now: unix time, whole seconds (the alias of a handoff carries it).
+        source_node: under which the node of the source runs: an alias, if it came by a handoff.
     """
 
     spec: ProcessSpec
@@ -36,17 +38,48 @@ class Move:
     destination_host: str
     fallback: InstanceId
     now: int
+    source_node: str
+
+
+class HandoffPhase(IntEnum):
+    """What the master says of a handoff, as in `StateConfig`."""
+
+    SHADOW = 1
+    SWITCH = 2
+    TAKE_OVER = 3
+    ABORT = 4
+    RESUME = 5
+    DONE = 6
+
+
+class ReportPhase(IntEnum):
+    """How far the source or the destination of a handoff is, as in `HandoffReport`."""
+
+    ATTACHED = 1
+    SILENT = 2
+    RELEASED = 3
+    RESUMED = 4
+    SHADOWING = 11
+    READY = 12
+    SWITCHING = 13
+    ACTIVE = 14
+    ABORTED = 15
+    FAILED = 20
 
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """Start an instance on a host; done when the slave says that it runs."""
+    """Start an instance on a host; done when the slave says that it runs.
+
+    A shadow is the destination of a handoff: it has an alias, stays silent, and is not restarted.
+    """
 
     instance: InstanceId
     host: str
     timeout: float
     node_name: str = ""
     undo: Step | None = None
+    shadow: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +103,31 @@ class Stop:
 
 
 @dataclass(frozen=True, slots=True)
+class Configure:
+    """Publish `state_config` with this phase to the source and the destination of the move.
+
+    Each phase is done when they have answered as in the handoff protocol; DONE, and any phase that
+    is not `awaited`, at once.
+    """
+
+    phase: HandoffPhase
+    timeout: float
+    awaited: bool = True
+    undo: Step | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class SetRestart:
+    """Give an instance another restart policy; done when its slave has taken it."""
+
+    instance: InstanceId
+    host: str
+    restart: RestartPolicy
+    timeout: float
+    undo: Step | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class Commit:
     """From here on the destination owns the name; there is one in each plan."""
 
@@ -88,7 +146,7 @@ class Execute:
     undo: Step | None = None
 
 
-Step = Start | AwaitReady | Stop | Commit | Execute
+Step = Start | AwaitReady | Stop | Configure | SetRestart | Commit | Execute
 
 
 @dataclass(frozen=True, slots=True)

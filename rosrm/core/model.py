@@ -163,12 +163,15 @@ class Assignment:
     Attributes:
         epoch: of the master that gave it.
         node_name: under which the node runs; differs from the process's name in a handoff.
+        shadow: it starts as the destination of a handoff: silent, and not restarted until its slave
+            is told otherwise.
     """
 
     instance: InstanceId
     spec: ProcessSpec
     epoch: int
     node_name: str
+    shadow: bool = False
 
 
 class InstanceState(str, Enum):

@@ -58,6 +58,7 @@ def begin_move(
     move = Move(
         process.spec, source.id, source.host.name, state.new_instance_id(process),
         destination.name, state.new_instance_id(process), int(state.wall),
+        source.node_name or process.name,
     )  # fmt: skip
     plan = _propose(state, name, move)
     if isinstance(plan, str):

@@ -66,6 +66,7 @@ class Instance:
         recalled: a master ordered it to stop and was itself restarted: its end is not its own.
         order: of an unanswered stop, 0: none.
         order_at: when it was given.
+        node_name: under which its node runs, where that is not the process's name.
     """
 
     id: InstanceId
@@ -84,6 +85,7 @@ class Instance:
     recalled: bool = False
     order: int = 0
     order_at: float = 0.0
+    node_name: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -104,6 +104,11 @@ class MasterState:
     def _intent_of(self, process: Process) -> Intent:
         owner = self.instances.get(process.owner)
         held = {str(number): self.instances[number].host.name for number in process.instances}
+        aliases = {
+            str(number): alias
+            for number in process.instances
+            if (alias := self.instances[number].node_name)
+        }
         return Intent(
             "process", process.name,
             {
@@ -112,7 +117,7 @@ class MasterState:
                 "host": owner.host.name if owner else "", "instances": held,
                 "reason": process.reason, "excluded": dict(process.excluded),
                 "migrations": process.migrations, "exit_code": process.exit_code,
-                "restarts": process.restarts,
+                "restarts": process.restarts, "node_names": aliases,
             },
         )  # fmt: skip
 
@@ -199,10 +204,11 @@ class MasterState:
         self.hosts.charge(instance.host, -instance.charged, processes=-1)
 
     def assignment(
-        self, instance: InstanceId, spec: ProcessSpec, node_name: str = ""
-    ) -> Assignment:
+        self, instance: InstanceId, spec: ProcessSpec, node_name: str = "", *,
+        shadow: bool = False,
+    ) -> Assignment:  # fmt: skip
         """The order for a slave to run an instance."""
-        return Assignment(instance, spec, self.epoch, node_name or spec.name)
+        return Assignment(instance, spec, self.epoch, node_name or spec.name, shadow)
 
     def note_decision(self, process: Process, decision: Decision, kind: str, now: float) -> None:
         """Remember the newest decision about a process, for `explain`."""

@@ -45,7 +45,11 @@ def _order_start(state: MasterState, run: Run, step: Start, host: Host, now: flo
     if number not in state.instances and number not in run.ended:
         state.add_instance(step.instance, spec, host, now)
         state.save(process)
-    assignment = state.assignment(step.instance, spec, step.node_name)
+    instance = state.instances.get(number)
+    if instance is not None and instance.node_name != step.node_name:
+        instance.node_name = step.node_name
+        state.save(process)
+    assignment = state.assignment(step.instance, spec, step.node_name, shadow=step.shadow)
     state.emit(Order(run.order, host.host_id, "start", step.instance, assignment))
 
 

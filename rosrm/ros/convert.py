@@ -61,10 +61,7 @@ def spec_to_msg(spec: model.ProcessSpec) -> msg.ProcessSpec:
         ],
         remappings=pairs(spec.remappings), environment=pairs(spec.environment),
         working_directory=spec.working_directory or "", ros=spec.ros, kind=spec.kind.value,
-        restart=msg.RestartPolicy(
-            when=restart.when, delay=float(restart.delay), max_delay=float(restart.max_delay),
-            factor=float(restart.factor), attempts=restart.attempts, window=float(restart.window),
-        ),
+        restart=restart_to_msg(restart),
         needs=[
             msg.ResourceAmount(resource=name, amount=float(amount))
             for name, amount in spec.needs.items()
@@ -87,7 +84,7 @@ def spec_from_msg(message: msg.ProcessSpec) -> model.ProcessSpec:
     fault = _spec_fault(message)
     if fault:
         raise Refused(f"process {message.name!r}: {fault}")
-    restart, migration = message.restart, message.migration
+    migration = message.migration
     return model.ProcessSpec(
         name=message.name, namespace=message.ros_namespace, package=message.package or None,
         executable=message.executable or None, module=message.module or None,
@@ -99,10 +96,7 @@ def spec_from_msg(message: msg.ProcessSpec) -> model.ProcessSpec:
         remappings=mapping(message.remappings), environment=mapping(message.environment),
         working_directory=message.working_directory or None, ros=message.ros,
         kind=model.Kind(message.kind),
-        restart=model.RestartPolicy(
-            restart.when, restart.delay, restart.max_delay, restart.factor, restart.attempts,
-            restart.window,
-        ),
+        restart=_restart_from_msg(message.restart),
         needs={need.resource: need.amount for need in message.needs},
         required_labels=mapping(message.required_labels),
         preferred_labels=mapping(message.preferred_labels),
@@ -127,8 +121,6 @@ def _spec_fault(message: msg.ProcessSpec) -> str:
         return "package and executable go together"
     if message.kind not in {kind.value for kind in model.Kind}:
         return f"kind {message.kind!r}; allowed: service, job"
-    if message.restart.when not in ("never", "on-failure", "always"):
-        return f"restart {message.restart.when!r}; allowed: never, on-failure, always"
     if message.readiness.kind not in ("auto", "graph", "running"):
         return f"readiness {message.readiness.kind!r}; allowed: auto, graph, running"
     for need in message.needs:
@@ -139,13 +131,10 @@ def _spec_fault(message: msg.ProcessSpec) -> str:
 
 def _times_fault(message: msg.ProcessSpec) -> str:
     """A wait that is no number would never end, or never begin."""
-    restart = message.restart
-    if not 1.0 <= restart.factor < _INFINITE:
-        return f"the factor of its restarts is {restart.factor}; allowed: 1 and more"
+    fault = _restart_fault(message.restart)
+    if fault:
+        return fault
     times = {
-        "restart.delay": restart.delay,
-        "restart.max_delay": restart.max_delay,
-        "restart.window": restart.window,
         "readiness.timeout": message.readiness.timeout,
         "stop.interrupt_grace": message.stop.interrupt_grace,
         "stop.terminate_grace": message.stop.terminate_grace,
@@ -153,6 +142,40 @@ def _times_fault(message: msg.ProcessSpec) -> str:
     for name, seconds in times.items():
         if not 0.0 <= seconds < _INFINITE:
             return f"{name} is {seconds} s; allowed: 0 and more"
+    return ""
+
+
+def restart_to_msg(restart: model.RestartPolicy) -> msg.RestartPolicy:
+    """A restart policy."""
+    return msg.RestartPolicy(
+        when=restart.when, delay=float(restart.delay), max_delay=float(restart.max_delay),
+        factor=float(restart.factor), attempts=restart.attempts, window=float(restart.window),
+    )  # fmt: skip
+
+
+def restart_from_msg(message: msg.RestartPolicy) -> model.RestartPolicy:
+    """The inverse of `restart_to_msg`; raises `Refused` for what makes no policy."""
+    fault = _restart_fault(message)
+    if fault:
+        raise Refused(f"a restart policy: {fault}")
+    return _restart_from_msg(message)
+
+
+def _restart_from_msg(message: msg.RestartPolicy) -> model.RestartPolicy:
+    return model.RestartPolicy(
+        message.when, message.delay, message.max_delay, message.factor, message.attempts,
+        message.window,
+    )  # fmt: skip
+
+
+def _restart_fault(message: msg.RestartPolicy) -> str:
+    if message.when not in ("never", "on-failure", "always"):
+        return f"restart {message.when!r}; allowed: never, on-failure, always"
+    if not 1.0 <= message.factor < _INFINITE:
+        return f"the factor of its restarts is {message.factor}; allowed: 1 and more"
+    for name in ("delay", "max_delay", "window"):
+        if not 0.0 <= getattr(message, name) < _INFINITE:
+            return f"restart.{name} is {getattr(message, name)} s; allowed: 0 and more"
     return ""
 
 
@@ -167,7 +190,8 @@ def assignment_to_msg(assignment: model.Assignment) -> msg.Assignment:
     """An order to run an instance."""
     return msg.Assignment(
         instance=instance_to_msg(assignment.instance), epoch=assignment.epoch,
-        node_name=assignment.node_name, spec=spec_to_msg(assignment.spec),
+        node_name=assignment.node_name, shadow=assignment.shadow,
+        spec=spec_to_msg(assignment.spec),
     )  # fmt: skip
 
 
@@ -175,7 +199,7 @@ def assignment_from_msg(message: msg.Assignment) -> model.Assignment:
     """The inverse of `assignment_to_msg`; raises `Refused`."""
     return model.Assignment(
         instance_from_msg(message.instance), spec_from_msg(message.spec), message.epoch,
-        message.node_name,
+        message.node_name, message.shadow,
     )  # fmt: skip
 
 

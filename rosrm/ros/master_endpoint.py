@@ -37,6 +37,7 @@ _ACTIONS = {
     "start": srv.ControlHost.Request.START,
     "execute": srv.ControlHost.Request.EXECUTE,
     "report": srv.ControlHost.Request.REPORT,
+    "set_restart": srv.ControlHost.Request.SET_RESTART,
 }
 
 #: Seconds between two records of the same refusal, and refusals that are told apart.
@@ -237,7 +238,6 @@ class MasterEndpoint:
     # --- what is asked -------------------------------------------------------------------
 
     def _offer(self) -> None:
-        self._participant.serve(srv.Handshake, self._names(names.HANDSHAKE), self._take_handshake)
         self._participant.serve(srv.List, self._names(names.LIST), self._take_list)
         self._participant.serve(srv.Explain, self._names(names.EXPLAIN), self._take_explain)
         self._server.offer(
@@ -255,6 +255,8 @@ class MasterEndpoint:
             (srv.SetHostState, names.SET_HOST_STATE, self._host_set),
         ):
             self._server.offer(kind, self._names(name), self._as_event(kind, event))
+        # Last, as DDS tells of them in this order: who can shake hands can ask for all the others.
+        self._participant.serve(srv.Handshake, self._names(names.HANDSHAKE), self._take_handshake)
 
     def _as_event(
         self, kind: Any, make: Callable[[Any, int], happened.Event]
@@ -480,6 +482,8 @@ class MasterEndpoint:
             request.instance = convert.instance_to_msg(command.instance)
         if command.assignment is not None:
             request.assignment = convert.assignment_to_msg(command.assignment)
+        if command.restart is not None:
+            request.restart = convert.restart_to_msg(command.restart)
         if command.executor:
             request.arguments = json.dumps(dict(command.arguments))
 

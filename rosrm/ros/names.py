@@ -13,7 +13,7 @@ _LONGEST: Final = 64
 
 
 def token(name: str) -> str:
-    """A host's name as one token of a ROS name ("robot-1" -> "robot_1_bd82fad2").
+    """A name of a host or a process as one token of a ROS name ("robot-1" -> "robot_1_bd82fad2").
 
     Different names stay different, by a digest where one must be changed: in DDS all servers of a
     name execute a request, so that robot-1 would do what robot_1 is told.
@@ -39,6 +39,10 @@ class Names:
         """A name that belongs to one host."""
         return f"{self.namespace}/host/{token(host)}/{name}"
 
+    def of_handoff(self, process: str, destination: int) -> str:
+        """The channel of one handoff, named by its destination's instance number."""
+        return f"{self.namespace}/handoff/{token(process)}_{destination}"
+
 
 HANDSHAKE: Final = "handshake"
 REGISTER_HOST: Final = "register_host"
@@ -58,3 +62,4 @@ RESOURCE_INFO: Final = "resource_info"
 PROCESS_STATUS: Final = "process_status"
 PROCESS_USAGE: Final = "process_usage"
 MASTER_BEAT: Final = "master_beat"
+STATE_CONFIG: Final = "state_config"

@@ -40,6 +40,7 @@ class MigrationContract:
             destination_host="b",
             fallback=InstanceId(self.spec.name, 3),
             now=1_700_000_000,
+            source_node=self.spec.name,
         )
         policies = [replace(self.spec.migration, overlap=overlap) for overlap in (True, False)]
         return [replace(move, spec=replace(self.spec, migration=policy)) for policy in policies]

@@ -455,7 +455,7 @@ def test_a_lost_order_is_given_again() -> None:
 
 def test_the_shipped_shape_of_relaunch_keeps_to_its_declared_overlap() -> None:
     """Stop-first declares none, start-first a bound."""
-    move = Move(movable("p"), _id(1), "a", _id(2), "b", _id(3), 0)
+    move = Move(movable("p"), _id(1), "a", _id(2), "b", _id(3), 0, "p")
     assert StartFirstOrStopFirst().propose(move).overlap > 0.0
 
 
