@@ -1,0 +1,143 @@
+"""The inputs that a shadow, or a silent source, keeps until one of them is to go on. Pure."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Any, Final, NamedTuple
+
+#: Covered time stamps of one input that are remembered for messages which come after their mark.
+_REMEMBERED: Final = 4096
+
+
+class Kept(NamedTuple):
+    """One message in the buffer.
+
+    Attributes:
+        topic: of the input.
+        stamp: source time stamp, ns.
+        item: the message with all that is needed to serve it.
+    """
+
+    topic: str
+    stamp: int
+    item: Any
+
+
+@dataclass(slots=True)
+class _Track:
+    """What is known of one input.
+
+    Attributes:
+        covered: newest covered time stamps, in the order in which they were told.
+        newest: covered; None: none was.
+        overlap: a message was received that the source has processed too.
+        heard_at: when the last message came, seconds.
+        held: messages in the buffer.
+    """
+
+    heard_at: float
+    covered: dict[int, None] = field(default_factory=dict)
+    newest: int | None = None
+    single: bool = True
+    overlap: bool = False
+    held: int = 0
+
+
+class InputBuffer:
+    """Messages of all inputs, in the order in which they came.
+
+    Args:
+        limit: most messages of one input.
+        now: monotonic seconds.
+    """
+
+    def __init__(self, limit: int, now: float) -> None:
+        self._limit = limit
+        self._since = now
+        self._kept: deque[Kept] = deque()
+        self._tracks: dict[str, _Track] = {}
+
+    def _track(self, topic: str) -> _Track:
+        track = self._tracks.get(topic)
+        if track is None:
+            track = self._tracks[topic] = _Track(self._since)
+        return track
+
+    def add(self, topic: str, stamp: int, item: Any, now: float) -> bool:
+        """Keep a message, unless a state covers it already.
+
+        Returns:
+            False: there is no room for it.
+        """
+        track = self._track(topic)
+        track.heard_at = now
+        if _is_covered(track, stamp):
+            track.overlap = True
+            return True
+        if track.held >= self._limit:
+            return False
+        track.held += 1
+        self._kept.append(Kept(topic, stamp, item))
+        return True
+
+    def cover(self, topic: str, stamps: Iterable[int], *, single: bool) -> None:
+        """A state covers these messages of an input: they are dropped, now or when they come.
+
+        Args:
+            topic: of the input.
+            stamps: source time stamps, ns.
+            single: one publisher alone speaks there, so that its stamps are in order, and a message
+                that is older than the newest covered was passed over by the source.
+        """
+        track = self._track(topic)
+        track.single = single
+        new = [stamp for stamp in stamps if stamp not in track.covered]
+        if not new:
+            return
+        track.covered.update(dict.fromkeys(new))
+        newest = max(new)
+        track.newest = newest if track.newest is None else max(track.newest, newest)
+        while len(track.covered) > _REMEMBERED:
+            del track.covered[next(iter(track.covered))]
+        self._drop_covered(topic, track)
+
+    def _drop_covered(self, topic: str, track: _Track) -> None:
+        if not track.held:
+            return
+        left = [
+            one for one in self._kept if one.topic != topic or not _is_covered(track, one.stamp)
+        ]
+        dropped = len(self._kept) - len(left)
+        if dropped:
+            track.overlap = True
+            track.held -= dropped
+            self._kept = deque(left)
+
+    def overlaps(self, topic: str) -> bool:
+        """Whether a message was received that the state covers: from there on none is missing."""
+        return self._track(topic).overlap
+
+    def is_idle(self, topic: str, now: float, for_seconds: float) -> bool:
+        """Whether nothing waits, and nothing came for so long."""
+        track = self._track(topic)
+        return not track.held and now - track.heard_at >= for_seconds
+
+    def take(self) -> Kept | None:
+        """The oldest message, out of the buffer; None: it is empty."""
+        if not self._kept:
+            return None
+        kept = self._kept.popleft()
+        self._tracks[kept.topic].held -= 1
+        return kept
+
+    def __len__(self) -> int:
+        """How many messages wait."""
+        return len(self._kept)
+
+
+def _is_covered(track: _Track, stamp: int) -> bool:
+    if stamp in track.covered:
+        return True
+    return track.single and track.newest is not None and stamp <= track.newest

@@ -1,0 +1,93 @@
+"""Puts states together from marks and parts, whatever comes first. Pure."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+
+class PartKey(NamedTuple):
+    """The content of one serialised message, in short.
+
+    Attributes:
+        size: bytes.
+        digest: CRC-32.
+    """
+
+    size: int
+    digest: int
+
+
+def part_key(data: bytes) -> PartKey:
+    """What a mark says of a part."""
+    return PartKey(len(data), zlib.crc32(data))
+
+
+@dataclass(frozen=True, slots=True)
+class Cut:
+    """A complete state.
+
+    Attributes:
+        mark: as it came.
+        parts: serialised messages by topic.
+        arrived: of the mark, monotonic seconds.
+    """
+
+    mark: Any
+    parts: Mapping[str, bytes]
+    arrived: float
+
+
+class CutAssembler:
+    """Finds the newest state of which every part is at hand.
+
+    Args:
+        topics: of the parts.
+    """
+
+    def __init__(self, topics: Iterable[str]) -> None:
+        self._at_hand: dict[str, dict[PartKey, bytes]] = {topic: {} for topic in topics}
+        self._waiting: list[tuple[Any, float]] = []
+
+    def add_part(self, topic: str, data: bytes) -> None:
+        """A message came on a state topic."""
+        at_hand = self._at_hand[topic]
+        key = part_key(data)
+        at_hand.pop(key, None)  # it counts as new again
+        at_hand[key] = data
+
+    def add_mark(self, mark: Any, now: float) -> None:
+        """A mark came, newer than those before."""
+        self._waiting.append((mark, now))
+
+    def take(self) -> Cut | None:
+        """The newest complete state that was not taken before; older ones are given up."""
+        for index in range(len(self._waiting) - 1, -1, -1):
+            mark, arrived = self._waiting[index]
+            wanted = {part.topic: PartKey(part.size, part.digest) for part in mark.parts}
+            parts = {topic: self._at_hand[topic].get(key) for topic, key in wanted.items()}
+            if all(data is not None for data in parts.values()):
+                del self._waiting[: index + 1]
+                self._forget_older(wanted)
+                return Cut(mark, {t: d for t, d in parts.items() if d is not None}, arrived)
+        return None
+
+    def missing(self) -> list[str]:
+        """Topics of the newest mark whose part has not come."""
+        if not self._waiting:
+            return []
+        mark, _ = self._waiting[-1]
+        return [
+            part.topic
+            for part in mark.parts
+            if PartKey(part.size, part.digest) not in self._at_hand[part.topic]
+        ]
+
+    def _forget_older(self, wanted: Mapping[str, PartKey]) -> None:
+        """Parts come in order: what lies before the one in use is never marked again."""
+        for topic, key in wanted.items():
+            at_hand = self._at_hand[topic]
+            while next(iter(at_hand)) != key:
+                del at_hand[next(iter(at_hand))]

@@ -1,0 +1,289 @@
+"""The shadow: it follows the source's state, and becomes active when the source is silent."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Final
+
+from rosrm.node import channel as topics
+from rosrm.node.channel import Channel
+from rosrm.node.cuts import Cut, CutAssembler
+from rosrm.node.member import Member
+from rosrm.node.parts import Part, StateError
+from rosrm.version import PROTOCOL_VERSION
+from rosrm_msgs.msg import HandoffReport, StateConfig, StateMark
+
+#: Seconds without a message after which an input counts as idle.
+_IDLE: Final = 1.0
+#: Seconds between two looks at what is still waited for.
+_REVIEW: Final = 0.1
+
+
+class Destination:
+    """What a shadow does until it is active.
+
+    Args:
+        member: the node.
+        parts: of its state.
+        mark_topic: fully qualified.
+        activated: called when the node is active, with the sequence from which on.
+    """
+
+    def __init__(
+        self, member: Member, parts: list[Part], mark_topic: str, activated: Callable[[], None]
+    ) -> None:
+        self._member = member
+        self._parts = parts
+        self._mark_topic = mark_topic
+        self._activated = activated
+        self._channel: Channel | None = None
+        self._assembler: CutAssembler | None = None
+        self._subscriptions: list[Any] = []
+        self._timer: Any = None
+        self._cut: Cut | None = None
+        self._run = 0
+        self._attached = False
+        self._was_ready = False
+        self._may_switch = False
+        self._silent_at: int | None = None
+        self._over = False
+        member.on_overflow = self._overflowed
+
+    # --- the master's word -----------------------------------------------------------------
+
+    def configure(self, config: StateConfig) -> None:
+        """The master says something of the handoff to here."""
+        if self._over:
+            self._repeat()
+            return
+        if self._channel is None:
+            self._open(config)
+        else:
+            self._repeat()
+        if config.phase == StateConfig.SWITCH:
+            self._may_switch = True
+            self._review()
+        elif config.phase == StateConfig.TAKE_OVER:
+            self._take_over()
+        elif config.phase in (StateConfig.ABORT, StateConfig.RESUME):
+            self._end(HandoffReport.ABORTED, "the master called it off")
+
+    def _open(self, config: StateConfig) -> None:
+        member = self._member
+        self._channel = Channel(
+            member.plain, config.channel, config.destination, member.identity.instance, self._heard
+        )
+        self._assembler = CutAssembler(part.topic for part in self._parts)
+        subscribe = member.plain.create_subscription
+        self._subscriptions = [
+            subscribe(
+                part.message_type, part.topic, partial(self._part_came, part.topic), topics.STATE,
+                raw=True,
+            )
+            for part in self._parts
+        ]  # fmt: skip
+        self._subscriptions.append(
+            subscribe(StateMark, self._mark_topic, self._mark_came, topics.MARK)
+        )
+        self._timer = member.plain.create_timer(_REVIEW, self._look)
+        self._review()
+
+    def _repeat(self) -> None:
+        """The master asks again, perhaps a new one: it is told again how far this is."""
+        if self._channel is not None:
+            self._channel.repeat()
+
+    # --- the source's word -----------------------------------------------------------------
+
+    def _heard(self, report: HandoffReport) -> None:
+        with self._member.turn:
+            if self._over:
+                return
+            if report.phase == HandoffReport.ATTACHED:
+                self._attached = True
+            elif report.phase == HandoffReport.SILENT:
+                self._silent_at = report.sequence
+            elif report.phase == HandoffReport.FAILED:
+                self._end(HandoffReport.FAILED, f"the source cannot go on: {report.message}")
+            self._go_on()
+
+    def _part_came(self, topic: str, data: bytes) -> None:
+        with self._member.turn:
+            if self._assembler is not None and not self._over:
+                self._assembler.add_part(topic, data)
+                self._go_on()
+
+    def _mark_came(self, mark: StateMark) -> None:
+        with self._member.turn:
+            if self._assembler is None or self._over:
+                return
+            fault = self._fault_of(mark)
+            if fault:
+                self._end(HandoffReport.FAILED, fault)
+                return
+            self._run = mark.run
+            self._assembler.add_mark(mark, time.monotonic())
+            if mark.last:
+                self._silent_at = mark.sequence
+            self._go_on()
+
+    def _fault_of(self, mark: StateMark) -> str:
+        """Why the source's state cannot be this node's; "": it can."""
+        if mark.protocol_version != PROTOCOL_VERSION:
+            return (
+                f"the source speaks protocol version {mark.protocol_version}, this node "
+                f"{PROTOCOL_VERSION}: both need the same version of rosrm"
+            )
+        if self._run and mark.run != self._run:
+            return "the source was started again, and its state is a new one"
+        theirs = {part.topic: part.type for part in mark.parts}
+        ours = {part.topic: part.type_name for part in self._parts}
+        for topic in sorted(ours.keys() | theirs.keys()):
+            if theirs.get(topic) != ours.get(topic):
+                return (
+                    f"the state on {topic} is {theirs.get(topic, 'none')} at the source, and "
+                    f"{ours.get(topic, 'none')} here: both must be the same program"
+                )
+        return ""
+
+    # --- following -------------------------------------------------------------------------
+
+    def _look(self) -> None:
+        with self._member.turn:
+            if not self._over:
+                self._review()
+
+    def _go_on(self) -> None:
+        """Restore the newest state, if there is a new one, and see what follows."""
+        if self._over or self._assembler is None:
+            return
+        cut = self._assembler.take()
+        if cut is not None and not self._restore(cut):
+            return
+        self._review()
+
+    def _restore(self, cut: Cut) -> bool:
+        try:
+            for part in self._parts:
+                part.restore(cut.parts[part.topic])
+        except StateError as error:
+            self._end(HandoffReport.FAILED, str(error))
+            return False
+        self._cut = cut
+        for covered in cut.mark.inputs:
+            self._member.buffer.cover(
+                covered.topic, covered.covered, single=covered.publishers <= 1
+            )
+        return True
+
+    def _review(self) -> None:
+        """Say how far it is, ask for silence when it may, and become active on it."""
+        if self._channel is None:
+            return
+        if not self._was_ready:
+            missing = self._still_missing()
+            if missing:
+                self._channel.say(HandoffReport.SHADOWING, 0, f"waits {missing}")
+                return
+            self._was_ready = True
+            self._channel.say(HandoffReport.READY, self._sequence())
+        if not self._may_switch:
+            return
+        if self._silent_at is None:
+            self._channel.say(HandoffReport.SWITCHING, self._sequence())
+        elif self._sequence() >= self._silent_at:
+            self._activate()
+
+    def _sequence(self) -> int:
+        return int(self._cut.mark.sequence) if self._cut is not None else 0
+
+    def _still_missing(self) -> str:
+        """What keeps this node from being ready, in words; "": nothing."""
+        if not self._attached:
+            return "for the source to answer: is it up, and does it use rosrm.node?"
+        if self._cut is None:
+            return self._missing_state()
+        for covered in self._cut.mark.inputs:
+            if not self._follows(covered):
+                return f"until a message on {covered.topic} has been here and in the state"
+        ours = {one.topic_name: one.get_subscription_count() for one in self._member.outputs}
+        for output in self._cut.mark.outputs:
+            if ours.get(output.topic, output.subscriptions) < output.subscriptions:
+                return (
+                    f"for the readers of {output.topic}: {ours[output.topic]} of "
+                    f"{output.subscriptions} matched"
+                )
+        return ""
+
+    def _missing_state(self) -> str:
+        missing = self._assembler.missing() if self._assembler is not None else []
+        if missing:
+            return f"for the state on {', '.join(missing)}"
+        return f"for the first state, marked on {self._mark_topic}"
+
+    def _follows(self, covered: Any) -> bool:
+        """Whether no message of an input can be missing both here and in the state."""
+        buffer = self._member.buffer
+        own = next((one for one in self._member.inputs if one.topic == covered.topic), None)
+        if own is None or buffer.overlaps(covered.topic):
+            return True
+        return (
+            buffer.is_idle(covered.topic, time.monotonic(), _IDLE)
+            and own.subscription.get_publisher_count() >= covered.publishers
+        )
+
+    # --- the end ---------------------------------------------------------------------------
+
+    def _take_over(self) -> None:
+        """The source is no more: its last state is the newest there is."""
+        if self._cut is None:
+            self._end(HandoffReport.FAILED, "the source ended before a state of it was here")
+        else:
+            self._activate()
+
+    def _activate(self) -> None:
+        member, channel, cut = self._member, self._channel, self._cut
+        if channel is None or cut is None:
+            return
+        self._over = True
+        member.sequence = self._sequence()
+        for covered in cut.mark.inputs:
+            member.inherit(covered.topic, covered.covered)
+        passed = time.monotonic() - cut.arrived
+        member.become_active([None if ns < 0 else ns / 1e9 - passed for ns in cut.mark.timers_due])
+        channel.say(HandoffReport.ACTIVE, self._sequence())
+        self._unfollow()
+        self._activated()
+
+    def _end(self, phase: int, message: str) -> None:
+        """It will never be active; only its slave ends it."""
+        self._over = True
+        self._member.node.get_logger().warning(f"will not take over: {message}")
+        if self._channel is not None:
+            self._channel.say(phase, self._sequence(), message)
+        self._unfollow()
+
+    def _overflowed(self, topic: str) -> None:
+        if not self._over:
+            self._end(
+                HandoffReport.FAILED,
+                f"more came on {topic} than can be kept until the source's state covers it",
+            )
+
+    def _unfollow(self) -> None:
+        destroy = self._member.plain.destroy_subscription
+        for subscription in self._subscriptions:
+            destroy(subscription)
+        self._subscriptions = []
+        if self._timer is not None:
+            self._member.plain.destroy_timer(self._timer)
+            self._timer = None
+        self._assembler = None
+
+    def close(self) -> None:
+        """The handoff is over."""
+        if self._channel is not None:
+            self._channel.close()
+            self._channel = None

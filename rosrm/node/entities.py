@@ -1,0 +1,184 @@
+"""The author's publishers, inputs, timers and services, as a node that can be moved holds them."""
+
+from __future__ import annotations
+
+import inspect
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from rclpy.publisher import Publisher
+
+#: Source time stamps of the newest messages of each input that go with every mark.
+COVERED_KEPT: Final = 64
+
+
+@dataclass(slots=True)
+class Gate:
+    """Whether what the author publishes goes out."""
+
+    is_open: bool
+
+
+class GatedPublisher(Publisher):  # type: ignore[misc]  # rclpy brings no types
+    """A publisher that is silent while its node is a shadow, or has fallen silent."""
+
+    gate: Gate
+
+    def publish(self, msg: Any) -> None:
+        """Send a message, if this node is the active one; else it is dropped."""
+        if self.gate.is_open:
+            super().publish(msg)
+
+
+@dataclass(slots=True)
+class Input:
+    """One buffered subscription.
+
+    Attributes:
+        topic: fully qualified.
+        callback: the author's.
+        with_info: it wants the message's information too.
+        covered: source time stamps of the newest messages that were processed, ns.
+        subscription: rclpy's.
+    """
+
+    callback: Callable[..., Any]
+    with_info: bool
+    buffered: bool
+    topic: str = ""
+    covered: deque[int] = field(default_factory=lambda: deque(maxlen=COVERED_KEPT))
+    subscription: Any = None
+
+    def serve(self, message: Any, info: Any) -> None:
+        """Have the author's callback process a message."""
+        if self.with_info:
+            self.callback(message, info)
+        else:
+            self.callback(message)
+        self.covered.append(info["source_timestamp"])
+
+
+def wants_info(callback: Callable[..., Any]) -> bool:
+    """Whether an input's callback takes (message, information), as rclpy tells it."""
+    signature = inspect.signature(callback)
+    try:
+        signature.bind(object())
+    except TypeError:
+        return True
+    return False
+
+
+def refuse_coroutine(callback: Callable[..., Any], what: str) -> None:
+    """A callback is a cycle, and cycles do not overlap.
+
+    Raises:
+        TypeError: it is a coroutine function.
+    """
+    if inspect.iscoroutinefunction(callback):
+        raise TypeError(
+            f"rosrm.node: the callback of {what} is `async`, and a state lies between two "
+            f"callbacks: use an ordinary function"
+        )
+
+
+@dataclass(slots=True)
+class TimerOf:
+    """One timer of the author.
+
+    Attributes:
+        timer: rclpy's.
+        started: it runs, or is to run when its node becomes active.
+        period_ns: its own, while the timer was given another for one time.
+    """
+
+    timer: Any
+    started: bool
+    period_ns: int = 0
+
+    def due_ns(self) -> int:
+        """Nanoseconds until it is due; -1: it is cancelled."""
+        due = None if self.timer.is_canceled() else self.timer.time_until_next_call()
+        return -1 if due is None else max(0, due)
+
+    def start_in(self, seconds: float) -> None:
+        """Run first after so long, and in its own period from then on."""
+        self.period_ns = self.timer.timer_period_ns
+        self.timer.timer_period_ns = max(1, int(seconds * 1e9))
+        self.timer.reset()
+
+    def back_in_step(self) -> None:
+        """It ran for the first time after `start_in`."""
+        if self.period_ns:
+            self.timer.timer_period_ns, self.period_ns = self.period_ns, 0
+            self.timer.reset()
+
+    def stop(self) -> None:
+        """Run no more, until it is started again."""
+        if self.period_ns:
+            self.timer.timer_period_ns, self.period_ns = self.period_ns, 0
+        self.timer.cancel()
+
+
+class ServiceOf:
+    """One service of the author: a server that exists only while its node is active.
+
+    It stands for rclpy's `Service` where the author keeps what `create_service` returned.
+
+    Args:
+        create: makes the server.
+        destroy: takes it down.
+        name: as the author gave it.
+    """
+
+    def __init__(self, create: Callable[[], Any], destroy: Callable[[Any], Any], name: str) -> None:
+        self._create = create
+        self._destroy = destroy
+        self._service: Any = None
+        self.srv_name = name
+
+    def open(self) -> None:
+        """Serve from now on."""
+        if self._service is None:
+            self._service = self._create()
+
+    def close(self) -> None:
+        """Serve no more."""
+        if self._service is not None:
+            self._destroy(self._service)
+            self._service = None
+
+    def __getattr__(self, name: str) -> Any:
+        """What rclpy's object has, while there is one."""
+        if self._service is None:
+            raise AttributeError(f"{name}: the service {self.srv_name} is not open in a shadow")
+        return getattr(self._service, name)
+
+
+class OpeningOf:
+    """What the author has made when the node becomes active.
+
+    Args:
+        create: the author's function; what it returns is destroyed when the node falls silent,
+            where that has a `destroy`.
+    """
+
+    def __init__(self, create: Callable[[], Any]) -> None:
+        self._create = create
+        self._made: Any = None
+        self._is_open = False
+
+    def open(self) -> None:
+        """Make it."""
+        if not self._is_open:
+            self._is_open = True
+            self._made = self._create()
+
+    def close(self) -> None:
+        """Destroy it, where it can be."""
+        self._is_open = False
+        made, self._made = self._made, None
+        destroy = getattr(made, "destroy", None)
+        if destroy is not None:
+            destroy()

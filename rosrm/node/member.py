@@ -1,0 +1,271 @@
+"""A node that rosrm may move: what stands between the author's callbacks and ROS.
+
+At any time it is active (everything goes straight through), a shadow (its inputs are kept, nothing
+of it is heard), or silent (the same, of a source whose successor may be active). Each callback of
+the author is one cycle, and cycles never overlap, so that a state always lies between two of them.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterable
+from enum import Enum
+from typing import Any, Final
+
+from rosrm.node.buffer import InputBuffer
+from rosrm.node.entities import (
+    Gate,
+    GatedPublisher,
+    Input,
+    OpeningOf,
+    ServiceOf,
+    TimerOf,
+    refuse_coroutine,
+    wants_info,
+)
+from rosrm.node.identity import Identity
+
+#: Most messages of one input that are kept for a successor.
+BUFFER_LIMIT: Final = 1000
+#: rclpy's own, which every node has for itself.
+_INTERNAL: Final = frozenset({"/parameter_events", "/clock", "/rosout"})
+#: Seconds for which a request waits that was taken just before its node fell silent.
+_PATIENCE: Final = 1.0
+
+
+class Mode(Enum):
+    """What a node does."""
+
+    ACTIVE = "active"
+    SHADOW = "shadow"
+    SILENT = "silent"
+
+
+class Member:
+    """The author's entities of one node.
+
+    Args:
+        node: the author's.
+        plain: rclpy's own methods of it.
+        identity: that rosrm gave this process.
+
+    Attributes:
+        turn: held while a callback runs.
+        sequence: cycles so far.
+        on_cycle: called after each cycle.
+        on_overflow: called with the topic of an input for which there was no more room.
+    """
+
+    def __init__(self, node: Any, plain: Any, identity: Identity) -> None:
+        self.node = node
+        self.plain = plain
+        self.identity = identity
+        self.turn = threading.Condition(threading.RLock())
+        self.mode = Mode.SHADOW if identity.shadow else Mode.ACTIVE
+        self.sequence = 0
+        self.inputs: list[Input] = []
+        self.outputs: list[Any] = []
+        self.timers: list[TimerOf] = []
+        self.on_cycle: Callable[[], None] = _nothing
+        self.on_overflow: Callable[[str], None] = _ignore
+        self._gate = Gate(self.mode is Mode.ACTIVE)
+        self._openings: list[ServiceOf | OpeningOf] = []
+        self.buffer = self._new_buffer()
+
+    @property
+    def visible_node(self) -> str:
+        """Fully qualified name under which others know this node."""
+        return self.identity.node or str(self.node.get_fully_qualified_name())
+
+    def visible(self, name: str, resolve: Callable[[str], str]) -> str:
+        """A name as the author gave it, freed of the alias that this node may run under."""
+        own = f"{self.node.get_fully_qualified_name()}/"
+        resolved = resolve(name)
+        if not resolved.startswith(own) or own == f"{self.visible_node}/":
+            return name
+        return f"{self.visible_node}/{resolved[len(own) :]}"
+
+    def _new_buffer(self) -> InputBuffer:
+        return InputBuffer(BUFFER_LIMIT, time.monotonic())
+
+    # --- what the author creates -----------------------------------------------------------
+
+    def create_publisher(self, message_type: Any, topic: str, qos: Any, **rest: Any) -> Any:
+        """Create a publisher that can fall silent."""
+        if topic in _INTERNAL:
+            return self.plain.create_publisher(message_type, topic, qos, **rest)
+        wanted = rest.pop("publisher_class", GatedPublisher)
+        if not issubclass(wanted, GatedPublisher):
+            wanted = type(wanted.__name__, (GatedPublisher, wanted), {})
+        topic = self.visible(topic, self.node.resolve_topic_name)
+        publisher = self.plain.create_publisher(
+            message_type, topic, qos, publisher_class=wanted, **rest
+        )
+        publisher.gate = self._gate
+        self.outputs.append(publisher)
+        return publisher
+
+    def create_subscription(
+        self, message_type: Any, topic: str, callback: Callable[..., Any], qos: Any, *,
+        buffer: bool, **rest: Any,
+    ) -> Any:  # fmt: skip
+        """Create an input, whose messages are kept while this node is not active."""
+        if topic in _INTERNAL:
+            return self.plain.create_subscription(message_type, topic, callback, qos, **rest)
+        refuse_coroutine(callback, topic)
+        one = Input(callback, wants_info(callback), buffer)
+
+        def take(message: Any, info: Any) -> None:
+            self._received(one, message, info)
+
+        topic = self.visible(topic, self.node.resolve_topic_name)
+        one.subscription = self.plain.create_subscription(message_type, topic, take, qos, **rest)
+        one.topic = one.subscription.topic_name
+        self.inputs.append(one)
+        return one.subscription
+
+    def create_timer(
+        self, period: float, callback: Callable[..., Any], *rest: Any, autostart: bool, **named: Any
+    ) -> Any:
+        """Create a timer that runs while this node is active."""
+        refuse_coroutine(callback, f"a timer of {period} s")
+
+        def tick(*arguments: Any) -> None:
+            with self.turn:
+                if self.mode is Mode.ACTIVE:
+                    one.back_in_step()
+                    self._cycle(callback, *arguments)
+
+        active = self.mode is Mode.ACTIVE
+        timer = self.plain.create_timer(
+            period, tick, *rest, autostart=autostart and active, **named
+        )
+        one = TimerOf(timer, autostart)
+        self.timers.append(one)
+        return timer
+
+    def create_service(
+        self, service_type: Any, name: str, callback: Callable[..., Any], **rest: Any
+    ) -> ServiceOf:
+        """Create a service that is open while this node is active."""
+        refuse_coroutine(callback, f"the service {name}")
+        name = self.visible(name, self.node.resolve_service_name)
+
+        def serve(request: Any, response: Any) -> Any:
+            with self.turn:
+                if not self._is_active_soon():
+                    self.node.get_logger().error(f"silent: a request of {name} is not served")
+                    return response
+                return self._cycle(callback, request, response)
+
+        service = ServiceOf(
+            lambda: self.plain.create_service(service_type, name, serve, **rest),
+            self.plain.destroy_service, name,
+        )  # fmt: skip
+        self._add_opening(service)
+        return service
+
+    def when_active(self, create: Callable[[], Any]) -> None:
+        """Have something made that may exist only while this node is active."""
+        self._add_opening(OpeningOf(create))
+
+    def _add_opening(self, opening: ServiceOf | OpeningOf) -> None:
+        self._openings.append(opening)
+        if self.mode is Mode.ACTIVE:
+            opening.open()
+
+    def destroyed(self, entity: Any) -> None:
+        """The author destroyed a publisher, an input, a timer or a service."""
+        self.outputs = [one for one in self.outputs if one is not entity]
+        self.inputs = [one for one in self.inputs if one.subscription is not entity]
+        self.timers = [one for one in self.timers if one.timer is not entity]
+        self._openings = [one for one in self._openings if one is not entity]
+
+    # --- cycles ----------------------------------------------------------------------------
+
+    def _cycle(self, callback: Callable[..., Any], *arguments: Any) -> Any:
+        result = callback(*arguments)
+        self._cycle_ended()
+        return result
+
+    def _cycle_ended(self) -> None:
+        self.sequence += 1
+        self.on_cycle()
+
+    def _received(self, one: Input, message: Any, info: Any) -> None:
+        with self.turn:
+            if self.mode is Mode.ACTIVE:
+                one.serve(message, info)
+                self._cycle_ended()
+            elif one.buffered:
+                stamp, now = info["source_timestamp"], time.monotonic()
+                if not self.buffer.add(one.topic, stamp, (one, message, info), now):
+                    self.on_overflow(one.topic)
+
+    def _is_active_soon(self) -> bool:
+        """For a request that another thread took in the very moment of falling silent."""
+        return self.turn.wait_for(lambda: self.mode is Mode.ACTIVE, _PATIENCE)
+
+    # --- changes of the mode ---------------------------------------------------------------
+
+    def fall_silent(self) -> list[int]:
+        """Stop all that can be heard; returns what `timers_due` was (ns)."""
+        due = self.timers_due()
+        self.mode = Mode.SILENT
+        self._gate.is_open = False
+        self.buffer = self._new_buffer()
+        for timer in self.timers:
+            timer.started = not timer.timer.is_canceled()
+            timer.stop()
+        for opening in self._openings:
+            opening.close()
+        return due
+
+    def inherit(self, topic: str, covered: Iterable[int]) -> None:
+        """What the source had processed of an input is processed here too."""
+        for one in self.inputs:
+            if one.topic == topic:
+                one.covered.extend(covered)
+
+    def timers_due(self) -> list[int]:
+        """Nanoseconds until each timer is due, in the order of creation; -1: cancelled."""
+        return [timer.due_ns() for timer in self.timers]
+
+    def become_active(self, timers_due: list[float | None]) -> None:
+        """Serve what was kept, then go on.
+
+        Args:
+            timers_due: seconds until each timer is due, negative where it is late; None: it was
+                cancelled. Timers beyond the list start now.
+        """
+        self.mode = Mode.ACTIVE
+        self._gate.is_open = True
+        while (kept := self.buffer.take()) is not None:
+            one, message, info = kept.item
+            one.serve(message, info)
+            self._cycle_ended()
+        self._start_timers(timers_due)
+        for opening in self._openings:
+            opening.open()
+        self.turn.notify_all()
+
+    def _start_timers(self, due: list[float | None]) -> None:
+        for index, timer in enumerate(list(self.timers)):
+            if index >= len(due):
+                if timer.started:
+                    timer.timer.reset()
+                continue
+            seconds = due[index]
+            if seconds is None:
+                timer.timer.cancel()
+            else:
+                timer.start_in(seconds)
+
+
+def _nothing() -> None:
+    """Nobody follows."""
+
+
+def _ignore(_topic: str) -> None:
+    """Nobody follows."""

@@ -1,0 +1,207 @@
+"""The active node: it shows its state to whoever follows, and falls silent when it is asked to."""
+
+from __future__ import annotations
+
+import random
+import time
+from array import array
+from typing import Final
+
+from rclpy.duration import Duration
+
+from rosrm.node import channel as topics
+from rosrm.node.channel import Channel
+from rosrm.node.member import Member, Mode
+from rosrm.node.parts import Part, StateError
+from rosrm.version import PROTOCOL_VERSION
+from rosrm_msgs.msg import CoveredInput, HandoffReport, MatchedOutput, StateConfig, StateMark
+
+#: Most bytes of one part. Fast DDS carried 400 MB, but a node takes 3 s to make 200 MB of them.
+LARGEST_PART: Final = 256 << 20
+#: Seconds that a silent source waits for its last outputs to be acknowledged.
+_LAST_WORDS: Final = 1.0
+
+
+class Source:
+    """What the active node does for a successor.
+
+    Args:
+        member: the node.
+        parts: of its state.
+        mark_topic: fully qualified.
+    """
+
+    def __init__(self, member: Member, parts: list[Part], mark_topic: str) -> None:
+        self._member = member
+        self._parts = parts
+        self._run = random.getrandbits(63) | 1
+        self._channel: Channel | None = None
+        self._attached = False
+        self._may_switch = False
+        self._asked = False
+        self._fault = ""
+        self._timers_due: list[int] = []
+        self._silent_since = 0.0
+        plain = member.plain
+        self._marks = plain.create_publisher(StateMark, mark_topic, topics.MARK)
+        for part in parts:
+            part.publisher = plain.create_publisher(part.message_type, part.topic, topics.STATE)
+        member.on_cycle = self._after_cycle
+        member.on_overflow = self._overflowed
+
+    def add_part(self, part: Part) -> None:
+        """The author names another topic of the state."""
+        part.publisher = self._member.plain.create_publisher(
+            part.message_type, part.topic, topics.STATE
+        )
+
+    # --- the state -------------------------------------------------------------------------
+
+    def _after_cycle(self) -> None:
+        if self._fault:
+            return
+        if self._attached or self._marks.get_subscription_count():
+            self._show()
+        else:
+            self._show_single_parts()
+
+    def _show(self, *, last: bool = False) -> bool:
+        """Publish the state between two cycles, and the mark that says what it covers.
+
+        Returns:
+            False: it cannot be shown; the master has been told why.
+        """
+        try:
+            for part in self._parts:
+                part.publish(LARGEST_PART)
+        except StateError as error:
+            self._failed(str(error))
+            return False
+        self._marks.publish(self._mark(last=last))
+        return True
+
+    def _show_single_parts(self) -> None:
+        for part in self._parts:
+            if part.has_reader():
+                try:
+                    part.publish(LARGEST_PART)
+                except StateError as error:
+                    self._failed(str(error))
+
+    def _failed(self, fault: str) -> None:
+        """The state cannot be shown: this handoff fails, the node goes on."""
+        if not self._fault:
+            self._member.node.get_logger().error(f"{fault}. This node stays where it is")
+        self._fault = fault
+        if self._channel is not None:
+            self._channel.say(HandoffReport.FAILED, self._member.sequence, fault)
+
+    def _mark(self, *, last: bool) -> StateMark:
+        member = self._member
+        due = self._timers_due if last else member.timers_due()
+        return StateMark(
+            protocol_version=PROTOCOL_VERSION, run=self._run, sequence=member.sequence, last=last,
+            parts=[part.described() for part in self._parts],
+            inputs=[
+                CoveredInput(
+                    topic=one.topic, publishers=one.subscription.get_publisher_count(),
+                    covered=array("q", one.covered),
+                )
+                for one in member.inputs if one.buffered
+            ],
+            outputs=[
+                MatchedOutput(
+                    topic=one.topic_name, subscriptions=one.get_subscription_count()
+                )
+                for one in member.outputs
+            ],
+            timers_due=array("q", due),
+        )  # fmt: skip
+
+    # --- a handoff -------------------------------------------------------------------------
+
+    def configure(self, config: StateConfig) -> None:
+        """The master says something of a handoff away from here."""
+        if self._channel is None or self._channel.topic != config.channel:
+            if config.phase not in (StateConfig.SHADOW, StateConfig.SWITCH, StateConfig.RESUME):
+                return
+            self._open(config)
+        elif self._channel is not None:
+            self._channel.repeat()
+        if config.phase == StateConfig.SWITCH:
+            self._may_switch = True
+            self._switch()
+        elif config.phase == StateConfig.RESUME:
+            self._resume()
+        elif config.phase == StateConfig.DONE:
+            self.close()
+
+    def _open(self, config: StateConfig) -> None:
+        self.close()
+        self._fault = ""
+        self._channel = Channel(
+            self._member.plain, config.channel, config.destination,
+            self._member.identity.instance, self._heard,
+        )  # fmt: skip
+
+    def _heard(self, report: HandoffReport) -> None:
+        with self._member.turn:
+            if report.phase == HandoffReport.SHADOWING:
+                self._attach()
+            elif report.phase == HandoffReport.SWITCHING:
+                self._asked = True
+                self._switch()
+
+    def _attach(self) -> None:
+        if self._channel is None or self._attached or self._member.mode is not Mode.ACTIVE:
+            return
+        self._attached = True
+        self._channel.say(HandoffReport.ATTACHED, self._member.sequence)
+        self._show()
+
+    def _switch(self) -> None:
+        """Fall silent, once both the master and the destination want it."""
+        member = self._member
+        if self._channel is None or not (self._may_switch and self._asked) or self._fault:
+            return
+        if member.mode is Mode.ACTIVE:
+            self._timers_due = member.fall_silent()
+            self._silent_since = time.monotonic()
+            if not self._show(last=True):
+                self._go_on()
+                return
+            self._channel.say(HandoffReport.SILENT, member.sequence)
+            self._wait_until_heard()
+            self._channel.say(HandoffReport.RELEASED, member.sequence)
+
+    def _wait_until_heard(self) -> None:
+        """What is not acknowledged is lost when this node is stopped."""
+        until = time.monotonic() + _LAST_WORDS
+        for publisher in self._member.outputs:
+            left = max(0.0, until - time.monotonic())
+            publisher.wait_for_all_acked(Duration(seconds=left))
+
+    def _resume(self) -> None:
+        self._may_switch = self._asked = self._attached = False
+        if self._member.mode is Mode.SILENT:
+            self._go_on()
+        if self._channel is not None:
+            self._channel.say(HandoffReport.RESUMED, self._member.sequence)
+
+    def _go_on(self) -> None:
+        passed = time.monotonic() - self._silent_since
+        due = [None if ns < 0 else ns / 1e9 - passed for ns in self._timers_due]
+        self._member.become_active(due)
+
+    def _overflowed(self, topic: str) -> None:
+        self._member.node.get_logger().error(
+            f"silent for its successor, and the buffer of {topic} is full: a message is lost",
+            throttle_duration_sec=1.0,
+        )
+
+    def close(self) -> None:
+        """The handoff is over."""
+        self._may_switch = self._asked = self._attached = False
+        if self._channel is not None:
+            self._channel.close()
+            self._channel = None

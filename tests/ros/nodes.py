@@ -1,0 +1,179 @@
+"""Nodes of one process that think they are instances of rosrm's, and a conductor in the master's place.
+
+Real DDS between them; only the master's decisions and the slaves are missing, so that each word
+can be said, or left out, at any moment.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+from rosrm_msgs.msg import HandoffReport, StateConfig
+from std_msgs.msg import Int64
+
+from rosrm.node import Node
+from rosrm.node.channel import CHANNEL, STATE_CONFIG
+from rosrm.version import PROTOCOL_VERSION
+
+PATIENCE = 20.0
+TOPIC = "/rosrm/state_config"
+CLUSTER = "rosrm"
+EPOCH = 3
+RELIABLE = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
+
+
+class Counter(Node):
+    """Counts by itself, and what it is told to add."""
+
+    def __init__(self, name: str = "counter", period: float = 0.02, **named: Any) -> None:
+        super().__init__(name, **named)
+        self.count = 0
+        self.total = 0
+        self.output = self.create_publisher(Int64, "count", RELIABLE)
+        self.sums = self.create_publisher(Int64, "sum", RELIABLE)
+        self.create_subscription(Int64, "add", self.add, RELIABLE)
+        self.timer = self.create_timer(period, self.tick)
+        self.keep_state("~/state", Int64, self.save, self.restore)
+        self.keep_state("~/total", Int64, lambda: Int64(data=self.total), self.restore_total)
+
+    def tick(self) -> None:
+        self.count += 1
+        self.output.publish(Int64(data=self.count))
+
+    def add(self, message: Int64) -> None:
+        self.total += message.data
+        self.sums.publish(Int64(data=self.total))
+
+    def save(self) -> Int64:
+        return Int64(data=self.count)
+
+    def restore(self, message: Int64) -> None:
+        self.count = message.data
+
+    def restore_total(self, message: Int64) -> None:
+        self.total = message.data
+
+
+class Stage:
+    """A ROS context with an executor, on which nodes appear as instances of processes."""
+
+    def __init__(self, domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        self._environment = monkeypatch
+        self.context = rclpy.Context()
+        rclpy.init(
+            context=self.context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO
+        )
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.nodes: list[Any] = []
+        self.plain = self.add(rclpy.node.Node("observer", context=self.context))
+
+    def add(self, node: Any) -> Any:
+        self.executor.add_node(node)
+        self.nodes.append(node)
+        return node
+
+    def instance(
+        self, make: Callable[..., Any], number: int, *, name: str = "counter", alias: str = "",
+        shadow: bool = False, **named: Any,
+    ) -> Any:  # fmt: skip
+        """A node that was started by a slave, as it sees it."""
+        variables = {
+            "ROSRM_INSTANCE": f"{name}#{number}", "ROSRM_PROCESS": name, "ROSRM_NODE": f"/{name}",
+            "ROSRM_STATE_CONFIG": TOPIC, "ROSRM_CLUSTER": CLUSTER, "ROSRM_EPOCH": str(EPOCH),
+            "ROSRM_SHADOW": "1" if shadow else "",
+        }  # fmt: skip
+        with pytest.MonkeyPatch.context() as patch:
+            for variable, value in variables.items():
+                patch.setenv(variable, value)
+            if alias:
+                named["cli_args"] = ["--ros-args", "-r", f"__node:={alias}"]
+            return self.add(make(context=self.context, **named))
+
+    def spin_until(
+        self, condition: Callable[[], bool], what: str, timeout: float = PATIENCE
+    ) -> None:
+        deadline = time.monotonic() + timeout
+        while not condition():
+            assert time.monotonic() < deadline, f"{what} did not come about in {timeout:g} s"
+            self.executor.spin_once(timeout_sec=0.05)
+
+    def spin(self, seconds: float) -> None:
+        until = time.monotonic() + seconds
+        while (left := until - time.monotonic()) > 0:
+            self.executor.spin_once(timeout_sec=min(left, 0.05))
+
+    def listen(self, message_type: Any, topic: str, qos: Any = RELIABLE) -> list[Any]:
+        """All that is said on a topic from now on."""
+        heard: list[Any] = []
+        self.plain.create_subscription(message_type, topic, heard.append, qos)
+        return heard
+
+    def remove(self, node: Any) -> None:
+        self.nodes.remove(node)
+        self.executor.remove_node(node)
+        node.destroy_node()
+
+    def close(self) -> None:
+        self.executor.shutdown()
+        for node in self.nodes:
+            node.destroy_node()
+        self.context.try_shutdown()
+
+
+class Conductor:
+    """Says what the master would say of one handoff, and hears what comes back."""
+
+    def __init__(
+        self, stage: Stage, *, source: int, destination: int, name: str = "counter"
+    ) -> None:
+        self._stage = stage
+        self.config = StateConfig(
+            protocol_version=PROTOCOL_VERSION, cluster=CLUSTER, epoch=EPOCH, process=name,
+            source=source, destination=destination, source_node=f"/{name}",
+            destination_node=f"/{name}_{destination}", channel=f"/rosrm/handoff/{name}_{destination}",
+        )  # fmt: skip
+        self.reports: list[HandoffReport] = []
+        self._publisher = stage.plain.create_publisher(StateConfig, TOPIC, STATE_CONFIG)
+        stage.plain.create_subscription(
+            HandoffReport, self.config.channel, self.reports.append, CHANNEL
+        )
+
+    def say(self, phase: int, **other: Any) -> None:
+        """Say a phase; `other`: fields that differ from what is right."""
+        right = {
+            field: getattr(self.config, field) for field in self.config.get_fields_and_field_types()
+        }
+        self._publisher.publish(StateConfig(**{**right, "phase": phase, **other}))
+
+    def of(self, number: int) -> list[int]:
+        """The phases that an instance reported."""
+        return [report.phase for report in self.reports if report.instance == number]
+
+    def wait(self, number: int, phase: int, timeout: float = PATIENCE) -> HandoffReport:
+        """Until an instance reports a phase."""
+        self._stage.spin_until(
+            lambda: phase in self.of(number),
+            f"report {phase} of {number}: {self.of(number)}",
+            timeout,
+        )
+        return next(
+            report for report in reversed(self.reports)
+            if report.instance == number and report.phase == phase
+        )  # fmt: skip
+
+    def hand_over(self) -> None:
+        """The good course."""
+        self.say(StateConfig.SHADOW)
+        self.wait(self.config.destination, HandoffReport.READY)
+        self.say(StateConfig.SWITCH)
+        self.wait(self.config.destination, HandoffReport.ACTIVE)
+        self.wait(self.config.source, HandoffReport.RELEASED)
