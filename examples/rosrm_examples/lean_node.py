@@ -20,11 +20,20 @@ def lean_node(name: str, arguments: list[str]) -> Iterator[Node]:
         name: The node's name, unless the arguments remap it.
         arguments: The command line; only what follows `--ros-args` is used.
     """
-    rclpy.init(
-        args=[*arguments, *_WITHOUT_TYPE_SERVICE], signal_handler_options=SignalHandlerOptions.NO
-    )
-    try:
+    with ros_context([*arguments, *_WITHOUT_TYPE_SERVICE]):
         node = Node(name, enable_rosout=False, start_parameter_services=False)
         yield node  # held here too: a caller need not name it to keep it in the graph
+
+
+@contextmanager
+def ros_context(arguments: list[str]) -> Iterator[None]:
+    """Has ROS ready for as long as the context lasts; signals stay the caller's.
+
+    Args:
+        arguments: The command line; only what follows `--ros-args` is used.
+    """
+    rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        yield
     finally:
         rclpy.shutdown()

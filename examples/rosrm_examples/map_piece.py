@@ -21,10 +21,8 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from types import FrameType
 
 import numpy as np
-from geometry_msgs.msg import Point, Quaternion, Vector3
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from rclpy.utilities import remove_ros_args
@@ -32,28 +30,12 @@ from rclpy.utilities import remove_ros_args
 from rosrm_examples.drives import DEFAULT_OVERLAP, Drive, load_drive
 from rosrm_examples.errors import ExampleError
 from rosrm_examples.lean_node import lean_node
+from rosrm_examples.odometry import odometry_message
 from rosrm_examples.pieces import MapPiece, save_piece
-from rosrm_examples.poses import quaternion
 from rosrm_examples.slam import Slam
+from rosrm_examples.stopping import StopSignals
 
 PROGRESS_SCANS = 10
-
-
-class StopSignals:
-    """Notes SIGINT and SIGTERM, so that the node stops between two scans and never within one.
-
-    Attributes:
-        came: The number of the signal that came last, or None.
-    """
-
-    def __init__(self) -> None:
-        """Takes both signals over."""
-        self.came: int | None = None
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._note)
-
-    def _note(self, number: int, _: FrameType | None) -> None:
-        self.came = number
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -101,7 +83,7 @@ def _map(piece: Drive, node: Node, rate: float, stop: StopSignals) -> Slam:
         if stop.came is not None:
             break
         slam.add_scan(points, float(t))
-        publisher.publish(_odometry(slam))
+        publisher.publish(odometry_message(slam.poses[-1], slam.velocity, slam.times[-1]))
         if done % PROGRESS_SCANS == 0 or done == len(piece):
             cpu = (time.process_time() - cpu_before) / done
             print(f"{done}/{len(piece)} scans, {cpu:.3f} s of CPU a scan", flush=True)
@@ -119,24 +101,6 @@ def _result(number: int, of: int, piece: Drive, slam: Slam) -> MapPiece:
         poses=np.array(slam.poses),
         points=slam.map_points(),
     )
-
-
-def _odometry(slam: Slam) -> Odometry:
-    """Turns the present pose and velocity into a message."""
-    pose, t = slam.poses[-1], slam.times[-1]
-    x, y, z = (float(value) for value in pose[:3, 3])
-    qx, qy, qz, qw = quaternion(pose[:3, :3])
-    velocity = [float(value) for value in slam.velocity]
-    message = Odometry()
-    message.header.stamp.sec = int(t)
-    message.header.stamp.nanosec = int((t - int(t)) * 1e9)
-    message.header.frame_id = "map"
-    message.child_frame_id = "lidar"
-    message.pose.pose.position = Point(x=x, y=y, z=z)
-    message.pose.pose.orientation = Quaternion(x=qx, y=qy, z=qz, w=qw)
-    message.twist.twist.linear = Vector3(x=velocity[0], y=velocity[1], z=velocity[2])
-    message.twist.twist.angular = Vector3(x=velocity[3], y=velocity[4], z=velocity[5])
-    return message
 
 
 if __name__ == "__main__":

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import os
 import zipfile
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rosrm_examples.arrays import Arrays, Floats, Keys, Points
 from rosrm_examples.errors import PieceError
@@ -42,23 +45,34 @@ def piece_path(folder: Path, number: int) -> Path:
 def save_piece(folder: Path, piece: MapPiece) -> Path:
     """Writes a piece into a folder so that a reader finds either nothing or all of it."""
     path = piece_path(folder, piece.number)
+    write_arrays(path, {field.name: getattr(piece, field.name) for field in fields(piece)})
+    return path
+
+
+def write_arrays(path: Path, arrays: Mapping[str, ArrayLike]) -> None:
+    """Writes an .npz so that a reader finds either nothing or all of it."""
     unfinished = path.with_suffix(f".{os.getpid()}.tmp")
+    named: dict[str, Any] = {name: np.asarray(value) for name, value in arrays.items()}
     try:
         with unfinished.open("wb") as file:
-            np.savez(file, **{field.name: getattr(piece, field.name) for field in fields(piece)})
+            np.savez(file, **named)
         unfinished.replace(path)
     finally:
         unfinished.unlink(missing_ok=True)
-    return path
+
+
+def read_arrays(path: Path, names: Iterable[str]) -> Arrays:
+    """Reads arrays by name; raises PieceError where one is missing or damaged."""
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            return {name: archive[name] for name in names}
+    except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
+        raise PieceError(f"{path}: not a piece of a map: {error}") from error
 
 
 def load_piece(path: Path) -> MapPiece:
     """Reads a piece; raises PieceError where there is none or it is damaged."""
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays: Arrays = {field.name: archive[field.name] for field in fields(MapPiece)}
-    except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
-        raise PieceError(f"{path}: not a piece of a map: {error}") from error
+    arrays = read_arrays(path, [field.name for field in fields(MapPiece)])
     return MapPiece(
         number=int(arrays["number"]),
         of=int(arrays["of"]),

@@ -71,6 +71,18 @@ def quaternion(rotation: Floats) -> tuple[float, float, float, float]:
     return x, y, z, float(np.cos(angle / 2))
 
 
+def rotation_from_quaternion(x: float, y: float, z: float, w: float) -> Floats:
+    """Turns a quaternion, of unit length but for rounding, into a (3, 3) rotation."""
+    x, y, z, w = np.array([x, y, z, w]) / np.sqrt(x * x + y * y + z * z + w * w)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
 def mean_pose(poses: Floats) -> Pose:
     """Averages (S, 4, 4) poses that lie close together (chordal mean of the rotations)."""
     left, _, right = np.linalg.svd(poses[:, :3, :3].mean(axis=0))

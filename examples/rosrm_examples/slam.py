@@ -49,6 +49,7 @@ class Slam:
         poses: The pose of each scan so far.
         times: The time of each scan, seconds.
         velocity: (6,) of the sensor in its own frame: m/s along and rad/s about x, y, z.
+        keyframes: How many scans have entered the map since this object was made.
     """
 
     def __init__(self, settings: SlamSettings | None = None) -> None:
@@ -57,9 +58,11 @@ class Slam:
         self.poses: list[Pose] = []
         self.times: list[float] = []
         self.velocity: Floats = np.zeros(6)
-        self._levels = [NdtMap(cell) for cell in self.settings.cells]
-        self._cloud = VoxelCloud(self.settings.cloud_voxel_m)
-        self._keyframe: Floats | None = None  # where the sensor was at the last keyframe
+        self.keyframes = 0
+        self._levels: list[NdtMap]
+        self._cloud: VoxelCloud
+        self._keyframe: Floats | None
+        self._clear_map()
 
     def add_scan(self, points: Points, t: float) -> Pose:
         """Takes the next scan and returns the sensor's pose.
@@ -90,6 +93,19 @@ class Slam:
             ndt.insert(world)
         self._cloud.insert(world)
         self._keyframe = pose[:3, 3]
+        self.keyframes += 1
+
+    @property
+    def has_map(self) -> bool:
+        """Whether there is anything to match a scan against."""
+        return self._keyframe is not None
+
+    def map_points_since(self, earlier: Arrays) -> Points:
+        """Returns what came into the map since an earlier `map_state`: (M, 3) float32 metres."""
+        if "cloud_keys" not in earlier:
+            return self.map_points()
+        points = self._cloud.points_since(earlier["cloud_keys"], earlier["cloud_rows"])
+        return points.astype(np.float32)
 
     def map_points(self) -> Points:
         """Returns the map so far, thinned: (M, 3) float32 metres, frame of the first scan."""
@@ -97,21 +113,38 @@ class Slam:
 
     def state(self, with_map: bool = True) -> Arrays:
         """Returns the whole state by name; without the map it is small, but not exact."""
-        state: Arrays = {
-            "format": np.array(STATE_FORMAT),
-            "poses": np.array(self.poses).reshape(-1, 4, 4),
-            "times": np.array(self.times),
-            "velocity": self.velocity.copy(),
-        }
+        state: Arrays = {"format": np.array(STATE_FORMAT), **self.motion_state()}
         for field in fields(self.settings):
             state[f"settings_{field.name}"] = np.array(getattr(self.settings, field.name))
-        if with_map and self._keyframe is not None:
-            state["keyframe"] = self._keyframe.copy()
-            state["cloud_keys"] = self._cloud.table.keys
-            state["cloud_rows"] = self._cloud.table.rows.copy()
-            for level, ndt in enumerate(self._levels):
-                for name, array in ndt.to_arrays().items():
-                    state[f"level{level}_{name}"] = array
+        if with_map:
+            state.update(self.map_state())
+        return state
+
+    def motion_state(self, newest: int | None = None) -> Arrays:
+        """Returns the trajectory and the velocity by name.
+
+        Args:
+            newest: How many poses, the last ones; the last alone is enough to go on. None: all.
+        """
+        first = 0 if newest is None else max(0, len(self.poses) - newest)
+        return {
+            "poses": np.array(self.poses[first:]).reshape(-1, 4, 4),
+            "times": np.array(self.times[first:]),
+            "velocity": self.velocity.copy(),
+        }
+
+    def map_state(self) -> Arrays:
+        """Returns the map by name; nothing before the first keyframe."""
+        if self._keyframe is None:
+            return {}
+        state: Arrays = {
+            "keyframe": self._keyframe.copy(),
+            "cloud_keys": self._cloud.table.keys,
+            "cloud_rows": self._cloud.table.rows.copy(),
+        }
+        for level, ndt in enumerate(self._levels):
+            for name, array in ndt.to_arrays().items():
+                state[f"level{level}_{name}"] = array
         return state
 
     @classmethod
@@ -120,14 +153,21 @@ class Slam:
         if int(state["format"]) != STATE_FORMAT:
             raise ValueError(f"SLAM state of format {state['format']}: only {STATE_FORMAT} is read")
         slam = cls(_settings_from(state))
-        slam.poses = list(state["poses"].copy())
-        slam.times = state["times"].tolist()
-        slam.velocity = state["velocity"].copy()
-        if "keyframe" in state:
-            slam._restore_map(state)
+        slam.restore_motion(state)
+        slam.restore_map(state)
         return slam
 
-    def _restore_map(self, state: Arrays) -> None:
+    def restore_motion(self, state: Arrays) -> None:
+        """Overwrites trajectory and velocity with what `motion_state` returned."""
+        self.poses = list(state["poses"].copy())
+        self.times = state["times"].tolist()
+        self.velocity = state["velocity"].copy()
+
+    def restore_map(self, state: Arrays) -> None:
+        """Overwrites the map with what `map_state` returned."""
+        if "keyframe" not in state:
+            self._clear_map()
+            return
         self._keyframe = state["keyframe"].copy()
         self._cloud.table.keys = state["cloud_keys"]
         self._cloud.table.rows = state["cloud_rows"].copy()
@@ -135,6 +175,11 @@ class Slam:
             prefix = f"level{level}_"
             arrays = {n[len(prefix) :]: a for n, a in state.items() if n.startswith(prefix)}
             self._levels[level] = NdtMap.from_arrays(arrays)
+
+    def _clear_map(self) -> None:
+        self._levels = [NdtMap(cell) for cell in self.settings.cells]
+        self._cloud = VoxelCloud(self.settings.cloud_voxel_m)
+        self._keyframe = None  # where the sensor was at the last keyframe
 
     def _predict(self, t: float) -> Pose:
         """Moves the last pose on with constant velocity."""

@@ -46,8 +46,7 @@ def sum_by_key(keys: Keys, features: Floats) -> tuple[Keys, Floats]:
 def thin(points: Points, size: float) -> Floats:
     """Replaces the (N, 3) points of each voxel of `size` metres by their mean: (V, 3)."""
     _, sums = sum_by_key(voxel_keys(points, size), _with_ones(points))
-    means: Floats = sums[:, 1:] / sums[:, :1]
-    return means
+    return _means(sums)
 
 
 class VoxelTable:
@@ -95,8 +94,24 @@ class VoxelCloud:
 
     def points(self) -> Floats:
         """Returns the (V, 3) means, metres."""
-        means: Floats = self.table.rows[:, 1:] / self.table.rows[:, :1]
-        return means
+        return _means(self.table.rows)
+
+    def points_since(self, keys: Keys, rows: Floats) -> Floats:
+        """Returns the (W, 3) means, metres, of the points added since the table was this one.
+
+        Args:
+            keys: (V,) of the table then.
+            rows: (V, 4) of the table then.
+        """
+        added = self.table.rows.copy()
+        added[self.table.find(keys)] -= rows
+        return _means(added[added[:, 0] > 0])
+
+
+def _means(rows: Floats) -> Floats:
+    """Divides rows of count, sum of x, y, z by their counts."""
+    means: Floats = rows[:, 1:] / rows[:, :1]
+    return means
 
 
 def _with_ones(points: Points) -> Floats:

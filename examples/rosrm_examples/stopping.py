@@ -1,0 +1,23 @@
+"""Signals that ask a process to stop."""
+
+from __future__ import annotations
+
+import signal
+from types import FrameType
+
+
+class StopSignals:
+    """Notes SIGINT and SIGTERM, so that a node stops between two scans and never within one.
+
+    Attributes:
+        came: The number of the signal that came last, or None.
+    """
+
+    def __init__(self) -> None:
+        """Takes both signals over."""
+        self.came: int | None = None
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._note)
+
+    def _note(self, number: int, _: FrameType | None) -> None:
+        self.came = number
