@@ -10,8 +10,16 @@ from rosrm.core.charges import learn_from
 from rosrm.core.commands import Order
 from rosrm.core.hosts import Host, HostCondition
 from rosrm.core.lookahead import learn_run_time, review_slots
-from rosrm.core.model import EMPTY, InstanceId, InstanceState, InstanceStatus, Kind
-from rosrm.core.processes import End, Run
+from rosrm.core.migration import Start
+from rosrm.core.model import (
+    EMPTY,
+    InstanceId,
+    InstanceState,
+    InstanceStatus,
+    Kind,
+    RestartPolicy,
+)
+from rosrm.core.runs import End, Run
 from rosrm.core.state import Instance, MasterState, Process, ProcessPhase, Wanted
 
 #: What the state of the owning instance means for the process.
@@ -59,9 +67,17 @@ def reconcile(
         take_status(state, host, status, now)
     for number in sorted(host.instances - held.keys()):
         instance = state.instances[number]
-        if instance.state is None and not registering:
+        if instance.state is None and (not registering or _yet_to_start(state, instance)):
             continue
         gone(state, instance, now, f"{host.name} does not hold it any more")
+
+
+def _yet_to_start(state: MasterState, instance: Instance) -> bool:
+    """A plan has it counted there, and this master has not given the order to start it."""
+    run = state.runs.get(instance.id.process)
+    return run is not None and any(
+        isinstance(step, Start) and step.instance == instance.id for step in run.ahead
+    )
 
 
 def take_status(state: MasterState, host: Host, status: InstanceStatus, now: float) -> None:
@@ -170,6 +186,7 @@ def _ended(
     run = state.runs.get(process.name)
     if run is not None:
         run.ended[instance.id.number] = end
+        state.save_run(run)
         if status.state is InstanceState.REFUSED and not _recalled(run, instance):
             exclude(process, instance.host, status)
     if process.owner != instance.id.number:
@@ -217,6 +234,13 @@ def conclude(state: MasterState, process: Process, end: End, host: Host, now: fl
     else:
         reason = status.message or f"exit code {process.exit_code}"
         _finish(state, process, ProcessPhase.FAILED, host, now, reason)
+
+
+def restarts_after(policy: RestartPolicy, status: InstanceStatus) -> bool:
+    """Whether a slave would have started an instance again that ended so."""
+    if status.state is InstanceState.REFUSED or policy.when == "never":
+        return False
+    return policy.when == "always" or bool(status.exit_code or status.exit_signal)
 
 
 def exclude(process: Process, host: Host, status: InstanceStatus) -> None:
@@ -280,6 +304,7 @@ def gone(state: MasterState, instance: Instance, now: float, reason: str) -> Non
     run = state.runs.get(process.name)
     if run is not None:
         run.ended[instance.id.number] = end
+        state.save_run(run)
     elif process.owner == instance.id.number:
         conclude(state, process, end, instance.host, now)
     else:
@@ -316,7 +341,7 @@ def regained_sight(state: MasterState, host: Host, now: float) -> None:
 
 
 def phase_in_sight(state: MasterState, process: Process, owner: Instance) -> ProcessPhase:
-    """As `phase_of`, unless the host is lost."""
-    if state.hosts.condition_of(owner.host) is HostCondition.LOST:
+    """As `phase_of`, unless the host is not heard."""
+    if state.hosts.condition_of(owner.host) in (HostCondition.LOST, HostCondition.EXPECTED):
         return ProcessPhase.UNREACHABLE
     return phase_of(process, owner)

@@ -15,6 +15,7 @@ RestartRequested        restarts where it runs, or queues anew what has ended
 MigrationRequested      begins a migration
 HostStateRequested      cordons, uncordons, drains
 OrderAnswered           notes that a slave took an order or refused it
+HandoffReported         notes how far the nodes of a handoff are
 AssignmentWithdrawn     queues the process again at its old place
 PeerRefused             records it
 TimePassed              looks at every deadline: silence, delivery, steps, hysteresis
@@ -28,7 +29,7 @@ from types import MappingProxyType
 from typing import Any, Final
 
 from rosrm.core import events as happened
-from rosrm.core import intake, lifecycle, moves, requests, upkeep
+from rosrm.core import handoffs, intake, lifecycle, moves, requests, upkeep
 from rosrm.core.assigning import place_waiting
 from rosrm.core.commands import Command
 from rosrm.core.state import MasterState
@@ -52,6 +53,7 @@ HANDLERS: Final[Mapping[type, _Handler]] = MappingProxyType(
         happened.MigrationRequested: requests.migration_requested,
         happened.HostStateRequested: requests.host_state_requested,
         happened.OrderAnswered: moves.order_answered,
+        happened.HandoffReported: handoffs.handoff_reported,
         happened.TimePassed: upkeep.time_passed,
     }
 )

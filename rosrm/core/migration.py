@@ -7,11 +7,11 @@ rolled forward. What can be neither is STUCK, and said loudly.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
 from math import inf
-from typing import Any
+from typing import Any, Final
 
 from rosrm.core.model import EMPTY, InstanceId, ProcessSpec, RestartPolicy
 
@@ -50,6 +50,9 @@ class HandoffPhase(IntEnum):
     ABORT = 4
     RESUME = 5
     DONE = 6
+
+
+_FORWARD: Final = (HandoffPhase.SHADOW, HandoffPhase.SWITCH, HandoffPhase.DONE)
 
 
 class ReportPhase(IntEnum):
@@ -171,10 +174,14 @@ def plan_fault(plan: Plan, move: Move) -> str:
         return f"it has {commits} commit points, not one"
     if not 0.0 <= plan.overlap < inf:
         return f"its overlap is {plan.overlap:g} s"
-    for step in _all_steps(plan):
+    for step in all_steps(plan.steps):
         fault = _step_fault(step, move)
         if fault:
             return f"{type(step).__name__} {fault}"
+    for step in plan.steps:
+        fault = _handoff_fault(step)
+        if fault:
+            return fault
     for step in plan.steps:
         if isinstance(step, Commit):
             return "it commits to a destination that it never starts or awaits"
@@ -186,19 +193,45 @@ def plan_fault(plan: Plan, move: Move) -> str:
 def _step_fault(step: Step, move: Move) -> str:
     if isinstance(step, Commit):
         return ""
+    if not 0.0 < step.timeout < inf:
+        return "has no time-out"
+    if isinstance(step, Configure):
+        return ""
     hosts = {move.source_host, move.destination_host}
     if step.host not in hosts:
         return f"names the host {step.host!r}, not one of {sorted(hosts)}"
-    if not 0.0 < step.timeout < inf:
-        return "has no time-out"
     numbered = (move.source, move.destination, move.fallback)
     if not isinstance(step, Execute) and step.instance not in numbered:
         return f"names the instance {step.instance}, which is not of this move"
+    if isinstance(step, Start) and step.shadow:
+        return _shadow_fault(step, move)
     return ""
 
 
-def _all_steps(plan: Plan) -> Iterator[Step]:
-    for step in plan.steps:
+def _shadow_fault(step: Start, move: Move) -> str:
+    if step.instance != move.destination:
+        return "starts a shadow that is not the destination"
+    if step.node_name in ("", move.spec.name, move.source_node):
+        return "starts a shadow without an alias of its own"
+    return ""
+
+
+def _handoff_fault(step: Step) -> str:
+    """A source that has fallen silent is told to go on only when the destination never will."""
+    if not isinstance(step, Configure):
+        return ""
+    if step.phase not in _FORWARD:
+        return f"it says {step.phase.name} on the way forward"
+    undo = step.undo
+    aborts = isinstance(undo, Configure) and undo.phase is HandoffPhase.ABORT and undo.awaited
+    if step.phase is HandoffPhase.SWITCH and not aborts:
+        return "it says SWITCH, and its undo is not ABORT"
+    return ""
+
+
+def all_steps(steps: Iterable[Step]) -> Iterator[Step]:
+    """Steps with their undo, the undo of that, and so on."""
+    for step in steps:
         current: Step | None = step
         while current is not None:
             yield current

@@ -9,6 +9,7 @@ forward   fails, committed    it is tried again; the process is shown as stuck u
 back      is done             the next undo; after the last, the source goes on
 back      fails               it is tried again; the process is shown as stuck until it is done
 any       cannot be done      it is left out: an instance that has ended never starts again
+back      destination active  forward to the commit: in a handoff the destination decides
 ========  ==================  ==============================================================
 
 A process that is to be cancelled turns back; one that is stuck is given up, and all its instances
@@ -20,119 +21,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 from rosrm.core import events as happened
-from rosrm.core import lifecycle
-from rosrm.core.hosts import Host
-from rosrm.core.migration import (
-    AwaitReady,
-    Commit,
-    Move,
-    Plan,
-    Start,
-    Step,
-    Stop,
-    plan_fault,
-)
+from rosrm.core import handoffs, lifecycle
+from rosrm.core.hosts import HostCondition
+from rosrm.core.migration import AwaitReady, Commit, Configure, SetRestart, Start, Step, Stop
 from rosrm.core.model import InstanceId, InstanceState
-from rosrm.core.placement import Ranking
+from rosrm.core.runs import End
 from rosrm.core.state import MasterState, Process, ProcessPhase, Run, Wanted
-from rosrm.core.steps import DONE, give_order, give_order_again, outcome_of, title
-from rosrm.ports import Intent
-
-# --- begin ------------------------------------------------------------------------------------
-
-
-def begin_move(
-    state: MasterState, process: Process, ranking: Ranking, destination: Host, cause: str,
-    now: float,
-) -> str:  # fmt: skip
-    """Begin to move a running process to a host that has room for it by a ranking.
-
-    Returns:
-        "" or why it cannot be moved; then nothing has changed.
-    """
-    refusal = why_immovable(state, process)
-    if refusal:
-        return refusal
-    source = state.instances[process.owner]
-    name = process.spec.migration.strategy or ""
-    move = Move(
-        process.spec, source.id, source.host.name, state.new_instance_id(process),
-        destination.name, state.new_instance_id(process), int(state.wall),
-        source.node_name or process.name,
-    )  # fmt: skip
-    plan = _propose(state, name, move)
-    if isinstance(plan, str):
-        state.record(now, "plugin_failed", plan, process=process.name)
-        return plan
-    run = Run(
-        process.name, plan, name, source.id, source.host, move.destination, destination, cause, now
-    )
-    state.runs[process.name] = run
-    demand = ranking.demand
-    state.charge_instance(
-        move.destination, destination, now, demand.amounts, demand.estimated,
-        ranking.need[:, destination.column],
-    )  # fmt: skip
-    state.set_phase(process, ProcessPhase.MIGRATING, now, f"to {destination.name}: {cause}")
-    state.record(
-        now, "migration_begun",
-        f"{process.name} moves from {source.host.name} to {destination.name} by {name}: {cause}",
-        process=process.name, host=destination.name,
-        facts={
-            "from": source.host.name, "to": destination.name, "strategy": name, "cause": cause,
-            "steps": [title(step) for step in plan.steps], "overlap": plan.overlap,
-            "source": source.id.number, "destination": move.destination.number,
-        },
-    )  # fmt: skip
-    state.save(process)
-    _save(state, run)
-    return ""
-
-
-def why_immovable(state: MasterState, process: Process) -> str:
-    """Why a process cannot be moved now; "" if it can."""
-    strategy = process.spec.migration.strategy
-    if process.name in state.runs:
-        return (
-            f"{process.name} is moving already, to {state.runs[process.name].destination_host.name}"
-        )
-    if process.phase is not ProcessPhase.RUNNING:
-        return f"{process.name} is {process.phase.value}; only a running process can be moved"
-    if len(process.instances) > 1:
-        return f"an earlier instance of {process.name} is still being stopped"
-    if strategy is None:
-        return f"{process.name} has no migration strategy; give it `migration:` in its file"
-    if strategy not in state.strategies:
-        return (
-            f"{process.name} wants the migration strategy {strategy!r}, which is not selected "
-            f"here; there are {', '.join(sorted(state.strategies)) or 'none'}"
-        )
-    return ""
-
-
-def _propose(state: MasterState, name: str, move: Move) -> Plan | str:
-    """The strategy's plan, or why there is none; a strategy that raises is named."""
-    try:
-        plan = state.strategies[name].propose(move)
-        fault = plan_fault(plan, move)
-    except Exception as error:  # noqa: BLE001 - a third party's code: anything may come
-        return f"the migration strategy {name!r} gave no plan: {type(error).__name__}: {error}"
-    return f"the migration strategy {name!r} gave an unsound plan: {fault}" if fault else plan
-
-
-def _save(state: MasterState, run: Run) -> None:
-    state.emit(
-        Intent(
-            "migration", run.process,
-            {
-                "strategy": run.strategy, "source": run.source.number,
-                "source_host": run.source_host.name, "destination": run.destination.number,
-                "destination_host": run.destination_host.name, "committed": run.committed,
-                "index": run.index, "back": run.undo is not None,
-            },
-        )
-    )  # fmt: skip
-
+from rosrm.core.steps import DONE, give_order, give_order_again, outcome_of, timed_out, title
 
 # --- go on ------------------------------------------------------------------------------------
 
@@ -142,11 +37,6 @@ def advance_all(state: MasterState, now: float) -> None:
     for run in list(state.runs.values()):
         while run.process in state.runs and _advance(state, run, now):
             pass
-
-
-def moves_under_way(state: MasterState) -> int:
-    """How many processes are moving; one that is stuck does not keep others from moving."""
-    return sum(not run.stuck for run in state.runs.values())
 
 
 def order_answered(state: MasterState, event: happened.OrderAnswered, now: float) -> None:
@@ -159,11 +49,8 @@ def order_answered(state: MasterState, event: happened.OrderAnswered, now: float
 
 def _advance(state: MasterState, run: Run, now: float) -> bool:
     """Look at the step in hand; True: there may be more to do at once."""
-    if run.undo is None and not run.committed:
-        reason = _why_turn_back(state, run)
-        if reason:
-            _turn_back(state, run, reason, now)
-    step = _step_in_hand(run)
+    _choose_way(state, run, now)
+    step = run.step_in_hand
     if step is None or (run.stuck and state.processes[run.process].wanted is Wanted.CANCEL):
         _conclude(state, run, now)
         return False
@@ -171,16 +58,12 @@ def _advance(state: MasterState, run: Run, now: float) -> bool:
         _go_on(state, run, now)
         return True
     if not run.begun:
-        if now < run.retry_at:
+        if now < run.retry_at or _is_expected(state, run, step):
             return False
         run.begun, run.answer = True, None
         run.deadline = now + max(step.timeout, 0.0)
         give_order(state, run, step, now)
-    outcome = outcome_of(step, state, run)
-    if outcome is None and isinstance(step, (Stop, Start)):
-        give_order_again(state, run, step, now)
-    if outcome is None and now >= run.deadline:
-        outcome = f"{title(step)} took longer than {step.timeout:g} s"
+    outcome = _outcome(state, run, step, now)
     if outcome is None:
         return False
     if outcome == DONE:
@@ -190,9 +73,42 @@ def _advance(state: MasterState, run: Run, now: float) -> bool:
     return run.begun or not run.stuck
 
 
-def _step_in_hand(run: Run) -> Step | None:
-    steps = run.plan.steps if run.undo is None else run.undo
-    return steps[run.index] if run.index < len(steps) else None
+def _choose_way(state: MasterState, run: Run, now: float) -> None:
+    """Before the commit: a destination that is active decides, or else what befell the source."""
+    if run.committed:
+        return
+    if handoffs.is_active(state, run):
+        if run.undo is not None:
+            _go_forward(state, run, now)
+    elif run.undo is None:
+        reason = _why_turn_back(state, run)
+        if reason:
+            _turn_back(state, run, reason, now)
+
+
+def _is_expected(state: MasterState, run: Run, step: Step) -> bool:
+    """A host that the step needs has not come back since the master started.
+
+    It is waited for until its lease is over; then the step is begun, and its own time-out judges.
+    """
+    if isinstance(step, Commit):
+        return False
+    if not isinstance(step, Configure):
+        concerned = [state.hosts.by_name[step.host]]
+    else:
+        both = (run.source.number, run.destination.number) if step.awaited else ()
+        concerned = [state.instances[one].host for one in both if one in state.instances]
+    return any(state.hosts.condition_of(host) is HostCondition.EXPECTED for host in concerned)
+
+
+def _outcome(state: MasterState, run: Run, step: Step, now: float) -> str | None:
+    """Of the step in hand, now; what can be done about one that takes its time is done."""
+    outcome = outcome_of(step, state, run)
+    if outcome is None:
+        give_order_again(state, run, step, now)
+        if now >= run.deadline:
+            outcome = timed_out(state, run, step, now)
+    return outcome
 
 
 def _next(state: MasterState, run: Run, step: Step, now: float) -> None:
@@ -212,7 +128,15 @@ def _next(state: MasterState, run: Run, step: Step, now: float) -> None:
     elif isinstance(step, Start) and run.undo is not None:
         process.owner = step.instance.number
         state.save(process)
+    elif isinstance(step, SetRestart):
+        _note_policy(process, run, step)
     _go_on(state, run, now)
+
+
+def _note_policy(process: Process, run: Run, step: SetRestart) -> None:
+    """One that has ended meanwhile was not restarted: that is made up for at the end."""
+    if step.restart == process.spec.restart and step.instance.number not in run.ended:
+        run.suspended.discard(step.instance.number)
 
 
 def _cannot_be_done(state: MasterState, run: Run, step: Step, now: float) -> bool:
@@ -232,10 +156,14 @@ def _go_on(state: MasterState, run: Run, now: float) -> None:
     run.begun = False
     run.retry_at = now
     if run.stuck:
-        run.stuck = False
-        process = state.processes[run.process]
-        state.set_phase(process, ProcessPhase.MIGRATING, now, f"to {run.destination_host.name}")
-    _save(state, run)
+        _not_stuck(state, run, now)
+    state.save_run(run)
+
+
+def _not_stuck(state: MasterState, run: Run, now: float) -> None:
+    run.stuck = False
+    process = state.processes[run.process]
+    state.set_phase(process, ProcessPhase.MIGRATING, now, f"to {run.destination_host.name}")
 
 
 def _failed(state: MasterState, run: Run, step: Step, reason: str, now: float) -> None:
@@ -266,11 +194,22 @@ def _failed(state: MasterState, run: Run, step: Step, reason: str, now: float) -
 def _turn_back(state: MasterState, run: Run, reason: str, now: float) -> None:
     """Before the commit: undo every step so far, the one in hand included, newest first."""
     run.failure = reason
-    so_far = run.plan.steps[: run.index + 1]
-    run.undo = [step.undo for step in reversed(so_far) if step.undo is not None]
-    run.index, run.begun = 0, False
+    run.turn_back()
     state.record(now, "migration_undone", f"{run.process} stays: {reason}", process=run.process)
-    _save(state, run)
+    state.save_run(run)
+
+
+def _go_forward(state: MasterState, run: Run, now: float) -> None:
+    """On the way back it turns out that the destination is active: it owns the name."""
+    run.undo, run.index, run.begun = None, run.commit_index, False
+    run.retry_at = now
+    if run.stuck:
+        _not_stuck(state, run, now)
+    state.record(
+        now, "migration_redone", f"{run.process} moves after all: {run.destination} is active",
+        process=run.process,
+    )  # fmt: skip
+    state.save_run(run)
 
 
 def _why_turn_back(state: MasterState, run: Run) -> str:
@@ -278,9 +217,10 @@ def _why_turn_back(state: MasterState, run: Run) -> str:
     if state.processes[run.process].wanted is Wanted.CANCEL:
         return f"{run.process} is to be cancelled"
     end = run.ended.get(run.source.number)
-    if end is not None and (end.completed or not _told_to_stop(run, run.source)):
-        return f"{run.source} ended by itself"
-    return ""
+    if end is None:
+        return ""
+    excused = _told_to_stop(run, run.source) or handoffs.is_switching(run)
+    return f"{run.source} ended by itself" if end.completed or not excused else ""
 
 
 def _goes_on(state: MasterState, run: Run) -> bool:
@@ -292,8 +232,7 @@ def _goes_on(state: MasterState, run: Run) -> bool:
 
 def _told_to_stop(run: Run, instance: InstanceId) -> bool:
     """The plan has ordered this instance to stop."""
-    so_far = run.plan.steps if run.undo is not None else run.plan.steps[: run.index + 1]
-    return any(isinstance(step, Stop) and step.instance == instance for step in so_far)
+    return any(isinstance(step, Stop) and step.instance == instance for step in run.so_far)
 
 
 # --- the end ----------------------------------------------------------------------------------
@@ -301,8 +240,8 @@ def _told_to_stop(run: Run, instance: InstanceId) -> bool:
 
 def _conclude(state: MasterState, run: Run, now: float) -> None:
     """The last step is done: the process goes its own way again."""
-    del state.runs[run.process]
-    state.emit(Intent("migration", run.process, None))
+    handoffs.close(state, run)
+    state.end_run(run)
     process = state.processes[run.process]
     moved = run.undo is None
     process.moved_at = now
@@ -331,13 +270,22 @@ def _settle_owner(state: MasterState, process: Process, run: Run, now: float) ->
     owner = state.instances.get(process.owner)
     if owner is None:
         host = run.destination_host if run.committed else run.source_host
-        end = run.ended[process.owner]
-        told = process.owner == run.source.number and _told_to_stop(run, run.source)
-        if told and not end.completed:
-            end = replace(end, ordered=True)
-        lifecycle.conclude(state, process, end, host, now)
+        lifecycle.conclude(state, process, _end_of_owner(process, run), host, now)
         return
     if process.wanted is not Wanted.RUN and not owner.stopping:
         lifecycle.stop_instance(state, owner, now)
     state.set_phase(process, lifecycle.phase_in_sight(state, process, owner), now)
     state.save(process)
+
+
+def _end_of_owner(process: Process, run: Run) -> End:
+    """How the owner ended, if a move had not been in the way."""
+    end = run.ended[process.owner]
+    policy = process.spec.restart
+    if process.owner == run.source.number and _told_to_stop(run, run.source) and not end.completed:
+        return replace(end, ordered=True)
+    if process.owner in run.suspended and lifecycle.restarts_after(policy, end.status):
+        how = end.status.message or f"it ended on a signal or with code {process.exit_code}"
+        why = f"restart by policy {policy.when!r}: {how}"
+        return replace(end, gone=True, status=replace(end.status, message=why))
+    return end

@@ -1,4 +1,4 @@
-"""What the master knows of each process, of each of its instances, and of each move under way."""
+"""What the master knows of each process and of each of its instances."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from typing import Any, Final
 from rosrm.core.columns import FloatArray
 from rosrm.core.hosts import Host
 from rosrm.core.lazy import Lazy
-from rosrm.core.migration import Plan
-from rosrm.core.model import InstanceId, InstanceState, InstanceStatus, ProcessSpec
+from rosrm.core.model import InstanceId, InstanceState, ProcessSpec
 from rosrm.core.placement import Demand
 from rosrm.core.specs import spec_to_dict
 
@@ -86,63 +85,6 @@ class Instance:
     order: int = 0
     order_at: float = 0.0
     node_name: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class End:
-    """How an instance ended.
-
-    Attributes:
-        ordered: it had been told to stop, so that its exit code says nothing.
-        completed: a job that came to its end by itself, whatever it had been told meanwhile.
-        gone: its host does not hold it any more and says nothing of its end.
-    """
-
-    status: InstanceStatus
-    ordered: bool = False
-    completed: bool = False
-    gone: bool = False
-
-
-@dataclass(slots=True)
-class Run:
-    """A plan that is being carried out.
-
-    Attributes:
-        index: of the step in hand, in `steps` or, going back, in `undo`.
-        undo: steps still to be done on the way back; None: going forward.
-        committed: the destination owns the name.
-        deadline: of the step in hand.
-        begun: the step in hand has been ordered.
-        order: of the step in hand, 0: none.
-        stuck: a step that must be done failed; it is tried again from `retry_at` on.
-        answer: of the slave to the order of the step in hand: accepted, message.
-        launched: numbers of the instances that were ordered to start.
-        ended: how its instances ended, by number.
-    """
-
-    process: str
-    plan: Plan
-    strategy: str
-    source: InstanceId
-    source_host: Host
-    destination: InstanceId
-    destination_host: Host
-    cause: str
-    started: float
-    index: int = 0
-    undo: list[Any] | None = None
-    committed: bool = False
-    begun: bool = False
-    deadline: float = 0.0
-    order: int = 0
-    order_at: float = 0.0
-    failure: str = ""
-    stuck: bool = False
-    retry_at: float = 0.0
-    answer: tuple[bool, str] | None = None
-    launched: set[int] = field(default_factory=set)
-    ended: dict[int, End] = field(default_factory=dict)
 
 
 class PlainSpec(Lazy):

@@ -7,9 +7,9 @@ those the one with the largest relief goes. When no host has room nothing moves.
 from __future__ import annotations
 
 from rosrm.core.assigning import demand_to_move, ranking_of
+from rosrm.core.begin import begin_move, moves_under_way, why_immovable
 from rosrm.core.hosts import Host
 from rosrm.core.model import InstanceState
-from rosrm.core.moves import begin_move, moves_under_way, why_immovable
 from rosrm.core.state import Instance, MasterState, Process
 from rosrm.core.verdicts import decide, verdict_of
 

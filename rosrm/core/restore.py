@@ -7,8 +7,10 @@ from typing import Any
 
 from rosrm.core.lifecycle import adopt_to_stop
 from rosrm.core.model import InstanceId
+from rosrm.core.plans import plan_from_dict
+from rosrm.core.runs import end_from_dict, way_back
 from rosrm.core.specs import spec_from_dict
-from rosrm.core.state import MasterState, Process, ProcessPhase, Wanted
+from rosrm.core.state import MasterState, Process, ProcessPhase, Run, Wanted
 from rosrm.ports import Intent
 
 _Table = Mapping[str, Mapping[str, Any]]
@@ -18,9 +20,8 @@ def restore(state: MasterState, intents: Callable[[str], _Table], now: float) ->
     """Fill an empty state with what was intended.
 
     Nothing is started or stopped here: processes that run are expected on their hosts, and are
-    compared with what those hold when their slaves register. A migration under way is not taken
-    up again: the instance that owns the name, as committed or not, goes on; the other is stopped
-    when its host is heard.
+    compared with what those hold when their slaves register. A migration under way goes on with the
+    step that was in hand, which is given once more; every step can be.
 
     `intents` gives the journal's table of a name.
     """
@@ -32,47 +33,56 @@ def restore(state: MasterState, intents: Callable[[str], _Table], now: float) ->
     for program, amounts in intents("learned").items():
         state.learned.restore(program, amounts)
     stored = sorted(intents("process").values(), key=lambda item: int(item["order"]))
+    moves = intents("migration")
     for item in stored:
-        _restore_process(state, item, now)
+        process = _restore_process(state, item, now)
+        move = moves.get(process.name)
+        _restore_instances(state, process, item, move, now)
+        if move is None or not _restore_move(state, process, item, move, now):
+            _restore_place(state, process, now)
     state.next_order = 1 + max((int(item["order"]) for item in stored), default=0)
     numbers = intents("cluster").get("instances", {})
     state.next_instance = state.reserved_instances = int(numbers.get("next", 1))
-    for name, move in intents("migration").items():
-        _forget_move(state, name, move)
 
 
-def _restore_process(state: MasterState, item: Mapping[str, Any], now: float) -> None:
-    phase = ProcessPhase(item["phase"])
+def _restore_process(state: MasterState, item: Mapping[str, Any], now: float) -> Process:
     process = Process(
-        spec_from_dict(item["spec"]), int(item["order"]), phase, now,
+        spec_from_dict(item["spec"]), int(item["order"]), ProcessPhase(item["phase"]), now,
         wanted=Wanted(item["wanted"]), reason=item["reason"], excluded=dict(item["excluded"]),
         migrations=int(item["migrations"]), exit_code=int(item["exit_code"]),
         restarts=int(item["restarts"]),
     )  # fmt: skip
     state.processes[process.name] = process
-    _restore_instances(state, process, item, now)
-    if phase is ProcessPhase.QUEUED:
+    return process
+
+
+def _restore_place(state: MasterState, process: Process, now: float) -> None:
+    if process.phase is ProcessPhase.QUEUED:
         state.queue.add(process.name, process.spec.priority, process.order)
-    elif phase is ProcessPhase.SET_ASIDE:
+    elif process.phase is ProcessPhase.SET_ASIDE:
         state.set_aside.add(process.name)
-    elif not phase.over:
+    elif not process.phase.over:
         _expect_to_run(state, process, now)
 
 
 def _restore_instances(
-    state: MasterState, process: Process, item: Mapping[str, Any], now: float
-) -> None:
-    """Put on the books what may still run: the owner to go on, any other to be stopped."""
+    state: MasterState, process: Process, item: Mapping[str, Any],
+    move: Mapping[str, Any] | None, now: float,
+) -> None:  # fmt: skip
+    """Put on the books what may still run: the owner, what moves, and any other to be stopped."""
+    aliases, moving = item.get("node_names", {}), _numbers_of(move)
+    ended = move.get("ended", {}) if move is not None else {}
     for number, host_name in item["instances"].items():
         host = state.hosts.by_name.get(host_name)
-        if host is None:
+        if host is None or number in ended:
             continue
         instance = InstanceId(process.name, int(number))
-        if instance.number == item["owner"]:
-            process.owner = instance.number
-            state.add_instance(instance, process.spec, host, now)
+        if instance.number == item["owner"] or instance.number in moving:
+            held = state.add_instance(instance, process.spec, host, now)
+            held.node_name = str(aliases.get(number, ""))
         else:
             adopt_to_stop(state, instance, host, now)
+    process.owner = item["owner"] if item["owner"] in process.instances else 0
 
 
 def _expect_to_run(state: MasterState, process: Process, now: float) -> None:
@@ -90,10 +100,70 @@ def _expect_to_run(state: MasterState, process: Process, now: float) -> None:
         state.enqueue(process, now, "nothing of it was left when the master started")
 
 
-def _forget_move(state: MasterState, name: str, move: Mapping[str, Any]) -> None:
-    """A move that was under way is over; its source may have been told to stop already."""
-    process = state.processes.get(name)
+# --- moves ------------------------------------------------------------------------------------
+
+
+def _numbers_of(move: Mapping[str, Any] | None) -> frozenset[int]:
+    """The instances of a move; none, where it cannot be taken up again."""
+    if move is None or "plan" not in move:
+        return frozenset()
+    return frozenset({int(move["source"]), int(move["destination"]), *map(int, move["launched"])})
+
+
+def _restore_move(
+    state: MasterState, process: Process, item: Mapping[str, Any], move: Mapping[str, Any],
+    now: float,
+) -> bool:  # fmt: skip
+    """Take a move up again; False: nobody can, and it is over."""
+    try:
+        run = _run_of(state, process, move, now)
+    except (KeyError, TypeError, ValueError) as fault:
+        _forget_move(state, process, move, str(fault), now)
+        return False
+    process.owner = int(item["owner"])
+    state.runs[process.name] = run
+    for number in process.instances.intersection(move["stopping"]):
+        state.instances[number].stopping = True
+    state.set_phase(process, ProcessPhase.MIGRATING, now, f"to {run.destination_host.name}")
+    state.record(
+        now, "migration_taken_up", f"{process.name} goes on moving to {run.destination_host.name}",
+        process=process.name, host=run.destination_host.name,
+    )  # fmt: skip
+    return True
+
+
+def _run_of(state: MasterState, process: Process, move: Mapping[str, Any], now: float) -> Run:
+    hosts = state.hosts.by_name
+    plan = plan_from_dict(move["plan"])
+    run = Run(
+        process.name, plan, move["strategy"], InstanceId(process.name, int(move["source"])),
+        hosts[move["source_host"]], InstanceId(process.name, int(move["destination"])),
+        hosts[move["destination_host"]], move["cause"], now, move["source_node"],
+        move["destination_node"], index=int(move["index"]), turned_at=int(move["turned_at"]),
+        committed=bool(move["committed"]), failure=move["failure"],
+        launched=set(move["launched"]), suspended=set(move["suspended"]),
+    )  # fmt: skip
+    if move["back"]:
+        run.undo = way_back(plan, run.turned_at)
+    for number, end in move["ended"].items():
+        run.ended[int(number)] = end_from_dict(InstanceId(process.name, int(number)), end)
+    return run
+
+
+def _forget_move(
+    state: MasterState, process: Process, move: Mapping[str, Any], fault: str, now: float
+) -> None:
+    """The owner of the name goes on, and any other instance is stopped.
+
+    The source may have been told to stop already.
+    """
     source = state.instances.get(int(move["source"]))
-    if process is not None and source is not None and process.owner == source.id.number:
+    if source is not None and process.owner == source.id.number:
         source.recalled = True
-    state.emit(Intent("migration", name, None))
+    for instance in state.instances_of(process):
+        instance.stopping = instance.id.number != process.owner
+    state.record(
+        now, "migration_forgotten", f"the move of {process.name} cannot go on: {fault}",
+        process=process.name,
+    )  # fmt: skip
+    state.emit(Intent("migration", process.name, None))

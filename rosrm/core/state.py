@@ -13,8 +13,9 @@ from rosrm.core.hosts import Host, HostTable
 from rosrm.core.model import EMPTY, Assignment, InstanceId, ProcessSpec
 from rosrm.core.needs import LearnedNeeds
 from rosrm.core.placement import Demand, NamedPolicy, Ranking
-from rosrm.core.processes import Instance, Process, ProcessPhase, Run, Wanted
+from rosrm.core.processes import Instance, Process, ProcessPhase, Wanted
 from rosrm.core.queue import Queue
+from rosrm.core.runs import Run, run_to_dict
 from rosrm.core.settings import CoreSettings
 from rosrm.core.verdicts import Decision
 from rosrm.ports import Intent, MigrationStrategy, Record, ScoringPolicy
@@ -70,6 +71,7 @@ class MasterState:
         self.demands: dict[Any, Demand] = {}
         self._out: list[Command] = []
         self._unsaved: dict[str, Process] = {}
+        self._unsaved_runs: dict[str, Run] = {}
 
     # --- what handlers emit --------------------------------------------------------------
 
@@ -82,6 +84,9 @@ class MasterState:
         for process in self._unsaved.values():
             self._out.append(self._intent_of(process))
         self._unsaved.clear()
+        for run in self._unsaved_runs.values():
+            self._out.append(self._intent_of_run(run))
+        self._unsaved_runs.clear()
         out, self._out = self._out, []
         return out
 
@@ -120,6 +125,21 @@ class MasterState:
                 "restarts": process.restarts, "node_names": aliases,
             },
         )  # fmt: skip
+
+    def save_run(self, run: Run) -> None:
+        """Make durable how far a move is, as it stands after the event in hand."""
+        self._unsaved_runs[run.process] = run
+
+    def end_run(self, run: Run) -> None:
+        """A move is over."""
+        del self.runs[run.process]
+        self._unsaved_runs.pop(run.process, None)
+        self.emit(Intent("migration", run.process, None))
+
+    def _intent_of_run(self, run: Run) -> Intent:
+        numbers = sorted(self.processes[run.process].instances)
+        stopping = [number for number in numbers if self.instances[number].stopping]
+        return Intent("migration", run.process, run_to_dict(run, stopping))
 
     def order_id(self) -> int:
         """A number for an order to a slave, unique within this run of the master."""

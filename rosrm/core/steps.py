@@ -5,20 +5,35 @@ from __future__ import annotations
 from functools import singledispatch
 from typing import Any, Final
 
-from rosrm.core import lifecycle
+from rosrm.core import handoffs, lifecycle
 from rosrm.core.commands import Order
+from rosrm.core.handoffs import DONE
 from rosrm.core.hosts import Host
-from rosrm.core.migration import AwaitReady, Commit, Execute, Start, Step, Stop
+from rosrm.core.migration import (
+    AwaitReady,
+    Commit,
+    Configure,
+    Execute,
+    SetRestart,
+    Start,
+    Step,
+    Stop,
+)
 from rosrm.core.model import InstanceState
 from rosrm.core.state import MasterState, Run
 
-DONE: Final = ""
+__all__ = ["DONE", "give_order", "give_order_again", "outcome_of", "timed_out", "title"]
+
 _RUNS: Final = frozenset({InstanceState.RUNNING, InstanceState.READY})
 
 
 def give_order(state: MasterState, run: Run, step: Step, now: float) -> None:
-    """Ask the slave for what the step needs."""
+    """Ask the slave for what the step needs; the nodes themselves, in a handoff."""
     if isinstance(step, Commit | AwaitReady):
+        return
+    if isinstance(step, Configure):
+        run.order = 0
+        handoffs.publish(state, run, step.phase)
         return
     host = state.hosts.by_name[step.host]
     run.order, run.order_at = state.order_id(), now
@@ -32,8 +47,17 @@ def give_order(state: MasterState, run: Run, step: Step, now: float) -> None:
                 arguments=step.arguments, timeout=step.timeout,
             )
         )  # fmt: skip
+    elif isinstance(step, SetRestart):
+        _order_restart_policy(state, run, step, host)
     else:
         _order_start(state, run, step, host, now)
+
+
+def _order_restart_policy(state: MasterState, run: Run, step: SetRestart, host: Host) -> None:
+    if step.restart != state.processes[run.process].spec.restart:
+        run.suspended.add(step.instance.number)
+        state.save_run(run)
+    state.emit(Order(run.order, host.host_id, "set_restart", step.instance, restart=step.restart))
 
 
 def _order_start(state: MasterState, run: Run, step: Start, host: Host, now: float) -> None:
@@ -42,6 +66,9 @@ def _order_start(state: MasterState, run: Run, step: Start, host: Host, now: flo
     if _in_the_way(state, run, step, now):
         return
     run.launched.add(number)
+    if step.shadow:
+        run.suspended.add(number)
+    state.save_run(run)
     if number not in state.instances and number not in run.ended:
         state.add_instance(step.instance, spec, host, now)
         state.save(process)
@@ -69,10 +96,21 @@ def _in_the_way(state: MasterState, run: Run, step: Start, now: float) -> bool:
     return bool(others)
 
 
-def give_order_again(state: MasterState, run: Run, step: Stop | Start, now: float) -> None:
-    """A start or stop may be given twice without harm; one may have been lost."""
-    if now - run.order_at >= state.settings.order_retry:
+def give_order_again(state: MasterState, run: Run, step: Step, now: float) -> None:
+    """A start, a stop or a restart policy may be given twice without harm; one may be lost."""
+    if isinstance(step, Configure):
+        handoffs.take_over_if_alone(state, run, step, now)
+    elif isinstance(step, Execute | AwaitReady | Commit):
+        return
+    elif now - run.order_at >= state.settings.order_retry:
         give_order(state, run, step, now)
+
+
+def timed_out(state: MasterState, run: Run, step: Step, now: float) -> str | None:
+    """What the passing of a step's time means: as `outcome_of`."""
+    if isinstance(step, Configure):
+        return handoffs.timed_out(state, run, step, now)
+    return f"{title(step)} took longer than {step.timeout:g} s"
 
 
 @singledispatch
@@ -107,6 +145,23 @@ def _(step: Stop, state: MasterState, run: Run) -> str | None:
 
 
 @outcome_of.register
+def _(step: Configure, state: MasterState, run: Run) -> str | None:
+    return handoffs.outcome(step, state, run)
+
+
+@outcome_of.register
+def _(step: SetRestart, state: MasterState, run: Run) -> str | None:
+    if step.instance.number not in state.instances:
+        return DONE  # it has ended: there is nothing to restart
+    if run.answer is None:
+        return None
+    accepted, message = run.answer
+    return (
+        DONE if accepted else f"{step.host} kept the restart policy of {step.instance}: {message}"
+    )
+
+
+@outcome_of.register
 def _(step: Commit, state: MasterState, run: Run) -> str | None:
     return DONE
 
@@ -133,5 +188,9 @@ def title(step: Step) -> str:
         return "commit"
     if isinstance(step, Execute):
         return f"execute {step.executor} on {step.host}"
+    if isinstance(step, Configure):
+        return f"state_config {step.phase.name}"
+    if isinstance(step, SetRestart):
+        return f"restart policy {step.restart.when!r} of {step.instance} on {step.host}"
     word = {Start: "start", AwaitReady: "await ready", Stop: "stop"}[type(step)]
     return f"{word} {step.instance} on {step.host}"

@@ -1,0 +1,104 @@
+"""Beginning a move: is there a way, a room and a plan?"""
+
+from __future__ import annotations
+
+import json
+
+from rosrm.core.hosts import Host
+from rosrm.core.migration import Move, Plan, Start, plan_fault
+from rosrm.core.placement import Ranking
+from rosrm.core.plans import plan_to_dict
+from rosrm.core.state import MasterState, Process, ProcessPhase, Run
+from rosrm.core.steps import title
+
+
+def begin_move(
+    state: MasterState, process: Process, ranking: Ranking, destination: Host, cause: str,
+    now: float,
+) -> str:  # fmt: skip
+    """Begin to move a running process to a host that has room for it by a ranking.
+
+    Returns:
+        "" or why it cannot be moved; then nothing has changed.
+    """
+    refusal = why_immovable(state, process)
+    if refusal:
+        return refusal
+    source = state.instances[process.owner]
+    name = process.spec.migration.strategy or ""
+    move = Move(
+        process.spec, source.id, source.host.name, state.new_instance_id(process),
+        destination.name, state.new_instance_id(process), int(state.wall),
+        source.node_name or process.name,
+    )  # fmt: skip
+    plan = _propose(state, name, move)
+    if isinstance(plan, str):
+        state.record(now, "plugin_failed", plan, process=process.name)
+        return plan
+    run = Run(
+        process.name, plan, name, source.id, source.host, move.destination, destination, cause,
+        now, move.source_node, _destination_node(plan, move),
+    )  # fmt: skip
+    state.runs[process.name] = run
+    demand = ranking.demand
+    state.charge_instance(
+        move.destination, destination, now, demand.amounts, demand.estimated,
+        ranking.need[:, destination.column],
+    )  # fmt: skip
+    state.set_phase(process, ProcessPhase.MIGRATING, now, f"to {destination.name}: {cause}")
+    state.record(
+        now, "migration_begun",
+        f"{process.name} moves from {source.host.name} to {destination.name} by {name}: {cause}",
+        process=process.name, host=destination.name,
+        facts={
+            "from": source.host.name, "to": destination.name, "strategy": name, "cause": cause,
+            "steps": [title(step) for step in plan.steps], "overlap": plan.overlap,
+            "source": source.id.number, "destination": move.destination.number,
+        },
+    )  # fmt: skip
+    state.save(process)
+    state.save_run(run)
+    return ""
+
+
+def moves_under_way(state: MasterState) -> int:
+    """How many processes are moving; one that is stuck does not keep others from moving."""
+    return sum(not run.stuck for run in state.runs.values())
+
+
+def why_immovable(state: MasterState, process: Process) -> str:
+    """Why a process cannot be moved now; "" if it can."""
+    strategy = process.spec.migration.strategy
+    if process.name in state.runs:
+        return (
+            f"{process.name} is moving already, to {state.runs[process.name].destination_host.name}"
+        )
+    if process.phase is not ProcessPhase.RUNNING:
+        return f"{process.name} is {process.phase.value}; only a running process can be moved"
+    if len(process.instances) > 1:
+        return f"an earlier instance of {process.name} is still being stopped"
+    if strategy is None:
+        return f"{process.name} has no migration strategy; give it `migration:` in its file"
+    if strategy not in state.strategies:
+        return (
+            f"{process.name} wants the migration strategy {strategy!r}, which is not selected "
+            f"here; there are {', '.join(sorted(state.strategies)) or 'none'}"
+        )
+    return ""
+
+
+def _propose(state: MasterState, name: str, move: Move) -> Plan | str:
+    """The strategy's plan, or why there is none; a strategy that raises is named."""
+    try:
+        plan = state.strategies[name].propose(move)
+        fault = plan_fault(plan, move)
+        json.dumps(plan_to_dict(plan))  # it goes into the journal
+    except Exception as error:  # noqa: BLE001 - a third party's code: anything may come
+        return f"the migration strategy {name!r} gave no plan: {type(error).__name__}: {error}"
+    return f"the migration strategy {name!r} gave an unsound plan: {fault}" if fault else plan
+
+
+def _destination_node(plan: Plan, move: Move) -> str:
+    starts = (step for step in plan.steps if isinstance(step, Start))
+    aliases = [step.node_name for step in starts if step.instance == move.destination]
+    return next(iter(aliases), "") or move.spec.name
