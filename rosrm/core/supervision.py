@@ -5,23 +5,29 @@
                                its number is dead, or all is stopped: -      refused
     -         StopOrdered      - (a start that comes late is refused)        refused
               RestartOrdered   -                                             refused
+              AmendOrdered     -                                             refused
     starting  Spawned          -                                             running
                                a stop came in between: SIGINT                stopping
               SpawnFailed      final, or by policy where it may pass         failed, backoff
               StopOrdered      Unspawn (one in hand is stopped later)        starting
               Resumed          Spawn (the supervisor was restarted)          starting
+              AmendOrdered     - (its policy is another from now on)         starting
     running   Exited           by policy                                     exited, failed, backoff
                                others of its session live: SIGINT            stopping
               StopOrdered      SIGINT                                        stopping
               RestartOrdered   SIGINT, to start again afterwards             stopping
+              AmendOrdered     -                                             running
     stopping  TimePassed       SIGTERM, then SIGKILL, then SIGKILL again     stopping
               Exited           as was meant (end, restart, policy)           exited, starting, ...
                                others of its session live: -                 stopping
               Cleared          as was meant (end, restart, policy)           exited, starting, ...
               StopOrdered      now it is meant to end                        stopping
+              RestartOrdered   unless it is meant to end: to start again     stopping
+              AmendOrdered     -                                             stopping
     backoff   TimePassed       Spawn                                         starting
               RestartOrdered   Spawn, the count of restarts afresh           starting
               StopOrdered      -                                             exited
+              AmendOrdered     - (if the policy now allows no restart)       failed, backoff
     ended     Forgotten        Drop; its number is dead                      -
 
 Whatever is not in the table changes nothing; an order that changes nothing has its status told
@@ -109,6 +115,13 @@ class RestartOrdered(NamedTuple):
     instance: Key
 
 
+class AmendOrdered(NamedTuple):
+    """The client wants another restart policy for it from now on."""
+
+    instance: Key
+    restart: RestartRule
+
+
 class Forgotten(NamedTuple):
     """The client has kept its final status: this side need not."""
 
@@ -175,6 +188,7 @@ Event = (
     StartOrdered
     | StopOrdered
     | RestartOrdered
+    | AmendOrdered
     | Forgotten
     | Resumed
     | Spawned
@@ -341,7 +355,7 @@ class Supervision:
             return
         elif event.instance in self.instances:
             yield from self._known(self.instances[event.instance], event, now)
-        elif isinstance(event, (StartOrdered, StopOrdered, RestartOrdered)):
+        elif isinstance(event, (StartOrdered, StopOrdered, RestartOrdered, AmendOrdered)):
             yield from self._unknown(event)
 
     def _known(self, instance: Instance, event: Event, now: float) -> Iterator[Command]:
@@ -353,7 +367,9 @@ class Supervision:
         if not commands and isinstance(event, _ORDERS):
             yield Tell(instance.key)
 
-    def _unknown(self, event: StartOrdered | StopOrdered | RestartOrdered) -> Iterator[Command]:
+    def _unknown(
+        self, event: StartOrdered | StopOrdered | RestartOrdered | AmendOrdered
+    ) -> Iterator[Command]:
         name, number = event.instance
         starts = isinstance(event, StartOrdered)
         restart = event.restart if isinstance(event, StartOrdered) else RestartRule()
@@ -402,7 +418,7 @@ class Supervision:
 # --- transitions: each changes the instance and says what follows -----------------------------
 
 Transition = Callable[[Instance, "Event", float], list[Command]]
-_ORDERS: Final = (StartOrdered, StopOrdered, RestartOrdered, Forgotten)
+_ORDERS: Final = (StartOrdered, StopOrdered, RestartOrdered, AmendOrdered, Forgotten)
 
 
 def _spawned(instance: Instance, event: Event, now: float) -> list[Command]:
@@ -475,6 +491,14 @@ def _mean_to_end(instance: Instance, event: Event, now: float) -> list[Command]:
     return [Tell(instance.key)]
 
 
+def _mean_to_restart(instance: Instance, event: Event, now: float) -> list[Command]:
+    if instance.then != THEN_POLICY:
+        return []  # it is meant to end, or to start again already
+    instance.then = THEN_RESTART
+    instance.message = _stopping(instance)
+    return [Tell(instance.key)]
+
+
 def _escalate(instance: Instance, event: Event, now: float) -> list[Command]:
     """The next step of a stop; after SIGKILL only that again."""
     instance.step = min(instance.step + 1, _KILL)
@@ -506,21 +530,42 @@ def _stop_in_backoff(instance: Instance, event: Event, now: float) -> list[Comma
     return [Tell(instance.key)]
 
 
+def _amend(instance: Instance, event: Event, now: float) -> list[Command]:
+    assert isinstance(event, AmendOrdered)
+    if instance.restart == event.restart:
+        return []
+    instance.restart = event.restart
+    return [Tell(instance.key)]
+
+
+def _amend_in_backoff(instance: Instance, event: Event, now: float) -> list[Command]:
+    commands = _amend(instance, event, now)
+    rule = instance.restart
+    if commands and (rule.when == "never" or _recent_restarts(instance, now) >= rule.attempts):
+        _end(instance, FAILED, f"{_ending(instance)}; by its new policy it is not restarted")
+    return commands
+
+
 TRANSITIONS: Final[dict[tuple[str, type], Transition]] = {
     (STARTING, Spawned): _spawned,
     (STARTING, SpawnFailed): _spawn_failed,
     (STARTING, StopOrdered): _stop_before_spawn,
     (STARTING, Resumed): _spawn,
+    (STARTING, AmendOrdered): _amend,
     (RUNNING, Exited): _exited,
     (RUNNING, StopOrdered): _stop,
     (RUNNING, RestartOrdered): _restart,
+    (RUNNING, AmendOrdered): _amend,
     (STOPPING, TimePassed): _escalate,
     (STOPPING, Exited): _exited,
     (STOPPING, Cleared): _cleared,
     (STOPPING, StopOrdered): _mean_to_end,
+    (STOPPING, RestartOrdered): _mean_to_restart,
+    (STOPPING, AmendOrdered): _amend,
     (BACKOFF, TimePassed): _restart_due,
     (BACKOFF, RestartOrdered): _restart_now,
     (BACKOFF, StopOrdered): _stop_in_backoff,
+    (BACKOFF, AmendOrdered): _amend_in_backoff,
 }
 
 
@@ -562,8 +607,7 @@ def _by_policy(instance: Instance, ending: str, *, succeeded: bool, now: float) 
     if rule.when == "never" or (rule.when == "on-failure" and succeeded):
         _end(instance, EXITED if succeeded else FAILED, "" if succeeded else ending)
         return
-    instance.recent = [at for at in instance.recent if now - at < rule.window]
-    done = len(instance.recent)
+    done = _recent_restarts(instance, now)
     if done >= rule.attempts:
         limit = f"{done} restarts within {rule.window:g} s are the most allowed"
         _end(instance, FAILED, f"{ending}; {limit}")
@@ -573,6 +617,12 @@ def _by_policy(instance: Instance, ending: str, *, succeeded: bool, now: float) 
     instance.then = ""
     instance.deadline = now + wait
     instance.message = f"{ending}; restart {done + 1} of {rule.attempts} in {wait:.1f} s"
+
+
+def _recent_restarts(instance: Instance, now: float) -> int:
+    """How many restarts lie within the policy's window; older ones count no more."""
+    instance.recent = [at for at in instance.recent if now - at < instance.restart.window]
+    return len(instance.recent)
 
 
 def backoff(rule: RestartRule, done: int) -> float:

@@ -22,6 +22,7 @@ from rosrm.core.model import (
     StopPolicy,
 )
 from rosrm.core.supervision import (
+    AmendOrdered,
     Forgotten,
     RestartOrdered,
     RestartRule,
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 __all__ = [
+    "Amended",
     "LaunchOrder",
     "LogLimits",
     "SupervisorClient",
@@ -68,6 +70,7 @@ class LaunchOrder:
         argv: the command line; its first word is looked up in the PATH of `environment`.
         environment: the whole of it, nothing is inherited.
         working_directory: None: one of its own, below the state directory.
+        memo: kept by the supervisor for a later run of the client; see `SupervisorClient.memos`.
     """
 
     instance: InstanceId
@@ -76,6 +79,19 @@ class LaunchOrder:
     working_directory: str | None = None
     restart: RestartPolicy = field(default_factory=RestartPolicy)
     stop: StopPolicy = field(default_factory=StopPolicy)
+    memo: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Amended:
+    """The supervisor has recorded that an instance has this restart policy from now on."""
+
+    instance: InstanceId
+    restart: RestartPolicy
+
+
+#: What the supervisor tells of an instance.
+Told = InstanceStatus | Amended
 
 
 def log_path(state_directory: Path, instance: InstanceId) -> Path:
@@ -100,6 +116,7 @@ class SupervisorClient:
     Attributes:
         instances: what the supervisor knew when the connection was made: every instance that has
             not been forgotten, final statuses included.
+        memos: what an earlier client wanted to be remembered of those that have not ended.
         notes: what the supervisor found wrong with its record, for people.
         pid: of the supervisor.
     """
@@ -108,13 +125,14 @@ class SupervisorClient:
         self._peer = peer
         self._state = state_directory
         self._lines = protocol.Lines()
-        self._received: list[InstanceStatus] = []
+        self._received: list[Told] = []
         self._failure: SupervisorError | None = None
         self._ending = False
         self._sending = threading.Lock()
         self._base: Mapping[str, str] | None = None
         self._base_id = ""
         self.instances: tuple[InstanceStatus, ...] = ()
+        self.memos: Mapping[InstanceId, str] = {}
         self.notes: tuple[str, ...] = ()
         self.pid = 0
 
@@ -166,6 +184,21 @@ class SupervisorClient:
         """Stop it, then start it again; the restart policy does not count this."""
         self._order(RestartOrdered(_key(instance)))
 
+    def amend(
+        self, instance: InstanceId, restart: RestartPolicy, changes: Mapping[str, str | None]
+    ) -> None:
+        """Give it another restart policy; answered by `Amended`, of what has ended too.
+
+        Args:
+            changes: of its environment when it starts again; None: without this variable.
+        """
+        order = AmendOrdered(_key(instance), _rule(restart))
+        self._order(protocol.Amend(order, changes))
+
+    def remember(self, instance: InstanceId, memo: str) -> None:
+        """Keep another text for a later run of the client."""
+        self._order(protocol.Remember(_key(instance), memo))
+
     def forget(self, instances: Iterable[InstanceId]) -> None:
         """Their final statuses are kept elsewhere now: the supervisor need not."""
         forgotten = tuple(Forgotten(_key(instance)) for instance in instances)
@@ -182,8 +215,8 @@ class SupervisorClient:
         """Readable when `receive` has something; for a selector."""
         return self._peer.fileno()
 
-    def receive(self, timeout: float | None = None) -> list[InstanceStatus]:
-        """The statuses that have come, oldest first; [] when none came in time.
+    def receive(self, timeout: float | None = None) -> list[Told]:
+        """What the supervisor has told, oldest first; [] when nothing came in time.
 
         Raises:
             SupervisorEnded: the shutdown is complete.
@@ -221,15 +254,15 @@ class SupervisorClient:
             name: value for name, value in order.environment.items() if base.get(name) != value
         }
         changes.update((name, None) for name in base if name not in order.environment)
-        restart, stop = order.restart, order.stop
         return protocol.Launch(
             _key(order.instance),
             order.argv,
             self._base_id,
             changes,
             order.working_directory,
-            RestartRule(*(getattr(restart, name) for name in RestartRule._fields)),
-            StopRule(*(getattr(stop, name) for name in StopRule._fields)),
+            _rule(order.restart),
+            StopRule(*(getattr(order.stop, name) for name in StopRule._fields)),
+            order.memo,
         )
 
     def _choose_base(self, environment: Mapping[str, str]) -> None:
@@ -288,6 +321,10 @@ class SupervisorClient:
         told = fields["tell"]
         if told == "status":
             self._received.append(_status(fields["status"]))
+        elif told == "amended":
+            instance = InstanceId(*protocol.read_key(fields["instance"]))
+            rule = protocol.read_restart(fields["restart"])  # type: ignore[arg-type]
+            self._received.append(Amended(instance, RestartPolicy(*rule)))
         elif told == "welcome":
             self._take_welcome(fields)
         elif told == "refused":
@@ -299,15 +336,17 @@ class SupervisorClient:
 
     def _take_welcome(self, fields: Mapping[str, object]) -> None:
         number, pid = fields["protocol"], fields["pid"]
-        notes, instances = fields["notes"], fields["instances"]
         if number != protocol.PROTOCOL:
             raise ValueError(f"it speaks protocol {number!r}, this is {protocol.PROTOCOL}")
+        notes, instances, memos = fields["notes"], fields["instances"], fields["memos"]
         assert isinstance(pid, int)
         assert isinstance(notes, list)
         assert isinstance(instances, list)
+        assert isinstance(memos, list)
         self.pid = pid
         self.notes = tuple(str(note) for note in notes)
         self.instances = tuple(_status(value) for value in instances)
+        self.memos = {InstanceId(*protocol.read_key(key)): str(memo) for key, memo in memos}
 
     def _fail(self, failure: SupervisorError) -> None:
         """Remember what ends the connection; what came before it is delivered first."""
@@ -388,6 +427,10 @@ def _poll(file: object, event: int, timeout: float | None) -> bool:
 
 def _key(instance: InstanceId) -> tuple[str, int]:
     return (instance.process, instance.number)
+
+
+def _rule(restart: RestartPolicy) -> RestartRule:
+    return RestartRule(*(getattr(restart, name) for name in RestartRule._fields))
 
 
 def _status(value: object) -> InstanceStatus:

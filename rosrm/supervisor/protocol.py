@@ -7,20 +7,27 @@ The client orders, by the key `do`:
 
     hello        protocol, pid, log             first of all; log: the limits of `LogLimits`
     environment  id, variables                  a base that later `start`s name
-    start        instance, argv, environment, changes, directory, restart, stop
+    start        instance, argv, environment, changes, directory, restart, stop, memo
                                                 environment: id of a base; changes: variable to
                                                 value, or null to leave it out; restart and stop:
                                                 the fields of the policies, in their order
+                                                memo: a text that is kept for the client
     stop         instance                       SIGINT, SIGTERM, SIGKILL; never heard of: a start
                                                 that comes late will be refused
     restart      instance                       stop, then start again
+    amend        instance, restart, changes     from now on it has this restart policy, and these
+                                                changes on top of its own when it starts again
+    remember     instance, memo                 another text to keep
     forget       instances                      their final statuses are kept by the client now
     shutdown                                    stop everything, then end
 
 The supervisor tells, by the key `tell`:
 
-    welcome      protocol, pid, notes, instances   the answer to hello; instances: their statuses
+    welcome      protocol, pid, notes, instances, memos
+                                                   the answer to hello; instances: their statuses;
+                                                   memos: [instance, text] of those that have one
     status       status                            something has changed, or was ordered again
+    amended      instance, restart                 the order is recorded; its status came before
     refused      message                           the connection is closed after it
     ended                                          the shutdown is complete; closed after it
 
@@ -32,10 +39,11 @@ A line that is not understood is refused, never guessed at; so is another protoc
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 from rosrm.core.supervision import (
+    AmendOrdered,
     Forgotten,
     Instance,
     Key,
@@ -47,7 +55,7 @@ from rosrm.core.supervision import (
 )
 from rosrm.supervisor.logs import LogLimits
 
-PROTOCOL: Final = 1
+PROTOCOL: Final = 2
 #: Longest line that is read.
 LONGEST_LINE: Final = 8 << 20
 
@@ -83,6 +91,26 @@ class Launch(NamedTuple):
     directory: str | None
     restart: RestartRule
     stop: StopRule
+    memo: str = ""
+
+    def amended(self, amendment: Amend) -> Launch:
+        """How it is started after an amendment."""
+        changes = {**self.changes, **amendment.changes}
+        return self._replace(changes=changes, restart=amendment.order.restart)
+
+
+class Amend(NamedTuple):
+    """Another restart policy, and another environment when it starts again."""
+
+    order: AmendOrdered
+    changes: Mapping[str, str | None]
+
+
+class Remember(NamedTuple):
+    """What the client wants to know of an instance after its own restart."""
+
+    instance: Key
+    memo: str
 
 
 class Forget(NamedTuple):
@@ -91,7 +119,17 @@ class Forget(NamedTuple):
     instances: tuple[Forgotten, ...]
 
 
-Order = Hello | Environment | Launch | StopOrdered | RestartOrdered | Forget | ShutdownOrdered
+Order = (
+    Hello
+    | Environment
+    | Launch
+    | StopOrdered
+    | RestartOrdered
+    | Amend
+    | Remember
+    | Forget
+    | ShutdownOrdered
+)
 
 
 class Status(NamedTuple):
@@ -140,10 +178,15 @@ def _order_fields(order: Order) -> dict[str, Any]:
         return {"do": "environment", "id": order.id, "variables": dict(order.variables)}
     if isinstance(order, Launch):
         return {"do": "start", **launch_fields(order)}
-    if isinstance(order, StopOrdered):
-        return {"do": "stop", "instance": order.instance}
-    if isinstance(order, RestartOrdered):
-        return {"do": "restart", "instance": order.instance}
+    if isinstance(order, (StopOrdered, RestartOrdered)):
+        kind = "stop" if isinstance(order, StopOrdered) else "restart"
+        return {"do": kind, "instance": order.instance}
+    if isinstance(order, Amend):
+        instance, restart = order.order
+        changes = dict(order.changes)
+        return {"do": "amend", "instance": instance, "restart": restart, "changes": changes}
+    if isinstance(order, Remember):
+        return {"do": "remember", "instance": order.instance, "memo": order.memo}
     if isinstance(order, Forget):
         return {"do": "forget", "instances": [forgotten.instance for forgotten in order.instances]}
     return {"do": "shutdown"}
@@ -159,6 +202,7 @@ def launch_fields(launch: Launch) -> dict[str, Any]:
         "directory": launch.directory,
         "restart": launch.restart,
         "stop": launch.stop,
+        "memo": launch.memo,
     }
 
 
@@ -173,46 +217,50 @@ def decode_order(text: bytes) -> Order:
 
 
 def _order(kind: object, fields: Mapping[str, Any]) -> Order:
-    if kind == "start":
-        return read_launch(fields)
-    if kind == "stop":
-        return StopOrdered(read_key(fields["instance"]))
-    if kind == "forget":
-        return Forget(tuple(Forgotten(read_key(key)) for key in fields["instances"]))
-    if kind == "restart":
-        return RestartOrdered(read_key(fields["instance"]))
-    if kind == "environment":
-        return Environment(_text(fields["id"]), _texts(fields["variables"]))
-    if kind == "hello":
-        return Hello(int(fields["protocol"]), int(fields["pid"]), _limits(fields["log"]))
-    if kind == "shutdown":
-        return ShutdownOrdered()
-    known = "hello, environment, start, stop, restart, forget, shutdown"
-    raise ProtocolError(f"unknown order {kind!r}; known: {known}")
+    reader = _READERS.get(kind) if isinstance(kind, str) else None
+    if reader is None:
+        raise ProtocolError(f"unknown order {kind!r}; known: {', '.join(_READERS)}")
+    return reader(fields)
 
 
 def read_launch(fields: Mapping[str, Any]) -> Launch:
     """Undo `launch_fields`. Raises KeyError, TypeError or ValueError."""
     argv = tuple(_text(argument) for argument in fields["argv"])
     directory = fields["directory"]
-    changes = fields["changes"]
     if not argv:
         raise ValueError("argv is empty")
     if directory is not None:
         _text(directory)
-    for name, value in changes.items():
-        _text(name)
-        if value is not None:
-            _text(value)
     return Launch(
         read_key(fields["instance"]),
         argv,
         _text(fields["environment"]),
-        changes,
+        _changes(fields["changes"]),
         directory,
         read_restart(fields["restart"]),
         read_stop(fields["stop"]),
+        _text(fields.get("memo", "")),  # records of before protocol 2 have none
     )
+
+
+def _read_amend(fields: Mapping[str, Any]) -> Amend:
+    order = AmendOrdered(read_key(fields["instance"]), read_restart(fields["restart"]))
+    return Amend(order, _changes(fields["changes"]))
+
+
+_READERS: Final[Mapping[str, Callable[[Mapping[str, Any]], Order]]] = {
+    "hello": lambda fields: Hello(
+        int(fields["protocol"]), int(fields["pid"]), _limits(fields["log"])
+    ),
+    "environment": lambda fields: Environment(_text(fields["id"]), _texts(fields["variables"])),
+    "start": read_launch,
+    "stop": lambda fields: StopOrdered(read_key(fields["instance"])),
+    "restart": lambda fields: RestartOrdered(read_key(fields["instance"])),
+    "amend": _read_amend,
+    "remember": lambda fields: Remember(read_key(fields["instance"]), _text(fields["memo"])),
+    "forget": lambda fields: Forget(tuple(Forgotten(read_key(key)) for key in fields["instances"])),
+    "shutdown": lambda _: ShutdownOrdered(),
+}
 
 
 def read_key(value: Any) -> Key:
@@ -248,6 +296,12 @@ def _text(value: Any) -> str:
     return value
 
 
+def _changes(value: Any) -> dict[str, str | None]:
+    return {
+        _text(name): None if change is None else _text(change) for name, change in value.items()
+    }
+
+
 def _texts(value: Any) -> dict[str, str]:
     return {_text(name): _text(text) for name, text in value.items()}
 
@@ -255,15 +309,22 @@ def _texts(value: Any) -> dict[str, str]:
 # --- what is told -----------------------------------------------------------------------------
 
 
-def encode_welcome(pid: int, notes: Sequence[str], statuses: Sequence[Status]) -> bytes:
+def encode_welcome(
+    pid: int, notes: Sequence[str], statuses: Sequence[Status], memos: Mapping[Key, str]
+) -> bytes:
     """The answer to `hello`."""
     welcome = {"tell": "welcome", "protocol": PROTOCOL, "pid": pid, "notes": list(notes)}
-    return line({**welcome, "instances": statuses})
+    return line({**welcome, "instances": statuses, "memos": list(memos.items())})
 
 
 def encode_status(status: Status) -> bytes:
     """One line for one change."""
     return line({"tell": "status", "status": status})
+
+
+def encode_amended(order: AmendOrdered) -> bytes:
+    """It is in the record."""
+    return line({"tell": "amended", "instance": order.instance, "restart": order.restart})
 
 
 def encode_refusal(message: str) -> bytes:

@@ -245,6 +245,10 @@ class Server:
             self._learn_environment(connection, order)
         elif isinstance(order, protocol.Launch):
             self._start(order)
+        elif isinstance(order, protocol.Amend):
+            self._amend(order)
+        elif isinstance(order, protocol.Remember):
+            self._remember(order)
         elif isinstance(order, protocol.Forget):
             for forgotten in order.instances:
                 self._happened(forgotten)
@@ -268,8 +272,9 @@ class Server:
         self._logs.limits = hello.log
         self._telling.clear()  # all that it would say is in the statuses
         statuses = [protocol.Status.of(instance) for instance in self._core.instances.values()]
+        memos = {key: launch.memo for key, launch in self._launches.items() if launch.memo}
         self._record.flush()
-        connection.send(protocol.encode_welcome(os.getpid(), self._notes, statuses))
+        connection.send(protocol.encode_welcome(os.getpid(), self._notes, statuses, memos))
 
     def _client_is_gone(self, client: Connection) -> bool:
         """Its end may have come in the same round as its successor."""
@@ -289,6 +294,23 @@ class Server:
             self._launches[launch.instance] = launch
             self._record.launch(launch)
         self._happened(supervision.StartOrdered(launch.instance, launch.restart, launch.stop))
+
+    def _amend(self, amendment: protocol.Amend) -> None:
+        launch = self._launches.get(amendment.order.instance)
+        if launch is not None:
+            self._keep_launch(launch.amended(amendment))
+        self._happened(amendment.order)
+        self._telling.append(protocol.encode_amended(amendment.order))
+
+    def _remember(self, order: protocol.Remember) -> None:
+        launch = self._launches.get(order.instance)
+        if launch is not None:  # of what has ended there is nothing to keep
+            self._keep_launch(launch._replace(memo=order.memo))
+
+    def _keep_launch(self, launch: protocol.Launch) -> None:
+        if launch != self._launches[launch.instance]:
+            self._launches[launch.instance] = launch
+            self._record.launch(launch)
 
     def _refuse(self, connection: Connection, message: str) -> None:
         connection.closing = True

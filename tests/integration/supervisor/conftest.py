@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from rosrm.core.model import InstanceId, InstanceState, StopPolicy
+from rosrm.core.model import InstanceId, InstanceState, RestartPolicy, StopPolicy
 from rosrm.supervisor import members, record
-from rosrm.supervisor.client import LaunchOrder, SupervisorClient, log_path
+from rosrm.supervisor.client import Amended, LaunchOrder, SupervisorClient, log_path
 
 QUICK = StopPolicy(interrupt_grace=0.3, terminate_grace=0.3)
 TIMEOUT = 15.0
@@ -51,6 +51,8 @@ class Host:
         while time.monotonic() < deadline:
             for status in client.receive(deadline - time.monotonic()):
                 seen.append(status)
+                if isinstance(status, Amended):
+                    continue
                 if status.instance == instance and status.state in states:
                     return status
         pytest.fail(f"{instance} was in none of {states} within {TIMEOUT} s; told: {seen}")
@@ -66,6 +68,14 @@ class Host:
     def ended(self, client, name: str, number: int = 1):
         final = (InstanceState.EXITED, InstanceState.FAILED, InstanceState.REFUSED)
         return self.wait(client, name, *final, number=number)
+
+    def amend(self, client, name: str, restart: RestartPolicy) -> None:
+        """Until the supervisor has it in its record; as the slave orders it."""
+        instance, deadline = InstanceId(name, 1), time.monotonic() + TIMEOUT
+        client.amend(instance, restart, {"ROSRM_SHADOW": None})
+        wanted = Amended(instance, restart)
+        while wanted not in client.receive(max(0.0, deadline - time.monotonic())):
+            assert time.monotonic() < deadline, f"{wanted} was not told within {TIMEOUT} s"
 
     def kill_supervisor(self, client) -> None:
         os.kill(client.pid, signal.SIGKILL)

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 
 from rosrm.core.supervision import (
+    AmendOrdered,
     Forgotten,
     RestartOrdered,
     RestartRule,
@@ -21,6 +22,16 @@ SECONDS = st.floats(0, 1e6)
 KEYS = st.tuples(st.text(), st.integers(0, 2**53))
 # What Linux gives as a word: any bytes, those that are no UTF-8 as surrogates.
 WORDS = st.binary().map(lambda data: data.decode("utf-8", "surrogateescape"))
+RULES = st.builds(
+    RestartRule,
+    st.sampled_from(["never", "on-failure", "always"]),
+    SECONDS,
+    SECONDS,
+    SECONDS,
+    st.integers(0, 99),
+    SECONDS,
+)
+CHANGES = st.dictionaries(WORDS, st.none() | WORDS)
 ORDERS = st.one_of(
     st.builds(protocol.Hello, st.integers(), st.integers(), st.just(LogLimits(1, 2, 3, 4))),
     st.builds(protocol.Environment, st.text(), st.dictionaries(WORDS, WORDS)),
@@ -29,21 +40,16 @@ ORDERS = st.one_of(
         KEYS,
         st.lists(WORDS, min_size=1).map(tuple),
         st.text(),
-        st.dictionaries(WORDS, st.none() | WORDS),
+        CHANGES,
         st.none() | WORDS,
-        st.builds(
-            RestartRule,
-            st.sampled_from(["never", "on-failure", "always"]),
-            SECONDS,
-            SECONDS,
-            SECONDS,
-            st.integers(0, 99),
-            SECONDS,
-        ),
+        RULES,
         st.builds(StopRule, SECONDS, SECONDS),
+        st.text(),
     ),
     st.builds(StopOrdered, KEYS),
     st.builds(RestartOrdered, KEYS),
+    st.builds(protocol.Amend, st.builds(AmendOrdered, KEYS, RULES), CHANGES),
+    st.builds(protocol.Remember, KEYS, st.text()),
     st.builds(protocol.Forget, st.lists(st.builds(Forgotten, KEYS)).map(tuple)),
     st.just(ShutdownOrdered()),
 )
@@ -79,6 +85,11 @@ def test_lines_are_cut_wherever_the_stream_is(lines, data):
         (b'{"do": "stop"}', "'stop' cannot be read: KeyError"),
         (b'{"do": "stop", "instance": ["a"]}', "'stop' cannot be read: ValueError"),
         (b'{"do": "stop", "instance": [1, 2]}', "'stop' cannot be read: TypeError"),
+        (
+            b'{"do": "amend", "instance": ["a", 1], "restart": ["maybe", 1, 1, 1, 1, 1]}',
+            "'amend' cannot be read: ValueError",
+        ),
+        (b'{"do": ["stop"]}', "unknown order"),
     ],
 )
 def test_what_is_not_understood_is_refused(line, said):

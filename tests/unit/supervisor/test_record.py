@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 
 import pytest
 
 from rosrm.core import supervision as sv
 from rosrm.supervisor import record as rc
-from rosrm.supervisor.protocol import Launch
+from rosrm.supervisor.protocol import Amend, Launch
 
 TALKER = ("talker", 7)
-LAUNCH = Launch(TALKER, ("sleep", "1"), "base", {}, None, sv.RestartRule(), sv.StopRule())
+LAUNCH = Launch(TALKER, ("sleep", "1"), "base", {}, None, sv.RestartRule(), sv.StopRule(), "memo")
 
 
 @pytest.fixture
@@ -42,6 +43,45 @@ def test_an_instance_comes_back_as_it_was(tmp_path, core, record):
     assert recorded.births == {TALKER: 55}
     assert recorded.same_boot
     assert not recorded.notes
+
+
+def test_an_amendment_counts_from_then_on(tmp_path, core, record):
+    """A shadow that was confirmed: its policy and its environment are others, also compacted."""
+    amend = Amend(sv.AmendOrdered(TALKER, sv.RestartRule("on-failure")), {"ROSRM_SHADOW": None})
+    amended = LAUNCH.amended(amend)
+    core.handle(amend.order, 1.0)
+    record.launch(amended)
+    record.state(core.instances[TALKER], 55)
+    record.flush()
+    for _ in range(2):
+        recorded = rc.read(str(tmp_path))
+        assert recorded.launches == {TALKER: amended}
+        assert recorded.launches[TALKER].changes == {"ROSRM_SHADOW": None}
+        assert recorded.launches[TALKER].memo == "memo"
+        assert recorded.instances[TALKER].restart.when == "on-failure"
+        record.rewrite(core, {TALKER: amended}, {"base": {}}, lambda key: 55)
+
+
+def test_a_record_of_before_protocol_2_is_read(tmp_path, core):
+    """Its launches had no memo."""
+    instance = core.instances[TALKER]
+    state = {name: getattr(instance, name) for name in sv.Instance.__slots__}
+    lines = [
+        {"record": "header", "version": 1, "boot": "another"},
+        {"record": "environment", "id": "base", "variables": {"A": "1"}},
+        {
+            "record": "order", "instance": ["talker", 7], "argv": ["sleep", "1"],
+            "environment": "base", "changes": {"A": None}, "directory": None,
+            "restart": ["always", 1.0, 30.0, 2.0, 5, 300.0], "stop": [1.0, 2.0],
+        },
+        {"record": "state", "birth": 55, **state},
+    ]  # fmt: skip
+    text = "".join(json.dumps(line) + "\n" for line in lines)
+    (tmp_path / "instances.jsonl").write_text(text)
+    recorded = rc.read(str(tmp_path))
+    assert not recorded.notes
+    assert recorded.launches[TALKER].restart.when == "always"
+    assert recorded.launches[TALKER].memo == ""
 
 
 def test_the_last_line_counts(tmp_path, core, record):

@@ -200,6 +200,82 @@ def test_stop_during_a_forced_restart_wins():
     assert instance.phase == sv.EXITED
 
 
+def test_a_restart_while_its_own_end_is_in_hand_is_carried_out():
+    """Its leader has ended by itself, what it left is being stopped: then it starts again."""
+    core, instance = started()
+    core.handle(sv.Exited(TALKER, 3, leftovers=True), 1.0)
+    assert kinds(core.handle(sv.RestartOrdered(TALKER), 1.1)) == ["Tell"]
+    assert instance.message.startswith("to restart it: SIGINT")
+    assert kinds(core.handle(sv.Cleared(TALKER), 2.0)) == ["Tell", "Spawn"]
+    assert instance.restarts == 0
+
+
+NEVER = sv.RestartRule("never")
+ON_FAILURE = sv.RestartRule("on-failure")
+
+
+def test_another_policy_counts_at_the_next_end():
+    """A source whose policy is suspended ends for good; a shadow that is none any more does not."""
+    core, instance = started(restart=ON_FAILURE)
+    assert kinds(core.handle(sv.AmendOrdered(TALKER, NEVER), 1.0)) == ["Tell"]
+    core.handle(sv.Exited(TALKER, signal=9), 2.0)
+    assert instance.phase == sv.FAILED
+    core, instance = started(restart=NEVER)
+    core.handle(sv.AmendOrdered(TALKER, ON_FAILURE), 1.0)
+    core.handle(sv.Exited(TALKER, signal=9), 2.0)
+    assert instance.phase == sv.BACKOFF
+
+
+def test_a_repeated_policy_only_tells_again():
+    """DDS repeats; so does a master that was restarted."""
+    core, instance = started()
+    core.handle(sv.AmendOrdered(TALKER, ON_FAILURE), 1.0)
+    assert kinds(core.handle(sv.AmendOrdered(TALKER, ON_FAILURE), 2.0)) == ["Tell"]
+    assert (instance.phase, instance.restart) == (sv.RUNNING, ON_FAILURE)
+
+
+@pytest.mark.parametrize(
+    ("restart", "phase"),
+    [
+        (NEVER, sv.FAILED),
+        (sv.RestartRule("on-failure", attempts=1), sv.FAILED),
+        (sv.RestartRule("on-failure", attempts=2), sv.BACKOFF),
+    ],
+)
+def test_a_policy_that_allows_no_restart_ends_the_wait_for_one(restart, phase):
+    """One restart was made and another one is due: it is given up, or stays due when it was."""
+    core, instance = started(restart=ON_FAILURE)
+    core.handle(sv.Exited(TALKER, 1), 0.0)
+    core.handle(sv.TimePassed(), 1.0)
+    core.handle(sv.Spawned(TALKER, 101), 1.0)
+    core.handle(sv.Exited(TALKER, 1), 2.0)
+    assert core.deadline() == 4.0
+    assert kinds(core.handle(sv.AmendOrdered(TALKER, restart), 3.0)) == ["Tell"]
+    assert instance.phase == phase
+    assert core.deadline() == (4.0 if phase == sv.BACKOFF else None)
+    if phase == sv.FAILED:
+        assert instance.message == "exit code 1; by its new policy it is not restarted"
+
+
+def test_a_policy_for_what_is_being_stopped_counts_afterwards():
+    """Its leader ended by itself and left others: whether it starts again is decided at the end."""
+    core, instance = started(restart=ON_FAILURE)
+    core.handle(sv.Exited(TALKER, 3, leftovers=True), 1.0)
+    core.handle(sv.AmendOrdered(TALKER, NEVER), 1.5)
+    core.handle(sv.Cleared(TALKER), 2.0)
+    assert instance.phase == sv.FAILED
+
+
+def test_a_policy_for_what_has_ended_tells_its_end():
+    """And wakes nothing up; nor does one for what was never heard of."""
+    core, instance = started()
+    core.handle(sv.Exited(TALKER, 1), 1.0)
+    assert kinds(core.handle(sv.AmendOrdered(TALKER, ON_FAILURE), 2.0)) == ["Tell"]
+    assert (instance.phase, instance.restart) == (sv.FAILED, sv.RestartRule())
+    core.handle(sv.AmendOrdered(("stranger", 8), ON_FAILURE), 2.0)
+    assert core.instances["stranger", 8].phase == sv.REFUSED
+
+
 def test_leftovers_are_stopped_before_it_counts_as_ended():
     """Its leader exits by itself and leaves others: they are stopped, then its exit code counts."""
     core, instance = started()
@@ -371,6 +447,19 @@ class Host(RuleBasedStateMachine):
         else:
             self.happens(sv.StartOrdered(key, sv.RestartRule("always"), sv.StopRule()))
 
+    @precondition(lambda self: self.core.instances)
+    @rule(data=st.data(), restart=POLICIES)
+    def amend(self, data, restart):
+        key = data.draw(st.sampled_from(sorted(self.core.instances)))
+        before = self.core.instances[key].phase
+        self.policy_restarts.pop(key, None)
+        self.happens(sv.AmendOrdered(key, restart))
+        instance = self.core.instances[key]
+        assert instance.ended or instance.restart == restart
+        gives_up = before == sv.BACKOFF and restart.when == "never"
+        assert instance.phase == before or instance.phase == sv.FAILED
+        assert (instance.phase == sv.FAILED) >= gives_up
+
     @precondition(lambda self: self.queue)
     @rule()
     def spawn_begins(self):
@@ -427,6 +516,11 @@ class Host(RuleBasedStateMachine):
     def what_was_stopped_is_on_its_way_out(self):
         for key in self.stopped & set(self.core.instances):
             assert self.core.instances[key].phase not in (sv.RUNNING, sv.BACKOFF), key
+
+    @invariant()
+    def what_is_never_restarted_does_not_wait_for_it(self):
+        for key, instance in self.core.instances.items():
+            assert instance.phase != sv.BACKOFF or instance.restart.when != "never", key
 
     @invariant()
     def restarts_stay_within_the_policy(self):
