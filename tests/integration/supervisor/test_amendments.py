@@ -1,0 +1,177 @@
+"""Another restart policy for what runs: for the two ends of a handoff. And what is remembered."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+
+import pytest
+
+from rosrm.core.model import InstanceId, InstanceState, RestartPolicy
+
+from .conftest import wait_gone, wait_until
+
+NEVER = RestartPolicy("never")
+ON_FAILURE = RestartPolicy("on-failure", delay=0.05)
+SAYS_WHAT_IT_IS = ("sh", "-c", "echo shadow: $ROSRM_SHADOW; exec sleep 1000")
+
+#: The supervisor is killed at either moment, or not at all.
+KILLS = pytest.mark.parametrize("killed", ["never", "before", "after"])
+
+
+def shadow(host, name: str, **options):
+    """An order as the slave makes it for the destination of a handoff."""
+    environment = {**os.environ, "ROSRM_SHADOW": "1"}
+    return host.order(name, *SAYS_WHAT_IT_IS, environment=environment, restart=NEVER, **options)
+
+
+def amended(host, client, name: str, restart: RestartPolicy, killed: str):
+    """Set the policy, with a SIGKILL of the supervisor before or after; returns the client."""
+    if killed == "before":
+        host.kill_supervisor(client)
+        client = host.connect()
+    host.amend(client, name, restart)
+    if killed == "after":
+        host.kill_supervisor(client)
+        client = host.connect()
+    return client
+
+
+def kill(host, pid: int, name: str) -> None:
+    """End a run that has said what it is."""
+    wait_until(lambda: host.log(name).exists() and host.log(name).read_text(), "it has spoken")
+    os.kill(pid, signal.SIGKILL)
+    wait_gone(pid)
+
+
+@KILLS
+def test_a_suspended_policy_lets_the_source_end(host, client, killed):
+    """With `never` its end is final, though it was ordered to be restarted."""
+    client.start([host.order("source", *SAYS_WHAT_IT_IS, restart=ON_FAILURE)])
+    pid = host.running(client, "source").pid
+    client = amended(host, client, "source", NEVER, killed)
+    kill(host, pid, "source")
+    status = host.ended(client, "source")
+    assert (status.state, status.restarts) == (InstanceState.FAILED, 0)
+
+
+@KILLS
+def test_a_confirmed_shadow_is_restarted_as_none(host, client, killed):
+    """It follows its policy from then on, and its next run is not told that it is a shadow."""
+    client.start([shadow(host, "copy")])
+    pid = host.running(client, "copy").pid
+    client = amended(host, client, "copy", ON_FAILURE, killed)
+    kill(host, pid, "copy")
+    status = host.wait(client, "copy", InstanceState.RUNNING)
+    assert (status.restarts, status.pid != pid) == (1, True)
+    said = "shadow: 1\nshadow:\n"
+    wait_until(lambda: host.log("copy").read_text() == said, "both runs have spoken")
+
+
+def test_an_end_while_no_supervisor_runs_follows_the_new_policy(host, client):
+    """Supervisor and process are killed at once: the next supervisor goes by what was recorded."""
+    client.start([shadow(host, "copy"), host.order("source", "sleep", "9", restart=ON_FAILURE)])
+    source = host.running(client, "source").pid
+    host.amend(client, "copy", ON_FAILURE)
+    host.amend(client, "source", NEVER)
+    client.close()
+    client = host.connect()
+    copy = next(one.pid for one in client.instances if one.instance.process == "copy")
+    host.kill_supervisor(client)
+    for pid in (source, copy):
+        os.kill(pid, signal.SIGKILL)
+        wait_gone(pid)
+    client = host.connect()
+    found = {one.instance.process: one.state for one in client.instances}
+    assert found == {"copy": InstanceState.BACKOFF, "source": InstanceState.FAILED}
+
+
+def test_a_shadow_ends_for_good_whoever_is_killed(host, client):
+    """Not even a restart of slave and supervisor makes one that was not confirmed start again."""
+    client.start([shadow(host, "copy")])
+    pid = host.running(client, "copy").pid
+    host.kill_supervisor(client)
+    client = host.connect()
+    kill(host, pid, "copy")
+    assert host.ended(client, "copy").state is InstanceState.FAILED
+    client.close()
+    client = host.connect()
+    assert [one.state for one in client.instances] == [InstanceState.FAILED]
+
+
+def test_a_shadow_says_nothing_of_those_beside_it(host, client):
+    """The environment of the first order is the base of the others: its mark is not theirs."""
+    client.start([shadow(host, "copy"), host.order("plain", *SAYS_WHAT_IT_IS)])
+    host.running(client, "plain")
+    wait_until(lambda: host.log("plain").read_text() == "shadow:\n", "it has spoken")
+
+
+def test_a_restart_on_order_makes_no_shadow_of_a_confirmed_one(host, client):
+    """As a user may order it later."""
+    client.start([shadow(host, "copy")])
+    host.running(client, "copy")
+    wait_until(lambda: host.log("copy").read_text(), "it has spoken")
+    host.amend(client, "copy", NEVER)
+    client.restart(InstanceId("copy", 1))
+    host.wait(client, "copy", InstanceState.STARTING)
+    said = "shadow: 1\nshadow:\n"
+    wait_until(lambda: host.log("copy").read_text() == said, "both runs have spoken")
+
+
+def test_an_amendment_of_what_has_ended_is_answered(host, client):
+    """With its end, which it does not change."""
+    host.run(client, host.order("job", "false"))
+    host.amend(client, "job", ON_FAILURE)
+    client.close()
+    client = host.connect()
+    assert [one.state for one in client.instances] == [InstanceState.FAILED]
+
+
+def test_a_restart_beats_the_end_that_is_under_way(host, client):
+    """Its leader has ended, what it left is being stopped: the order to restart is not lost."""
+    leaves = "echo run; trap '' INT; (trap '' INT; sleep 1000) & sleep 0.2; exit 0"
+    client.start([host.order("leaver", "sh", "-c", leaves)])
+    host.wait(client, "leaver", InstanceState.STOPPING)
+    client.restart(InstanceId("leaver", 1))
+    host.wait(client, "leaver", InstanceState.STARTING)
+    wait_until(lambda: host.log("leaver").read_text().startswith("run\nrun\n"), "it ran again")
+    assert host.ended(client, "leaver").state is InstanceState.EXITED
+
+
+def test_what_is_to_be_remembered_is(host, client):
+    """For the next slave, over a SIGKILL of the supervisor, until the instance has ended."""
+    kept, other = InstanceId("kept", 1), InstanceId("other", 1)
+    orders = [host.order("kept", "sleep", "1000", memo="a"), host.order("other", "sleep", "1000")]
+    client.start(orders)
+    host.running(client, "other")
+    client.close()
+    client = host.connect()
+    assert client.memos == {kept: "a"}
+    client.remember(kept, "b")
+    client.remember(other, "c")
+    client.stop(kept)
+    host.ended(client, "kept")  # by then the orders were read
+    client.remember(kept, "too late")
+    host.amend(client, "other", NEVER)
+    host.kill_supervisor(client)
+    client = host.connect()
+    assert client.memos == {other: "c"}
+
+
+def test_a_record_of_an_earlier_version_is_taken_over(host, client):
+    """Its launches have no memo; what runs, runs on, and can be amended."""
+    client.start([host.order("kept", *SAYS_WHAT_IT_IS)])
+    pid = host.running(client, "kept").pid
+    host.kill_supervisor(client)
+    path = host.state / "instances.jsonl"
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    for line in lines:
+        line.pop("memo", None)
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    client = host.connect()
+    assert [(one.state, one.pid) for one in client.instances] == [(InstanceState.RUNNING, pid)]
+    assert client.notes == ()
+    host.amend(client, "kept", ON_FAILURE)
+    kill(host, pid, "kept")
+    assert host.wait(client, "kept", InstanceState.RUNNING).restarts == 1
