@@ -47,21 +47,20 @@ class Destination:
         self._attached = False
         self._was_ready = False
         self._may_switch = False
-        self._silent_at: int | None = None
         self._over = False
+        self._fault = ""
         member.on_overflow = self._overflowed
 
     # --- the master's word -----------------------------------------------------------------
 
     def configure(self, config: StateConfig) -> None:
         """The master says something of the handoff to here."""
-        if self._over:
-            self._repeat()
-            return
         if self._channel is None:
             self._open(config)
         else:
-            self._repeat()
+            self._channel.repeat()  # perhaps another master asks, after the first was lost
+        if self._over:
+            return
         if config.phase == StateConfig.SWITCH:
             self._may_switch = True
             self._review()
@@ -75,25 +74,32 @@ class Destination:
         self._channel = Channel(
             member.plain, config.channel, config.destination, member.identity.instance, self._heard
         )
+        if self._over:
+            self._channel.say(HandoffReport.FAILED, 0, self._fault)
+            return
         self._assembler = CutAssembler(part.topic for part in self._parts)
-        subscribe = member.plain.create_subscription
-        self._subscriptions = [
-            subscribe(
+        for part in self._parts:
+            self._follow(
                 part.message_type, part.topic, partial(self._part_came, part.topic), topics.STATE,
                 raw=True,
-            )
-            for part in self._parts
-        ]  # fmt: skip
-        self._subscriptions.append(
-            subscribe(StateMark, self._mark_topic, self._mark_came, topics.MARK)
-        )
-        self._timer = member.plain.create_timer(_REVIEW, self._look)
-        self._review()
+            )  # fmt: skip
+        self._follow(StateMark, self._mark_topic, self._mark_came, topics.MARK)
+        if not self._over:
+            self._timer = member.plain.create_timer(_REVIEW, self._look)
+            self._review()
 
-    def _repeat(self) -> None:
-        """The master asks again, perhaps a new one: it is told again how far this is."""
-        if self._channel is not None:
-            self._channel.repeat()
+    def _follow(
+        self, message_type: Any, topic: str, callback: Callable[[Any], None], qos: Any, *,
+        raw: bool = False,
+    ) -> None:  # fmt: skip
+        if self._over:
+            return
+        subscribe = self._member.plain.create_subscription
+        try:
+            self._subscriptions.append(subscribe(message_type, topic, callback, qos, raw=raw))
+        except Exception as error:  # noqa: BLE001 - rclpy raises what the middleware says
+            # An entity of the author's may have another type on that topic.
+            self._end(HandoffReport.FAILED, f"{topic} cannot be followed: {error}")
 
     # --- the source's word -----------------------------------------------------------------
 
@@ -103,8 +109,6 @@ class Destination:
                 return
             if report.phase == HandoffReport.ATTACHED:
                 self._attached = True
-            elif report.phase == HandoffReport.SILENT:
-                self._silent_at = report.sequence
             elif report.phase == HandoffReport.FAILED:
                 self._end(HandoffReport.FAILED, f"the source cannot go on: {report.message}")
             self._go_on()
@@ -125,8 +129,6 @@ class Destination:
                 return
             self._run = mark.run
             self._assembler.add_mark(mark, time.monotonic())
-            if mark.last:
-                self._silent_at = mark.sequence
             self._go_on()
 
     def _fault_of(self, mark: StateMark) -> str:
@@ -167,7 +169,7 @@ class Destination:
     def _restore(self, cut: Cut) -> bool:
         try:
             for part in self._parts:
-                part.restore(cut.parts[part.topic])
+                part.restore_changed(cut.parts[part.topic])
         except StateError as error:
             self._end(HandoffReport.FAILED, str(error))
             return False
@@ -191,10 +193,10 @@ class Destination:
             self._channel.say(HandoffReport.READY, self._sequence())
         if not self._may_switch:
             return
-        if self._silent_at is None:
-            self._channel.say(HandoffReport.SWITCHING, self._sequence())
-        elif self._sequence() >= self._silent_at:
+        if self._cut is not None and self._cut.mark.last:
             self._activate()
+        else:
+            self._channel.say(HandoffReport.SWITCHING, self._sequence())
 
     def _sequence(self) -> int:
         return int(self._cut.mark.sequence) if self._cut is not None else 0
@@ -259,7 +261,7 @@ class Destination:
 
     def _end(self, phase: int, message: str) -> None:
         """It will never be active; only its slave ends it."""
-        self._over = True
+        self._over, self._fault = True, message
         self._member.node.get_logger().warning(f"will not take over: {message}")
         if self._channel is not None:
             self._channel.say(phase, self._sequence(), message)

@@ -40,6 +40,7 @@ class Part:
         self._save = save
         self._restore = restore
         self._key: PartKey | None = None
+        self._restored: PartKey | None = None
         self.publisher: Any = None
 
     def has_reader(self) -> bool:
@@ -91,18 +92,22 @@ class Part:
         size, digest = self._key or (0, 0)
         return StatePart(topic=self.topic, type=self.type_name, size=size, digest=digest)
 
-    def restore(self, data: bytes) -> None:
-        """Take over a serialised message.
+    def restore_changed(self, data: bytes) -> None:
+        """Take over a serialised message, unless it is what was taken over last.
 
         Raises:
             StateError: it cannot be read, or the author's function raised.
         """
+        key = part_key(data)
+        if key == self._restored:
+            return
         try:
             self._restore(deserialize_message(data, self.message_type))
         except Exception as error:  # the author's code: anything may come
             raise StateError(
                 f"restoring {self.topic} raised {type(error).__name__}: {error}"
             ) from error
+        self._restored = key
 
 
 def type_name(message_type: Any) -> str:

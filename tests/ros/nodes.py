@@ -1,4 +1,4 @@
-"""Nodes of one process that think they are instances of rosrm's, and a conductor in the master's place.
+"""Nodes that think they are instances of rosrm's, and a conductor in the master's place.
 
 Real DDS between them; only the master's decisions and the slaves are missing, so that each word
 can be said, or left out, at any moment.
@@ -6,7 +6,6 @@ can be said, or left out, at any moment.
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable
 from typing import Any
@@ -16,12 +15,13 @@ import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
-from rosrm_msgs.msg import HandoffReport, StateConfig
 from std_msgs.msg import Int64
 
+from rosrm.local_cluster import claim_domain
 from rosrm.node import Node
 from rosrm.node.channel import CHANNEL, STATE_CONFIG
 from rosrm.version import PROTOCOL_VERSION
+from rosrm_msgs.msg import HandoffReport, StateConfig
 
 PATIENCE = 20.0
 TOPIC = "/rosrm/state_config"
@@ -63,14 +63,25 @@ class Counter(Node):
 
 
 class Stage:
-    """A ROS context with an executor, on which nodes appear as instances of processes."""
+    """A ROS context with an executor, on which nodes appear as instances of processes.
 
-    def __init__(self, domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-        self._environment = monkeypatch
+    Args:
+        beside: another stage: in its domain, spun with it, and a DDS participant of its own.
+    """
+
+    def __init__(self, beside: Stage | None = None) -> None:
+        self._claim = None
+        self._beside: list[Stage] = []
+        if beside is None:
+            self.domain, self._claim = claim_domain()
+        else:
+            self.domain = beside.domain
+            beside._beside.append(self)
         self.context = rclpy.Context()
         rclpy.init(
-            context=self.context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO
+            context=self.context,
+            domain_id=self.domain,
+            signal_handler_options=SignalHandlerOptions.NO,
         )
         self.executor = SingleThreadedExecutor(context=self.context)
         self.nodes: list[Any] = []
@@ -104,12 +115,13 @@ class Stage:
         deadline = time.monotonic() + timeout
         while not condition():
             assert time.monotonic() < deadline, f"{what} did not come about in {timeout:g} s"
-            self.executor.spin_once(timeout_sec=0.05)
+            self.spin(0.05)
 
     def spin(self, seconds: float) -> None:
-        until = time.monotonic() + seconds
-        while (left := until - time.monotonic()) > 0:
-            self.executor.spin_once(timeout_sec=min(left, 0.05))
+        """Do what is ready, within so long."""
+        self.executor.spin_once(timeout_sec=seconds)
+        for stage in self._beside:
+            stage.executor.spin_once(timeout_sec=0.0)
 
     def listen(self, message_type: Any, topic: str, qos: Any = RELIABLE) -> list[Any]:
         """All that is said on a topic from now on."""
@@ -127,6 +139,10 @@ class Stage:
         for node in self.nodes:
             node.destroy_node()
         self.context.try_shutdown()
+        for stage in self._beside:
+            stage.close()
+        if self._claim is not None:
+            self._claim.close()
 
 
 class Conductor:
@@ -139,7 +155,8 @@ class Conductor:
         self.config = StateConfig(
             protocol_version=PROTOCOL_VERSION, cluster=CLUSTER, epoch=EPOCH, process=name,
             source=source, destination=destination, source_node=f"/{name}",
-            destination_node=f"/{name}_{destination}", channel=f"/rosrm/handoff/{name}_{destination}",
+            destination_node=f"/{name}_{destination}",
+            channel=f"/rosrm/handoff/{name}_{destination}",
         )  # fmt: skip
         self.reports: list[HandoffReport] = []
         self._publisher = stage.plain.create_publisher(StateConfig, TOPIC, STATE_CONFIG)

@@ -1,0 +1,494 @@
+"""`rosrm.node` on real DDS: each word of the handoff protocol, said, left out, or said wrongly."""
+
+from __future__ import annotations
+
+import time
+from itertools import pairwise
+from types import SimpleNamespace
+
+import pytest
+import rclpy
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from std_msgs.msg import Int64, String
+from std_srvs.srv import Trigger
+
+from rosrm.node import Migratable, source
+from rosrm_msgs.msg import HandoffReport, StateConfig
+from tests.ros.nodes import EPOCH, PATIENCE, RELIABLE, Conductor, Counter, Stage
+
+R, C = HandoffReport, StateConfig
+
+
+@pytest.fixture
+def stage(monkeypatch):
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    stage = Stage()
+    yield stage
+    stage.close()
+
+
+@pytest.fixture
+def pair(stage):
+    """A counting source, its shadow, what is heard of both, and a conductor."""
+    counts, sums = stage.listen(Int64, "count"), stage.listen(Int64, "sum")
+    first = stage.instance(Counter, 1)
+    stage.spin_until(lambda: counts, "the first count")
+    second = stage.instance(Counter, 2, alias="counter_1700000000", shadow=True)
+    conductor = Conductor(stage, source=1, destination=2)
+    return SimpleNamespace(
+        first=first, second=second, counts=counts, sums=sums, conductor=conductor
+    )
+
+
+def numbers(heard):
+    return [message.data for message in heard]
+
+
+def goes_on(stage, heard, more=5):
+    """Wait until more is heard than there was."""
+    before = len(heard)
+    stage.spin_until(lambda: len(heard) >= before + more, "further counts")
+
+
+# --- the good course --------------------------------------------------------------------------
+
+
+def test_the_successor_goes_on_where_the_source_stopped(stage, pair):
+    """No count is missing, none comes twice, and they come in order."""
+    pair.conductor.hand_over()
+    goes_on(stage, pair.counts)
+    assert numbers(pair.counts) == list(range(pair.counts[0].data, pair.counts[-1].data + 1))
+    silent = pair.conductor.wait(1, R.SILENT)
+    assert pair.conductor.wait(2, R.ACTIVE).sequence == silent.sequence
+
+
+def test_every_input_is_processed_once(stage, pair):
+    """While they stream in, through the whole handoff."""
+    talker = stage.plain.create_publisher(Int64, "add", RELIABLE)
+    sent = []
+
+    def send():
+        sent.append(1)
+        talker.publish(Int64(data=1))
+
+    stage.plain.create_timer(0.004, send)
+    pair.conductor.hand_over()
+    goes_on(stage, pair.sums, 50)
+    pair.conductor.say(C.DONE)
+    stage.remove(pair.first)
+    stage.plain.destroy_timer(next(iter(stage.plain.timers)))
+    stage.spin_until(lambda: pair.second.total == len(sent), "the last sum")
+    assert numbers(pair.sums) == list(range(pair.sums[0].data, len(sent) + 1))
+
+
+def test_a_shadow_is_not_heard_before_it_is_active(stage, pair):
+    """No output, no state, no timer, no service; a node of one name would be heard twice."""
+    pair.conductor.say(C.SHADOW)
+    pair.conductor.wait(2, R.READY)
+    goes_on(stage, pair.counts, 20)
+    assert pair.second.count <= pair.first.count
+    assert numbers(pair.counts) == list(range(pair.counts[0].data, pair.counts[-1].data + 1))
+    assert stage.plain.count_publishers("/counter/state") == 1
+
+
+def test_the_alias_changes_no_visible_name(stage, pair):
+    """Topics below ~ and parameter services are where they were."""
+    pair.conductor.hand_over()
+    stage.remove(pair.first)
+    names = [name for name, _ in stage.plain.get_service_names_and_types()]
+    stage.spin_until(lambda: stage.plain.count_publishers("/counter/state") == 1, "its state topic")
+    assert pair.second.get_name() == "counter_1700000000"
+    assert "/counter/set_parameters" in names
+    assert not [name for name in names if "1700000000" in name and "type_desc" not in name]
+
+
+def test_parameters_set_at_run_time_move_along(stage):
+    """With the effect of being set, and those that were declared late."""
+
+    class Tuned(Counter):
+        def __init__(self, **named):
+            super().__init__(**named)
+            self.declare_parameter("gain", 1.0)
+            self.gains = []
+            self.add_on_set_parameters_callback(self.note)
+
+        def note(self, parameters):
+            self.gains += [one.value for one in parameters if one.name == "gain"]
+            return rclpy.node.SetParametersResult(successful=True)
+
+    first = stage.instance(Tuned, 1)
+    first.set_parameters([Parameter("gain", value=2.5)])
+    first.declare_parameter("late", "yes")
+    second = stage.instance(Tuned, 2, alias="counter_17", shadow=True)
+    conductor = Conductor(stage, source=1, destination=2)
+    conductor.say(C.SHADOW)
+    conductor.wait(2, R.READY)
+    first.set_parameters([Parameter("gain", value=3.5)])
+    conductor.hand_over()
+    assert second.get_parameter("gain").value == 3.5
+    assert second.get_parameter("late").value == "yes"
+    assert second.gains[-1] == 3.5
+
+
+def test_a_service_is_open_in_the_active_node_alone(stage):
+    """In DDS all servers of one name execute a request."""
+
+    class Server(Counter):
+        def __init__(self, **named):
+            super().__init__(**named)
+            self.served = 0
+            self.create_service(Trigger, "~/poke", self.poke)
+
+        def poke(self, request, response):
+            self.served += 1
+            response.message = self.get_name()
+            return response
+
+    first = stage.instance(Server, 1)
+    second = stage.instance(Server, 2, alias="counter_17", shadow=True)
+    client = stage.plain.create_client(Trigger, "/counter/poke")
+
+    def call():
+        future = client.call_async(Trigger.Request())
+        stage.spin_until(future.done, "an answer")
+        return future.result().message
+
+    conductor = Conductor(stage, source=1, destination=2)
+    conductor.say(C.SHADOW)
+    conductor.wait(2, R.READY)
+    stage.spin_until(client.service_is_ready, "the service")
+    assert [call() for _ in range(3)] == ["counter"] * 3
+    conductor.hand_over()
+    stage.spin_until(
+        lambda: _servers(stage, "/counter/poke") == ["counter_17"], "the successor's service"
+    )
+    assert [call() for _ in range(3)] == ["counter_17"] * 3
+    assert (first.served, second.served) == (3, 3)
+
+
+def _servers(stage, name):
+    """The nodes that serve a name, as the graph has it."""
+    nodes = ("counter", "counter_17")
+    return [
+        node for node in nodes
+        if name in dict(stage.plain.get_service_names_and_types_by_node(node, "/"))
+    ]  # fmt: skip
+
+
+def test_timers_go_on_in_step(stage):
+    """A slow timer runs when the source's would have, not one period after the handoff."""
+    ticks = stage.listen(Int64, "count")
+    times = []
+    stage.plain.create_subscription(Int64, "count", lambda _: times.append(time.monotonic()), 10)
+    first = stage.instance(lambda **named: Counter(period=1.0, **named), 1)
+    second = stage.instance(
+        lambda **named: Counter(period=1.0, **named), 2, alias="counter_17", shadow=True
+    )
+    conductor = Conductor(stage, source=1, destination=2)
+    conductor.hand_over()
+    stage.remove(first)
+    done = len(ticks)
+    stage.spin_until(lambda: len(times) >= done + 2, "two more ticks")
+    assert numbers(ticks) == list(range(1, len(ticks) + 1))
+    gaps = [later - earlier for earlier, later in pairwise(times)]
+    assert all(0.5 < gap < 1.5 for gap in gaps), gaps
+    assert second.timer.timer_period_ns == 1_000_000_000
+
+
+def test_a_successor_can_be_succeeded(stage, pair):
+    """There and back again, under another alias."""
+    pair.conductor.hand_over()
+    pair.conductor.say(C.DONE)
+    stage.remove(pair.first)
+    third = stage.instance(Counter, 3, alias="counter_1700000009", shadow=True)
+    conductor = Conductor(stage, source=2, destination=3)
+    conductor.hand_over()
+    stage.remove(pair.second)
+    goes_on(stage, pair.counts)
+    assert numbers(pair.counts) == list(range(pair.counts[0].data, pair.counts[-1].data + 1))
+    assert third.count >= pair.counts[-1].data
+
+
+def test_a_shadow_waits_until_the_readers_of_its_outputs_are_matched(stage, pair):
+    """A reader that it cannot reach would lose what it says first."""
+    stage.listen(Int64, "count", QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT))
+    pair.conductor.say(C.SHADOW)
+    pair.conductor.wait(2, R.READY)
+    assert pair.second.output.get_subscription_count() >= 2
+
+
+def test_an_opening_is_made_in_the_active_node_and_destroyed_in_the_silent_one(stage):
+    """What must not be there twice: an action server, say."""
+    made = []
+
+    class Opener(Counter):
+        def __init__(self, **named):
+            super().__init__(**named)
+            self.when_active(self.open)
+
+        def open(self):
+            made.append(("made", self.get_name()))
+            return SimpleNamespace(destroy=lambda: made.append(("destroyed", self.get_name())))
+
+    stage.instance(Opener, 1)
+    stage.instance(Opener, 2, alias="counter_17", shadow=True)
+    assert made == [("made", "counter")]
+    Conductor(stage, source=1, destination=2).hand_over()
+    assert made[1:] == [("destroyed", "counter"), ("made", "counter_17")]
+
+
+# --- called off -------------------------------------------------------------------------------
+
+
+def test_a_source_that_resumes_has_lost_nothing(stage, pair):
+    """What came while it was silent is processed; its timers and services go on."""
+    talker = stage.plain.create_publisher(Int64, "add", RELIABLE)
+    stage.spin_until(lambda: talker.get_subscription_count() == 2, "both inputs")
+    pair.second._rosrm._destination._activate = lambda: None  # it never becomes active
+    pair.conductor.say(C.SHADOW)
+    pair.conductor.wait(2, R.READY)
+    pair.conductor.say(C.SWITCH)
+    pair.conductor.wait(1, R.RELEASED)
+    for _ in range(5):
+        talker.publish(Int64(data=1))
+    stage.spin_until(lambda: len(pair.first._rosrm.member.buffer) == 5, "five kept messages")
+    pair.conductor.say(C.ABORT)
+    pair.conductor.wait(2, R.ABORTED)
+    pair.conductor.say(C.RESUME)
+    pair.conductor.wait(1, R.RESUMED)
+    goes_on(stage, pair.counts)
+    assert numbers(pair.counts) == list(range(pair.counts[0].data, pair.counts[-1].data + 1))
+    stage.spin_until(lambda: numbers(pair.sums) == [1, 2, 3, 4, 5], "the sums")
+
+
+def test_a_shadow_that_was_called_off_never_becomes_active(stage, pair):
+    """Whatever is said afterwards."""
+    pair.conductor.say(C.SHADOW)
+    pair.conductor.wait(2, R.READY)
+    pair.conductor.say(C.ABORT)
+    pair.conductor.wait(2, R.ABORTED)
+    pair.conductor.say(C.SWITCH)
+    pair.conductor.say(C.TAKE_OVER)
+    goes_on(stage, pair.counts, 20)
+    assert R.ACTIVE not in pair.conductor.of(2)
+    assert numbers(pair.counts) == list(range(pair.counts[0].data, pair.counts[-1].data + 1))
+
+
+def test_an_active_successor_cannot_be_called_off(stage, pair):
+    """It says so again: there must be no second owner."""
+    pair.conductor.hand_over()
+    pair.conductor.reports.clear()
+    pair.conductor.say(C.ABORT)
+    pair.conductor.wait(2, R.ACTIVE)
+    goes_on(stage, pair.counts)
+
+
+def test_a_source_falls_silent_only_when_master_and_destination_both_want_it(stage, pair):
+    """One of them may be wrong."""
+    pair.second._rosrm._destination._review = lambda: None  # it does not ask
+    pair.conductor.say(C.SHADOW)
+    pair.conductor.say(C.SWITCH)
+    goes_on(stage, pair.counts, 20)
+    assert R.SILENT not in pair.conductor.of(1)
+
+
+def test_the_last_state_is_enough_when_the_source_is_lost(stage, pair):
+    """The master says so, for it alone knows."""
+    pair.conductor.say(C.SHADOW)
+    pair.conductor.wait(2, R.READY)
+    last = pair.first.count
+    stage.remove(pair.first)
+    pair.conductor.say(C.TAKE_OVER)
+    pair.conductor.wait(2, R.ACTIVE)
+    goes_on(stage, pair.counts)
+    assert last in (pair.counts[-1].data - 5, *range(last - 2, pair.counts[-1].data))
+    assert numbers(pair.counts)[-5:] == list(
+        range(pair.counts[-1].data - 4, pair.counts[-1].data + 1)
+    )
+
+
+# --- bad input --------------------------------------------------------------------------------
+
+
+def fails(stage, pair, text, *, of=2):
+    """The handoff fails with a message, and the source counts on."""
+    pair.conductor.say(C.SHADOW)
+    report = pair.conductor.wait(of, R.FAILED)
+    assert text in report.message
+    goes_on(stage, pair.counts)
+    assert R.READY not in pair.conductor.of(2)
+
+
+def test_a_restore_function_that_raises(stage, pair):
+    """Found out while the source still runs."""
+    pair.second._rosrm._parts[1]._restore = lambda message: 1 // 0
+    fails(stage, pair, "restoring /counter/state raised ZeroDivisionError")
+
+
+def test_a_save_function_that_raises(stage, pair):
+    """Its node goes on."""
+    pair.first._rosrm._parts[1]._save = lambda: 1 // 0
+    fails(stage, pair, "saving /counter/state raised ZeroDivisionError", of=1)
+
+
+def test_a_state_of_another_class_than_named(stage, pair):
+    """Said by the source."""
+    pair.first._rosrm._parts[1]._save = lambda: String(data="3")
+    fails(stage, pair, "returned a String, not a std_msgs/msg/Int64", of=1)
+
+
+def test_a_state_that_is_too_large(stage, pair, monkeypatch):
+    """Refused before it is sent."""
+    monkeypatch.setattr(source, "LARGEST_PART", 4)
+    fails(stage, pair, "12 bytes, more than the 4 that may travel", of=1)
+
+
+def test_a_state_of_another_type(stage, pair):
+    """Both must be the same program."""
+
+    class Other(Counter):
+        def keep_state(self, topic, message_type, save, restore):
+            super().keep_state(topic, String, String, lambda message: None)
+
+    stage.remove(pair.second)
+    pair.second = Stage(beside=stage).instance(Other, 2, alias="counter_17", shadow=True)
+    text = "/counter/state is std_msgs/msg/Int64 at the source, and std_msgs/msg/String here"
+    fails(stage, pair, text)
+
+
+def test_a_state_topic_that_cannot_be_followed(stage, pair):
+    """The node itself has another type there; said, and no crash."""
+    pair.second._rosrm._parts[1].message_type = String
+    fails(stage, pair, "/counter/state cannot be followed")
+
+
+def test_a_state_of_other_topics(stage, pair):
+    """A part that only one of them knows."""
+    pair.second.keep_state("~/more", Int64, Int64, lambda message: None)
+    fails(stage, pair, "/counter/more is none at the source, and std_msgs/msg/Int64 here")
+
+
+def test_a_state_that_nobody_publishes_is_said_to_be_waited_for(stage):
+    """The master's time-out ends it, with this message."""
+    stage.instance(Counter, 2, alias="counter_17", shadow=True)
+    conductor = Conductor(stage, source=1, destination=2)
+    conductor.say(C.SHADOW)
+    report = conductor.wait(2, R.SHADOWING)
+    assert "waits for the source to answer" in report.message
+
+
+def test_a_source_that_was_started_again_is_another_one(stage, pair):
+    """Its state begins anew."""
+    pair.conductor.say(C.SHADOW)
+    pair.conductor.wait(2, R.READY)
+    stage.remove(pair.first)
+    stage.instance(Counter, 1)
+    report = pair.conductor.wait(2, R.FAILED)
+    assert "the source was started again" in report.message
+
+
+def test_more_input_than_can_be_kept(stage, pair, monkeypatch):
+    """The shadow gives up; nothing of the source is lost."""
+    monkeypatch.setattr(pair.second._rosrm.member.buffer, "_limit", 3)
+    talker = stage.plain.create_publisher(Int64, "add", RELIABLE)
+    stage.spin_until(lambda: talker.get_subscription_count() == 2, "both inputs")
+    for _ in range(5):
+        talker.publish(Int64(data=1))
+    stage.spin_until(lambda: pair.second._rosrm._destination._over, "the overflow")
+    fails(stage, pair, "more came on /add than can be kept")
+    stage.spin_until(lambda: numbers(pair.sums) == [1, 2, 3, 4, 5], "the source's sums")
+
+
+@pytest.mark.parametrize(
+    ("wrong", "text"),
+    [
+        ({"cluster": "another"}, "it is of 'another', and 'rosrm' started this node"),
+        ({"epoch": EPOCH - 1}, f"it is of epoch {EPOCH - 1}, and this is epoch {EPOCH}"),
+        ({"protocol_version": 1}, "its protocol version is 1"),
+        ({"channel": ""}, "it names no channel"),
+    ],
+)
+def test_a_state_config_of_a_stranger_is_left_alone(stage, pair, wrong, text, capfd):
+    """With one line in the log, whatever it says and however often."""
+    for phase in (C.SHADOW, C.SWITCH, C.TAKE_OVER, C.SHADOW):
+        pair.conductor.say(phase, **wrong)
+    goes_on(stage, pair.counts, 20)
+    assert pair.conductor.reports == []
+    assert capfd.readouterr().err.count(text) == 2  # the source and the shadow, once each
+
+
+def test_a_state_config_for_a_stranger_is_none_of_a_nodes_business(stage, pair, capfd):
+    """Other processes move all the time."""
+    pair.conductor.say(C.SHADOW, process="other")
+    pair.conductor.say(C.SWITCH, source=7, destination=8)
+    goes_on(stage, pair.counts, 20)
+    assert pair.conductor.reports == []
+    assert "state_config" not in capfd.readouterr().err
+
+
+def test_a_newer_epoch_fences_an_older_one(stage, pair):
+    """A master that was replaced has nothing to say any more."""
+    pair.conductor.say(C.SHADOW, epoch=EPOCH + 2)
+    pair.conductor.wait(2, R.READY)
+    pair.conductor.say(C.SWITCH, epoch=EPOCH + 1)
+    goes_on(stage, pair.counts, 20)
+    assert R.SILENT not in pair.conductor.of(1)
+
+
+def test_async_callbacks_are_refused(stage):
+    """A state lies between two callbacks."""
+
+    class Async(Counter):
+        def __init__(self, **named):
+            super().__init__(**named)
+            self.create_timer(1.0, self.later)
+
+        async def later(self):
+            """Never runs."""
+
+    with pytest.raises(TypeError, match="is `async`"):
+        stage.instance(Async, 1)
+
+
+def test_a_state_topic_is_named_once(stage):
+    """Each part has a topic of its own."""
+    node = stage.instance(Counter, 1)
+    with pytest.raises(ValueError, match="/counter/state is named twice"):
+        node.keep_state("/counter/state", Int64, Int64, print)
+
+
+# --- without rosrm ----------------------------------------------------------------------------
+
+
+def test_without_rosrm_it_is_rclpys_node(stage):
+    """Not a topic, a callback or an object more."""
+    ours = stage.add(Counter(context=stage.context))
+    talker = stage.plain.create_publisher(Int64, "add", RELIABLE)
+    sums = stage.listen(Int64, "sum")
+    stage.spin_until(lambda: talker.get_subscription_count() == 1, "its input")
+    talker.publish(Int64(data=2))
+    stage.spin_until(lambda: numbers(sums) == [2], "its output")
+    assert type(ours.output) is rclpy.publisher.Publisher
+    topics = [name for name, _ in stage.plain.get_topic_names_and_types()]
+    assert not [name for name in topics if "rosrm" in name or name.startswith("/counter/")]
+    assert ours._rosrm is None
+
+
+def test_a_lifecycle_node_can_be_made_migratable(stage):
+    """`Migratable` stands before whatever node it is."""
+    lifecycle = pytest.importorskip("rclpy.lifecycle")
+
+    class Managed(Migratable, lifecycle.LifecycleNode):
+        def __init__(self, **named):
+            super().__init__("counter", **named)
+            self.output = self.create_lifecycle_publisher(Int64, "count", RELIABLE)
+
+    node = stage.instance(Managed, 1)
+    heard = stage.listen(Int64, "count")
+    stage.spin_until(lambda: node.output.get_subscription_count() == 1, "a listener")
+    node.output.publish(Int64(data=1))
+    node.trigger_configure()
+    node.trigger_activate()
+    node.output.publish(Int64(data=2))
+    stage.spin_until(lambda: numbers(heard) == [2], "what was published when active", PATIENCE)

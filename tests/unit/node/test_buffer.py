@@ -1,0 +1,112 @@
+"""The inputs that are kept for a successor: none lost, none processed twice."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rosrm.node.buffer import InputBuffer
+
+A, B = "/a", "/b"
+
+
+def drained(buffer):
+    return [(kept.topic, kept.stamp) for kept in iter(buffer.take, None)]
+
+
+def filled(*messages, limit=100):
+    buffer = InputBuffer(limit, 0.0)
+    for topic, stamp in messages:
+        assert buffer.add(topic, stamp, None, 0.0)
+    return buffer
+
+
+def test_messages_come_out_in_the_order_in_which_they_came_in():
+    """Across inputs too."""
+    messages = [(A, 3), (B, 9), (A, 4), (B, 10)]
+    assert drained(filled(*messages)) == messages
+
+
+def test_what_a_state_covers_is_dropped():
+    """The rest stays, in order."""
+    buffer = filled((A, 1), (B, 1), (A, 2), (A, 3))
+    buffer.cover(A, [1, 2], single=True)
+    assert drained(buffer) == [(B, 1), (A, 3)]
+
+
+def test_a_message_may_come_after_the_state_that_covers_it():
+    """Marks and inputs take different ways."""
+    buffer = filled()
+    buffer.cover(A, [5], single=False)
+    assert buffer.add(A, 5, None, 0.0)
+    assert buffer.add(A, 6, None, 0.0)
+    assert drained(buffer) == [(A, 6)]
+
+
+def test_what_one_publisher_said_before_the_newest_covered_was_passed_over():
+    """The source never had it: it is not made up for, out of order."""
+    buffer = filled((A, 1), (A, 2), (A, 3))
+    buffer.cover(A, [2], single=True)
+    assert drained(buffer) == [(A, 3)]
+
+
+def test_the_clocks_of_several_publishers_are_not_compared():
+    """A robot whose clock is behind is not taken for covered."""
+    buffer = filled((A, 1000), (A, 3))
+    buffer.cover(A, [1000], single=False)
+    assert drained(buffer) == [(A, 3)]
+
+
+def test_the_buffer_is_bounded_for_each_input():
+    """One that floods does not push out another."""
+    buffer = filled((A, 1), (A, 2), limit=2)
+    assert not buffer.add(A, 3, None, 0.0)
+    assert buffer.add(B, 3, None, 0.0)
+    buffer.cover(A, [1], single=True)
+    assert buffer.add(A, 3, None, 0.0)
+    assert drained(buffer) == [(A, 2), (B, 3), (A, 3)]
+
+
+def test_an_input_overlaps_once_a_message_was_here_and_in_the_state():
+    """Whichever came first."""
+    buffer = filled((A, 5))
+    buffer.cover(A, [4], single=True)
+    assert not buffer.overlaps(A)
+    buffer.cover(A, [5], single=True)
+    assert buffer.overlaps(A)
+    buffer.cover(B, [7], single=True)
+    assert not buffer.overlaps(B)
+    buffer.add(B, 7, None, 0.0)
+    assert buffer.overlaps(B)
+
+
+def test_an_input_is_idle_when_nothing_waits_and_nothing_came_for_a_while():
+    """From the beginning of the buffer on."""
+    buffer = InputBuffer(10, 100.0)
+    assert not buffer.is_idle(A, 100.5, 1.0)
+    assert buffer.is_idle(A, 101.0, 1.0)
+    buffer.add(A, 1, None, 101.0)
+    assert not buffer.is_idle(A, 103.0, 1.0)
+    buffer.cover(A, [1], single=True)
+    assert buffer.is_idle(A, 103.0, 1.0)
+
+
+@given(st.data())
+def test_source_and_successor_together_process_each_message_once(data):
+    """However the ways of messages and marks interleave, and wherever the source stops."""
+    total = data.draw(st.integers(1, 12))
+    joined = data.draw(st.integers(0, total))  # the shadow hears messages from here on
+    stopped = data.draw(st.integers(joined, total))  # the source processes those before it
+    messages = [("message", stamp) for stamp in range(joined, total)]
+    marks = [("mark", covered) for covered in range(stopped + 1)]
+    events = []
+    while messages or marks:
+        first = data.draw(st.sampled_from([queue for queue in (messages, marks) if queue]))
+        events.append(first.pop(0))
+    buffer = InputBuffer(100, 0.0)
+    for kind, value in events:
+        if kind == "message":
+            assert buffer.add(A, value, None, 0.0)
+        else:
+            buffer.cover(A, range(value)[-3:], single=True)
+    assert drained(buffer) == [(A, stamp) for stamp in range(stopped, total)]

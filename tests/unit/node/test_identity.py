@@ -1,0 +1,34 @@
+"""Whether rosrm started this process, and as what."""
+
+from __future__ import annotations
+
+import pytest
+
+from rosrm.node.identity import Identity, identity_from
+
+FULL = {
+    "ROSRM_INSTANCE": "robot/p#12",
+    "ROSRM_NODE": "/ns/p",
+    "ROSRM_STATE_CONFIG": "/rosrm/state_config",
+    "ROSRM_CLUSTER": "lab",
+    "ROSRM_EPOCH": "4",
+}
+
+
+def test_a_slave_tells_who_a_process_is():
+    """Also one whose name has a slash."""
+    identity = identity_from(FULL)
+    assert identity == Identity("robot/p", 12, "/ns/p", "/rosrm/state_config", "lab", 4, False)
+
+
+def test_a_shadow_is_told_so():
+    """Only with the very word."""
+    assert identity_from({**FULL, "ROSRM_SHADOW": "1"}).shadow
+    assert not identity_from({**FULL, "ROSRM_SHADOW": ""}).shadow
+
+
+@pytest.mark.parametrize("missing", ["ROSRM_INSTANCE", "ROSRM_STATE_CONFIG"])
+def test_without_rosrm_there_is_no_identity(missing):
+    """The node is then rclpy's and nothing else."""
+    assert identity_from({**FULL, missing: ""}) is None
+    assert identity_from({}) is None
