@@ -32,15 +32,19 @@ from rosrm_msgs import msg, srv
 
 #: Seconds for one request to the master.
 _PATIENCE: Final = 3.0
-#: A long poll is asked anew after this, so that one that was lost does not last, seconds.
+#: A long poll is asked anew after this, so that one that was lost does not last, seconds. The first
+#: after a registration sooner, as it may have gone out before DDS knew its way, then ever later.
 _POLL_ANEW: Final = 30.0
+_FIRST_POLL_ANEW: Final = 1.0
 #: Seconds for which a name that is taken is asked for again: the former run of this slave may
 #: have been killed a moment ago.
 _NAME_TAKEN: Final = 5.0
 #: Seconds for the last statuses to reach the master.
 _LAST_WORDS: Final = 2.0
-#: Beats of a master in its silence before it counts as gone.
+#: Beats of a master in its silence before it counts as gone; and before another run of a master
+#: that has no newer epoch is believed: of two at once the younger gives way.
 _MISSED_BEATS: Final = 10
+_MISSED_BY_ANOTHER: Final = 3
 
 
 class Link(Enum):
@@ -48,6 +52,7 @@ class Link(Enum):
 
     SEARCHING = "searching"
     GREETING = "greeting"
+    LISTENING = "listening"  # for a beat of who greeted us: it alone tells which run that is
     REGISTERING = "registering"
     REGISTERED = "registered"
 
@@ -106,10 +111,14 @@ class SlaveEndpoint:
         self._master_beat = 0
         self._beat_at = 0.0
         self._beat_period = 1.0
-        self._master: tuple[str, int] = ("", 0)
+        self._greeting = srv.Handshake.Response()
+        self._greeted_at = 0.0
+        self._newest_beat: msg.MasterBeat | None = None
+        self._incarnation = 0  # of the master that we are registered with, or about to be
         self._taken_since: float | None = None
         self._told = ""
         self._poll_open = False
+        self._poll_anew = _FIRST_POLL_ANEW
         self._sequence = 0
         self._status_sequence = 0
         self._row = np.zeros((), LAYOUT)
@@ -157,8 +166,10 @@ class SlaveEndpoint:
         self._control.expire(now)
         if self.link is Link.SEARCHING and self._clients[srv.Handshake].service_is_ready():
             self._greet(now)
-        silence = now - self._beat_at
-        if self.link is Link.REGISTERED and silence > _MISSED_BEATS * self._beat_period:
+        if self.link is Link.LISTENING and now - self._greeted_at >= _PATIENCE:
+            self.link = Link.SEARCHING
+        if self.link is Link.REGISTERED and self._missed(_MISSED_BEATS, now):
+            silence = now - self._beat_at
             self._lose_master(f"the master has been silent for {silence:.1f} s; processes go on")
 
     def _greet(self, now: float) -> None:
@@ -179,15 +190,21 @@ class SlaveEndpoint:
         if fault or not answer.accepted:
             self.failure = fault or answer.message
             return
-        self._note_beat(answer.beat, time.monotonic())
-        self._master = (f"{answer.master} (pid {answer.pid} on {answer.hostname})", answer.epoch)
-        self._register()
+        self._greeting, self._greeted_at = answer, time.monotonic()
+        self._note_beat(answer.beat, self._greeted_at)
+        self.link = Link.LISTENING
+        self._register_if_known()
 
-    def _register(self) -> None:
+    def _register_if_known(self) -> None:
+        """Register as soon as a beat has told which run of the master it was that greeted us."""
+        beat = self._newest_beat
+        if beat is None or _speaker(beat) != _speaker(self._greeting):
+            return
+        self._incarnation = beat.incarnation
         self.link = Link.REGISTERING
         self._poll_open = False
         request = srv.RegisterHost.Request(
-            envelope=self._control.envelope(self._master_beat, self._master[1]),
+            envelope=self._control.envelope(self._master_beat, self._greeting.epoch),
             host=convert.host_to_msg(self._description),
             instances=[convert.status_to_msg(status) for status in self._host.statuses()],
         )
@@ -210,10 +227,15 @@ class SlaveEndpoint:
         self._epoch = answer.epoch
         self._beat_period = response.beat_period
         self._beat_at = now
+        self._poll_anew = _FIRST_POLL_ANEW
         self._row["host_id"] = self.host_id
         self.link = Link.REGISTERED
         self._host.take(core.Registered(answer.epoch))
-        self._host.say(f"registered with master {self._master[0]} as host {self.host_id}")
+        greeting = self._greeting
+        self._host.say(
+            f"registered with master {greeting.master} (pid {greeting.pid} on {greeting.hostname}) "
+            f"as host {self.host_id}"
+        )
 
     def _turned_down(self, answer: msg.Answer, now: float) -> None:
         """A name may still be held by a former run of this very slave: ask again for a moment."""
@@ -228,6 +250,7 @@ class SlaveEndpoint:
     def _lose_master(self, reason: str) -> None:
         self.link = Link.SEARCHING
         self._poll_open = False
+        self._newest_beat = None
         self._control.forget()
         self._host.take(core.MasterLost())
         self._host.say(reason)
@@ -235,11 +258,19 @@ class SlaveEndpoint:
     def _take_beat(self, beat: msg.MasterBeat) -> None:
         if version_refusal(beat.protocol_version, "the master"):
             return  # the handshake says it clearly
-        if self.link is Link.REGISTERED and beat.epoch != self._epoch:
-            if beat.epoch < self._epoch:
+        now = time.monotonic()
+        if self.link is Link.REGISTERED and beat.incarnation != self._incarnation:
+            if beat.epoch <= self._epoch and not self._missed(_MISSED_BY_ANOTHER, now):
                 return
             self._lose_master(f"the master has started again (epoch {beat.epoch})")
-        self._note_beat(beat.beat, time.monotonic())
+        self._newest_beat = beat
+        self._note_beat(beat.beat, now)
+        if self.link is Link.LISTENING:
+            self._register_if_known()
+
+    def _missed(self, beats: int, now: float) -> bool:
+        """Whether our master has been silent for longer than so many beats."""
+        return now - self._beat_at > beats * self._beat_period
 
     def _note_beat(self, beat: int, now: float) -> None:
         self._master_beat, self._beat_at = beat, now
@@ -257,13 +288,15 @@ class SlaveEndpoint:
             host_id=self.host_id, incarnation=self._description.incarnation,
         )  # fmt: skip
         self._control.call(
-            self._clients[srv.RequestProcess], request, now + _POLL_ANEW, self._take_work
+            self._clients[srv.RequestProcess], request, now + self._poll_anew, self._take_work
         )
 
     def _take_work(self, response: srv.RequestProcess.Response | None) -> None:
         self._poll_open = False
         if response is None:
+            self._poll_anew = min(2.0 * self._poll_anew, _POLL_ANEW)
             return
+        self._poll_anew = _POLL_ANEW
         answer = response.answer
         if not answer.accepted:
             if answer.code in ("unknown", "stale"):
@@ -381,6 +414,11 @@ class SlaveEndpoint:
         self._control.call(
             self._clients[srv.Leave], request, time.monotonic() + 1.0, lambda _: done()
         )
+
+
+def _speaker(said: msg.MasterBeat | srv.Handshake.Response) -> tuple[str, int, int]:
+    """Which master said something, as far as a greeting tells."""
+    return said.hostname, said.pid, said.epoch
 
 
 def _ordered(request: srv.ControlHost.Request) -> core.Event:

@@ -335,12 +335,34 @@ def test_a_lost_journal(make_cluster) -> None:
     journal.rename(journal.with_name("old"))
     cluster.reconnect()
     cluster.start_master()
-    cluster.wait_for_hosts()
+    cluster.wait_for_hosts(timeout=20.0)  # not only when the open request for work is repeated
     wait_gone(before.pid)
     for number in range(3):
         assert cluster.run(job(f"new{number}", "true"))[0].state == "finished"
     cluster.submit(service("p"))
     assert cluster.wait("p", "running").pid != before.pid
+
+
+@pytest.mark.parametrize("epoch", [1, 2])
+def test_a_lost_journal_of_a_master_that_is_back_at_once(make_cluster, epoch) -> None:
+    """The slave hears no silence, and the same epoch or an older one: it registers anew."""
+    cluster = make_cluster(host("h0"))
+    for _ in range(1, epoch):
+        end(cluster.master, signal.SIGKILL)
+        cluster.reconnect()
+        cluster.start_master()
+        cluster.wait_for_hosts()
+    cluster.submit(service("p"))
+    before = cluster.wait("p", "running")
+    end(cluster.master, signal.SIGKILL)
+    for file in (cluster.directory / "master").glob("journal.sqlite*"):
+        file.unlink()
+    cluster.reconnect()
+    cluster.start_master()
+    cluster.wait_for_hosts(timeout=20.0)
+    assert "epoch 1" in cluster.events("master_started")[-1].message
+    wait_gone(before.pid)
+    assert cluster.run(job("new", "true"))[0].state == "finished"
 
 
 # --- the shell --------------------------------------------------------------------------------

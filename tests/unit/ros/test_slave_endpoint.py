@@ -1,0 +1,265 @@
+"""How a slave tells which master it has: without DDS, by a clock that the test sets."""
+
+from __future__ import annotations
+
+import pytest
+
+from rosrm.core import slave as core
+from rosrm.core.model import HostDescription
+from rosrm.ros import slave_endpoint
+from rosrm.ros.slave_endpoint import Link, SlaveEndpoint
+from rosrm.version import PROTOCOL_VERSION
+from rosrm_msgs import msg, srv
+
+PERIOD = 0.2
+
+
+class Clock:
+    """Seconds; stands in for the module `time`."""
+
+    now = 100.0
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def monotonic_ns(self) -> int:
+        return int(self.now * 1e9)
+
+
+class Call:
+    """A request on its way, and what becomes of it."""
+
+    def __init__(self, request) -> None:
+        self.request = request
+        self._done = None
+
+    def add_done_callback(self, done) -> None:
+        self._done = done
+
+    def answer(self, response) -> None:
+        self._response = response
+        self._done(self)
+
+    def result(self):
+        return self._response
+
+
+class Peer:
+    """Stands for a service client and a publisher: it keeps what is sent."""
+
+    def __init__(self) -> None:
+        self.sent: list[Call] = []
+
+    def service_is_ready(self) -> bool:
+        return True
+
+    def call_async(self, request) -> Call:
+        self.sent.append(Call(request))
+        return self.sent[-1]
+
+    def remove_pending_request(self, call) -> None:
+        pass
+
+    def publish(self, message) -> None:
+        pass
+
+
+class Wire:
+    """Stands for the participant and for its node."""
+
+    settings = type("Settings", (), {"namespace": "/rosrm"})
+
+    def __init__(self) -> None:
+        self.node = self
+        self.to: dict[type, Peer] = {}
+        self.hear = {}
+
+    def create_client(self, kind, _name, *, qos_profile) -> Peer:
+        return self.to.setdefault(kind, Peer())
+
+    def create_publisher(self, _kind, _name, _qos) -> Peer:
+        return Peer()
+
+    def create_subscription(self, kind, _name, callback, _qos) -> None:
+        self.hear[kind] = callback
+
+    def counted(self, callback):
+        return callback
+
+    def serve(self, *_arguments) -> None:
+        pass
+
+
+class Host:
+    """Stands for the slave's runtime."""
+
+    def __init__(self) -> None:
+        self.events = []
+
+    def take(self, event) -> None:
+        self.events.append(event)
+
+    def statuses(self) -> list:
+        return []
+
+    def say(self, message: str) -> None:
+        pass
+
+
+class Master:
+    """One run of a master, as a slave meets it."""
+
+    def __init__(self, slave: Slave, incarnation: int, epoch: int = 1, pid: int = 7) -> None:
+        self._slave = slave
+        self._is = {"hostname": "m", "pid": pid, "epoch": epoch}
+        self._incarnation = incarnation
+        self._epoch = epoch
+
+    def beat(self) -> None:
+        beat = msg.MasterBeat(
+            protocol_version=PROTOCOL_VERSION, incarnation=self._incarnation,
+            beat=self._slave.clock.monotonic_ns(), **self._is,
+        )  # fmt: skip
+        self._slave.wire.hear[msg.MasterBeat](beat)
+
+    def greet(self) -> None:
+        self._slave.newest(srv.Handshake).answer(
+            srv.Handshake.Response(
+                protocol_version=PROTOCOL_VERSION, accepted=True, beat=1, **self._is
+            )
+        )
+
+    def take_in(self) -> None:
+        answer = msg.Answer(protocol_version=PROTOCOL_VERSION, accepted=True, epoch=self._epoch)
+        self._slave.newest(srv.RegisterHost).answer(
+            srv.RegisterHost.Response(answer=answer, host_id=1, beat_period=PERIOD)
+        )
+
+
+class Slave:
+    """The endpoint, and all that is around it."""
+
+    def __init__(self, clock: Clock) -> None:
+        self.clock, self.wire, self.host = clock, Wire(), Host()
+        description = HostDescription("h0", 5)
+        self.endpoint = SlaveEndpoint(self.wire, self.host, description, max_age=5.0)
+
+    @property
+    def link(self) -> Link:
+        return self.endpoint.link
+
+    def sent(self, kind) -> list[Call]:
+        return self.wire.to[kind].sent
+
+    def newest(self, kind) -> Call:
+        return self.sent(kind)[-1]
+
+    def pass_time(self, seconds: float, *masters: Master) -> None:
+        """Cycle by cycle; these masters beat."""
+        for _ in range(round(seconds / PERIOD)):
+            self.clock.now += PERIOD
+            for master in masters:
+                master.beat()
+            self.endpoint.go_on(self.clock.now)
+            self.endpoint.ask(self.clock.now)
+
+    def join(self, master: Master) -> None:
+        """Greeted, heard, taken in."""
+        self.pass_time(PERIOD)
+        master.beat()
+        master.greet()
+        master.take_in()
+        assert self.link is Link.REGISTERED
+
+
+@pytest.fixture
+def slave(monkeypatch) -> Slave:
+    clock = Clock()
+    monkeypatch.setattr(slave_endpoint, "time", clock)
+    return Slave(clock)
+
+
+@pytest.mark.parametrize("epoch", [1, 2, 3])
+def test_another_run_of_the_master_is_told_whatever_its_epoch(slave, epoch) -> None:
+    """A master whose journal was lost begins at epoch 1 again: the slave registers anew."""
+    old, new = Master(slave, 11, epoch=2), Master(slave, 12, epoch=epoch, pid=8)
+    slave.join(old)
+    slave.pass_time(2.0, old)
+    assert slave.link is Link.REGISTERED
+    slave.pass_time(1.0, new)
+    assert core.MasterLost() in slave.host.events
+    assert slave.link is Link.GREETING
+
+    new.greet()
+    assert slave.link is Link.REGISTERING
+    new.take_in()
+    slave.pass_time(PERIOD, new)
+    assert slave.host.events[-1] == core.Registered(epoch)
+    assert len(slave.sent(srv.RegisterHost)) == 2
+    work = slave.newest(srv.RequestProcess).request
+    assert (len(slave.sent(srv.RequestProcess)), work.envelope.epoch) == (2, epoch)
+
+
+def test_another_run_is_told_though_the_first_was_never_heard(slave) -> None:
+    """The first is killed as soon as it has taken the slave in: its greeting alone is not enough."""
+    old, new = Master(slave, 11), Master(slave, 12, pid=8)
+    slave.pass_time(PERIOD)
+    old.greet()
+    assert slave.link is Link.LISTENING
+    slave.pass_time(1.0, new)
+    assert slave.sent(srv.RegisterHost) == []
+    slave.pass_time(3.0, new)  # the greeting has become old
+    new.greet()
+    new.take_in()
+    assert slave.link is Link.REGISTERED
+
+
+def test_a_run_in_the_place_of_the_first_is_told(slave) -> None:
+    """In a container every master is pid 1 of the same host name."""
+    old, new = Master(slave, 11, pid=1), Master(slave, 12, pid=1)
+    slave.join(old)
+    slave.pass_time(1.0, new)
+    assert slave.link is Link.GREETING
+    new.greet()
+    new.take_in()
+    slave.pass_time(5.0, new)
+    assert slave.link is Link.REGISTERED
+    assert len(slave.sent(srv.RegisterHost)) == 2
+
+
+def test_of_two_masters_the_one_that_lives_is_kept(slave) -> None:
+    """Of two at once the younger gives way; only a newer epoch is believed at once."""
+    ours = Master(slave, 11, epoch=2)
+    slave.join(ours)
+    for epoch in (1, 2):
+        slave.pass_time(3.0, ours, Master(slave, 12, epoch=epoch, pid=8))
+        assert slave.link is Link.REGISTERED
+    Master(slave, 13, epoch=3, pid=9).beat()
+    assert slave.link is Link.SEARCHING
+
+
+def test_a_silent_master_is_lost(slave) -> None:
+    slave.join(Master(slave, 11))
+    slave.pass_time(1.8)
+    assert slave.link is Link.REGISTERED
+    slave.pass_time(0.6)
+    assert slave.link is not Link.REGISTERED
+    assert core.MasterLost() in slave.host.events
+
+
+def test_a_request_for_work_that_was_lost_is_soon_repeated(slave) -> None:
+    """The first after a registration may be; one that is open for long is repeated seldom."""
+    master = Master(slave, 11)
+    slave.join(master)
+    start, at = slave.clock.now, []
+    for _ in range(round(100.0 / PERIOD)):
+        before = len(slave.sent(srv.RequestProcess))
+        slave.pass_time(PERIOD, master)
+        if len(slave.sent(srv.RequestProcess)) > before:
+            at.append(slave.clock.now - start)
+    assert at == pytest.approx([0.2, 1.2, 3.2, 7.2, 15.2, 31.2, 61.2, 91.2], abs=1.0)
+    answer = msg.Answer(protocol_version=PROTOCOL_VERSION, accepted=True)
+    slave.newest(srv.RequestProcess).answer(srv.RequestProcess.Response(answer=answer))
+    before = len(slave.sent(srv.RequestProcess))
+    slave.pass_time(29.0, master)
+    assert len(slave.sent(srv.RequestProcess)) == before + 1
