@@ -10,10 +10,13 @@ AssignmentsReceived     has them launched, once, or holds them until a slot is f
 LaunchRefused           reports that the host cannot run it, and why
 StopOrdered             has it stopped; one never heard of will never be started
 RestartOrdered          has it stopped and started again here
+RestartPolicySet        has the supervisor keep it, unless it has ended or is not known: settled
+RestartPolicyRecorded   the supervisor has it in its record: settled
 ReportRequested         reports everything
 SupervisorReported      follows the instance; a new run must become ready anew
-SupervisorReplaced      the same; what the new one does not know is gone; reports everything
-SeenInGraph             the instance is ready
+SupervisorReplaced      the same; what the new one does not know is gone; reports everything, and
+                        orders again what may have been lost with the former one
+SeenInGraph             the instance is ready; a later run of this slave shall know
 TimePassed              an instance that is not ready in time is stopped; old ends are forgotten
 ======================  =========================================================================
 """
@@ -35,6 +38,7 @@ from rosrm.core.model import (
     InstanceState,
     InstanceStatus,
     ProcessSpec,
+    RestartPolicy,
 )
 
 #: Seconds for which the end of an instance is kept for a master that did not hear of it.
@@ -42,6 +46,21 @@ REMEMBER_END: Final = 60.0
 _SLOTS: Final = np.left_shift(np.uint32(1), np.arange(RESOURCE_SLOTS, dtype=np.uint32))
 #: Orders to stop what was never heard of that are remembered.
 _TOMBSTONES: Final = 10_000
+
+
+@dataclass(frozen=True, slots=True)
+class Awaited:
+    """How an instance becomes ready by being seen in the ROS graph.
+
+    Attributes:
+        node_name: fully qualified name of its node.
+        timeout: seconds that each of its runs has for it.
+        seen: pid of the run that was seen; 0: none was.
+    """
+
+    node_name: str
+    timeout: float
+    seen: int = 0
 
 
 # --- what can happen --------------------------------------------------------------------------
@@ -89,6 +108,22 @@ class RestartOrdered:
 
 
 @dataclass(frozen=True, slots=True)
+class RestartPolicySet:
+    """The master wants an instance to have another restart policy; a shadow is none any more."""
+
+    instance: InstanceId
+    restart: RestartPolicy
+
+
+@dataclass(frozen=True, slots=True)
+class RestartPolicyRecorded:
+    """The supervisor has written down which restart policy an instance has."""
+
+    instance: InstanceId
+    restart: RestartPolicy
+
+
+@dataclass(frozen=True, slots=True)
 class ReportRequested:
     """The master wants to know of every instance."""
 
@@ -102,9 +137,15 @@ class SupervisorReported:
 
 @dataclass(frozen=True, slots=True)
 class SupervisorReplaced:
-    """Another supervisor took over; `statuses`: all that it knows."""
+    """Another supervisor took over, or this slave found one at its start.
+
+    Attributes:
+        statuses: all that it knows.
+        awaited: what it was told to remember of instances that become ready in the ROS graph.
+    """
 
     statuses: tuple[InstanceStatus, ...]
+    awaited: Mapping[InstanceId, Awaited] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,6 +185,31 @@ class Restart:
 
 
 @dataclass(frozen=True, slots=True)
+class Amend:
+    """Have the supervisor keep another restart policy; `RestartPolicyRecorded` follows."""
+
+    instance: InstanceId
+    restart: RestartPolicy
+
+
+@dataclass(frozen=True, slots=True)
+class Settle:
+    """Answer the order to set this restart policy; `refusal`: why it cannot be; "": it is."""
+
+    instance: InstanceId
+    restart: RestartPolicy
+    refusal: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Remember:
+    """Have the supervisor keep this for a later run of this slave."""
+
+    instance: InstanceId
+    awaited: Awaited
+
+
+@dataclass(frozen=True, slots=True)
 class Forget:
     """Let the supervisor forget ended instances."""
 
@@ -158,7 +224,7 @@ class Report:
     complete: bool = False
 
 
-Command = Launch | Stop | Restart | Forget | Report
+Command = Launch | Stop | Restart | Amend | Settle | Remember | Forget | Report
 
 
 # --- the state --------------------------------------------------------------------------------
@@ -171,16 +237,19 @@ class Held:
     Attributes:
         status: as it was reported last.
         spec: None where this slave found it running at its own start.
-        node_name: fully qualified name of its node; "" where it is none.
+        awaited: None: it is ready as soon as it runs.
         ready_by: deadline for becoming ready; None: it is ready, or does not run.
         unready: why it was stopped, where it did not become ready in time.
+        unsettled: restart policies that the master has set and the supervisor has not recorded
+            yet, in order.
     """
 
     status: InstanceStatus
     spec: ProcessSpec | None = None
-    node_name: str = ""
+    awaited: Awaited | None = None
     ready_by: float | None = None
     unready: str = ""
+    unsettled: tuple[RestartPolicy, ...] = ()
     ended_at: float = 0.0
 
 
@@ -200,6 +269,10 @@ class SlaveState:
     waiting: dict[InstanceId, Assignment] = field(default_factory=dict)
     tombstones: dict[InstanceId, None] = field(default_factory=dict)
 
+    def awaited_in_graph(self) -> Mapping[InstanceId, Held]:
+        """Instances that become ready by being seen in the ROS graph."""
+        return {instance: held for instance, held in self.held.items() if held.ready_by is not None}
+
     def statuses(self) -> tuple[InstanceStatus, ...]:
         """Of every instance, ended ones that are still remembered included."""
         return tuple(held.status for held in self.held.values())
@@ -211,14 +284,6 @@ class SlaveState:
     def live(self) -> int:
         """How many instances have not ended."""
         return sum(not held.status.state.ended for held in self.held.values())
-
-    def awaited_in_graph(self) -> Mapping[InstanceId, Held]:
-        """Instances that become ready by being seen in the ROS graph."""
-        return {
-            instance: held
-            for instance, held in self.held.items()
-            if held.ready_by is not None and held.node_name
-        }
 
 
 def under_limits(
@@ -241,6 +306,12 @@ def awaits_graph(spec: ProcessSpec) -> bool:
     """Whether an instance is ready when it is seen in the ROS graph, not as soon as it runs."""
     kind = spec.readiness.kind
     return kind == "graph" or (kind == "auto" and spec.ros)
+
+
+def qualified_name(namespace: str, node_name: str) -> str:
+    """A node's name with its namespace: `/robot/camera`."""
+    inside = namespace.strip("/")
+    return f"/{inside}/{node_name}" if inside else f"/{node_name}"
 
 
 # --- handlers ---------------------------------------------------------------------------------
@@ -284,11 +355,15 @@ def _assigned(state: SlaveState, event: AssignmentsReceived, now: float) -> _Com
 
 
 def _waiting(assignment: Assignment) -> Held:
-    name = _qualified(assignment) if awaits_graph(assignment.spec) else ""
+    spec = assignment.spec
+    awaited = None
+    if awaits_graph(spec):
+        name = qualified_name(spec.namespace, assignment.node_name)
+        awaited = Awaited(name, spec.readiness.timeout)
     status = InstanceStatus(
         assignment.instance, InstanceState.HELD, message="waits for a free slot there"
     )
-    return Held(status, assignment.spec, name)
+    return Held(status, spec, awaited)
 
 
 def _start_waiting(state: SlaveState) -> _Commands:
@@ -307,11 +382,6 @@ def _why_not(state: SlaveState, assignment: Assignment) -> str:
     if assignment.instance in state.tombstones:
         return "it was stopped or refused here before this order came"
     return ""
-
-
-def _qualified(assignment: Assignment) -> str:
-    namespace = "/" + assignment.spec.namespace.strip("/")
-    return f"{namespace.rstrip('/')}/{assignment.node_name}"
 
 
 def _launch_refused(state: SlaveState, event: LaunchRefused, now: float) -> _Commands:
@@ -353,6 +423,38 @@ def _restart_ordered(state: SlaveState, event: RestartOrdered, now: float) -> _C
     return [Restart(event.instance)]
 
 
+def _restart_policy_set(state: SlaveState, event: RestartPolicySet, now: float) -> _Commands:
+    held = state.held.get(event.instance)
+    if held is None:
+        return [_not_held(event)]
+    if held.status.state.ended:
+        return [Report((held.status,)), Settle(event.instance, event.restart)]
+    waiting = state.waiting.get(event.instance)
+    if waiting is not None:  # nobody but this slave knows of it yet
+        spec = replace(waiting.spec, restart=event.restart)
+        state.waiting[event.instance] = replace(waiting, spec=spec, shadow=False)
+        return [Report((held.status,)), Settle(event.instance, event.restart)]
+    held.unsettled += (event.restart,)
+    return [Amend(event.instance, event.restart)]
+
+
+def _not_held(order: RestartPolicySet) -> Settle:
+    never = f"{order.instance} is not known here: it never ran on this host, or ended long ago"
+    return Settle(order.instance, order.restart, never)
+
+
+def _restart_policy_recorded(
+    state: SlaveState, event: RestartPolicyRecorded, now: float
+) -> _Commands:
+    held = state.held.get(event.instance)
+    if held is None:
+        return [Settle(event.instance, event.restart)]
+    if event.restart in held.unsettled:
+        at = held.unsettled.index(event.restart)
+        held.unsettled = held.unsettled[:at] + held.unsettled[at + 1 :]
+    return [Report((held.status,)), Settle(event.instance, event.restart)]
+
+
 def _report_requested(state: SlaveState, event: ReportRequested, now: float) -> _Commands:
     return [Report(state.statuses(), complete=True)]
 
@@ -369,23 +471,37 @@ def _supervisor_reported(state: SlaveState, event: SupervisorReported, now: floa
 
 def _supervisor_replaced(state: SlaveState, event: SupervisorReplaced, now: float) -> _Commands:
     known = {status.instance for status in event.statuses}
+    again: _Commands = []
     for instance, held in list(state.held.items()):
         lost = instance not in known and instance not in state.waiting
         if lost and not held.status.state.ended:
             del state.held[instance]
             _bury(state, instance)
+        again += [
+            _amend_again(RestartPolicySet(instance, restart), held, lost=lost)
+            for restart in held.unsettled
+        ]
     for status in event.statuses:
-        _follow(state, status, now)
-    return [*_start_waiting(state), Report(state.statuses(), complete=True)]
+        _follow(state, status, now, event.awaited.get(status.instance))
+    return [*again, *_start_waiting(state), Report(state.statuses(), complete=True)]
 
 
-def _follow(state: SlaveState, reported: InstanceStatus, now: float) -> InstanceStatus | None:
+def _amend_again(order: RestartPolicySet, held: Held, *, lost: bool) -> Command:
+    """What was ordered may have been lost with the supervisor."""
+    if held.status.state.ended:
+        return Settle(order.instance, order.restart)
+    return _not_held(order) if lost else Amend(order.instance, order.restart)
+
+
+def _follow(
+    state: SlaveState, reported: InstanceStatus, now: float, awaited: Awaited | None = None
+) -> InstanceStatus | None:
     """Take over what the supervisor says; None: that is known."""
     held = state.held.get(reported.instance)
     if held is None:
-        held = state.held[reported.instance] = Held(reported)
+        held = state.held[reported.instance] = Held(reported, awaited=awaited)
         if reported.state is InstanceState.RUNNING:
-            held.status = replace(reported, state=InstanceState.READY)
+            held.status = _running(held, reported, now)
     elif reported.state is InstanceState.RUNNING:
         if held.status.state is InstanceState.READY and held.status.pid == reported.pid:
             return None
@@ -401,9 +517,9 @@ def _follow(state: SlaveState, reported: InstanceStatus, now: float) -> Instance
 
 def _running(held: Held, reported: InstanceStatus, now: float) -> InstanceStatus:
     """A new run: ready at once, or to be seen in the graph first."""
-    if not held.node_name or held.spec is None:
+    if held.awaited is None or held.awaited.seen == reported.pid:
         return replace(reported, state=InstanceState.READY)
-    held.ready_by = now + held.spec.readiness.timeout
+    held.ready_by = now + held.awaited.timeout
     return reported
 
 
@@ -415,11 +531,12 @@ def _with_unready(held: Held, reported: InstanceStatus) -> InstanceStatus:
 
 def _seen(state: SlaveState, event: SeenInGraph, now: float) -> _Commands:
     held = state.held.get(event.instance)
-    if held is None or held.ready_by is None:
+    if held is None or held.ready_by is None or held.awaited is None:
         return []
     held.ready_by = None
     held.status = replace(held.status, state=InstanceState.READY)
-    return [Report((held.status,))]
+    held.awaited = replace(held.awaited, seen=held.status.pid)
+    return [Remember(event.instance, held.awaited), Report((held.status,))]
 
 
 def _may_be_forgotten(state: SlaveState, held: Held, now: float) -> bool:
@@ -430,10 +547,11 @@ def _time_passed(state: SlaveState, event: TimePassed, now: float) -> _Commands:
     commands: _Commands = []
     forgotten = []
     for instance, held in state.held.items():
-        if held.ready_by is not None and now >= held.ready_by and held.spec is not None:
+        awaited = held.awaited
+        if held.ready_by is not None and now >= held.ready_by and awaited is not None:
             held.ready_by = None
             held.unready = (
-                f"not ready within {held.spec.readiness.timeout:g} s: no node {held.node_name} of "
+                f"not ready within {awaited.timeout:g} s: no node {awaited.node_name} of "
                 f"this instance was seen in the ROS graph"
             )
             commands.append(Stop(instance))
@@ -457,6 +575,8 @@ HANDLERS: Final[Mapping[type, _Handler]] = MappingProxyType(
         LaunchRefused: _launch_refused,
         StopOrdered: _stop_ordered,
         RestartOrdered: _restart_ordered,
+        RestartPolicySet: _restart_policy_set,
+        RestartPolicyRecorded: _restart_policy_recorded,
         ReportRequested: _report_requested,
         SupervisorReported: _supervisor_reported,
         SupervisorReplaced: _supervisor_replaced,
@@ -472,6 +592,8 @@ Event = (
     | LaunchRefused
     | StopOrdered
     | RestartOrdered
+    | RestartPolicySet
+    | RestartPolicyRecorded
     | ReportRequested
     | SupervisorReported
     | SupervisorReplaced

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from rclpy.duration import Duration
 
 from rosrm.core import slave as core
-from rosrm.core.model import HostDescription, InstanceStatus
+from rosrm.core.model import HostDescription, InstanceId, InstanceStatus, RestartPolicy
 from rosrm.errors import Refused
 from rosrm.ros import convert, names, qos
 from rosrm.ros.control import (
@@ -79,6 +79,16 @@ class Host(Protocol):
     def read_log(self, process: str, number: int, offset: int, max_bytes: int) -> LogSlice:
         """A part of a log; raises `Refused`."""
 
+    def set_restart(
+        self, instance: InstanceId, restart: RestartPolicy, settled: Callable[[str], None]
+    ) -> None:
+        """Give an instance another restart policy.
+
+        Args:
+            settled: called in the loop's thread; with "" when the policy survives whatever is
+                killed, else with the reason why there is no such instance.
+        """
+
     def execute(
         self, executor: str, arguments: dict[str, Any], done: Callable[[bool, str, str], None]
     ) -> None:
@@ -95,6 +105,7 @@ class SlaveEndpoint:
         link: how far it is with its master.
         failure: why it must give up; "" while it need not.
         superseded: it must because another slave lives under its name.
+        cluster: name of the master that greeted us last; "" before the first one.
     """
 
     def __init__(
@@ -106,6 +117,7 @@ class SlaveEndpoint:
         self.link = Link.SEARCHING
         self.failure = ""
         self.superseded = False
+        self.cluster = ""
         self.host_id = 0
         self._epoch = 0
         self._master_beat = 0
@@ -190,6 +202,7 @@ class SlaveEndpoint:
         if fault or not answer.accepted:
             self.failure = fault or answer.message
             return
+        self.cluster = answer.master
         self._greeting, self._greeted_at = answer, time.monotonic()
         self._note_beat(answer.beat, self._greeted_at)
         self.link = Link.LISTENING
@@ -317,11 +330,24 @@ class SlaveEndpoint:
             if request.action == kind.EXECUTE:
                 self._execute(request, respond)
                 return
+            if request.action == kind.SET_RESTART:
+                self._set_restart(request, respond)
+                return
             self._host.take(_ordered(request))
         except Refused as refusal:
             respond(srv.ControlHost.Response(answer=refused(refusal.code, str(refusal))))
             return
         respond(srv.ControlHost.Response(answer=accepted()))
+
+    def _set_restart(
+        self, request: srv.ControlHost.Request, respond: Callable[[Any], None]
+    ) -> None:
+        def settled(refusal: str) -> None:
+            answer = refused("unknown", refusal) if refusal else accepted()
+            respond(srv.ControlHost.Response(answer=answer))
+
+        restart = convert.restart_from_msg(request.restart)
+        self._host.set_restart(convert.instance_from_msg(request.instance), restart, settled)
 
     def _execute(self, request: srv.ControlHost.Request, respond: Callable[[Any], None]) -> None:
         def done(good: bool, message: str, result: str) -> None:

@@ -10,10 +10,25 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Final
 
 from rosrm.core.model import Assignment
+from rosrm.core.slave import qualified_name
 
+#: Set where an instance starts as the destination of a handoff.
+SHADOW: Final = "ROSRM_SHADOW"
+#: What tells a process who it is. A slave that was itself started by rosrm hands none of it on.
+_IDENTITY: Final = (
+    "ROSRM_PROCESS",
+    "ROSRM_INSTANCE",
+    "ROSRM_HOST",
+    "ROSRM_NODE",
+    "ROSRM_STATE_CONFIG",
+    "ROSRM_CLUSTER",
+    "ROSRM_EPOCH",
+    SHADOW,
+)
 _GUARD: Final = "_ROS_WHEELS_BOOTSTRAP_COMPLETE"
 _LIBRARIES: Final = "LD_LIBRARY_PATH"
 #: PREFIX/lib/pythonX.Y/site-packages/ros_NAME.libs: a folder that the bootstrapper adds.
@@ -22,22 +37,47 @@ _WHEEL_FOLDER: Final = re.compile(
 )
 
 
+@dataclass(frozen=True, slots=True)
+class Whereabouts:
+    """What a process is told of the cluster that it runs in.
+
+    Attributes:
+        host: name of the host in rosrm.
+        cluster: name of the master that gives the orders.
+        state_config: topic on which the master speaks of handoffs.
+    """
+
+    host: str
+    cluster: str
+    state_config: str
+
+
 def process_environment(
-    assignment: Assignment, base: Mapping[str, str], host: str
+    assignment: Assignment, base: Mapping[str, str], where: Whereabouts
 ) -> dict[str, str]:
     """All variables of an instance; what its spec says goes last.
 
     Args:
         assignment: whose instance it is for.
         base: the slave's own environment, its ROS settings (ROS_DOMAIN_ID, ...) included.
-        host: name of this host in rosrm.
+        where: it will run.
     """
+    spec = assignment.spec
     environment = without_bootstrapper(base)
+    for name in _IDENTITY:
+        environment.pop(name, None)
     environment["ROSRM_PROCESS"] = assignment.instance.process
     environment["ROSRM_INSTANCE"] = str(assignment.instance)
-    environment["ROSRM_HOST"] = host
+    environment["ROSRM_HOST"] = where.host
+    environment["ROSRM_STATE_CONFIG"] = where.state_config
+    environment["ROSRM_CLUSTER"] = where.cluster
+    environment["ROSRM_EPOCH"] = str(assignment.epoch)
+    if spec.ros or spec.package is not None:  # under an alias too it is known by this name
+        environment["ROSRM_NODE"] = qualified_name(spec.namespace, spec.name)
+    if assignment.shadow:
+        environment[SHADOW] = "1"
     environment["PYTHONUNBUFFERED"] = "1"
-    environment.update(assignment.spec.environment)
+    environment.update(spec.environment)
     return environment
 
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from rosrm.core.model import Assignment, ProcessSpec
+from rosrm.core.model import Assignment, ProcessSpec, RestartPolicy
 from rosrm.errors import LaunchError
 from rosrm.slave import ament_index
-from rosrm.slave.environment import process_environment
+from rosrm.slave.environment import Whereabouts, process_environment
 from rosrm.slave.ros_arguments import join_arguments, parameters_text, ros_arguments
 from rosrm.supervisor.client import LaunchOrder, log_path
 
@@ -18,7 +18,7 @@ def launch_order(
     base_environment: Mapping[str, str],
     python: str,
     *,
-    host: str,
+    where: Whereabouts,
     state_directory: Path,
 ) -> LaunchOrder:
     """What the supervisor is to start for an assignment; its parameters are written to a file.
@@ -27,14 +27,14 @@ def launch_order(
         assignment: what is to run.
         base_environment: the slave's own, its ROS settings included.
         python: the interpreter for modules.
-        host: name of this host in rosrm.
+        where: it will run.
         state_directory: of this host's supervisor; the parameters lie beside the instance's log.
 
     Raises:
         LaunchError: what was looked for, and where.
     """
     spec = assignment.spec
-    environment = process_environment(assignment, base_environment, host)
+    environment = process_environment(assignment, base_environment, where)
     command = _command(spec, environment, python)
     if spec.ros or spec.package is not None:
         parameters_file = _write_parameters(assignment, state_directory)
@@ -47,7 +47,8 @@ def launch_order(
         argv=(*command, *arguments),
         environment=environment,
         working_directory=_working_directory(spec),
-        restart=spec.restart,
+        # A shadow that has ended is never started again: the source is active all the while.
+        restart=RestartPolicy("never") if assignment.shadow else spec.restart,
         stop=spec.stop,
     )
 

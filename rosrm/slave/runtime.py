@@ -12,6 +12,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any, Final
 
@@ -26,25 +27,30 @@ from rosrm.core.model import (
     InstanceId,
     InstanceState,
     InstanceStatus,
+    RestartPolicy,
     StopPolicy,
 )
 from rosrm.errors import LaunchError, Refused, SupervisorError
 from rosrm.ports import ProbeContext
 from rosrm.registry import Registry
 from rosrm.ros.graph import GraphWatch
-from rosrm.ros.names import token
+from rosrm.ros.names import STATE_CONFIG, Names, token
 from rosrm.ros.participant import Participant
 from rosrm.ros.slave_endpoint import Link, LogSlice, SlaveEndpoint, result_json
+from rosrm.slave.environment import SHADOW, Whereabouts
 from rosrm.slave.launch import launch_order
 from rosrm.slave.log_reading import NOTHING_YET, newest_instance, read_log
+from rosrm.slave.memos import from_memo, to_memo
 from rosrm.slave.sampling import Sampler
 from rosrm.slave.sessions import SessionTable, SessionUsage
 from rosrm.state_directory import only_one
 from rosrm.supervisor.client import (
+    Amended,
     LogLimits,
     SupervisorClient,
     SupervisorEnded,
     SupervisorGone,
+    Told,
 )
 from rosrm.version import __version__
 
@@ -66,6 +72,8 @@ _BEATS_MISSED: Final = 3
 _READINGS_FIRST: Final = 3
 
 Executor = Callable[[Mapping[str, Any]], Mapping[str, Any]]
+#: Told of the outcome of an order: why it was refused; "": it is done.
+Settled = Callable[[str], None]
 
 
 class SlaveRuntime:
@@ -90,6 +98,7 @@ class SlaveRuntime:
         self._events: deque[core.Event] = deque()
         self._from_threads: deque[Callable[[], None]] = deque()
         self._graph_before: dict[InstanceId, frozenset[bytes]] = {}
+        self._unsettled: dict[tuple[InstanceId, RestartPolicy], list[Settled]] = {}
         self._executors: Mapping[str, Executor] = registry.executors()
         self._leaders: dict[InstanceId, int] = {}
         self._seen: Mapping[int, SessionUsage] = {}
@@ -238,7 +247,8 @@ class SlaveRuntime:
     def _look_at_graph(self, awaited: Mapping[InstanceId, core.Held]) -> None:
         for instance, held in awaited.items():
             before = self._graph_before.get(instance, frozenset())
-            if self._graph.sees(held.node_name, self._sessions.members(held.status.pid), before):
+            pids = self._sessions.members(held.status.pid)
+            if held.awaited and self._graph.sees(held.awaited.node_name, pids, before):
                 self.take(core.SeenInGraph(instance))
 
     # --- core and supervisor -------------------------------------------------------------
@@ -272,6 +282,13 @@ class SlaveRuntime:
             self._supervisor.stop(command.instance)
         elif isinstance(command, core.Restart):
             self._supervisor.restart(command.instance)
+        elif isinstance(command, core.Amend):
+            self._supervisor.amend(command.instance, command.restart, {SHADOW: None})
+        elif isinstance(command, core.Settle):
+            for settled in self._unsettled.pop((command.instance, command.restart), []):
+                settled(command.refusal)
+        elif isinstance(command, core.Remember):
+            self._supervisor.remember(command.instance, to_memo(command.awaited))
         elif isinstance(command, core.Forget):
             self._supervisor.forget(command.instances)
         else:
@@ -279,17 +296,22 @@ class SlaveRuntime:
 
     def _launch(self, assignments: Sequence[Assignment]) -> None:
         orders = []
+        where = Whereabouts(
+            self._config.host,
+            self._endpoint.cluster,
+            Names(self._config.ros.namespace)(STATE_CONFIG),
+        )
         for assignment in assignments:
-            held = self._state.held[assignment.instance]
-            if held.node_name:
-                self._graph_before[assignment.instance] = self._graph.endpoints(held.node_name)
+            awaited = self._state.held[assignment.instance].awaited
+            if awaited is not None:
+                before = self._graph.endpoints(awaited.node_name)
+                self._graph_before[assignment.instance] = before
             try:
-                orders.append(
-                    launch_order(
-                        assignment, self._environment, sys.executable, host=self._config.host,
-                        state_directory=self._supervisor_state,
-                    )
+                order = launch_order(
+                    assignment, self._environment, sys.executable, where=where,
+                    state_directory=self._supervisor_state,
                 )  # fmt: skip
+                orders.append(replace(order, memo="" if awaited is None else to_memo(awaited)))
             except LaunchError as error:
                 self.say(f"{assignment.instance} cannot be started here: {error}")
                 self.take(core.LaunchRefused(assignment.instance, str(error)))
@@ -303,12 +325,12 @@ class SlaveRuntime:
         """Runs in a thread of its own: the supervisor's words, into the loop."""
         while True:
             try:
-                statuses = self._supervisor.receive(None)
+                told = self._supervisor.receive(None)
             except SupervisorError as error:
                 self._from_threads.append(partial(self._supervisor_gone, error))
                 self._wake()
                 return
-            self._from_threads.append(partial(self._take_statuses, statuses))
+            self._from_threads.append(partial(self._take_told, told))
             self._wake()
 
     def _wake(self) -> None:
@@ -339,12 +361,18 @@ class SlaveRuntime:
             self.say(note)
         for status in self._supervisor.instances:
             self._follow_session(status)
-        self.take(core.SupervisorReplaced(tuple(self._supervisor.instances)))
+        memos = {one: from_memo(memo) for one, memo in self._supervisor.memos.items()}
+        awaited = {one: memo for one, memo in memos.items() if memo is not None}
+        self.take(core.SupervisorReplaced(tuple(self._supervisor.instances), awaited))
 
-    def _take_statuses(self, statuses: Sequence[InstanceStatus]) -> None:
+    def _take_told(self, told: Sequence[Told]) -> None:
+        statuses = tuple(one for one in told if isinstance(one, InstanceStatus))
         for status in statuses:
             self._follow_session(status)
-        self.take(core.SupervisorReported(tuple(statuses)))
+        self.take(core.SupervisorReported(statuses))
+        for one in told:
+            if isinstance(one, Amended):
+                self.take(core.RestartPolicyRecorded(one.instance, one.restart))
 
     def _follow_session(self, status: InstanceStatus) -> None:
         """Keep the table of sessions, for probes and usage."""
@@ -366,6 +394,11 @@ class SlaveRuntime:
     def statuses(self) -> Sequence[InstanceStatus]:
         """All that this host holds."""
         return self._state.statuses()
+
+    def set_restart(self, instance: InstanceId, restart: RestartPolicy, settled: Settled) -> None:
+        """Give an instance another restart policy; `settled` when it is on record."""
+        self._unsettled.setdefault((instance, restart), []).append(settled)
+        self.take(core.RestartPolicySet(instance, restart))
 
     def say(self, message: str) -> None:
         """Tell the user."""

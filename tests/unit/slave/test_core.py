@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
+from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from rosrm.core import slave
 from rosrm.core.model import (
@@ -18,7 +18,9 @@ from rosrm.core.model import (
     InstanceStatus,
     ProcessSpec,
     Readiness,
+    RestartPolicy,
 )
+from rosrm.slave.memos import from_memo, to_memo
 
 PLAIN = ProcessSpec("p", command=("true",))
 NODE = ProcessSpec("n", module="m", ros=True, namespace="/robot", readiness=Readiness(timeout=10.0))
@@ -52,6 +54,11 @@ class Slave:
 @pytest.fixture
 def one() -> Slave:
     return Slave()
+
+
+def awaited_names(one: Slave) -> list[str]:
+    """Who is looked for in the graph."""
+    return [h.awaited.node_name for h in one.state.awaited_in_graph().values()]
 
 
 def states(commands) -> list[InstanceState]:
@@ -143,10 +150,19 @@ def test_a_node_is_ready_when_it_is_seen(one) -> None:
     one.step(assigned(NODE))
     assert one.state.awaited_in_graph() == {}
     assert states(one.step(told(STATE.RUNNING, "n", pid=5))) == [STATE.RUNNING]
-    assert [h.node_name for h in one.state.awaited_in_graph().values()] == ["/robot/n"]
+    assert awaited_names(one) == ["/robot/n"]
     assert states(one.step(slave.SeenInGraph(InstanceId("n", 1)))) == [STATE.READY]
     assert one.step(slave.SeenInGraph(InstanceId("n", 1))) == []
     assert one.state.awaited_in_graph() == {}
+
+
+def test_a_shadow_is_awaited_under_its_alias(one) -> None:
+    """The source has the node's own name; the shadow's is in the graph as soon as it is ready."""
+    shadow = Assignment(InstanceId("n", 2), NODE, 1, "n_1700000000", shadow=True)
+    one.step(slave.AssignmentsReceived((shadow,)))
+    one.step(told(STATE.RUNNING, "n", 2, pid=5))
+    assert awaited_names(one) == ["/robot/n_1700000000"]
+    assert states(one.step(slave.SeenInGraph(InstanceId("n", 2)))) == [STATE.READY]
 
 
 def test_readiness_kinds(one) -> None:
@@ -191,6 +207,147 @@ def test_what_a_former_run_of_the_slave_left_is_ready(one) -> None:
     assert states(one.step(told(STATE.RUNNING, "n", pid=5))) == [STATE.READY]
     assert one.step(slave.TimePassed(), after=1000.0) == []
     assert one.step(assigned(NODE)) == []
+
+
+# --- a later run of the slave -----------------------------------------------------------------
+
+NODE_1 = InstanceId("n", 1)
+
+
+def memo_of(commands) -> slave.Awaited:
+    """What the supervisor is to remember, as a later run reads it."""
+    (memo,) = [c.awaited for c in commands if isinstance(c, slave.Remember)]
+    return from_memo(to_memo(memo))
+
+
+def taken_over(one: Slave, status: InstanceStatus, awaited: slave.Awaited) -> Slave:
+    """Another run of the slave, which found this with the supervisor."""
+    later = Slave()
+    later.now = one.now
+    later.step(slave.SupervisorReplaced((status,), {status.instance: awaited}))
+    return later
+
+
+def test_a_node_that_was_still_awaited_is_awaited_by_the_next_slave(one) -> None:
+    """It is not ready because the slave that waited for it was killed."""
+    one.step(assigned(NODE))
+    awaited = from_memo(to_memo(one.of("n").awaited))
+    later = taken_over(one, InstanceStatus(NODE_1, STATE.RUNNING, pid=5), awaited)
+    assert later.of("n").status.state is STATE.RUNNING
+    assert awaited_names(later) == ["/robot/n"]
+    assert later.step(slave.TimePassed(), after=9.9) == []
+    assert later.step(slave.TimePassed(), after=0.2) == [slave.Stop(NODE_1)]
+
+
+def test_a_node_that_was_seen_is_ready_for_the_next_slave(one) -> None:
+    """The run that was seen, that is: its next one must be seen anew."""
+    one.step(assigned(NODE))
+    one.step(told(STATE.RUNNING, "n", pid=5))
+    awaited = memo_of(one.step(slave.SeenInGraph(NODE_1)))
+    later = taken_over(one, InstanceStatus(NODE_1, STATE.RUNNING, pid=5), awaited)
+    assert later.of("n").status.state is STATE.READY
+    assert later.step(slave.TimePassed(), after=1000.0) == []
+    later.step(told(STATE.BACKOFF, "n"))
+    assert states(later.step(told(STATE.RUNNING, "n", pid=6))) == [STATE.RUNNING]
+    assert awaited_names(later) == ["/robot/n"]
+    later = taken_over(one, InstanceStatus(NODE_1, STATE.RUNNING, pid=6), awaited)
+    assert later.of("n").status.state is STATE.RUNNING
+
+
+@pytest.mark.parametrize("memo", ["", "{}", "[1]", "nothing", '["/n", "soon", 0]'])
+def test_a_memo_of_another_version_is_none(memo) -> None:
+    """What it says is not guessed at."""
+    assert from_memo(memo) is None
+
+
+# --- another restart policy -------------------------------------------------------------------
+
+ONE = InstanceId("p", 1)
+NEVER = RestartPolicy("never")
+ON_FAILURE = RestartPolicy("on-failure")
+
+
+def running() -> Slave:
+    """A slave with one instance that runs."""
+    one = Slave()
+    one.step(assigned())
+    one.step(told(STATE.RUNNING, pid=5))
+    return one
+
+
+def test_a_restart_policy_is_settled_when_it_is_recorded() -> None:
+    """Each time it is ordered; its status is told as well."""
+    one = running()
+    for _ in range(2):
+        assert one.step(slave.RestartPolicySet(ONE, NEVER)) == [slave.Amend(ONE, NEVER)]
+        report, settled = one.step(slave.RestartPolicyRecorded(ONE, NEVER))
+        assert states([report]) == [STATE.READY]
+        assert settled == slave.Settle(ONE, NEVER)
+
+
+def test_a_restart_policy_of_what_the_slave_found_running() -> None:
+    """Its spec is not known any more: the supervisor has all that is needed."""
+    one = Slave()
+    one.step(slave.SupervisorReplaced((InstanceStatus(ONE, STATE.RUNNING, pid=5),)))
+    assert one.step(slave.RestartPolicySet(ONE, NEVER)) == [slave.Amend(ONE, NEVER)]
+
+
+def test_a_restart_policy_is_ordered_again_from_another_supervisor() -> None:
+    """The one that was killed may have had it or not; the next one's word counts."""
+    one = running()
+    one.step(slave.RestartPolicySet(ONE, NEVER))
+    replaced = slave.SupervisorReplaced((InstanceStatus(ONE, STATE.RUNNING, pid=5),))
+    assert slave.Amend(ONE, NEVER) in one.step(replaced)
+    one.step(slave.RestartPolicyRecorded(ONE, NEVER))
+    assert [type(c) for c in one.step(replaced)] == [slave.Report]
+
+
+def test_an_older_policy_that_is_recorded_does_not_settle_a_newer_one() -> None:
+    """Both were under way: each is answered for itself."""
+    one = running()
+    one.step(slave.RestartPolicySet(ONE, NEVER))
+    one.step(slave.RestartPolicySet(ONE, ON_FAILURE))
+    assert one.step(slave.RestartPolicyRecorded(ONE, NEVER))[-1] == slave.Settle(ONE, NEVER)
+    replaced = slave.SupervisorReplaced((InstanceStatus(ONE, STATE.RUNNING, pid=5),))
+    assert one.step(replaced)[:-1] == [slave.Amend(ONE, ON_FAILURE)]
+
+
+def test_a_restart_policy_of_what_has_ended_tells_its_end() -> None:
+    """The master can go on; so it can where the end came in between."""
+    one = running()
+    one.step(slave.RestartPolicySet(ONE, NEVER))
+    one.step(told(STATE.FAILED))
+    report, settled = one.step(slave.RestartPolicySet(ONE, NEVER))
+    assert states([report]) == [STATE.FAILED]
+    assert settled == slave.Settle(ONE, NEVER)
+    replaced = slave.SupervisorReplaced((InstanceStatus(ONE, STATE.FAILED),))
+    assert slave.Settle(ONE, NEVER) in one.step(replaced)
+
+
+def test_a_restart_policy_of_a_stranger_is_refused() -> None:
+    """Also where nobody but a supervisor that was killed could have known it."""
+    one = Slave()
+    (settled,) = one.step(slave.RestartPolicySet(ONE, NEVER))
+    assert "p#1 is not known here" in settled.refusal
+    one = running()
+    one.step(slave.RestartPolicySet(ONE, NEVER))
+    settled = one.step(slave.SupervisorReplaced(()))[0]
+    assert isinstance(settled, slave.Settle)
+    assert settled.refusal
+
+
+def test_a_restart_policy_of_what_waits_for_a_slot() -> None:
+    """It is started with it, and as no shadow."""
+    one = running()
+    one.state.max_processes = 1
+    shadow = Assignment(InstanceId("p", 2), PLAIN, 1, "p_1700000000", shadow=True)
+    one.step(slave.AssignmentsReceived((shadow,)))
+    _, settled = one.step(slave.RestartPolicySet(InstanceId("p", 2), ON_FAILURE))
+    assert settled == slave.Settle(InstanceId("p", 2), ON_FAILURE)
+    (launch,) = [c for c in one.step(told(STATE.EXITED)) if isinstance(c, slave.Launch)]
+    (assignment,) = launch.assignments
+    assert assignment.spec.restart == ON_FAILURE
+    assert not assignment.shadow
 
 
 def test_stop_and_restart_go_to_the_supervisor(one) -> None:
@@ -259,6 +416,8 @@ class AnySlave(RuleBasedStateMachine):
         self.alive: dict[InstanceId, InstanceState] = {}
         self.reported: dict[InstanceId, InstanceState] = {}
         self.stopped: set[InstanceId] = set()
+        self.amending: list[tuple[InstanceId, RestartPolicy]] = []
+        self.unsettled: set[tuple[InstanceId, RestartPolicy]] = set()
 
     def feed(self, event) -> None:
         for command in slave.step(self.state, event, self.now):
@@ -272,6 +431,11 @@ class AnySlave(RuleBasedStateMachine):
             elif isinstance(command, slave.Stop):
                 assert command.instance in self.alive, "a stop of what does not run"
                 self.stopped.add(command.instance)
+            elif isinstance(command, slave.Amend):
+                assert command.instance in self.alive, "a policy for what does not run"
+                self.amending.append((command.instance, command.restart))
+            elif isinstance(command, slave.Settle):
+                self.unsettled.discard((command.instance, command.restart))
             elif isinstance(command, slave.Forget):
                 assert not self.alive.keys() & set(command.instances), "a live one forgotten"
 
@@ -290,6 +454,26 @@ class AnySlave(RuleBasedStateMachine):
     @rule(spec=SPECS, number=NUMBERS)
     def restart(self, spec, number) -> None:
         self.feed(slave.RestartOrdered(InstanceId(spec.name, number)))
+
+    @rule(spec=SPECS, number=NUMBERS, restart=st.sampled_from([NEVER, ON_FAILURE]))
+    def set_restart(self, spec, number, restart) -> None:
+        instance = InstanceId(spec.name, number)
+        self.unsettled.add((instance, restart))
+        self.feed(slave.RestartPolicySet(instance, restart))
+
+    @precondition(lambda self: self.amending)
+    @rule()
+    def record(self) -> None:
+        self.feed(slave.RestartPolicyRecorded(*self.amending.pop(0)))
+
+    @rule(hears=st.booleans())
+    def replace_supervisor(self, hears) -> None:
+        """It was killed: orders that it did not read are lost, what it had recorded is not."""
+        if not hears:
+            self.amending.clear()
+        found = (InstanceStatus(one, state, 7) for one, state in self.alive.items())
+        ended = (h.status for h in self.state.held.values() if h.status.state.ended)
+        self.feed(slave.SupervisorReplaced((*found, *ended)))
 
     @rule(spec=SPECS, number=NUMBERS)
     def see(self, spec, number) -> None:
@@ -332,6 +516,11 @@ class AnySlave(RuleBasedStateMachine):
         for instance, held in self.state.held.items():
             known = self.reported.get(instance, STATE.STARTING)
             assert known is held.status.state
+
+    @invariant()
+    def every_order_is_or_will_be_settled(self) -> None:
+        wanted = {(i, restart) for i, h in self.state.held.items() for restart in h.unsettled}
+        assert self.unsettled <= wanted | set(self.amending)
 
     @invariant()
     def only_running_ones_are_awaited(self) -> None:

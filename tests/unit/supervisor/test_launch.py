@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+from dataclasses import replace
 
 import hypothesis.strategies as st
 import pytest
@@ -12,10 +13,11 @@ from hypothesis import given
 
 from rosrm.core.model import Assignment, InstanceId, ProcessSpec, RestartPolicy, StopPolicy
 from rosrm.errors import LaunchError
-from rosrm.slave.environment import process_environment, without_bootstrapper
+from rosrm.slave.environment import Whereabouts, process_environment, without_bootstrapper
 from rosrm.slave.launch import launch_order
 from rosrm.slave.ros_arguments import join_arguments, parameters_text
 
+HERE = Whereabouts("robot1", "fleet", "/rosrm/state_config")
 VENV = "/home/robot/venv"
 SITE = f"{VENV}/lib/python3.12/site-packages"
 
@@ -25,12 +27,21 @@ def assignment(**fields) -> Assignment:
     return Assignment(InstanceId("talker", 7), spec, 1, "talker")
 
 
+def shadow() -> Assignment:
+    """A destination of a handoff: under an alias, though the node is known by its own name."""
+    spec = ProcessSpec(
+        name="talker", namespace="robot", command=("node",), ros=True, parameters={"rate": 10},
+        restart=RestartPolicy("always"),
+    )  # fmt: skip
+    return Assignment(InstanceId("talker", 8), spec, 3, "talker_1700000000", shadow=True)
+
+
 def order(tmp_path, environment=None, **fields):
     return launch_order(
         assignment(**fields),
         {"PATH": "/usr/bin", **(environment or {})},
         sys.executable,
-        host="robot1",
+        where=HERE,
         state_directory=tmp_path,
     )
 
@@ -86,10 +97,19 @@ def test_a_ros_node_gets_its_name_namespace_and_remappings(tmp_path):
 
 def test_an_alias_names_the_node(tmp_path):
     """In a handoff the node's name is the assignment's, not the spec's."""
-    spec = ProcessSpec(name="talker", command=("node",), ros=True)
-    alias = Assignment(InstanceId("talker", 8), spec, 1, "talker_1700000000")
-    made = launch_order(alias, {}, "python3", host="h", state_directory=tmp_path)
+    made = launch_order(shadow(), {}, "python3", where=HERE, state_directory=tmp_path)
     assert "__node:=talker_1700000000" in made.argv
+    (file,) = (tmp_path / "logs").glob("*.yaml")
+    assert yaml.safe_load(file.read_text()) == {"/**": {"ros__parameters": {"rate": 10}}}
+
+
+def test_a_shadow_is_not_restarted(tmp_path):
+    """Its end is final, whatever its spec says; what is no shadow follows its spec."""
+    made = launch_order(shadow(), {}, "python3", where=HERE, state_directory=tmp_path)
+    assert made.restart == RestartPolicy("never")
+    plain = replace(shadow(), shadow=False)
+    made = launch_order(plain, {}, "python3", where=HERE, state_directory=tmp_path)
+    assert made.restart == RestartPolicy("always")
 
 
 @pytest.mark.parametrize(
@@ -136,7 +156,7 @@ def test_packages_lie_in_the_prefix_of_python_too(tmp_path, prefix):
         assignment(package="demo_nodes", executable="talker"),
         {},
         str(prefix / "bin" / "python3"),
-        host="h",
+        where=HERE,
         state_directory=tmp_path,
     )
     assert made.argv[0] == str(prefix / "lib" / "demo_nodes" / "talker")
@@ -277,7 +297,7 @@ def test_the_spec_has_the_last_word():
     made = process_environment(
         assignment(command=("x",), environment={"ROS_DOMAIN_ID": "9", "PYTHONUNBUFFERED": ""}),
         {"ROS_DOMAIN_ID": "5", "RMW_IMPLEMENTATION": "rmw_fastrtps_cpp"},
-        "robot1",
+        HERE,
     )
     assert made == {
         "ROS_DOMAIN_ID": "9",
@@ -285,5 +305,27 @@ def test_the_spec_has_the_last_word():
         "ROSRM_PROCESS": "talker",
         "ROSRM_INSTANCE": "talker#7",
         "ROSRM_HOST": "robot1",
+        "ROSRM_STATE_CONFIG": "/rosrm/state_config",
+        "ROSRM_CLUSTER": "fleet",
+        "ROSRM_EPOCH": "1",
         "PYTHONUNBUFFERED": "",
     }
+
+
+def test_a_node_is_told_by_which_name_it_is_known():
+    """Its alias is not in it; and it is told that it starts as a shadow."""
+    made = process_environment(shadow(), {}, HERE)
+    assert made["ROSRM_NODE"] == "/robot/talker"
+    assert made["ROSRM_SHADOW"] == "1"
+    assert made["ROSRM_EPOCH"] == "3"
+    packaged = assignment(package="demo_nodes", executable="talker", namespace="/")
+    assert process_environment(packaged, {}, HERE)["ROSRM_NODE"] == "/talker"
+
+
+def test_who_the_slave_is_itself_is_not_handed_on():
+    """A slave may be started by rosrm, even as a shadow: its processes are none for that."""
+    slave = process_environment(shadow(), {}, HERE)
+    made = process_environment(assignment(command=("x",)), slave, HERE)
+    assert "ROSRM_SHADOW" not in made
+    assert "ROSRM_NODE" not in made
+    assert made["ROSRM_INSTANCE"] == "talker#7"
