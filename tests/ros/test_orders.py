@@ -1,0 +1,143 @@
+"""What a real slave does for a handoff: another restart policy, readiness, the environment."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import time
+
+import pytest
+
+from rosrm.core.model import InstanceId, Kind, RestartPolicy
+from rosrm.ros import convert, names, qos
+from rosrm.ros.client import wait_for, wait_for_service
+from rosrm.ros.control import ControlClient
+from rosrm.ros.participant import Participant
+from rosrm_msgs import srv
+from tests.ros.clusters import NODE, PATIENCE, host, node, python, service, wait_gone
+
+NEVER = RestartPolicy("never")
+ON_FAILURE = RestartPolicy("on-failure", delay=0.05)
+
+
+@pytest.fixture(scope="module")
+def cluster(make_shared):
+    return make_shared(host("h0"))
+
+
+class Orders:
+    """Gives the slave orders beside the master's; it has the same clock as this test."""
+
+    def __init__(self, cluster) -> None:
+        self.participant = Participant(cluster.ros, "orders")
+        path = names.Names(cluster.ros.namespace).of_host("h0", names.CONTROL)
+        self.control = ControlClient(self.participant, "test")
+        self.client = self.participant.node.create_client(
+            srv.ControlHost, path, qos_profile=qos.SERVICE
+        )
+
+    def set_restart(self, instance: InstanceId, restart: RestartPolicy):
+        """The answer."""
+        deadline = time.monotonic() + PATIENCE
+        assert wait_for_service(self.participant, self.client, deadline)
+        request = srv.ControlHost.Request(
+            envelope=self.control.envelope(time.monotonic_ns(), 1 << 40),
+            action=srv.ControlHost.Request.SET_RESTART,
+            instance=convert.instance_to_msg(instance), restart=convert.restart_to_msg(restart),
+        )  # fmt: skip
+        return wait_for(self.participant, self.client.call_async(request), deadline).answer
+
+
+@pytest.fixture
+def orders(cluster):
+    made = Orders(cluster)
+    yield made
+    made.participant.close()
+
+
+def end(pid: int) -> None:
+    os.kill(pid, signal.SIGKILL)
+    wait_gone(pid)
+
+
+def replace_slave(cluster) -> None:
+    """Another run of it, after a SIGKILL."""
+    part = cluster.slaves["h0"]
+    part.process.kill()
+    part.process.wait()
+    cluster.start_slave(host("h0"))
+    cluster.wait_for_hosts()
+
+
+def test_another_policy_counts_from_its_answer_on(cluster, orders) -> None:
+    """Whatever is killed a moment after it."""
+    cluster.submit(service("source", restart=ON_FAILURE), service("copy"))
+    for name in ("source", "copy"):
+        cluster.wait(name, "running")
+    rows = {name: cluster.process(name) for name in ("source", "copy")}
+    for name, restart in (("source", NEVER), ("copy", ON_FAILURE)):
+        answer = orders.set_restart(InstanceId(name, rows[name].number), restart)
+        assert answer.accepted, answer.message
+    lock = cluster.directory / "hosts" / "h0" / "supervisor" / "supervisor.lock"
+    os.kill(int(lock.read_text()), signal.SIGKILL)
+    for row in rows.values():
+        end(row.pid)
+    assert cluster.wait("source", "failed", "finished").state == "failed"
+    cluster.wait_until("copy again", lambda view: any(
+        row.name == "copy" and row.restarts == 1 and row.state == "running"
+        for row in view.processes
+    ))  # fmt: skip
+    again = orders.set_restart(InstanceId("source", rows["source"].number), ON_FAILURE)
+    assert again.accepted
+    cluster.cancel("copy")
+
+
+def test_a_policy_for_what_a_killed_slave_left(cluster, orders) -> None:
+    """The next slave knows nothing of its spec."""
+    cluster.submit(service("left", restart=ON_FAILURE))
+    row = cluster.wait("left", "running")
+    replace_slave(cluster)
+    cluster.wait("left", "running")
+    answer = orders.set_restart(InstanceId("left", row.number), NEVER)
+    assert answer.accepted, answer.message
+    end(row.pid)
+    assert cluster.wait("left", "failed").restarts == 0
+
+
+def test_a_policy_for_a_stranger_is_refused(orders) -> None:
+    """With a code for programs, and a reason for people."""
+    answer = orders.set_restart(InstanceId("nobody", 99), NEVER)
+    assert (answer.accepted, answer.code) == (False, "unknown")
+    assert "nobody#99 is not known here" in answer.message
+
+
+def test_a_node_that_is_awaited_when_its_slave_is_killed_is_not_ready(cluster, tmp_path) -> None:
+    """The next slave waits for it; and the one after that knows that it was seen."""
+    go = tmp_path / "go"
+    waits = f"import os, time\nwhile not os.path.exists({str(go)!r}): time.sleep(0.05)\n"
+    cluster.submit(node("late", waits + NODE))
+    pid = cluster.wait("late", "starting").pid
+    replace_slave(cluster)
+    deadline = time.monotonic() + 1.0
+    while time.monotonic() < deadline:
+        assert cluster.process("late").state in ("starting", "unreachable")
+        cluster.client.spin(0.05)
+    go.touch()
+    assert cluster.wait("late", "running").pid == pid
+    replace_slave(cluster)
+    assert cluster.wait("late", "running").pid == pid
+    cluster.cancel("late")
+
+
+def test_a_process_is_told_who_it_is(cluster) -> None:
+    """And by whom it was started, so that it can judge who speaks to it."""
+    code = "import json, os; print(json.dumps(dict(os.environ)))"
+    environment = {"ROS_DOMAIN_ID": str(cluster.domain)}
+    cluster.run(python("who", code, kind=Kind.JOB, environment=environment, ros=True))
+    told = json.loads(cluster.log("who"))
+    assert told["ROSRM_NODE"] == "/who"
+    assert told["ROSRM_STATE_CONFIG"] == "/rosrm/state_config"
+    assert told["ROSRM_CLUSTER"] == cluster.cluster.name
+    assert told["ROSRM_EPOCH"] == "1"
+    assert "ROSRM_SHADOW" not in told
