@@ -1,0 +1,239 @@
+"""What an outside observer notices when a node moves, over many moves between two hosts.
+
+`--strategy handoff` (the default): a stateful node answers the inputs of a driver (or counts by a
+timer of its own: `--driven timer`) while it is moved to and fro. Lost, repeated and out of order
+are counted in its answers; the gap is from the source's last output to the destination's first,
+minus one period. `--strategy relaunch`: a stateless node speaks in each cycle. The gap is the same,
+negative where both were active for a moment; lost are the cycles in which no instance was active,
+repeated those in which both were.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import itertools
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from std_msgs.msg import Int64MultiArray
+
+from benchmarks.handoff_nodes import OUTPUT, QOS
+from benchmarks.hosts import three_hosts
+from benchmarks.machine import percentile, print_report, say
+from rosrm.config.settings import ClusterConfig, MigrationSettings
+from rosrm.core.model import MigrationPolicy, ProcessSpec
+from rosrm.local_cluster import LocalCluster
+
+_ROOT = Path(__file__).resolve().parents[1]
+_NS = 1e9
+#: Seconds of undisturbed output before and after each move.
+_SETTLE = 0.5
+#: Seconds within which a move must have ended, one way or the other.
+_PATIENCE = 60.0
+_NAME = "moving"
+
+
+class Output(NamedTuple):
+    """One output as the observer got it: when DDS received it, and what it says."""
+
+    received: int
+    instance: int
+    sequence: int
+    answered: int
+
+
+@dataclass
+class Outcome:
+    """What came of the moves: how each ended, and what they were seen to cost."""
+
+    ends: list[str]
+    gaps: list[float]
+    lost: int
+    repeated: int
+    out_of_order: int
+
+
+class Observer:
+    """Records every output, in a participant and a thread of its own."""
+
+    def __init__(self, domain: int) -> None:
+        self.outputs: list[Output] = []
+        self._context = rclpy.Context()
+        rclpy.init(
+            context=self._context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO
+        )
+        self._node = Node("handoff_observer", context=self._context)
+        self._node.create_subscription(Int64MultiArray, OUTPUT, self._take, QOS)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        self._thread = threading.Thread(target=self._executor.spin, daemon=True)
+        self._thread.start()
+
+    def _take(self, message: Int64MultiArray, info: Any) -> None:
+        self.outputs.append(Output(info["received_timestamp"], *message.data))
+
+    def wait_for(self, count: int, timeout: float = _PATIENCE) -> None:
+        """Until so many more outputs have come."""
+        wanted, deadline = len(self.outputs) + count, time.monotonic() + timeout
+        while len(self.outputs) < wanted:
+            if time.monotonic() >= deadline:
+                raise TimeoutError(f"{count} more outputs did not come in {timeout:g} s")
+            time.sleep(0.01)
+
+    def close(self) -> None:
+        self._executor.shutdown()
+        self._thread.join(5.0)
+        self._node.destroy_node()
+        self._context.try_shutdown()
+
+
+@contextlib.contextmanager
+def driver(cluster: LocalCluster, rate: float) -> Iterator[None]:
+    """Inputs at a rate, from a process of its own."""
+    environment = {**os.environ, **cluster.ros.environment(), "ROS_DOMAIN_ID": str(cluster.domain)}
+    process = subprocess.Popen(
+        [sys.executable, "-m", "benchmarks.handoff_nodes", "drive", "--rate", str(rate)],
+        cwd=_ROOT, env=environment, start_new_session=True,
+    )  # fmt: skip
+    try:
+        yield
+    finally:
+        process.send_signal(signal.SIGINT)
+        try:
+            process.wait(5.0)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait(5.0)
+
+
+def process_of(strategy: str, program: str, rate: float) -> ProcessSpec:
+    return ProcessSpec(
+        _NAME, module="benchmarks.handoff_nodes", arguments=(program, "--rate", str(rate)),
+        environment={"PYTHONPATH": str(_ROOT)}, ros=True,
+        migration=MigrationPolicy(strategy=strategy),
+    )  # fmt: skip
+
+
+def move(cluster: LocalCluster) -> str:
+    """Move the process to the other host; returns "migrated" or "stayed"."""
+    last = cluster.client.list(events=True, newest=1).events[-1].sequence
+    here = cluster.process(_NAME).host
+    there = next(name for name in cluster.slaves if name != here)
+    cluster.client.migrate(_NAME, there)
+    deadline = time.monotonic() + _PATIENCE
+    while time.monotonic() < deadline:
+        events = cluster.client.list(events=True, process=_NAME, after=last).events
+        for event in events:
+            if event.kind in ("migrated", "stayed"):
+                if event.kind == "stayed":
+                    say(event.message)
+                return str(event.kind)
+        cluster.client.spin(0.05)
+    raise TimeoutError(f"the move to {there} did not end in {_PATIENCE:g} s")
+
+
+def gaps_of_handoff(outputs: Sequence[Output], period: float) -> list[float]:
+    """Seconds beyond one period, from the last output of one instance to the next one's first."""
+    return [
+        (after.received - before.received) / _NS - period
+        for before, after in itertools.pairwise(outputs)
+        if before.instance != after.instance
+    ]
+
+
+def outcome_of_handoff(ends: list[str], outputs: Sequence[Output], period: float) -> Outcome:
+    answered = [output.answered for output in outputs]
+    sequence = [output.sequence for output in outputs]
+    # Both must be gapless: no input without an answer, and no answer that the observer missed.
+    missing = max(
+        max(numbers) - min(numbers) + 1 - len(set(numbers)) for numbers in (answered, sequence)
+    )
+    repeated = max(len(numbers) - len(set(numbers)) for numbers in (answered, sequence))
+    disorder = sum(later < earlier for earlier, later in itertools.pairwise(sequence))
+    return Outcome(ends, gaps_of_handoff(outputs, period), missing, repeated, disorder)
+
+
+def outcome_of_relaunch(ends: list[str], outputs: Sequence[Output], period: float) -> Outcome:
+    """Of a node that says the same in each cycle, whichever instance speaks."""
+    by_instance: dict[int, list[float]] = {}
+    for output in outputs:
+        by_instance.setdefault(output.instance, []).append(output.received / _NS)
+    gaps, lost, repeated = [], 0, 0
+    for before, after in itertools.pairwise(by_instance.values()):
+        gaps.append(after[0] - before[-1] - period)
+        lost += max(0, round((after[0] - before[-1]) / period) - 1)
+        repeated += sum(time < before[-1] for time in after)
+    return Outcome(ends, gaps, lost, repeated, 0)
+
+
+def measure(strategy: str, driven: str, rate: float, runs: int) -> Outcome:
+    program = "tick" if strategy == "relaunch" else {"input": "echo", "timer": "count"}[driven]
+    period = 1.0 / rate
+    settings = ClusterConfig(
+        migration=MigrationSettings(strategies={strategy: {}}, automatic=False)
+    )
+    with contextlib.ExitStack() as stack:
+        folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="rosrm-handoff-"))
+        cluster = stack.enter_context(
+            LocalCluster(Path(folder), cluster=settings, hosts=three_hosts()[:2])
+        )
+        observer = Observer(cluster.domain or 0)
+        stack.callback(observer.close)
+        cluster.client.submit([process_of(strategy, program, rate)])
+        cluster.wait_until("the node running", lambda view: view.processes[0].state == "running")
+        if program == "echo":
+            stack.enter_context(driver(cluster, rate))
+        observer.wait_for(max(3, int(rate * _SETTLE)))
+        ends = []
+        for run in range(runs):
+            ends.append(move(cluster))
+            observer.wait_for(max(3, int(rate * _SETTLE)))
+            if (run + 1) % 10 == 0:
+                say(f"{run + 1}/{runs} moves at {rate:g} Hz")
+        outputs = list(observer.outputs)
+    if strategy == "relaunch":
+        return outcome_of_relaunch(ends, outputs, period)
+    return outcome_of_handoff(ends, outputs, period)
+
+
+def main() -> None:
+    """Measure and print one JSON object."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--rate", type=float, default=10.0, help="Hz")
+    parser.add_argument("--runs", type=int, default=100, help="moves")
+    parser.add_argument("--strategy", choices=["handoff", "relaunch"], default="handoff")
+    parser.add_argument("--driven", choices=["input", "timer"], default="input")
+    chosen = parser.parse_args()
+    outcome = measure(chosen.strategy, chosen.driven, chosen.rate, chosen.runs)
+    gaps = outcome.gaps
+    print_report(
+        "handoff",
+        {
+            "strategy": chosen.strategy, "driven": chosen.driven, "rate_hz": chosen.rate,
+            "lost": outcome.lost, "repeated": outcome.repeated,
+            "out_of_order": outcome.out_of_order,
+            "gap_p50_ms": round(percentile(gaps, 0.5) * 1e3, 3) if gaps else None,
+            "gap_p99_ms": round(percentile(gaps, 0.99) * 1e3, 3) if gaps else None,
+            "gap_max_ms": round(max(gaps) * 1e3, 3) if gaps else None,
+            "moved": outcome.ends.count("migrated"), "stayed": outcome.ends.count("stayed"),
+        },
+        runs=chosen.runs,
+    )  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()
