@@ -18,12 +18,12 @@ unexport AMENT_PREFIX_PATH CMAKE_PREFIX_PATH COLCON_PREFIX_PATH ROS_DISTRO RMW_I
 export ROS_AUTOMATIC_DISCOVERY_RANGE := LOCALHOST
 
 .DEFAULT_GOAL := help
-.PHONY: help setup test lint format demo bench clean
+.PHONY: help setup test lint format demo demo-migration bench clean
 
 help: ## this list
 	@echo "make TARGET, each sets up what it needs:"
-	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  %-8s%s\n", $$1, $$2 }' $(MAKEFILE_LIST)
-	@echo "Variables: PYTHON=python3.12 (setup), LAYERS=\"unit ros\" ARGS=\"-k name\" (test)"
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  %-16s%s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@echo "Variables: PYTHON=python3.12 (setup), LAYERS=\"unit ros\" ARGS=\"-k name\" (test), DRIVE=path (demo-migration)"
 
 setup: ## make .venv with all that the other targets need
 	@command -v $(PYTHON) >/dev/null || { \
@@ -48,6 +48,9 @@ format: setup ## mend what ruff can mend
 
 demo: setup ## three hosts on this machine map a LiDAR drive: out/demo/
 	@$(BIN)/python -m rosrm_examples.demo --out out/demo
+
+demo-migration: setup ## a LiDAR drive is mapped while the SLAM moves to another host: out/migration/
+	@$(BIN)/python -m rosrm_examples.demo_migration --out out/migration $(if $(DRIVE),--drive "$(DRIVE)")
 
 bench: setup ## all benchmarks; each ends with one line of JSON
 	@set -e; for name in $(BENCHMARKS); do echo "== $$name"; $(BIN)/python -m benchmarks.$$name; done

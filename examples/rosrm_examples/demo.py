@@ -21,61 +21,45 @@ if __name__ == "__main__":  # ends the imports below without a traceback
     signal.signal(signal.SIGINT, lambda *_: os._exit(130))
 
 import argparse
-import fcntl
 import json
-import shutil
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final, TextIO
-
-import psutil
-from rich.console import Console
+from typing import Any, Final
 
 from rosrm.core.views import ProcessRow
-from rosrm.errors import RosrmError
-from rosrm_examples.demo_job import LEAST_BUDGET, Scenario, arrivals, budget_for, count_by_kind
+from rosrm.local_cluster import LocalCluster
+from rosrm_examples.demo_frame import CLUSTER, Stage, Unfit, free_memory, own_folder, run_demo
+from rosrm_examples.demo_job import (
+    HOSTS,
+    LEAST_BUDGET,
+    MEMORY_LIMIT,
+    Scenario,
+    arrivals,
+    budget_for,
+    cluster_config,
+    count_by_kind,
+    host_configs,
+)
 from rosrm_examples.demo_plots import USAGE_FILE, draw_usage, title_of
 from rosrm_examples.demo_record import EVENTS_FILE, SAMPLES_FILE, Record, summarise
-from rosrm_examples.demo_run import Demo, DemoFailed, Stopped, StopSignals
+from rosrm_examples.demo_run import Arrivals, Demo
 from rosrm_examples.demo_screen import screen_for
-from rosrm_examples.drives import Drive, default_drive, load_drive
-from rosrm_examples.errors import ExampleError
+from rosrm_examples.drives import Drive, drive_of
 from rosrm_examples.merge import join, write_map
 from rosrm_examples.pieces import load_pieces
-from rosrm_resources.memory import CgroupMemory
 
 SUMMARY_FILE: Final = "summary.json"
 #: What the demo leaves, in the order in which one looks at it.
 LEFT: Final = (SUMMARY_FILE, USAGE_FILE, "map.png", "map.ply", EVENTS_FILE, SAMPLES_FILE)
-#: Below the folder of results; a folder with this file in it is the demo's own to empty.
-_CLUSTER, _PIECES, _MARK = "cluster", "pieces", ".rosrm-demo"
-
-
-class Unfit(Exception):
-    """The demo cannot begin with these arguments, or on this machine."""
+#: Below the folder of results.
+_PIECES: Final = "pieces"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the demo; returns the exit status."""
     options = _parse(arguments)
-    signals = StopSignals()
-    console = Console()
-    try:
-        _demonstrate(options, signals, console)
-    except Stopped as stopped:
-        print(f"demo: stopped by {stopped}", file=sys.stderr)
-        return 128 + stopped.number
-    except (Unfit, ExampleError) as error:
-        print(f"demo: {error}", file=sys.stderr)
-        return 2
-    except DemoFailed as error:
-        print(f"demo: {error}", file=sys.stderr)
-        return 1
-    except (RosrmError, TimeoutError, OSError) as error:
-        print(f"demo: {error}; see the logs in {options.out / _CLUSTER}", file=sys.stderr)
-        return 1
-    return 0
+    return run_demo("demo", options.out, lambda stage: _demonstrate(options, stage))
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -104,46 +88,27 @@ def _pace(text: str) -> float:
     return pace
 
 
-def _demonstrate(options: argparse.Namespace, signals: StopSignals, console: Console) -> None:
-    drive = load_drive(options.drive) if options.drive else default_drive()
+def _demonstrate(options: argparse.Namespace, stage: Stage) -> None:
+    drive = drive_of(options.drive)
     drive.piece(1, options.pieces)  # raises where it cannot be cut so
     scenario = Scenario(
         drive.name, len(drive), options.pieces, options.seed, options.pace, _budget()
     )
     out: Path = options.out
-    with _own_folder(out):
-        console.print(_opening(scenario), highlight=False, soft_wrap=True)
-        demo = Demo(scenario, out / _CLUSTER, screen_for(console), signals)
-        processes = demo.carry_out(arrivals(scenario, (out / _PIECES).absolute(), Path.cwd()))
-        signals.check()
-        summary = _write_results(out, drive, demo.record, processes)
-    console.print(_closing(summary, processes, out), highlight=False, soft_wrap=True)
+    with own_folder(out, (*LEFT, "trajectory.npz"), [_PIECES]):
+        stage.console.print(_opening(scenario), highlight=False, soft_wrap=True)
+        record = Record(HOSTS, {"memory": MEMORY_LIMIT}, scenario.budget)
+        demo = Demo(_cluster(scenario, out), record, screen_for(stage.console), stage.signals)
+        coming = arrivals(scenario, (out / _PIECES).absolute(), Path.cwd())
+        processes = demo.carry_out(Arrivals(coming))
+        stage.signals.check()
+        summary = _write_results(out, drive, record, processes)
+    stage.console.print(_closing(summary, processes, out), highlight=False, soft_wrap=True)
 
 
-# --- the folder of results ---------------------------------------------------------------------
-
-
-def _own_folder(out: Path) -> TextIO:
-    """Empties the folder of an earlier demo; the file that is returned keeps a second demo out.
-
-    Raises:
-        Unfit: the folder is not of a demo, or another demo writes to it.
-    """
-    out.mkdir(parents=True, exist_ok=True)
-    mark = out / _MARK
-    if not mark.exists() and any(out.iterdir()):
-        raise Unfit(f"--out {out}: holds files that are of no demo; name a new or empty folder")
-    lock = mark.open("a")
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        lock.close()
-        raise Unfit(f"--out {out}: another demo is writing to it") from None
-    for folder in (_CLUSTER, _PIECES):
-        shutil.rmtree(out / folder, ignore_errors=True)
-    for name in (*LEFT, "trajectory.npz"):
-        (out / name).unlink(missing_ok=True)
-    return lock
+def _cluster(scenario: Scenario, out: Path) -> LocalCluster:
+    hosts = host_configs(scenario.budget, os.cpu_count() or 1)
+    return LocalCluster(out / CLUSTER, cluster_config(scenario.pace), hosts)
 
 
 def _write_results(
@@ -167,11 +132,7 @@ def _budget() -> int:
     Raises:
         Unfit: too little for the demo.
     """
-    free = float(psutil.virtual_memory().available)
-    group = CgroupMemory.find()
-    if group is not None:
-        free = min(free, group.capacity * (1.0 - group.usage()))
-        group.close()
+    free = free_memory()
     budget = budget_for(free)
     if budget < LEAST_BUDGET:
         raise Unfit(

@@ -1,8 +1,7 @@
-"""Carries the demo out: starts the cluster, submits what comes, watches until all has ended."""
+"""Carries a demo out: starts the cluster, does what its script says, watches until it is over."""
 
 from __future__ import annotations
 
-import os
 import signal
 import time
 from collections.abc import Iterable, Sequence
@@ -10,30 +9,24 @@ from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from types import FrameType
-from typing import Final
+from typing import Final, Protocol
 
 from rosrm.core.model import InstanceId
 from rosrm.core.views import ProcessRow, Snapshot
 from rosrm.errors import RosrmError
 from rosrm.local_cluster import LocalCluster, Part
+from rosrm.ros.client import MasterClient
 from rosrm.supervisor.client import log_path
-from rosrm_examples.demo_job import (
-    HOSTS,
-    MEMORY_LIMIT,
-    Arrival,
-    Scenario,
-    cluster_config,
-    host_configs,
-)
+from rosrm_examples.demo_job import Arrival
 from rosrm_examples.demo_record import Record
 from rosrm_examples.demo_screen import Screen
 
 _START_S: Final = 30.0
-#: Everything has ended by then, at any pace, or something is wrong.
+#: A demo is over by then, or something is wrong.
 _LONGEST_S: Final = 150.0
 _SAMPLE_S: Final = 0.2
 _SPIN_S: Final = 0.05
-_OVER: Final = frozenset({"finished", "failed", "cancelled"})
+OVER: Final = frozenset({"finished", "failed", "cancelled"})
 _WRONG: Final = frozenset({"failed", "cancelled", "set_aside", "stuck"})
 
 
@@ -70,26 +63,51 @@ class StopSignals:
             raise Stopped(self._came)
 
 
+class Script(Protocol):
+    """What a demo does, and when it is over."""
+
+    def act(self, client: MasterClient, elapsed: float) -> None:
+        """Do what is due, `elapsed` seconds after the beginning; called again and again."""
+
+    def is_over(self, view: Snapshot) -> bool:
+        """Look at hosts and processes: whether nothing is left to do or to wait for."""
+
+
+class Arrivals:
+    """Submits processes at their times, until all have ended."""
+
+    def __init__(self, coming: Sequence[Arrival]) -> None:
+        self._left = list(coming)
+
+    def act(self, client: MasterClient, elapsed: float) -> None:
+        """Submit what is due."""
+        while self._left and self._left[0].at <= elapsed:
+            client.submit(self._left.pop(0).specs)
+
+    def is_over(self, view: Snapshot) -> bool:
+        """Whether all have ended."""
+        return not self._left and all(row.state in OVER for row in view.processes)
+
+
 class Demo:
-    """One run of the demo on a cluster of its own."""
+    """One run of a demo on a cluster of its own."""
 
     def __init__(
-        self, scenario: Scenario, directory: Path, screen: Screen, signals: StopSignals
+        self, cluster: LocalCluster, record: Record, screen: Screen, signals: StopSignals
     ) -> None:
         """Prepares the run; nothing is started.
 
         Args:
-            directory: for the states and logs of master and slaves.
+            cluster: to be started, and ended.
+            record: takes in all that is seen.
         """
-        hosts = host_configs(scenario.budget, os.cpu_count() or 1)
-        self.record = Record(HOSTS, {"memory": MEMORY_LIMIT}, scenario.budget)
+        self.record = record
         self._screen = screen
         self._signals = signals
-        self._directory = directory
-        self._cluster = LocalCluster(directory, cluster_config(scenario.pace), hosts)
+        self._cluster = cluster
 
-    def carry_out(self, coming: Sequence[Arrival]) -> Sequence[ProcessRow]:
-        """Run everything; returns the processes as they were at the end.
+    def carry_out(self, script: Script) -> Sequence[ProcessRow]:
+        """Do what the script says; returns the processes as they were at the end.
 
         Raises:
             DemoFailed: a process failed, a part of rosrm died, or it took too long.
@@ -98,7 +116,7 @@ class Demo:
         try:
             self._start_cluster()
             with closing(self._screen):
-                return self._run(coming)
+                return self._run(script)
         except RosrmError:
             self._check_parts()  # a part that has died says it better than who waited for it
             raise
@@ -109,32 +127,28 @@ class Demo:
         self._cluster.start_master()
         for host in self._cluster.hosts:
             self._cluster.start_slave(host)
-        self._cluster.wait_until("three hosts that accept work", self._all_accept, _START_S)
+        self._cluster.wait_until("every host accepting work", self._all_accept, _START_S)
 
     def _all_accept(self, view: Snapshot) -> bool:
         self._signals.check()
         return sum(row.accepting for row in view.hosts) == len(self._cluster.hosts)
 
-    def _run(self, coming: Sequence[Arrival]) -> Sequence[ProcessRow]:
+    def _run(self, script: Script) -> Sequence[ProcessRow]:
         began = time.monotonic()
-        left, next_look = list(coming), 0.0
+        next_look = 0.0
         while True:
             self._signals.check()
             self._check_parts()
             elapsed = time.monotonic() - began
-            self._submit_due(left, elapsed)
+            script.act(self._cluster.client, elapsed)
             if elapsed >= next_look:
                 view = self._look(elapsed)
-                if not left and all(row.state in _OVER for row in view.processes):
+                if script.is_over(view):
                     return view.processes
                 if elapsed > _LONGEST_S:
                     raise self._too_long(view.processes)
                 next_look = max(next_look + _SAMPLE_S, elapsed)
             self._cluster.client.spin(_SPIN_S)
-
-    def _submit_due(self, left: list[Arrival], elapsed: float) -> None:
-        while left and left[0].at <= elapsed:
-            self._cluster.client.submit(left.pop(0).specs)
 
     def _look(self, elapsed: float) -> Snapshot:
         view = self._cluster.client.list(
@@ -161,22 +175,21 @@ class Demo:
         return [*([master] if master else []), *self._cluster.slaves.values()]
 
     def _what_happened(self, row: ProcessRow) -> str:
+        directory = self._cluster.directory
         reason = row.reason or f"exit code {row.exit_code}"
         found = self.record.last_instance(row.name)
         if found is None:
-            return f"{row.name} is {row.state}: {reason}; see {self._directory / 'master.log'}"
+            return f"{row.name} is {row.state}: {reason}; see {directory / 'master.log'}"
         host, number = found
-        log = log_path(
-            self._directory / "hosts" / host / "supervisor", InstanceId(row.name, number)
-        )
+        log = log_path(directory / "hosts" / host / "supervisor", InstanceId(row.name, number))
         return f"{row.name} {row.state} on {host}: {reason}; see {log}{_last_words(log)}"
 
     def _too_long(self, rows: Sequence[ProcessRow]) -> DemoFailed:
-        late = [f"{row.name} is {row.state}" for row in rows if row.state not in _OVER]
+        late = [f"{row.name} is {row.state}" for row in rows if row.state not in OVER]
         more = f" and {len(late) - 5} more" if len(late) > 5 else ""
         return DemoFailed(
             f"not done after {_LONGEST_S:.0f} s: {', '.join(late[:5])}{more}; "
-            f"see the logs in {self._directory}"
+            f"see the logs in {self._cluster.directory}"
         )
 
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Final, Protocol
+from typing import Final, Protocol, TypeAlias
 
 from rich.console import Console
 from rich.live import Live
@@ -32,16 +32,28 @@ class Screen(Protocol):
         """Leave the terminal as it was."""
 
 
-def screen_for(console: Console) -> Screen:
-    """The live table where there is a terminal that can show it, else lines."""
-    return LiveScreen(console) if console.is_terminal else LineScreen(console)
+#: What there is to say of a snapshot, in one line.
+Words: TypeAlias = Callable[[Snapshot], str]
+
+
+def screen_for(console: Console, note: Words | None = None, line: Words | None = None) -> Screen:
+    """The live table where there is a terminal that can show it, else lines.
+
+    Args:
+        note: said beside the table; the default is that of the demo of pieces and holders.
+        line: said instead of it.
+    """
+    if console.is_terminal:
+        return LiveScreen(console, note or note_of)
+    return LineScreen(console, line or line_of)
 
 
 class LiveScreen:
     """The table of `rosrm top`, renewed in place."""
 
-    def __init__(self, console: Console) -> None:
+    def __init__(self, console: Console, note: Words) -> None:
         self._console = console
+        self._note = note
         self._live = Live(console=console, auto_refresh=False, transient=True)
         self._events: deque[EventRow] = deque(maxlen=_EVENTS)
 
@@ -50,7 +62,7 @@ class LiveScreen:
         self._events.extend(view.events)
         rows = max(_FEWEST_ROWS, self._console.height - _OTHER_LINES)
         shown = replace(view, events=list(self._events))
-        table = render(shown, rows=rows, events=_EVENTS, note=note_of(view))
+        table = render(shown, rows=rows, events=_EVENTS, note=self._note(view))
         self._live.start()
         self._live.update(table, refresh=True)
 
@@ -62,8 +74,9 @@ class LiveScreen:
 class LineScreen:
     """A line every few seconds, and one for each migration."""
 
-    def __init__(self, console: Console) -> None:
+    def __init__(self, console: Console, line: Words) -> None:
         self._console = console
+        self._line = line
         self._next = 0.0
 
     def show(self, view: Snapshot, elapsed: float) -> None:
@@ -73,7 +86,7 @@ class LineScreen:
                 self._print(f"        {event.message}")
         if elapsed >= self._next:
             self._next = elapsed + _LINE_EVERY_S
-            self._print(f"{elapsed:5.0f} s  {line_of(view)}")
+            self._print(f"{elapsed:5.0f} s  {self._line(view)}")
 
     def _print(self, text: str) -> None:
         self._console.print(text, highlight=False, markup=False, soft_wrap=True)
@@ -96,11 +109,16 @@ def note_of(view: Snapshot) -> str:
 
 def line_of(view: Snapshot) -> str:
     """`memory 41 40 42 %   9 pieces and 8 holders run, 3 wait, 12 finished`."""
-    memory = sample_of(view).usage.get("memory", {})
-    used = " ".join("  ?" if value is None else f"{100 * value:3.0f}" for value in memory.values())
     waiting = sum(row.state == "queued" for row in view.processes)
     finished = sum(row.state == "finished" for row in view.processes)
-    return f"memory {used} %   {_run(view.processes)}, {waiting} wait, {finished} finished"
+    return f"{memory_line(view)}   {_run(view.processes)}, {waiting} wait, {finished} finished"
+
+
+def memory_line(view: Snapshot) -> str:
+    """`memory 41 40 42 %`, in the order of the hosts."""
+    memory = sample_of(view).usage.get("memory", {})
+    used = " ".join("  ?" if value is None else f"{100 * value:3.0f}" for value in memory.values())
+    return f"memory {used} %"
 
 
 def _run(rows: Sequence[ProcessRow]) -> str:

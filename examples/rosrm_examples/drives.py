@@ -98,6 +98,11 @@ def load_drive(name: str | Path) -> Drive:
     return drive
 
 
+def drive_of(name: str | Path | None) -> Drive:
+    """Loads a drive by name or path; without one, the default drive."""
+    return load_drive(name) if name else default_drive()
+
+
 def default_drive() -> Drive:
     """Loads KITTI 0001 where it can be found, else the simulated street."""
     return load_drive("kitti0001" if _find_kitti("kitti0001") else "street")

@@ -30,7 +30,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options, ros_arguments = _parse(raw[1:])
     try:
         with _ros_node(ros_arguments) if options.ros else nullcontext():
-            _hold(options.mb, options.grow, options.seconds)
+            _hold(options.mb, options.grow, options.most, options.seconds)
     except (OSError, OverflowError) as error:
         print(f"holder: no more memory to be had: {error}", file=sys.stderr)
         return 1
@@ -44,6 +44,7 @@ def _parse(arguments: list[str]) -> tuple[argparse.Namespace, list[str]]:
     parser.add_argument("--mb", required=True, type=_amount, help="MB to hold")
     parser.add_argument("--seconds", type=_amount, help="for how long; without: until a signal")
     parser.add_argument("--grow", type=_amount, default=0.0, help="MB more in every second")
+    parser.add_argument("--most", type=_amount, default=math.inf, help="MB up to which it grows")
     parser.add_argument("--ros", action="store_true", help="be a ROS 2 node")
     return parser.parse_args(arguments[:at]), arguments[at:]
 
@@ -58,7 +59,7 @@ def _amount(text: str) -> float:
     return amount
 
 
-def _hold(mb: float, grow: float, seconds: float | None) -> None:
+def _hold(mb: float, grow: float, most: float, seconds: float | None) -> None:
     """Holds `mb` MB, and `grow` MB more a second, until a stop signal or the time is over."""
     blocks = [_touched(int(mb * 1e6))]
     held = mb
@@ -67,7 +68,7 @@ def _hold(mb: float, grow: float, seconds: float | None) -> None:
         spent = time.monotonic() - started
         if seconds is not None and spent >= seconds:
             return
-        wanted = mb + grow * spent
+        wanted = max(mb, min(mb + grow * spent, most))
         blocks.append(_touched(int((wanted - held) * 1e6)))
         held = wanted
         left = math.inf if seconds is None else seconds - spent

@@ -8,7 +8,7 @@ import pytest
 
 from rosrm.config import load_cluster, load_host, load_work
 from rosrm.registry import Registry
-from rosrm_examples import demo
+from rosrm_examples import demo, demo_frame
 
 EXAMPLES = Path(__file__).parents[3] / "examples"
 WORK = sorted((EXAMPLES / "work").glob("*.yaml"))
@@ -60,7 +60,7 @@ def test_the_holders_are_of_the_papers_sizes(registry):
 @pytest.fixture
 def run(monkeypatch, capsys):
     """Runs the demo's main up to where it would start; gives exit status and what it said."""
-    monkeypatch.setattr(demo, "StopSignals", lambda: None)
+    monkeypatch.setattr(demo_frame, "StopSignals", lambda: None)
 
     def run_main(*arguments):
         status = demo.main([str(argument) for argument in arguments])
@@ -90,18 +90,18 @@ def test_a_folder_of_somebody_else_is_left_alone(run, tmp_path):
 
 
 def test_a_folder_that_another_demo_writes_to(run, tmp_path):
-    with demo._own_folder(tmp_path):
+    with demo_frame.own_folder(tmp_path, demo.LEFT):
         status, said = run("--out", tmp_path, "--drive", "street:8", "--pieces", "2")
     assert status == 2
     assert "another demo is writing to it" in said
 
 
 def test_an_earlier_demo_is_cleared_away_and_nothing_else(tmp_path):
-    demo._own_folder(tmp_path).close()
+    demo_frame.own_folder(tmp_path, demo.LEFT).close()
     (tmp_path / "cluster").mkdir()
     (tmp_path / "summary.json").write_text("{}")
     (tmp_path / "notes.txt").write_text("keep")
-    demo._own_folder(tmp_path).close()
+    demo_frame.own_folder(tmp_path, demo.LEFT).close()
     assert sorted(path.name for path in tmp_path.iterdir()) == [".rosrm-demo", "notes.txt"]
 
 

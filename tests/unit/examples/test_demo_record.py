@@ -161,7 +161,7 @@ def test_a_line_says_how_it_stands():
 
 def test_lines_come_seldom_and_migrations_at_once():
     output = io.StringIO()
-    screen = LineScreen(Console(file=output, width=40))
+    screen = LineScreen(Console(file=output, width=40), line_of)
     begun = event(1, 0.5, "migration_begun", "holder_01", "host2")
     for elapsed in (0.0, 0.2, 0.4):
         screen.show(view(), elapsed)

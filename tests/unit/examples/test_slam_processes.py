@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -126,6 +127,58 @@ def test_map_piece_says_what_it_cannot_use(start: Start, tmp_path: Path) -> None
     assert errors == "map_piece: piece 3 of 2: pieces are numbered from 1 to 2\n"
 
 
+@pytest.mark.parametrize("state", ["full", "pose"])
+def test_a_played_drive_is_mapped_as_one_that_is_read(
+    start: Start, tmp_path: Path, state: str
+) -> None:
+    """Without rosrm: player and SLAM as two nodes, poses and map to the last bit."""
+    pytest.importorskip("rclpy")
+    from rosrm_examples.drives import load_drive
+    from rosrm_examples.map_part import load_parts
+    from rosrm_examples.migration_results import unmigrated_poses
+
+    parameters = ["-p", f"state:={state}", "-p", f"out:={tmp_path / 'parts'}"]
+    slam = start("slam_node", "--ros-args", *parameters)
+    report = tmp_path / "report.json"
+    player = start("player", "--drive", "street:20", "--hz", "25", "--report", str(report))
+    output, errors = player.communicate(timeout=30)
+    assert (player.returncode, errors) == (0, "")
+    assert "10/20 scans" in output
+    assert "sent 20 of 20 scans" in output
+    assert json.loads(report.read_text()) == {"scans_sent": 20}
+    time.sleep(0.5)  # all has arrived; the last one is being mapped
+    slam.send_signal(signal.SIGINT)
+    output, errors = slam.communicate(timeout=10)
+    assert (slam.returncode, errors) == (0, "")
+    assert output == f"wrote {tmp_path / 'parts' / 'slam.npz'}\n"
+    (part,) = load_parts(tmp_path / "parts")
+    assert part.poses.tolist() == unmigrated_poses(load_drive("street:20")).tolist()
+
+
+def test_a_player_waits_for_its_listeners_and_not_for_ever(start: Start) -> None:
+    """It says whom it waited for; a signal ends it as well."""
+    pytest.importorskip("rclpy")
+    player = start("player", "--drive", "street:3", "--wait", "0.3")
+    output, errors = player.communicate(timeout=20)
+    assert (player.returncode, output) == (1, "sent 0 of 3 scans\n")
+    assert errors == "player: 0 of 1 subscribers of /points came within 0.3 s\n"
+    player = start("player", "--drive", "street:300", "--subscribers", "0", "--hz", "50")
+    assert player.stdout is not None
+    player.stdout.readline()
+    player.send_signal(signal.SIGTERM)
+    output, errors = player.communicate(timeout=10)
+    assert (player.returncode, errors) == (128 + signal.SIGTERM, "")
+
+
+def test_the_slam_node_says_what_it_cannot_use(start: Start) -> None:
+    """One line that names the parameter and what is allowed."""
+    pytest.importorskip("rclpy")
+    slam = start("slam_node", "--ros-args", "-p", "state:=half")
+    _, errors = slam.communicate(timeout=20)
+    assert slam.returncode == 2
+    assert errors == "slam_node: parameter state: 'half'; allowed are full, pose\n"
+
+
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
 def test_holder_holds_what_it_is_told_until_a_signal(start: Start, stop: signal.Signals) -> None:
     """The memory is really there, beyond the process's own, and a signal ends it with 0."""
@@ -143,6 +196,15 @@ def test_holder_grows_and_ends_by_itself(start: Start) -> None:
     holder = start("holder", "--mb", "10", "--grow", "40", "--seconds", "1.5")
     wait_until(lambda: resident_mb(holder) > 45)
     assert (holder.wait(timeout=5), holder.communicate()) == (0, ("", ""))
+
+
+def test_holder_grows_up_to_its_most(start: Start) -> None:
+    """And holds that."""
+    empty = start("holder", "--mb", "0")
+    holder = start("holder", "--mb", "10", "--grow", "100", "--most", "40")
+    wait_until(lambda: resident_mb(holder) - resident_mb(empty) > 37)
+    time.sleep(0.5)
+    assert resident_mb(holder) - resident_mb(empty) == pytest.approx(40, abs=3)
 
 
 def test_holder_is_small_without_ros() -> None:

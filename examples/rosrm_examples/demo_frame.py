@@ -1,0 +1,98 @@
+"""What every demo is around its work: signals, exit status, the folder of results, free memory."""
+
+from __future__ import annotations
+
+import fcntl
+import shutil
+import sys
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, TextIO
+
+import psutil
+from rich.console import Console
+
+from rosrm.errors import RosrmError
+from rosrm_examples.demo_run import DemoFailed, Stopped, StopSignals
+from rosrm_examples.errors import ExampleError
+from rosrm_resources.memory import CgroupMemory
+
+#: Below the folder of results: states and logs of master and slaves.
+CLUSTER: Final = "cluster"
+#: A folder with this file in it is a demo's own to empty.
+_MARK: Final = ".rosrm-demo"
+
+
+class Unfit(Exception):
+    """The demo cannot begin with these arguments, or on this machine."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """What a demo works with.
+
+    Attributes:
+        console: for what it says.
+        signals: to be looked at now and then.
+    """
+
+    console: Console
+    signals: StopSignals
+
+
+def run_demo(name: str, out: Path, demonstrate: Callable[[Stage], None]) -> int:
+    """Carries a demo out and says what stopped it; returns the exit status."""
+    stage = Stage(Console(), StopSignals())
+    try:
+        demonstrate(stage)
+    except Stopped as stopped:
+        print(f"{name}: stopped by {stopped}", file=sys.stderr)
+        return 128 + stopped.number
+    except (Unfit, ExampleError) as error:
+        print(f"{name}: {error}", file=sys.stderr)
+        return 2
+    except DemoFailed as error:
+        print(f"{name}: {error}", file=sys.stderr)
+        return 1
+    except (RosrmError, TimeoutError, OSError) as error:
+        print(f"{name}: {error}; see the logs in {out / CLUSTER}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def own_folder(out: Path, left: Iterable[str], folders: Iterable[str] = ()) -> TextIO:
+    """Empties the folder of an earlier demo; the file that is returned keeps a second demo out.
+
+    Args:
+        left: files that a demo leaves.
+        folders: that it makes, beside that of the cluster.
+
+    Raises:
+        Unfit: the folder is not of a demo, or another demo writes to it.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    mark = out / _MARK
+    if not mark.exists() and any(out.iterdir()):
+        raise Unfit(f"--out {out}: holds files that are of no demo; name a new or empty folder")
+    lock = mark.open("a")
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        lock.close()
+        raise Unfit(f"--out {out}: another demo is writing to it") from None
+    for folder in (CLUSTER, *folders):
+        shutil.rmtree(out / folder, ignore_errors=True)
+    for name in left:
+        (out / name).unlink(missing_ok=True)
+    return lock
+
+
+def free_memory() -> float:
+    """Bytes that this machine, or the group that this process is in, has left."""
+    free = float(psutil.virtual_memory().available)
+    group = CgroupMemory.find()
+    if group is not None:
+        free = min(free, group.capacity * (1.0 - group.usage()))
+        group.close()
+    return free

@@ -1,0 +1,211 @@
+"""What the migration demo runs, and when: a player, the live SLAM, and a recorder that grows.
+
+The player stays on the robot, with its scanner. The SLAM begins on the host with the fast disk, and
+has to leave it when the recorder, which needs that disk, takes the memory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from rosrm.config.settings import ClusterConfig, HostConfig, MigrationSettings, ScoringChoice
+from rosrm.core.model import Kind, MigrationPolicy, ProcessSpec
+from rosrm.core.views import ProcessRow, Snapshot
+from rosrm.ros.client import MasterClient
+from rosrm_examples.demo_job import MEMORY_LIMIT
+from rosrm_examples.drives import Drive
+from rosrm_examples.observer import Observer
+
+#: The SLAM begins on the first; the player stays on the last.
+HOSTS: Final = ("host1", "host2", "robot")
+SLAM, PLAYER, RECORDER = "slam", "player", "recorder"
+#: Bytes of memory that host1 and host2, and the robot, count as their own.
+BUDGET: Final = 448 * 2**20
+_ROBOT_BUDGET: Final = 160 * 2**20
+#: Bytes that must be free on this machine: what runs on the hosts, and rosrm.
+LEAST_FREE: Final = 2 * BUDGET
+
+#: MB, declared.
+_SLAM_MB, _PLAYER_MB, _RECORDER_MB = 130, 90, 33
+#: MB that the recorder takes in the end, and in each second until then: it has not said so.
+_RECORDER_MOST_MB, _RECORDER_GROWTH_MB = 310, 200
+
+_FAST_DISK: Final = {"disk": "fast"}
+_SCANNER: Final = {"scanner": "yes"}
+
+#: A drive that is shorter is played slower, for a process needs its time to start: seconds.
+_SHORTEST_S: Final = 15.0
+#: The recorder comes when this part of the drive is over, and the SLAM moves soon after.
+_RECORDER_AT: Final = 0.15
+#: Seconds without a pose after which nothing more is expected.
+_QUIET_S: Final = 10.0
+_OVER: Final = ("finished", "failed", "cancelled")
+
+
+@dataclass(frozen=True)
+class LiveDrive:
+    """How a drive is played and mapped.
+
+    Attributes:
+        drive: what is played.
+        rate: times as fast as it was driven.
+        state: of the SLAM that moves: "full" or "pose".
+        out: folder for what the instances of the SLAM leave, absolute.
+        report: file for what the player says at its end, absolute.
+        working_directory: in which the drive is found.
+    """
+
+    drive: Drive
+    rate: float
+    state: str
+    out: Path
+    report: Path
+    working_directory: Path
+
+    @property
+    def period(self) -> float:
+        """Seconds between two scans, as they are played."""
+        return float(np.median(np.diff(self.drive.times))) / self.rate
+
+
+def usual_rate(drive: Drive) -> float:
+    """Real time, or slower where the drive is so short that nothing could move in it."""
+    return min(1.0, float(drive.times[-1] - drive.times[0]) / _SHORTEST_S)
+
+
+def cluster_config() -> ClusterConfig:
+    """The master's settings: what is stateful is handed off."""
+    return ClusterConfig(
+        name="migration-demo",
+        scoring=ScoringChoice(options={"weights": {"memory": 1.0}}),
+        migration=MigrationSettings(
+            strategies={"handoff": {}}, hysteresis=0.5, cooldown=120.0, headroom=0.02,
+            max_in_flight=1,
+        ),
+    )  # fmt: skip
+
+
+def host_configs(cores: int) -> list[HostConfig]:
+    """Three hosts out of one machine: each counts its own processes against a budget."""
+    labels = dict(zip(HOSTS, (_FAST_DISK, {}, _SCANNER), strict=True))
+    return [
+        HostConfig(
+            host=name,
+            labels=labels[name],
+            scope="slice",
+            budget={
+                "memory": _ROBOT_BUDGET if labels[name] == _SCANNER else BUDGET,
+                "cpu": 2 * cores,  # whoever maps may use them all; memory is what runs short
+                "disk": 2**30,
+            },
+            limits={"memory": MEMORY_LIMIT, "cpu": 1.0},
+        )
+        for name in HOSTS
+    ]
+
+
+def slam_spec(live: LiveDrive) -> ProcessSpec:
+    """The process that moves."""
+    return ProcessSpec(
+        name=SLAM,
+        module="rosrm_examples.slam_node",
+        parameters={"state": live.state, "out": str(live.out)},
+        environment={"OMP_NUM_THREADS": "1"},
+        ros=True,
+        needs={"memory": _SLAM_MB * 1e6},
+        preferred_labels=_FAST_DISK,
+        migration=MigrationPolicy(strategy="handoff"),
+    )
+
+
+def player_spec(live: LiveDrive) -> ProcessSpec:
+    """Plays the drive once, when the SLAM listens."""
+    return ProcessSpec(
+        name=PLAYER,
+        module="rosrm_examples.player",
+        arguments=(
+            "--drive", live.drive.name, "--rate", f"{live.rate:.6g}", "--report", str(live.report),
+        ),
+        environment={"OMP_NUM_THREADS": "1"},
+        working_directory=str(live.working_directory),
+        ros=True,
+        kind=Kind.JOB,
+        needs={"memory": _PLAYER_MB * 1e6},
+        required_labels=_SCANNER,
+    )  # fmt: skip
+
+
+def recorder_spec() -> ProcessSpec:
+    """Takes more memory than it has said, on the host with the fast disk."""
+    return ProcessSpec(
+        name=RECORDER,
+        module="rosrm_examples.holder",
+        arguments=(
+            "--mb", "20", "--grow", str(_RECORDER_GROWTH_MB), "--most", str(_RECORDER_MOST_MB),
+        ),
+        needs={"memory": _RECORDER_MB * 1e6},
+        required_labels=_FAST_DISK,
+    )  # fmt: skip
+
+
+class MigrationScript:
+    """SLAM, player, recorder, each in its turn; it is over when all scans that were sent are heard.
+
+    The cluster's end then ends the SLAM and the recorder.
+    """
+
+    def __init__(self, live: LiveDrive, observer: Observer) -> None:
+        self._live = live
+        self._observer = observer
+        self._rows: dict[str, ProcessRow] = {}
+        self._submitted: set[str] = set()
+        self._quiet_since = 0.0
+        self._heard = 0
+        self._elapsed = 0.0
+
+    def act(self, client: MasterClient, elapsed: float) -> None:
+        """Submit what is due."""
+        self._elapsed = elapsed
+        heard = len(self._observer.heard)
+        if heard > self._heard:
+            self._heard, self._quiet_since = heard, elapsed
+        for spec in self._due():
+            client.submit([spec])
+            self._submitted.add(spec.name)
+            self._quiet_since = elapsed
+
+    def _due(self) -> Sequence[ProcessSpec]:
+        if SLAM not in self._submitted:
+            return [slam_spec(self._live)]
+        if PLAYER not in self._submitted:
+            return [player_spec(self._live)] if self._slam_listens() else []
+        if RECORDER not in self._submitted and self._heard >= _RECORDER_AT * len(self._live.drive):
+            return [recorder_spec()]
+        return []
+
+    def _slam_listens(self) -> bool:
+        slam = self._rows.get(SLAM)
+        return slam is not None and slam.state == "running" and self._observer.publishers() > 0
+
+    def is_over(self, view: Snapshot) -> bool:
+        """Whether the player has ended, and every scan was heard, or nothing more comes."""
+        self._rows = {row.name: row for row in view.processes}
+        player = self._rows.get(PLAYER)
+        if player is None or player.state not in _OVER or self._rows[SLAM].state == "migrating":
+            return False
+        quiet = self._elapsed - self._quiet_since
+        return self._heard >= len(self._live.drive) or quiet >= _QUIET_S
+
+    def progress(self, view: Snapshot) -> str:
+        """How far the drive is, and where it is mapped."""
+        slam = next((row for row in view.processes if row.name == SLAM), None)
+        if slam is None:
+            return "the SLAM is to start"
+        where = f"on {slam.host}" if slam.host else "on no host yet"
+        moving = ", it moves" if slam.state == "migrating" else ""
+        return f"{self._heard:4} of {len(self._live.drive)} scans mapped, {where}{moving}"

@@ -1,0 +1,147 @@
+"""What became of a drive that was mapped live while the SLAM moved: figures, and what is wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, Final
+
+import numpy as np
+
+from rosrm_examples.arrays import Floats, Keys
+from rosrm_examples.drives import Drive
+from rosrm_examples.map_part import MapPart
+from rosrm_examples.merge import end_error_percent
+from rosrm_examples.observer import Heard
+from rosrm_examples.slam import Slam
+from rosrm_examples.stamps import nanoseconds_of, seconds_of, stamp_of
+
+#: Most that the poses may differ from those of the unmigrated run, metres, by what moved.
+LARGEST_DEVIATION_M: Final = {"full": 1e-9, "pose": 0.1}
+
+
+@dataclass(frozen=True)
+class LiveRun:
+    """What was seen of one live run.
+
+    Attributes:
+        drive: that was played.
+        sent: scans that the player sent.
+        heard: every pose that the observer heard, as they came.
+        parts: what each instance of the SLAM mapped, in the order in which they were active.
+        period: seconds between two scans, as they were played.
+    """
+
+    drive: Drive
+    sent: int
+    heard: Sequence[Heard]
+    parts: Sequence[MapPart]
+    period: float
+
+    def stamps(self) -> list[int]:
+        """Of all scans of the drive, nanoseconds."""
+        return [nanoseconds_of(stamp_of(float(t))) for t in self.drive.times]
+
+    def numbers(self, part: MapPart) -> Keys:
+        """(S,) which scans of the drive a part has, from 0."""
+        played = np.array([seconds_of(stamp_of(float(t))) for t in self.drive.times])
+        return np.searchsorted(played, part.times).astype(np.int64)
+
+    def by_stamp(self) -> dict[int, Heard]:
+        """The first pose that was heard of each scan."""
+        first: dict[int, Heard] = {}
+        for one in self.heard:
+            first.setdefault(one.stamp, one)
+        return first
+
+    def gaps(self) -> list[float]:
+        """Of each move: from the source's last output to the destination's first, less a period.
+
+        Seconds; negative where the next output came early. Moves of which one of the two was not
+        heard are left out.
+        """
+        first = self.by_stamp()
+        gaps = []
+        for source, destination in pairwise(self.parts):
+            ends = [nanoseconds_of(stamp_of(float(source.times[-1])))]
+            ends.append(nanoseconds_of(stamp_of(float(destination.times[0]))))
+            if all(stamp in first for stamp in ends):
+                last, next_one = (first[stamp].arrived for stamp in ends)
+                gaps.append(next_one - last - self.period)
+        return gaps
+
+
+def unmigrated_poses(drive: Drive) -> Floats:
+    """Maps a drive in one go, scans and times as a player sends them: (S, 4, 4) poses."""
+    slam = Slam()
+    for points, t in zip(drive.scans(), drive.times, strict=True):
+        slam.add_scan(points, seconds_of(stamp_of(float(t))))
+    return np.array(slam.poses)
+
+
+def summarise(run: LiveRun, unmigrated: Floats, migrations: int) -> dict[str, Any]:
+    """The figures of `summary.json`.
+
+    Args:
+        unmigrated: (S, 4, 4) poses of the same drive without a move.
+        migrations: that the master counts.
+    """
+    first, gaps = run.by_stamp(), run.gaps()
+    refused = sum(part.refused for part in run.parts)
+    return {
+        "drive": run.drive.name,
+        "scans_sent": run.sent,
+        "scans_processed": len(first),
+        "scans_lost": run.sent - len(first),
+        "scans_repeated": len(run.heard) - len(first) + refused,
+        "out_of_order": sum(b.stamp < a.stamp for a, b in pairwise(run.heard)),
+        "period_ms": round(1e3 * run.period, 3),
+        "gap_ms": round(1e3 * max(gaps), 3) if gaps else None,
+        "max_deviation_m": _max_deviation(run, unmigrated),
+        "end_error_percent": _end_error(run),
+        "migrations": migrations,
+        "parts": [
+            {"host": part.host, "scans": len(part.times), "points": len(part.points)}
+            for part in run.parts
+        ],
+    }
+
+
+def differences(summary: dict[str, Any], state: str, migrations: int) -> list[str]:
+    """What is not as it has to be, a line each; nothing, where all is well."""
+    wanted = {
+        "scans_lost": 0, "scans_repeated": 0, "out_of_order": 0, "migrations": migrations,
+    }  # fmt: skip
+    wrong = [
+        f"{name} is {summary[name]}, not {value}"
+        for name, value in wanted.items()
+        if summary[name] != value
+    ]
+    mapped = sum(part["scans"] for part in summary["parts"])
+    if mapped != summary["scans_sent"]:
+        wrong.append(f"the instances mapped {mapped} scans of {summary['scans_sent']}")
+    deviation, largest = summary["max_deviation_m"], LARGEST_DEVIATION_M[state]
+    if deviation is None or deviation > largest:
+        wrong.append(f"max_deviation_m is {deviation}, more than {largest:g}")
+    return wrong
+
+
+def _max_deviation(run: LiveRun, unmigrated: Floats) -> float | None:
+    """Metres; None: nothing was heard."""
+    first = run.by_stamp()
+    apart = [
+        float(np.linalg.norm(first[stamp].pose[:3, 3] - pose[:3, 3]))
+        for stamp, pose in zip(run.stamps(), unmigrated, strict=True)
+        if stamp in first
+    ]
+    return max(apart, default=None)
+
+
+def _end_error(run: LiveRun) -> float | None:
+    """Percent of the path; None: the truth is not known, or not all poses were heard."""
+    first, stamps = run.by_stamp(), run.stamps()
+    if run.drive.truth is None or not all(stamp in first for stamp in stamps):
+        return None
+    poses = np.array([first[stamp].pose for stamp in stamps])
+    return round(end_error_percent(poses, run.drive.truth), 3)
