@@ -23,7 +23,7 @@ from dataclasses import replace
 from rosrm.core import events as happened
 from rosrm.core import handoffs, lifecycle
 from rosrm.core.hosts import HostCondition
-from rosrm.core.migration import AwaitReady, Commit, Configure, SetRestart, Start, Step, Stop
+from rosrm.core.migration import AwaitReady, Commit, Configure, Start, Step, Stop
 from rosrm.core.model import InstanceId, InstanceState
 from rosrm.core.runs import End
 from rosrm.core.state import MasterState, Process, ProcessPhase, Run, Wanted
@@ -128,15 +128,7 @@ def _next(state: MasterState, run: Run, step: Step, now: float) -> None:
     elif isinstance(step, Start) and run.undo is not None:
         process.owner = step.instance.number
         state.save(process)
-    elif isinstance(step, SetRestart):
-        _note_policy(process, run, step)
     _go_on(state, run, now)
-
-
-def _note_policy(process: Process, run: Run, step: SetRestart) -> None:
-    """One that has ended meanwhile was not restarted: that is made up for at the end."""
-    if step.restart == process.spec.restart and step.instance.number not in run.ended:
-        run.suspended.discard(step.instance.number)
 
 
 def _cannot_be_done(state: MasterState, run: Run, step: Step, now: float) -> bool:

@@ -72,7 +72,8 @@ class Run:
         stuck: a step that must be done failed; it is tried again from `retry_at` on.
         answer: of the slave to the order of the step in hand: accepted, message.
         launched: numbers of the instances that were ordered to start.
-        suspended: numbers of the instances whose slave may not restart them at the moment.
+        suspended: numbers of the instances whose slave was told not to restart them. It may have
+            been told otherwise since: its answer may come before the news of an end.
         ended: how its instances ended, by number.
         heard: what they said of a handoff, by number.
         taking_over: the destination was told to go on without its source.

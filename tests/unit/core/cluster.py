@@ -18,9 +18,19 @@ import numpy as np
 
 from rosrm.core import events as happened
 from rosrm.core import listing, slave
-from rosrm.core.commands import Assign, Command, Order, Reply, Withdraw
+from rosrm.core.commands import Assign, Command, Order, PublishStateConfig, Reply, Withdraw
 from rosrm.core.master import step
-from rosrm.core.migration import AwaitReady, Commit, Move, Plan, Start, Stop
+from rosrm.core.migration import (
+    AwaitReady,
+    Commit,
+    Configure,
+    HandoffPhase,
+    Move,
+    Plan,
+    SetRestart,
+    Start,
+    Stop,
+)
 from rosrm.core.model import (
     EMPTY,
     RESOURCE_SLOTS,
@@ -28,18 +38,21 @@ from rosrm.core.model import (
     MigrationPolicy,
     ProcessSpec,
     Readiness,
+    RestartPolicy,
 )
 from rosrm.core.restore import restore
 from rosrm.core.settings import CoreSettings
 from rosrm.core.state import MasterState, Process
 from rosrm.ports import HostView, Intent, ProcessView, Record, Scores
 from tests.unit.core.machine import GIB, MIB, Machine
+from tests.unit.core.nodes import Air, Node
 
 __all__ = [
     "GIB",
     "MIB",
     "Cluster",
     "Eq1",
+    "HandOver",
     "Machine",
     "StartFirstOrStopFirst",
     "job",
@@ -105,6 +118,32 @@ class StartFirstOrStopFirst:
         return Plan((stop, start, ready, Commit()))
 
 
+class HandOver:
+    """As the shipped `handoff`."""
+
+    def __init__(self, timeout: float = 10.0) -> None:
+        self.timeout = timeout
+
+    def propose(self, move: Move) -> Plan:
+        t, there, here = self.timeout, move.destination_host, move.source_host
+        source, destination, policy = move.source, move.destination, move.spec.restart
+        alias = f"{move.spec.name}_{move.destination.number}"
+        abort, resume = (Configure(p, t) for p in (HandoffPhase.ABORT, HandoffPhase.RESUME))
+        stop_there, give_back = Stop(destination, there, t), SetRestart(source, here, policy, t)
+        return Plan(
+            (
+                Start(destination, there, t, alias, undo=stop_there, shadow=True),
+                SetRestart(source, here, RestartPolicy("never"), t, undo=give_back),
+                Configure(HandoffPhase.SHADOW, t, undo=resume),
+                Configure(HandoffPhase.SWITCH, t, undo=abort),
+                Commit(),
+                SetRestart(destination, there, policy, t),
+                Stop(source, here, t),
+                Configure(HandoffPhase.DONE, t),
+            )
+        )
+
+
 # --- the cluster ------------------------------------------------------------------------------
 
 
@@ -127,9 +166,14 @@ class Cluster:
         self.settings = CoreSettings(**{"settle": 1e9, **settings})
         self.policy = policy or Eq1()
         self.fallback = fallback
-        self.strategies = {"relaunch": StartFirstOrStopFirst(), **strategies}
+        self.strategies = {
+            "relaunch": StartFirstOrStopFirst(),
+            "handoff": HandOver(),
+            **strategies,
+        }
         self.state = self._new_state(epoch=1)
         self.machines: dict[str, Machine] = {}
+        self.air = Air(self.machines.values)
         self.records: list[Record] = []
         self.intents: dict[str, dict[str, Any]] = defaultdict(dict)
         self.replies: dict[int, Reply] = {}
@@ -180,6 +224,8 @@ class Cluster:
                 self.by_id(command.host_id).ordered.append(command)
             elif isinstance(command, Withdraw):
                 self._withdraw(command)
+            elif isinstance(command, PublishStateConfig):
+                self.air.publish(command)
 
     def _withdraw(self, command: Withdraw) -> None:
         machine = self.by_id(command.host_id)
@@ -206,11 +252,12 @@ class Cluster:
 
     def register(self, machine: Machine) -> Reply:
         """A slave registers; taken in, it sends a reading and asks for work."""
+        machine.begin_to_register()
         reply = self.ask(
             happened.HostRegistered, machine.description(), machine.slave.statuses(), settle=False
         )
         if reply.accepted:
-            machine.host_id = reply.host_id
+            machine.host_id, machine.fresh = reply.host_id, False
             machine.polled.clear()
             machine.tell(slave.Registered(self.state.epoch), self.now)
             self.read(machine)
@@ -292,7 +339,8 @@ class Cluster:
     def settle(self) -> None:
         """Everything that is on its way arrives, until nothing more is said."""
         for _ in range(200):
-            if not any(self._deliver(machine) for machine in self.machines.values()):
+            said = [self._deliver(machine) for machine in self.machines.values()]
+            if not any([*said, self._nodes_talk()]):
                 return
         raise AssertionError("the cluster talks without an end")
 
@@ -306,6 +354,16 @@ class Cluster:
         while machine.said:
             self.tell(machine.said.popleft())
         return busy
+
+    def _nodes_talk(self) -> bool:
+        """All that was said of handoffs arrives."""
+        arrivals = self.air.waiting()
+        for arrive in arrivals[:1]:
+            arrive()
+        heard = self.air.next_reports()
+        for at in heard[:1]:
+            self.tell(self.air.to_master.pop(at)[1])
+        return bool(arrivals or heard)
 
     def wait(self, seconds: float, *, tick: float = 0.1) -> None:
         """Time passes: readings and usages come, deadlines are looked at."""
@@ -332,6 +390,7 @@ class Cluster:
         for machine in self.machines.values():
             machine.polled.clear()
             machine.ordered.clear()
+        self.air.master_is_gone()
         self.state = self._new_state(self.state.epoch + 1)
         restore(self.state, lambda table: self.intents[table], self.now)
 
@@ -347,6 +406,20 @@ class Cluster:
             for machine in self.machines.values()
             for instance in machine.programs
             if instance.process == name
+        ]
+
+    def node(self, host: str, name: str = "p") -> Node:
+        """The newest node of a process on a host."""
+        machine = self.machines[host]
+        list(self.air.nodes())
+        return machine.programs[machine.find(name)].node
+
+    def active(self, name: str = "p") -> list[str]:
+        """Hosts on which a node of a process really is active."""
+        return [
+            machine.name
+            for machine, node in self.air.nodes()
+            if node.instance.process == name and node.active
         ]
 
     def counts(self) -> dict[str, int]:

@@ -20,7 +20,9 @@ from rosrm.core.model import (
     InstanceState,
     InstanceStatus,
     ResourceDescription,
+    RestartPolicy,
 )
+from tests.unit.core.nodes import Node
 
 MIB = 2.0**20
 GIB = 2.0**30
@@ -28,9 +30,16 @@ GIB = 2.0**30
 
 @dataclass
 class Program:
-    """One instance that really runs."""
+    """One instance that really runs.
+
+    Attributes:
+        node: its present run, if it is a node that can be moved with its state.
+        restart: what the supervisor does when it ends.
+    """
 
     assignment: Assignment
+    node: Node
+    restart: RestartPolicy
     state: InstanceState = InstanceState.RUNNING
     pid: int = 0
 
@@ -44,6 +53,7 @@ class Machine:
         ends: of instances that the supervisor remembers.
         refuses: process name to the reason why it cannot be started here.
         stubborn: process names that do not end when they are told to.
+        quirks: of the nodes of a process here, by its name; see `Node`.
         busy: usage of each resource without our processes, fraction.
         shown: base units that each process uses, by name; shows in readings and usages.
         polled: assignments that wait for the slave's next request, in the master's hands.
@@ -68,6 +78,8 @@ class Machine:
     ends: dict[InstanceId, InstanceStatus] = field(default_factory=dict)
     refuses: dict[str, str] = field(default_factory=dict)
     stubborn: set[str] = field(default_factory=set)
+    quirks: dict[str, set[str]] = field(default_factory=lambda: defaultdict(set))
+    settled: list[slave.Settle] = field(default_factory=list)
     busy: dict[str, float] = field(default_factory=lambda: {"memory": 0.1, "cpu": 0.1})
     shown: dict[str, dict[str, float]] = field(default_factory=lambda: defaultdict(dict))
     polled: list[Assignment] = field(default_factory=list)
@@ -75,6 +87,7 @@ class Machine:
     said: deque[happened.StatusesReceived] = field(default_factory=deque)
     connected: bool = True
     takes: bool = True
+    fresh: bool = False
     stale: set[str] = field(default_factory=set)
     sequence: int = 0
     batches: int = 0
@@ -96,6 +109,11 @@ class Machine:
             resources=self.resources, max_processes=self.max_processes,
             executors=tuple(self.executors),
         )  # fmt: skip
+
+    def begin_to_register(self) -> None:
+        """A new run of the slave takes no order that was meant for the former."""
+        if self.fresh:
+            self.ordered.clear()
 
     def usage(self) -> dict[str, float]:
         """Fraction of each resource, our running processes included."""
@@ -144,6 +162,11 @@ class Machine:
                 self._stop(command.instance, now)
             elif isinstance(command, slave.Restart):
                 self._restart(command.instance, now)
+            elif isinstance(command, slave.Amend):
+                self.programs[command.instance].restart = command.restart
+                self.tell(slave.RestartPolicyRecorded(command.instance, command.restart), now)
+            elif isinstance(command, slave.Settle):
+                self.settled.append(command)
             elif isinstance(command, slave.Forget):
                 for instance in command.instances:
                     self.ends.pop(instance, None)
@@ -164,7 +187,9 @@ class Machine:
             self.tell(slave.LaunchRefused(instance, reason), now)
             return
         self.pids += 1
-        self.programs[instance] = Program(assignment, pid=self.pids)
+        node = Node(instance, assignment.shadow, self.quirks[instance.process])
+        restart = RestartPolicy() if assignment.shadow else assignment.spec.restart
+        self.programs[instance] = Program(assignment, node, restart, pid=self.pids)
         status = InstanceStatus(instance, InstanceState.RUNNING, pid=self.pids)
         self._supervisor_says(status, now)
 
@@ -183,6 +208,7 @@ class Machine:
         program = self.programs[instance]
         self.pids += 1
         program.pid = self.pids
+        program.node = Node(instance, False, self.quirks[instance.process])
         for state, pid in ((InstanceState.STOPPING, 0), (InstanceState.RUNNING, self.pids)):
             self._supervisor_says(InstanceStatus(instance, state, pid=pid, restarts=1), now)
 
@@ -205,7 +231,11 @@ class Machine:
         return max(one for one in self.programs if one.process == name)
 
     def finish(self, name: str, now: float, *, code: int = 0, run_time: float = 10.0) -> None:
-        """A process ends by itself."""
+        """A process ends by itself, and is started again if its policy says so."""
+        when = self.programs[self.find(name)].restart.when
+        if when == "always" or (when == "on-failure" and code):
+            self._restart(self.find(name), now)
+            return
         state = InstanceState.EXITED if code == 0 else InstanceState.FAILED
         self._end(self.find(name), state, now, code=code, run_time=run_time)
 
@@ -229,6 +259,8 @@ class Machine:
             return happened.OrderAnswered(
                 order.order, accepted, "" if accepted else "failed", message
             )
+        if order.action == "set_restart":
+            return self._set_restart(order, now)
         event: slave.Event
         if order.action == "report":
             event = slave.ReportRequested()
@@ -242,6 +274,15 @@ class Machine:
         self.tell(event, now)
         return happened.OrderAnswered(order.order, accepted=True)
 
+    def _set_restart(self, order: Order, now: float) -> happened.OrderAnswered:
+        assert order.instance is not None
+        assert order.restart is not None
+        self.settled.clear()
+        self.tell(slave.RestartPolicySet(order.instance, order.restart), now)
+        (settled,) = self.settled
+        code = "refused" if settled.refusal else ""
+        return happened.OrderAnswered(order.order, not code, code, settled.refusal)
+
     def fetch(self, now: float) -> None:
         """The slave's open request is answered with what waits for it."""
         batch, self.polled = self.polled, []
@@ -251,6 +292,7 @@ class Machine:
     def restart_slave(self, now: float) -> None:
         """The slave is killed and comes up again; what runs, runs on."""
         self.incarnation += 1000
+        self.fresh = True
         self.sequence = self.batches = 0
         self.said.clear()
         self.ordered.clear()

@@ -17,9 +17,10 @@ from rosrm.core import events as happened
 from rosrm.core import slave
 from rosrm.core.assigning import demand_of
 from rosrm.core.commands import Assign, Command
-from rosrm.core.model import Kind, MigrationPolicy, ProcessSpec, Readiness
+from rosrm.core.model import Kind, MigrationPolicy, ProcessSpec, Readiness, RestartPolicy
 from rosrm.core.state import ProcessPhase, Wanted
-from tests.unit.core.cluster import MIB, Cluster, Machine, StartFirstOrStopFirst
+from tests.unit.core.cluster import MIB, Cluster, HandOver, Machine, StartFirstOrStopFirst
+from tests.unit.core.nodes import QUIRKS, Node
 
 NAMES = [f"p{i}" for i in range(5)]
 TWINS = [f"{name}x" for name in NAMES]
@@ -29,6 +30,7 @@ LABELLED = "c"
 # Few of them are met often: so that much befalls the same one.
 names = st.sampled_from([*NAMES[:1] * 4, *NAMES[:2] * 2, *NAMES])
 hosts = st.sampled_from(HOSTS)
+ways = st.sampled_from(["overlap", "stop first", "handoff", "handoff, restarted"])
 chance = st.booleans()
 #: Which of the things that are there at the moment; `Play.pick` takes it modulo their number.
 which_one = st.integers(0, 11)
@@ -38,25 +40,32 @@ def spec(
     name: str, kind: str, memory: int, moves: str, special: bool, priority: int
 ) -> ProcessSpec:
     """One of a few sorts of process."""
-    migration = MigrationPolicy("relaunch", overlap=moves == "overlap") if moves else None
+    strategy = "handoff" if moves.startswith("handoff") else "relaunch"
+    migration = MigrationPolicy(strategy, overlap=moves == "overlap") if moves else None
+    restart = RestartPolicy("on-failure" if moves == "handoff, restarted" else "never")
     return ProcessSpec(
         name, command=("run",), ros=kind == "node", priority=priority,
         kind=Kind.JOB if kind == "job" else Kind.SERVICE,
         needs={"memory": memory * MIB} if memory else {},
         required_labels={"arm": "yes"} if special else {},
-        migration=migration or MigrationPolicy(), readiness=Readiness(timeout=4.0),
+        migration=migration or MigrationPolicy(), restart=restart, readiness=Readiness(timeout=4.0),
     )  # fmt: skip
 
 
 class Play(RuleBasedStateMachine):
     """The rules of the play; the promises are its invariants."""
 
-    @initialize(backfill=chance, most=st.integers(1, 2), slots=st.integers(0, 2))
-    def begin(self, backfill: bool, most: int, slots: int) -> None:
+    @initialize(
+        backfill=chance, most=st.integers(1, 2), slots=st.integers(0, 2), first=ways, second=ways
+    )
+    def begin(self, backfill: bool, most: int, slots: int, first: str, second: str) -> None:
         self.cluster = Cluster(
             backfill=backfill, max_migrations=most, settle=3.0, suspect=1.0, lease=5.0,
             delivery_timeout=2.0, cooldown=2.0, hysteresis=0.4, order_retry=1.0,
-            strategies={"relaunch": StartFirstOrStopFirst(timeout=3.0)},
+            strategies={
+                "relaunch": StartFirstOrStopFirst(timeout=3.0),
+                "handoff": HandOver(timeout=3.0),
+            },
         )  # fmt: skip
         for name in HOSTS:
             labels = {"arm": "yes"} if name == LABELLED else {}
@@ -73,7 +82,7 @@ class Play(RuleBasedStateMachine):
         self.late: list[happened.Event] = []
         self.prompt = True
         # Something to play with from the beginning.
-        for name, moves in (("p0", "overlap"), ("p1", "stop first")):
+        for name, moves in (("p0", first), ("p1", second)):
             self.cluster.submit(spec(name, "node", 100, moves, special=False, priority=0))
             for machine, running in self.programs():
                 machine.seen_in_graph(running, self.cluster.now)
@@ -123,9 +132,11 @@ class Play(RuleBasedStateMachine):
     def register(self, machine: Machine) -> None:
         if not machine.connected:
             return
+        machine.begin_to_register()
         event = (happened.HostRegistered, machine.description(), machine.slave.statuses())
         if self.ask(*event):
             machine.host_id = self.cluster.replies[self.cluster._requests].host_id
+            machine.fresh = False
             machine.polled.clear()
             machine.tell(slave.Registered(self.cluster.state.epoch), self.cluster.now)
 
@@ -169,7 +180,7 @@ class Play(RuleBasedStateMachine):
     @rule(
         name=names, kind=st.sampled_from(["service", "job", "node", "node"]),
         memory=st.sampled_from([0, 100, 100, 300]),
-        moves=st.sampled_from(["overlap", "stop first", "overlap", "stop first", ""]),
+        moves=ways | st.just(""),
         special=chance, urgent=chance, twin=names,
     )  # fmt: skip
     def submit(
@@ -229,6 +240,54 @@ class Play(RuleBasedStateMachine):
     def set_host(self, host: str, action: str) -> None:
         self.ask(happened.HostStateRequested, host, action)
         self.flow()
+
+    # --- nodes ---------------------------------------------------------------------------
+
+    def nodes(self) -> list[tuple[Machine, Node]]:
+        """Those of processes that move with their state."""
+        return [
+            (machine, node)
+            for machine, node in self.cluster.air.nodes()
+            if self.is_stateful(machine, node)
+        ]
+
+    def is_stateful(self, machine: Machine, node: Node) -> bool:
+        spec = machine.programs[node.instance].assignment.spec
+        return spec.migration.strategy == "handoff"
+
+    @precondition(lambda self: self.nodes())
+    @rule(which=which_one, what=st.sampled_from([*QUIRKS, "none"]))
+    def node_changes(self, which: int, what: str) -> None:
+        """It keeps to the protocol or not."""
+        _, node = self.pick(self.nodes(), which)
+        node.quirks.clear()
+        if what != "none":
+            node.quirks.add(what)
+        self.flow()
+
+    @precondition(lambda self: self.cluster.air.waiting())
+    @rule(which=which_one)
+    def node_hears_something(self, which: int) -> None:
+        self.pick(self.cluster.air.waiting(), which)()
+        self.flow()
+
+    @precondition(lambda self: self.cluster.air.next_reports())
+    @rule(which=which_one)
+    def report_arrives(self, which: int) -> None:
+        at = self.pick(self.cluster.air.next_reports(), which)
+        self.tell(self.cluster.air.to_master.pop(at)[1])
+        self.flow()
+
+    @precondition(lambda self: self.nodes())
+    @rule(which=which_one, times=st.integers(1, 6))
+    def migrate_with_state_step_by_step(self, which: int, times: int) -> None:
+        """A handoff goes so far, and what comes next befalls it there."""
+        _, node = self.pick(self.nodes(), which)
+        self.ask(happened.MigrationRequested, node.instance.process, None)
+        self.prompt = False
+        for _ in range(times):
+            self.everything_arrives(nodes=False)
+            self.nodes_talk()
 
     # --- the network ---------------------------------------------------------------------
 
@@ -414,8 +473,19 @@ class Play(RuleBasedStateMachine):
     def all_arrives(self) -> None:
         self.everything_arrives()
 
-    def everything_arrives(self) -> None:
+    def nodes_talk(self) -> bool:
+        """Everything that is on its way between nodes and the master at this moment arrives."""
+        arrivals, heard = self.cluster.air.waiting(), self.cluster.air.next_reports()
+        for arrive in arrivals[:1]:
+            arrive()
+        for at in heard[:1]:
+            self.tell(self.cluster.air.to_master.pop(at)[1])
+        return bool(arrivals or heard)
+
+    def everything_arrives(self, *, nodes: bool = True) -> None:
         for _ in range(3):
+            while nodes and self.nodes_talk():
+                pass
             for machine in self.cluster.machines.values():
                 if not machine.connected:
                     continue
@@ -507,7 +577,12 @@ class Play(RuleBasedStateMachine):
             ]
             overlap = all(one.spec.migration.overlap and one.spec.migration.strategy
                           for one in running)  # fmt: skip
-            assert len(running) <= (2 if overlap else 1), [str(one.instance) for one in running]
+            shadows = {one.migration.strategy for one in (o.spec for o in running)} == {"handoff"}
+            most = 2 if overlap or shadows else 1
+            assert len(running) <= most, [str(one.instance) for one in running]
+        for name in {node.instance.process for _, node in self.nodes()}:
+            active = [node for _, node in self.nodes() if node.instance.process == name]
+            assert sum(node.active for node in active) <= 1, [str(one.instance) for one in active]
 
     @invariant()
     def an_end_is_told_as_it_was(self) -> None:
@@ -532,6 +607,8 @@ class Play(RuleBasedStateMachine):
             machine.connected = True
             machine.refuses.clear()
             machine.shown.clear()
+            for quirks in machine.quirks.values():
+                quirks.clear()
             machine.busy["memory"] = 0.05
             self.tame(machine, {*NAMES, *TWINS})
             machine.restart_slave(cluster.now)
@@ -547,6 +624,7 @@ class Play(RuleBasedStateMachine):
             assert process.phase.value in calm, (process.name, process.phase, process.reason)
             where = cluster.where(process.name)
             assert len(where) == (process.phase is ProcessPhase.RUNNING), (process.name, where)
+            assert cluster.active(process.name) == where
         self._cancel_all()
 
     def _let_nodes_come_up(self, times: int) -> None:

@@ -1,0 +1,250 @@
+"""Nodes on a table: what one that keeps to the handoff protocol does, and the topics between them.
+
+A `Node` belongs to one run of a program. It is active unless it was started as a shadow or has
+fallen silent, whatever the master believes. Its quirks are what it does wrong.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from rosrm.core.commands import PublishStateConfig
+from rosrm.core.events import HandoffReported
+from rosrm.core.migration import HandoffPhase, ReportPhase
+from rosrm.core.model import InstanceId
+
+if TYPE_CHECKING:
+    from tests.unit.core.machine import Machine
+
+#: What a node may do wrong: it never answers; it says FAILED; as a destination it is never ready or
+#: does not answer to ABORT; as a source it never falls silent, or does not answer to RESUME.
+QUIRKS = ("deaf", "unfit", "never ready", "no abort", "never silent", "no resume")
+
+
+@dataclass
+class Node:
+    """One run of a node.
+
+    Attributes:
+        quirks: shared with its machine, so that they may change while it runs.
+        handoff: number of the destination of the handoff that it takes part in; 0: none.
+        heard: of the other node in this handoff.
+        said: in this handoff; who comes late hears all of it.
+        configs, reports: on their way to it.
+    """
+
+    instance: InstanceId
+    shadow: bool
+    quirks: set[str]
+    active: bool = True
+    handoff: int = 0
+    heard: set[ReportPhase] = field(default_factory=set)
+    said: list[HandoffReported] = field(default_factory=list)
+    configs: deque[PublishStateConfig] = field(default_factory=deque)
+    reports: deque[HandoffReported] = field(default_factory=deque)
+    switched: bool = False
+    resumed: bool = False
+    aborted: bool = False
+    air: Air | None = None
+
+    def __post_init__(self) -> None:
+        self.active = not self.shadow
+
+    def has_said(self, phase: ReportPhase) -> bool:
+        return any(report.phase is phase for report in self.said)
+
+    def say(self, phase: ReportPhase, message: str = "") -> None:
+        number = self.instance.number
+        report = HandoffReported(self.instance.process, self.handoff, number, phase, 7, message)
+        self.said.append(report)
+        if self.air is not None:
+            self.air.spread(self, report)
+
+    def take_config(self) -> None:
+        """The master says something of a handoff that names this node."""
+        config = self.configs.popleft()
+        if "deaf" in self.quirks:
+            return
+        if config.destination != self.handoff:
+            self.handoff, self.switched, self.resumed = config.destination, False, False
+            self.said.clear()
+            self.heard.clear()
+            if self.air is not None:
+                self.air.open(self)
+        number = self.instance.number
+        (self._as_source if config.source == number else self._as_destination)(config.phase)
+
+    def take_report(self) -> None:
+        """The other node says something in the channel."""
+        report = self.reports.popleft()
+        if "deaf" in self.quirks or report.destination != self.handoff:
+            return
+        self.heard.add(report.phase)
+        if report.phase is ReportPhase.SHADOWING:
+            self.say(ReportPhase.ATTACHED)
+        elif report.phase is ReportPhase.ATTACHED:
+            self._maybe_ready()
+        elif report.phase is ReportPhase.SWITCHING:
+            self._maybe_silent()
+        elif report.phase is ReportPhase.SILENT:
+            self._maybe_active()
+
+    # --- source --------------------------------------------------------------------------
+
+    def _as_source(self, phase: HandoffPhase) -> None:
+        if phase is HandoffPhase.SHADOW and ReportPhase.SHADOWING in self.heard:
+            self.say(ReportPhase.ATTACHED)
+        elif phase is HandoffPhase.SWITCH:
+            self.switched = True
+            self._maybe_silent()
+        elif phase is HandoffPhase.RESUME:
+            self.resumed = self.active = True
+            if "no resume" not in self.quirks:
+                self.say(ReportPhase.RESUMED)
+
+    def _maybe_silent(self) -> None:
+        if not self.switched or self.resumed or ReportPhase.SWITCHING not in self.heard:
+            return
+        if "unfit" in self.quirks:
+            self.say(ReportPhase.FAILED, "the state is too large")
+        elif "never silent" not in self.quirks:
+            self.active = False
+            self.say(ReportPhase.SILENT)
+            self.say(ReportPhase.RELEASED)
+
+    # --- destination ---------------------------------------------------------------------
+
+    def _as_destination(self, phase: HandoffPhase) -> None:
+        if phase is HandoffPhase.DONE:
+            return
+        if self.active:
+            self.say(ReportPhase.ACTIVE)
+        elif self.aborted:
+            self.say(ReportPhase.ABORTED)
+        elif phase is HandoffPhase.SHADOW:
+            self.say(ReportPhase.SHADOWING, "waits for input /scan")
+            self._maybe_ready()
+        elif phase is HandoffPhase.SWITCH:
+            self.switched = True
+            self.say(ReportPhase.SWITCHING)
+            self._maybe_active()
+        elif phase is HandoffPhase.TAKE_OVER and self.has_said(ReportPhase.READY):
+            self._become_active()
+        elif phase is HandoffPhase.ABORT and "no abort" not in self.quirks:
+            self.aborted = True
+            self.say(ReportPhase.ABORTED)
+
+    def _maybe_ready(self) -> None:
+        if ReportPhase.ATTACHED not in self.heard or "never ready" in self.quirks:
+            return
+        if "unfit" in self.quirks:
+            self.say(ReportPhase.FAILED, "restore: KeyError: 'map'")
+        else:
+            self.say(ReportPhase.READY)
+
+    def _maybe_active(self) -> None:
+        silent = ReportPhase.SILENT in self.heard
+        if self.switched and silent and not self.aborted and not self.active:
+            self._become_active()
+
+    def _become_active(self) -> None:
+        self.active = True
+        self.say(ReportPhase.ACTIVE)
+
+
+class Air:
+    """The topics of handoffs between the master and all nodes: latched, reliable, in order.
+
+    Attributes:
+        latched: what the present master has said.
+        channels: those to which it is subscribed.
+        to_master: reports on their way to it, with the machine from which they come.
+    """
+
+    def __init__(self, machines: Callable[[], Iterable[Machine]]) -> None:
+        self._machines = machines
+        self.latched: list[PublishStateConfig] = []
+        self.channels: set[tuple[str, int]] = set()
+        self.to_master: list[tuple[Machine, HandoffReported]] = []
+
+    def nodes(self) -> Iterator[tuple[Machine, Node]]:
+        """Every node that runs; one that has come up meanwhile joins."""
+        for machine in self._machines():
+            for program in machine.programs.values():
+                if program.node.air is None:
+                    program.node.air = self
+                    program.node.configs.extend(
+                        config for config in self.latched if _names(config, program.node)
+                    )
+                yield machine, program.node
+
+    def publish(self, config: PublishStateConfig) -> None:
+        """The master speaks, and listens until it is DONE."""
+        channel = (config.process, config.destination)
+        if config.phase is HandoffPhase.DONE:
+            self.channels.discard(channel)
+        elif channel not in self.channels:
+            self.channels.add(channel)
+            for machine, node in self.nodes():
+                if (node.instance.process, node.handoff) == channel:
+                    self.to_master += [(machine, report) for report in node.said]
+        for _, node in self.nodes():
+            if _names(config, node):
+                node.configs.append(config)
+        self.latched.append(config)
+
+    def spread(self, speaker: Node, report: HandoffReported) -> None:
+        """A node speaks in the channel."""
+        for machine, node in self.nodes():
+            if node is speaker:
+                if (report.process, report.destination) in self.channels:
+                    self.to_master.append((machine, report))
+            elif _together(node, speaker):
+                node.reports.append(report)
+
+    def open(self, listener: Node) -> None:
+        """A node comes into a channel, and hears what was said there."""
+        for _, node in self.nodes():
+            if node is not listener and _together(node, listener):
+                listener.reports.extend(node.said)
+
+    def master_is_gone(self) -> None:
+        """What it has said and nobody has heard is lost."""
+        self.latched.clear()
+        self.channels.clear()
+        self.to_master.clear()
+        for _, node in self.nodes():
+            node.configs.clear()
+
+    def waiting(self) -> list[Callable[[], None]]:
+        """Whatever of all that is on its way to the nodes can arrive next."""
+        arrivals: list[Callable[[], None]] = []
+        for machine, node in self.nodes():
+            if machine.connected and node.configs:
+                arrivals.append(node.take_config)
+            if machine.connected and node.reports and self._peers_connected(node):
+                arrivals.append(node.take_report)
+        return arrivals
+
+    def _peers_connected(self, node: Node) -> bool:
+        return all(machine.connected for machine, other in self.nodes() if _together(node, other))
+
+    def next_reports(self) -> list[int]:
+        """Which of the reports to the master can arrive next: the first of each speaker."""
+        first: dict[int, int] = {}
+        for at, (machine, report) in enumerate(self.to_master):
+            if machine.connected:
+                first.setdefault(report.instance, at)
+        return list(first.values())
+
+
+def _names(config: PublishStateConfig, node: Node) -> bool:
+    named = (config.source, config.destination)
+    return config.process == node.instance.process and node.instance.number in named
+
+
+def _together(one: Node, other: Node) -> bool:
+    return one.instance.process == other.instance.process and one.handoff == other.handoff != 0

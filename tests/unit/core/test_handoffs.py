@@ -1,0 +1,561 @@
+"""Handoffs: moved or stayed, never two active, and a source that fell silent goes on or has ended.
+
+The nodes keep to the protocol (`nodes.Node`) but for the quirks that a test gives them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from rosrm.core import events as happened
+from rosrm.core.commands import PublishStateConfig
+from rosrm.core.migration import HandoffPhase, ReportPhase
+from rosrm.core.model import MigrationPolicy, ProcessSpec, RestartPolicy
+from tests.unit.core.cluster import Cluster, HandOver, Machine, process
+
+ON_FAILURE = RestartPolicy("on-failure", delay=0.5)
+
+
+def stateful(name: str = "p", **fields: Any) -> ProcessSpec:
+    """A process that is moved with its state."""
+    fields.setdefault("restart", ON_FAILURE)
+    return process(name, migration=MigrationPolicy("handoff"), **fields)
+
+
+def two_hosts(*, spec: ProcessSpec | None = None, **settings: Any) -> Cluster:
+    """P runs on a; b has room."""
+    cluster = Cluster("a", Machine("b", busy={"memory": 0.5, "cpu": 0.1}), **settings)
+    cluster.submit(spec or stateful())
+    assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
+    return cluster
+
+
+def quirk(cluster: Cluster, host: str, *quirks: str) -> None:
+    cluster.machines[host].quirks["p"].update(quirks)
+
+
+def said(cluster: Cluster) -> list[str]:
+    """The phases that were published, in order."""
+    return [one.phase.name for one in cluster.carried if isinstance(one, PublishStateConfig)]
+
+
+def restart_of(cluster: Cluster, host: str) -> RestartPolicy:
+    machine = cluster.machines[host]
+    return machine.programs[machine.find("p")].restart
+
+
+def begin(cluster: Cluster, until: HandoffPhase) -> None:
+    """Begin the move of p to b; everything flows until this phase is published, and no further."""
+    cluster.tell(happened.MigrationRequested(9, "p", "b"))
+    for _ in range(100):
+        if until.name in said(cluster):
+            return
+        for machine in cluster.machines.values():
+            cluster._deliver(machine)
+            if until.name in said(cluster):
+                return
+        cluster._nodes_talk()
+    raise AssertionError(f"{until.name} was never said")
+
+
+def has_stayed(cluster: Cluster) -> None:
+    """As before: one active instance at the source, restarted as its spec says."""
+    assert (cluster.phase("p"), cluster.where("p"), cluster.active()) == ("running", ["a"], ["a"])
+    assert restart_of(cluster, "a") == ON_FAILURE
+    assert len(cluster.told("stayed")) == 1
+    settled(cluster)
+
+
+def has_moved(cluster: Cluster) -> None:
+    """One active instance at the destination, restarted as its spec says."""
+    assert (cluster.phase("p"), cluster.where("p"), cluster.active()) == ("running", ["b"], ["b"])
+    assert restart_of(cluster, "b") == ON_FAILURE
+    assert len(cluster.told("migrated")) == 1
+    settled(cluster)
+
+
+def settled(cluster: Cluster) -> None:
+    assert not cluster.state.runs
+    assert not cluster.intents["migration"]
+    assert said(cluster)[-1] == "DONE"
+    assert not cluster.air.channels
+
+
+# --- forward ----------------------------------------------------------------------------------
+
+
+def test_the_good_course() -> None:
+    """Shadow, switch, commit, stop: each phase is said once."""
+    cluster = two_hosts()
+    reply = cluster.migrate("p", "b")
+    assert reply.accepted
+    has_moved(cluster)
+    assert said(cluster) == ["SHADOW", "SWITCH", "DONE"]
+    assert cluster["p"].migrations == 1
+
+
+def test_names_on_the_wire_are_fully_qualified() -> None:
+    """With the namespace; the destination under its alias."""
+    cluster = two_hosts(spec=stateful(namespace="/robot"))
+    cluster.migrate("p", "b")
+    config = next(one for one in cluster.carried if isinstance(one, PublishStateConfig))
+    assert (config.source, config.destination) == (1, 2)
+    assert (config.source_node, config.destination_node) == ("/robot/p", "/robot/p_2")
+
+
+@pytest.mark.parametrize("restarted", [False, True])
+def test_a_second_handoff_knows_the_alias_of_the_source(restarted: bool) -> None:
+    """Also a master that was started anew."""
+    moves = []
+
+    class Watched(HandOver):
+        def propose(self, move: Any) -> Any:
+            moves.append(move)
+            return super().propose(move)
+
+    cluster = two_hosts(strategies={"handoff": Watched()}, cooldown=0.0)
+    cluster.migrate("p", "b")
+    if restarted:
+        cluster.restart_master()
+    assert cluster.migrate("p", "a").accepted
+    assert [move.source_node for move in moves] == ["p", "p_2"]
+    assert cluster.active() == ["a"]
+    config = [one for one in cluster.carried if isinstance(one, PublishStateConfig)][-1]
+    assert config.source_node == "/p_2"
+
+
+def test_the_commit_is_durable_before_the_source_is_stopped() -> None:
+    """A stop is the first thing that cannot be undone."""
+    cluster = two_hosts()
+    begin(cluster, HandoffPhase.SWITCH)
+    while not cluster["p"].migrations:
+        cluster._nodes_talk()
+    assert cluster.intents["migration"]["p"]["committed"]
+    assert not cluster.orders("stop")
+
+
+def test_a_source_that_does_not_say_that_it_is_released_does_not_hold_up_the_move() -> None:
+    """Once the destination is active only time is lost by waiting."""
+    cluster = two_hosts()
+    begin(cluster, HandoffPhase.SWITCH)
+    cluster.air.to_master = [
+        one for one in cluster.air.to_master if one[1].phase is not ReportPhase.RELEASED
+    ]
+    while cluster._nodes_talk():
+        cluster.air.to_master = [
+            one for one in cluster.air.to_master if one[1].phase is not ReportPhase.RELEASED
+        ]
+    assert cluster.state.runs
+    cluster.wait(11.0)
+    has_moved(cluster)
+
+
+def test_a_second_move_is_refused_while_one_is_under_way() -> None:
+    """With its reason."""
+    cluster = two_hosts()
+    begin(cluster, HandoffPhase.SHADOW)
+    assert "p is moving already, to b" in cluster.migrate("p").message
+    has_moved(cluster)
+
+
+# --- back -------------------------------------------------------------------------------------
+
+
+def test_a_destination_that_is_never_ready_is_stopped_and_said_what_it_waits_for() -> None:
+    """The newest message of the destination is the reason."""
+    cluster = two_hosts()
+    quirk(cluster, "b", "never ready")
+    cluster.migrate("p", "b")
+    cluster.wait(11.0)
+    has_stayed(cluster)
+    (told,) = cluster.told("stayed")
+    assert told == (
+        "p stayed on a: state_config SHADOW took longer than 10 s: p#2 is SHADOWING: waits for "
+        "input /scan; p#1 is ATTACHED"
+    )
+
+
+def test_a_node_that_follows_no_protocol_stays_and_it_is_said_what_to_check() -> None:
+    """It was never asked for silence: nobody waits for it to say that it goes on."""
+    cluster = two_hosts()
+    quirk(cluster, "a", "deaf")
+    quirk(cluster, "b", "deaf")
+    cluster.migrate("p", "b")
+    cluster.wait(10.3)
+    has_stayed(cluster)
+    (told,) = cluster.told("stayed")
+    assert "nothing was heard of either node. Do they use rosrm.node?" in told
+    assert "`protocol: paper`" in told
+
+
+@pytest.mark.parametrize(
+    ("host", "told"),
+    [
+        ("b", "p#2 cannot go on with the handoff: restore: KeyError: 'map'"),
+        ("a", "p#1 cannot go on with the handoff: the state is too large"),
+    ],
+)
+def test_a_report_of_failure_ends_the_handoff(host: str, told: str) -> None:
+    """Of either node, with its message."""
+    cluster = two_hosts()
+    quirk(cluster, host, "unfit")
+    cluster.migrate("p", "b")
+    has_stayed(cluster)
+    assert cluster.told("stayed") == [f"p stayed on a: {told}"]
+
+
+def test_a_source_that_does_not_fall_silent_goes_on() -> None:
+    """The destination gives up before the source is told to go on."""
+    cluster = two_hosts()
+    quirk(cluster, "a", "never silent")
+    cluster.migrate("p", "b")
+    cluster.wait(11.0)
+    has_stayed(cluster)
+    assert said(cluster) == ["SHADOW", "SWITCH", "ABORT", "RESUME", "DONE"]
+
+
+@pytest.mark.parametrize("phase", [HandoffPhase.SHADOW, HandoffPhase.SWITCH])
+def test_a_destination_that_ends_leaves_the_source_as_it_was(phase: HandoffPhase) -> None:
+    """Its end is enough: nobody asks a dead node to give up."""
+    cluster = two_hosts()
+    begin(cluster, phase)
+    cluster.machines["b"].finish("p", cluster.now, code=3)
+    cluster.settle()
+    has_stayed(cluster)
+
+
+def test_a_destination_that_ends_after_it_was_active_and_before_the_commit() -> None:
+    """The source goes on from its own state."""
+    cluster = two_hosts()
+    begin(cluster, HandoffPhase.SWITCH)
+    while not cluster.node("b").active:
+        for arrive in cluster.air.waiting():
+            arrive()
+    cluster.machines["b"].finish("p", cluster.now, code=3)
+    cluster._deliver(cluster.machines["b"])
+    assert cluster.active() == []
+    cluster.settle()
+    has_stayed(cluster)
+
+
+def test_one_that_cannot_be_started_stays() -> None:
+    """The source was never told anything."""
+    cluster = two_hosts()
+    cluster.machines["b"].refuses["p"] = "no such executable"
+    cluster.migrate("p", "b")
+    assert (cluster.phase("p"), cluster.active()) == ("running", ["a"])
+    assert said(cluster) == []
+
+
+@pytest.mark.parametrize("phase", [HandoffPhase.SHADOW, HandoffPhase.SWITCH])
+def test_a_cancelled_process_ends_wherever_it_is(phase: HandoffPhase) -> None:
+    """The plan turns back, and both instances are stopped."""
+    cluster = two_hosts()
+    begin(cluster, phase)
+    cluster.tell(happened.CancelRequested(99, ("p",)))
+    cluster.wait(25.0)
+    assert (cluster.phase("p"), cluster.where("p")) == ("cancelled", [])
+    settled(cluster)
+
+
+def test_a_destination_that_answers_abort_with_active_has_moved() -> None:
+    """Too late to go back: the destination decides."""
+    cluster = two_hosts()
+    begin(cluster, HandoffPhase.SWITCH)
+    cluster.machines["b"].connected = False  # the master does not hear it; the nodes do each other
+    while any(node.reports or node.configs for _, node in cluster.air.nodes()):
+        for _, node in cluster.air.nodes():
+            if node.configs:
+                node.take_config()
+            if node.reports:
+                node.take_report()
+    assert cluster.active() == ["b"]
+    cluster.air.to_master.clear()
+    cluster.wait(10.5)
+    assert said(cluster)[-1] == "ABORT"
+    assert cluster.active() == ["b"]
+    cluster.machines["b"].connected = True
+    cluster.wait(1.0)
+    has_moved(cluster)
+    assert len(cluster.told("migration_redone")) == 1
+
+
+def test_a_destination_that_does_not_answer_to_abort_is_stopped_before_the_source_goes_on() -> None:
+    """Only its end says that it will never be active."""
+    cluster = two_hosts()
+    quirk(cluster, "a", "never silent")
+    quirk(cluster, "b", "no abort")
+    cluster.machines["b"].stubborn.add("p")
+    cluster.migrate("p", "b")
+    cluster.wait(25.0)
+    assert "RESUME" not in said(cluster)
+    assert len(cluster.orders("stop")) > 1
+    assert len(cluster.told("destination_unheard")) == 1
+    cluster.machines["b"].let_go("p", cluster.now)
+    cluster.settle()
+    has_stayed(cluster)
+
+
+def test_active_of_a_destination_that_was_ordered_to_stop_decides_nothing() -> None:
+    """Its end is on the way: then the source goes on."""
+    cluster = two_hosts()
+    quirk(cluster, "a", "never silent")
+    quirk(cluster, "b", "no abort")
+    cluster.machines["b"].stubborn.add("p")
+    cluster.migrate("p", "b")
+    cluster.wait(21.0)
+    cluster.tell(happened.HandoffReported("p", 2, 2, ReportPhase.ACTIVE))
+    cluster.wait(1.0)
+    assert "RESUME" not in said(cluster)
+    assert cluster["p"].migrations == 0
+    cluster.machines["b"].let_go("p", cluster.now)
+    cluster.settle()
+    has_stayed(cluster)
+
+
+def test_a_silent_source_that_does_not_say_that_it_goes_on_is_stuck() -> None:
+    """It is told again and again, and said; the process can be cancelled."""
+    cluster = two_hosts()
+    quirk(cluster, "a", "no resume")
+    begin(cluster, HandoffPhase.SWITCH)
+    cluster.machines["b"].finish("p", cluster.now, code=3)
+    cluster.wait(11.0)
+    assert cluster.phase("p") == "stuck"
+    assert "state_config RESUME took longer than 10 s" in cluster.told("migration_stuck")[0]
+    cluster.machines["a"].quirks["p"].clear()
+    cluster.wait(3.0)
+    has_stayed(cluster)
+
+
+# --- the source ends --------------------------------------------------------------------------
+
+
+def test_a_source_that_ends_before_the_switch_is_queued_again_by_its_policy() -> None:
+    """Its slave may not restart it while it moves: so the master has to."""
+    cluster = two_hosts()
+    quirk(cluster, "b", "never ready")
+    cluster.migrate("p", "b")
+    cluster.machines["a"].finish("p", cluster.now, code=3)
+    cluster.settle()
+    assert cluster.phase("p") == "running"
+    assert len(cluster.active()) == 1
+    (told,) = cluster.told("queued")
+    assert told == "p returns to the queue: restart by policy 'on-failure': exit code 3"
+
+
+def test_a_source_that_is_never_restarted_and_ends_before_the_switch_has_failed() -> None:
+    """As if no move had been in the way."""
+    cluster = two_hosts(spec=stateful(restart=RestartPolicy("never")))
+    quirk(cluster, "b", "never ready")
+    cluster.migrate("p", "b")
+    cluster.machines["a"].finish("p", cluster.now, code=3)
+    cluster.settle()
+    assert (cluster.phase("p"), cluster.where("p")) == ("failed", [])
+
+
+def test_a_source_that_ends_during_the_switch_is_taken_over() -> None:
+    """The destination has all that anybody has of its state."""
+    cluster = two_hosts()
+    quirk(cluster, "a", "never silent")
+    cluster.migrate("p", "b")
+    cluster.machines["a"].finish("p", cluster.now, code=3)
+    cluster.settle()
+    has_moved(cluster)
+    assert said(cluster) == ["SHADOW", "SWITCH", "TAKE_OVER", "DONE"]
+
+
+def test_take_over_is_said_again_until_it_is_answered() -> None:
+    """And when its time has passed both are gone: the process is queued."""
+    cluster = two_hosts(order_retry=2.0)
+    quirk(cluster, "a", "never silent")
+    cluster.migrate("p", "b")
+    quirk(cluster, "b", "deaf")
+    cluster.machines["a"].finish("p", cluster.now, code=3)
+    cluster.settle()
+    cluster.wait(5.0)
+    assert said(cluster).count("TAKE_OVER") == 3
+    cluster.wait(25.0)
+    assert cluster.phase("p") == "running"
+    assert len(cluster.active()) == 1
+    assert len(cluster.told("queued")) == 1
+
+
+def test_a_destination_that_ends_after_the_commit_is_queued_by_its_policy() -> None:
+    """Its slave is not told yet that it may restart it."""
+    cluster = two_hosts()
+    begin(cluster, HandoffPhase.SWITCH)
+    while not cluster["p"].migrations:
+        cluster._nodes_talk()
+    cluster.machines["b"].finish("p", cluster.now, code=3)
+    cluster.settle()
+    assert cluster.phase("p") == "running"
+    assert len(cluster.active()) == 1
+
+
+# --- slaves and the master --------------------------------------------------------------------
+
+PHASES = [HandoffPhase.SHADOW, HandoffPhase.SWITCH]
+MOMENTS: dict[str, Callable[[Cluster], None]] = {
+    "start": lambda cluster: cluster.tell(happened.MigrationRequested(9, "p", "b")),
+    "shadow": lambda cluster: begin(cluster, HandoffPhase.SHADOW),
+    "switch": lambda cluster: begin(cluster, HandoffPhase.SWITCH),
+    "done": lambda cluster: begin(cluster, HandoffPhase.DONE),
+}
+
+
+@pytest.mark.parametrize("moment", MOMENTS)
+@pytest.mark.parametrize("first", ["a", "b"])
+def test_a_master_that_is_killed_goes_on_with_the_step_in_hand(moment: str, first: str) -> None:
+    """Whichever slave comes back first; the nodes say again what they have said."""
+    cluster = two_hosts()
+    MOMENTS[moment](cluster)
+    cluster.kill_master()
+    for name in (first, "b" if first == "a" else "a"):
+        cluster.register(cluster.machines[name])
+        cluster.wait(2.0)
+        assert len(cluster.active()) <= 1
+    has_moved(cluster)
+
+
+def every_moment(strategy: str, overlap: bool = True) -> int:
+    """How many events the master takes in while a process moves."""
+    cluster, events = moving(strategy, overlap, stop_at=10_000)
+    assert cluster.where("p") == ["b"]
+    return events
+
+
+def moving(strategy: str, overlap: bool, stop_at: int) -> tuple[Cluster, int]:
+    """A move to b, until the master has taken in so many events."""
+    cluster = Cluster("a", Machine("b", busy={"memory": 0.5, "cpu": 0.1}))
+    policy = MigrationPolicy(strategy, overlap=overlap)
+    cluster.submit(process("p", migration=policy, restart=ON_FAILURE))
+    events = 0
+    tell = cluster.tell
+
+    class Killed(Exception):
+        pass
+
+    def counting(event: happened.Event) -> Any:
+        nonlocal events
+        if events == stop_at:
+            raise Killed
+        events += 1
+        return tell(event)
+
+    cluster.tell = counting  # type: ignore[method-assign]
+    try:
+        cluster.tell(happened.MigrationRequested(9, "p", "b"))
+        cluster.settle()
+    except Killed:
+        pass
+    cluster.tell = tell  # type: ignore[method-assign]
+    return cluster, events
+
+
+@pytest.mark.parametrize(
+    ("strategy", "overlap"), [("handoff", True), ("relaunch", True), ("relaunch", False)]
+)
+def test_a_master_may_be_killed_at_any_event_of_a_move(strategy: str, overlap: bool) -> None:
+    """It ends as moved or stayed, with one instance that runs; a handoff never has two active."""
+    count = every_moment(strategy, overlap)
+    assert count > 4
+    for stop_at in range(1, count):
+        cluster, _ = moving(strategy, overlap, stop_at)
+        cluster.restart_master()
+        cluster.wait(40.0, tick=0.5)
+        assert cluster.phase("p") == "running", stop_at
+        (host,) = cluster.where("p")
+        assert cluster.active() == [host]
+        assert restart_of(cluster, host) == ON_FAILURE
+        assert not cluster.intents["migration"]
+        assert len(cluster.told("migrated") + cluster.told("stayed")) == 1, stop_at
+
+
+@pytest.mark.parametrize("phase", PHASES)
+@pytest.mark.parametrize("host", ["a", "b"])
+def test_a_slave_that_is_killed_takes_nothing_with_it(phase: HandoffPhase, host: str) -> None:
+    """Its processes run on; the plan goes on with the slave that comes."""
+    cluster = two_hosts()
+    begin(cluster, phase)
+    cluster.machines[host].restart_slave(cluster.now)
+    cluster.now += 4.0
+    cluster.tell(happened.TimePassed())
+    assert cluster.register(cluster.machines[host]).accepted
+    cluster.wait(15.0)
+    has_moved(cluster)
+
+
+@pytest.mark.parametrize("phase", PHASES)
+@pytest.mark.parametrize("host", ["a", "b"])
+def test_a_host_that_is_cut_off_comes_back_to_one_active_instance(
+    phase: HandoffPhase, host: str
+) -> None:
+    """Whatever was decided meanwhile."""
+    cluster = two_hosts()
+    begin(cluster, phase)
+    cluster.machines[host].connected = False
+    for _ in range(12):
+        cluster.wait(5.0)
+        assert len(cluster.active()) <= 1
+    cluster.machines[host].connected = True
+    cluster.wait(30.0)
+    assert cluster.phase("p") == "running"
+    assert len(cluster.active()) == len(cluster.where("p")) == 1
+
+
+def test_both_hosts_never_come_back_after_the_master() -> None:
+    """The plan gives up after their lease and its own time-outs, and says so."""
+    cluster = two_hosts()
+    begin(cluster, HandoffPhase.SHADOW)
+    for machine in cluster.machines.values():
+        machine.connected = False
+    cluster.kill_master()
+    cluster.wait(60.0)
+    assert cluster.phase("p") == "stuck"
+    for machine in cluster.machines.values():
+        machine.connected = True
+        cluster.register(machine)
+    cluster.wait(30.0)
+    assert cluster.phase("p") == "running"
+    assert len(cluster.active()) == len(cluster.where("p")) == 1
+
+
+def test_a_destination_that_was_ordered_to_stop_is_known_to_a_new_master() -> None:
+    """What it says afterwards decides nothing there either."""
+    cluster = two_hosts()
+    quirk(cluster, "a", "never silent")
+    quirk(cluster, "b", "no abort")
+    cluster.machines["b"].stubborn.add("p")
+    cluster.migrate("p", "b")
+    cluster.wait(21.0)
+    cluster.restart_master()
+    cluster.tell(happened.HandoffReported("p", 2, 2, ReportPhase.ACTIVE))
+    cluster.wait(1.0)
+    assert cluster["p"].migrations == 0
+    cluster.machines["b"].let_go("p", cluster.now)
+    cluster.settle()
+    has_stayed(cluster)
+
+
+def test_a_move_in_the_journal_that_nobody_understands_is_over() -> None:
+    """Of another version: the owner goes on, and the other is stopped."""
+    cluster = two_hosts()
+    begin(cluster, HandoffPhase.SHADOW)
+    cluster.intents["migration"]["p"]["plan"]["steps"][0]["kind"] = "teleport"
+    cluster.restart_master()
+    cluster.wait(5.0)
+    assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
+    assert not cluster.intents["migration"]
+    assert "cannot go on: no step of a plan: 'teleport'" in cluster.told("migration_forgotten")[0]
+
+
+def test_reports_of_another_handoff_are_not_heard() -> None:
+    """Another destination, another process, or nobody at all."""
+    cluster = two_hosts()
+    begin(cluster, HandoffPhase.SHADOW)
+    for report in (("p", 7, 2), ("q", 2, 2), ("p", 2, 9)):
+        cluster.tell(happened.HandoffReported(*report, ReportPhase.ACTIVE))
+    assert not cluster.state.runs["p"].heard
