@@ -16,7 +16,7 @@ from typing import Any, Final
 from rosrm.config.settings import ClusterConfig
 from rosrm.core import events as happened
 from rosrm.core import listing, restore
-from rosrm.core.commands import Assign, Command, Order, Reply, Withdraw
+from rosrm.core.commands import Assign, Command, Order, PublishStateConfig, Reply, Withdraw
 from rosrm.core.master import step
 from rosrm.core.state import MasterState
 from rosrm.core.views import EventRow, PluginRow, Snapshot
@@ -217,6 +217,8 @@ class MasterRuntime:
                 endpoint.assign(command)
             elif isinstance(command, Order):
                 endpoint.order(command, now)
+            elif isinstance(command, PublishStateConfig):
+                endpoint.handoffs.publish(command)
             elif isinstance(command, Withdraw):
                 endpoint.withdraw(command, now)
 

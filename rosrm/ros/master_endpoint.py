@@ -26,6 +26,7 @@ from rosrm.ros.control import (
     refused,
     version_refusal,
 )
+from rosrm.ros.handoff_endpoint import HandoffEndpoint
 from rosrm.ros.participant import OpenRequest, Participant
 from rosrm.ros.readings import decode
 from rosrm.version import PROTOCOL_VERSION, __version__
@@ -106,6 +107,7 @@ class MasterEndpoint:
 
     Attributes:
         events: what happened since the runtime took them last.
+        handoffs: what is said and heard of handoffs.
         incarnation: random number of this run of the master.
     """
 
@@ -133,6 +135,9 @@ class MasterEndpoint:
         self._refused: dict[tuple[str, str], float] = {}
         self._client = ControlClient(participant, f"master {identity.name}")
         self._server = ControlServer(participant, Gate(beat, control.max_age))
+        self.handoffs = HandoffEndpoint(
+            participant, identity.name, identity.epoch, self._take_event, self._refuse_peer
+        )
         self._subscribe()
         self._offer()
 
@@ -157,6 +162,9 @@ class MasterEndpoint:
             self._participant.counted(self._take_beat), qos.BEAT,
         )  # fmt: skip
         self._beats = node.create_publisher(msg.MasterBeat, path(names.MASTER_BEAT), qos.BEAT)
+
+    def _take_event(self, event: happened.Event) -> None:
+        self.events.append(event)
 
     def poll_readings(self) -> None:
         """Take all readings that have come."""
