@@ -191,6 +191,14 @@ class MigrationStrategy(Protocol):
         """The steps of this move. Raises `ValueError` with the reason where it cannot move it."""
 
 
+@runtime_checkable
+class SpecChecking(Protocol):
+    """A migration strategy that says of a spec, before it is queued, whether it can move it."""
+
+    def spec_fault(self, spec: ProcessSpec) -> str:
+        """What is wrong with it, its own `migration.options` included; "": nothing. Pure."""
+
+
 @dataclass(frozen=True)
 class MigrationOffer:
     """Registers a migration strategy; the fields are as in `ProbeOffer`.

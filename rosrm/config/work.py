@@ -99,7 +99,11 @@ def _process(node: Node, plugins: PluginCheck, problems: Problems) -> ProcessSpe
     if strategy is None:
         return process.spec()
     named = node.deepest(("migration", "strategy"))
-    options = plugins.choice("migration", strategy, named, node.get("migration", "options"))
+    given = node.get("migration", "options")
+    checked = plugins.choice("migration", strategy, named, given)
+    # Only what this process says: for the rest the cluster's options hold.
+    said = given.items if given is not None else {}
+    options = {name: value for name, value in checked.items() if name in said}
     return replace(process, migration=replace(process.migration, options=options)).spec()
 
 

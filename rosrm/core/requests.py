@@ -10,8 +10,10 @@ from rosrm.core import lifecycle
 from rosrm.core.assigning import reconsider_set_aside
 from rosrm.core.commands import Order, Reply
 from rosrm.core.intake import save_host
+from rosrm.core.model import ProcessSpec
 from rosrm.core.relief import try_move
 from rosrm.core.state import MasterState, Process, ProcessPhase, Wanted
+from rosrm.ports import SpecChecking
 
 _WAITING = (ProcessPhase.QUEUED, ProcessPhase.SET_ASIDE)
 
@@ -85,7 +87,21 @@ def _submission_fault(state: MasterState, event: happened.SubmissionReceived) ->
                 f"{spec.name}: unknown migration strategy {strategy!r}; selected here: "
                 f"{_names(sorted(known)) or 'none'}. Nothing was queued"
             )
+        fault = _strategy_fault(state, spec)
+        if fault:
+            return f"{spec.name}: migration by {strategy!r}: {fault}. Nothing was queued"
     return ""
+
+
+def _strategy_fault(state: MasterState, spec: ProcessSpec) -> str:
+    """What the strategy of a spec has against it, if it looks at specs; "" for nothing."""
+    strategy: object = state.strategies.get(spec.migration.strategy or "")
+    if not isinstance(strategy, SpecChecking):
+        return ""
+    try:
+        return strategy.spec_fault(spec)
+    except Exception as error:  # noqa: BLE001 - a third party's code: anything may come
+        return f"it cannot say whether it moves this process: {type(error).__name__}: {error}"
 
 
 def _names(names: Iterable[str]) -> str:

@@ -7,9 +7,21 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, ClassVar
 
-from rosrm.core.migration import Commit, Execute, Move, Plan, Start, Step, Stop
+from rosrm.core.migration import (
+    Commit,
+    Configure,
+    Execute,
+    HandoffPhase,
+    Move,
+    Plan,
+    SetRestart,
+    Start,
+    Step,
+    Stop,
+)
 from rosrm.core.migration import plan_fault as fault_of
 from rosrm.core.model import EMPTY, InstanceId, ProcessSpec
+from rosrm.core.plans import plan_from_dict, plan_to_dict
 from rosrm.ports import MigrationOffer, MigrationStrategy
 
 
@@ -87,6 +99,48 @@ class MigrationContract:
                     assert plan.overlap > 0 or not same_name
                     assert move.spec.migration.overlap or not same_name
 
+    def test_survives_the_journal(self) -> None:
+        """A master that is started anew goes on with the very same plan."""
+        for move in self.moves():
+            plan = self.make().propose(move)
+            assert plan_from_dict(json.loads(json.dumps(plan_to_dict(plan)))) == plan
+
+    def test_a_shadow_is_released_after_the_commit(self) -> None:
+        """Its slave restarts it as its spec says, once it owns the name and not before."""
+        for move in self.moves():
+            plan = self.make().propose(move)
+            commit = len(before_commit(plan))
+            given = [
+                at > commit and step.restart == move.spec.restart
+                for at, step in enumerate(plan.steps)
+                if isinstance(step, SetRestart) and step.instance == move.destination
+            ]
+            assert given == [True] * len(shadows(plan))
+
+    def test_a_source_that_is_not_restarted_for_a_while_is_again_if_it_stays(self) -> None:
+        """What suspends its policy is undone by giving it back."""
+        for move in self.moves():
+            for step in before_commit(self.make().propose(move)):
+                if isinstance(step, SetRestart):
+                    undo = step.undo
+                    assert isinstance(undo, SetRestart)
+                    assert undo.instance == step.instance
+                    assert undo.restart == move.spec.restart
+
+    def test_a_silent_source_goes_on_only_when_its_successor_has_given_up(self) -> None:
+        """SWITCH is undone by ABORT, and before that stands a SHADOW that is undone by RESUME."""
+        for move in self.moves():
+            undone_by = {
+                step.phase: step.undo.phase
+                for step in before_commit(self.make().propose(move))
+                if isinstance(step, Configure) and isinstance(step.undo, Configure)
+            }
+            if HandoffPhase.SWITCH in undone_by:
+                assert list(undone_by.items()) == [
+                    (HandoffPhase.SHADOW, HandoffPhase.RESUME),
+                    (HandoffPhase.SWITCH, HandoffPhase.ABORT),
+                ]
+
     def test_executors_are_its_own(self) -> None:
         """An open step names an executor of the same offer, with arguments that are JSON."""
         for move in self.moves():
@@ -94,6 +148,11 @@ class MigrationContract:
                 if isinstance(step, Execute):
                     assert step.executor in self.offer.executors
                     json.dumps(dict(step.arguments))
+
+
+def shadows(plan: Plan) -> Sequence[Start]:
+    """The steps that start a destination in silence."""
+    return [step for step in plan.steps if isinstance(step, Start) and step.shadow]
 
 
 def before_commit(plan: Plan) -> Sequence[Step]:

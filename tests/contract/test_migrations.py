@@ -1,10 +1,22 @@
 """Every shipped migration strategy holds the contract that a third party's holds."""
 
 from dataclasses import replace
+from typing import ClassVar
 
 import pytest
 
-from rosrm.core.migration import AwaitReady, Commit, Execute, Plan, Start, Stop
+from rosrm.core.migration import (
+    AwaitReady,
+    Commit,
+    Configure,
+    Execute,
+    HandoffPhase,
+    Plan,
+    SetRestart,
+    Start,
+    Stop,
+)
+from rosrm.core.model import ProcessSpec, RestartPolicy
 from rosrm.ports import MigrationOffer
 from rosrm.testing import MigrationContract
 from rosrm_migration import plugin
@@ -14,6 +26,21 @@ OFFERS = {offer.name: offer for offer in plugin.register_migration_strategies()}
 
 class TestRelaunch(MigrationContract):
     offer = OFFERS["relaunch"]
+
+
+class TestHandoff(MigrationContract):
+    offer = OFFERS["handoff"]
+    spec = ProcessSpec("p", command=("true",), ros=True, restart=RestartPolicy("on-failure"))
+
+
+class TestHandoffAsInThePaper(MigrationContract):
+    offer = OFFERS["handoff"]
+    options: ClassVar = {"protocol": "paper", "state": "/p/state", "type": "std_msgs/msg/Int64"}
+    spec = ProcessSpec("p", command=("true",), ros=True)
+
+    def moves(self):
+        """Only of one that may overlap: for a moment both are active."""
+        return [move for move in super().moves() if move.spec.migration.overlap]
 
 
 def test_each_shipped_strategy_is_here():
@@ -51,6 +78,39 @@ def _changed(**change):
     return propose
 
 
+def _handing_over(
+    *,
+    aborts=True,
+    resumes=True,
+    releases=True,
+    gives_back=True,
+    alias="p_1",
+    phase=HandoffPhase.SWITCH,
+):
+    """A handoff with one thing that is wrong."""
+
+    def propose(move):
+        give_back = SetRestart(move.source, move.source_host, move.spec.restart, 5.0)
+        release = SetRestart(move.destination, move.destination_host, move.spec.restart, 5.0)
+        stop = Stop(move.destination, move.destination_host, 10.0)
+        start = Start(move.destination, move.destination_host, 10.0, alias, undo=stop, shadow=True)
+        suspend = SetRestart(move.source, move.source_host, RestartPolicy(), 5.0)
+        resume, abort = (Configure(p, 5.0) for p in (HandoffPhase.RESUME, HandoffPhase.ABORT))
+        return Plan(
+            (
+                start,
+                replace(suspend, undo=give_back if gives_back else None),
+                Configure(HandoffPhase.SHADOW, 5.0, undo=resume if resumes else None),
+                Configure(phase, 5.0, undo=abort if aborts else None),
+                Commit(),
+                *([release] if releases else []),
+                Stop(move.source, move.source_host, 10.0),
+            )
+        )
+
+    return propose
+
+
 @pytest.mark.parametrize(
     ("propose", "test"),
     [
@@ -59,6 +119,13 @@ def _changed(**change):
         (_changed(host="elsewhere"), "test_plan_is_sound"),
         (_changed(undo=None), "test_can_be_undone_before_the_commit"),
         (lambda move: replace(_sound(move), overlap=0.0), "test_an_overlap_is_declared"),
+        (_handing_over(aborts=False), "test_plan_is_sound"),
+        (_handing_over(phase=HandoffPhase.TAKE_OVER), "test_plan_is_sound"),
+        (_handing_over(alias="p"), "test_plan_is_sound"),
+        (_handing_over(resumes=False), "test_a_silent_source_goes_on_only_when"),
+        (_handing_over(releases=False), "test_a_shadow_is_released_after"),
+        (_handing_over(gives_back=False), "test_a_source_that_is_not_restarted"),
+        (_changed(timeout=object()), "test_survives_the_journal"),
         (_sound, "test_an_overlap_is_declared"),  # it overlaps though the process may not
         (
             lambda move: Plan((Execute("unknown", "a", {}, 1.0), Commit())),
@@ -71,5 +138,6 @@ def test_contract_catches(propose, test):
     contract = MigrationContract()
     strategy = type("Strategy", (), {"propose": staticmethod(propose)})
     contract.offer = MigrationOffer("bad", lambda options: strategy())
-    with pytest.raises(AssertionError):
-        getattr(contract, test)()
+    (named,) = (name for name in dir(contract) if name.startswith(test))
+    with pytest.raises((AssertionError, TypeError)):
+        getattr(contract, named)()

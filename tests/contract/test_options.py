@@ -7,10 +7,18 @@ import pytest
 from pydantic import TypeAdapter, ValidationError
 
 from rosrm.config.plain import from_plain, to_plain
+from rosrm_migration.plugin import register_migration_strategies
 from rosrm_resources.plugin import register_probes
 from rosrm_scoring.plugin import register_scoring_policies
 
-OFFERS = {offer.name: offer for offer in [*register_probes(), *register_scoring_policies()]}
+OFFERS = {
+    offer.name: offer
+    for offer in [
+        *register_probes(),
+        *register_scoring_policies(),
+        *register_migration_strategies(),
+    ]
+}
 
 
 @pytest.mark.parametrize("name", OFFERS)
@@ -33,6 +41,11 @@ def test_defaults_survive_the_way_to_the_slave(name):
         ("gpu", {"combine": "sum"}, "'max' or 'mean'"),
         ("network", {"capacity": 0}, "greater than 0"),
         ("weighted", {"weights": {"cpu": 1.5}}, "less than or equal to 1"),
+        ("handoff", {"ready_timeout": 0}, "greater than 0"),
+        ("handoff", {"protocol": "mine"}, "'rosrm' or 'paper'"),
+        ("handoff", {"protocol": "paper"}, "names the topic on which the node publishes"),
+        ("handoff", {"protocol": "paper", "state": "/s", "type": "Int64"}, "std_msgs/msg/Int64"),
+        ("handoff", {"state": "/s"}, "go with `protocol: paper`"),
         ("threshold", {"enter": 0.5, "leave": 0.6}, "must be below enter"),
     ],
 )

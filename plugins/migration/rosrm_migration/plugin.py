@@ -6,17 +6,25 @@ from collections.abc import Sequence
 
 from rosrm.hookspecs import hookimpl
 from rosrm.ports import MigrationOffer
+from rosrm_migration.handoff import WATCH, Handoff, HandoffOptions, watch
 from rosrm_migration.relaunch import Relaunch, RelaunchOptions
 
 
 @hookimpl
 def register_migration_strategies() -> Sequence[MigrationOffer]:
-    """Offer `relaunch`, for processes without a state."""
+    """Offer `relaunch`, for processes without a state, and `handoff`, for those with one."""
     return [
         MigrationOffer(
             name="relaunch",
             create=Relaunch,
             options=RelaunchOptions,
             summary="start at the destination, stop at the source; for stateless processes",
-        )
+        ),
+        MigrationOffer(
+            name="handoff",
+            create=Handoff,
+            options=HandoffOptions,
+            summary="the destination follows the source's state, and goes on from it",
+            executors={WATCH: watch},
+        ),
     ]

@@ -9,76 +9,82 @@ its source where the destination fails.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
 
-from annotated_types import Gt
-
+from rosrm.config.units import PositiveSeconds
 from rosrm.core.migration import AwaitReady, Commit, Move, Plan, Start, Stop
-
-#: Beyond the process's own grace: a signal, a report and a message take a moment.
-_STOP_MARGIN = 5.0
+from rosrm.core.model import ProcessSpec
+from rosrm_migration.options import check_seconds, options_of, stop_timeout
 
 
 @dataclass(frozen=True)
 class RelaunchOptions:
-    """What can be set.
+    """What can be set, for all processes or for one.
 
     Attributes:
         start_timeout: seconds within which the new instance must run.
     """
 
-    start_timeout: Annotated[float, Gt(0.0)] = 10.0
+    start_timeout: PositiveSeconds = 10.0
+
+    def __post_init__(self) -> None:
+        """Refuse a wait that is no time."""
+        check_seconds(self, "start_timeout")
 
 
 class Relaunch:
     """Plans a stateless move."""
 
     def __init__(self, options: RelaunchOptions) -> None:
-        self._start_timeout = options.start_timeout
+        self._options = options
+
+    def spec_fault(self, spec: ProcessSpec) -> str:
+        """Why a process cannot be moved so; "" if it can."""
+        try:
+            options_of(spec, self._options)
+        except ValueError as fault:
+            return str(fault)
+        return ""
 
     def propose(self, move: Move) -> Plan:
         """Start there, be ready there, commit, stop here; or stop here first."""
+        start_timeout = options_of(move.spec, self._options).start_timeout
         if move.spec.migration.overlap:
-            return self._start_first(move)
-        return self._stop_first(move)
+            return _start_first(move, start_timeout)
+        return _stop_first(move, start_timeout)
 
-    def _start_first(self, move: Move) -> Plan:
-        ready = move.spec.readiness.timeout
-        return Plan(
-            (
-                Start(
-                    move.destination, move.destination_host, self._start_timeout,
-                    undo=self._stop_destination(move),
-                ),
-                AwaitReady(move.destination, move.destination_host, ready),
-                Commit(),
-                Stop(move.source, move.source_host, _stop_timeout(move)),
+
+def _start_first(move: Move, start_timeout: float) -> Plan:
+    ready, stop = move.spec.readiness.timeout, stop_timeout(move.spec)
+    return Plan(
+        (
+            Start(
+                move.destination, move.destination_host, start_timeout,
+                undo=_stop_destination(move),
             ),
-            overlap=_stop_timeout(move) + ready,
-        )  # fmt: skip
+            AwaitReady(move.destination, move.destination_host, ready),
+            Commit(),
+            Stop(move.source, move.source_host, stop),
+        ),
+        overlap=stop + ready,
+    )  # fmt: skip
 
-    def _stop_first(self, move: Move) -> Plan:
-        return Plan(
-            (
-                Stop(
-                    move.source, move.source_host, _stop_timeout(move),
-                    undo=Start(move.fallback, move.source_host, self._start_timeout),
-                ),
-                Start(
-                    move.destination, move.destination_host, self._start_timeout,
-                    undo=self._stop_destination(move),
-                ),
-                AwaitReady(
-                    move.destination, move.destination_host, move.spec.readiness.timeout
-                ),
-                Commit(),
+
+def _stop_first(move: Move, start_timeout: float) -> Plan:
+    return Plan(
+        (
+            Stop(
+                move.source, move.source_host, stop_timeout(move.spec),
+                undo=Start(move.fallback, move.source_host, start_timeout),
             ),
-        )  # fmt: skip
+            Start(
+                move.destination, move.destination_host, start_timeout,
+                undo=_stop_destination(move),
+            ),
+            AwaitReady(move.destination, move.destination_host, move.spec.readiness.timeout),
+            Commit(),
+        ),
+    )  # fmt: skip
 
-    def _stop_destination(self, move: Move) -> Stop:
-        return Stop(move.destination, move.destination_host, _stop_timeout(move))
 
-
-def _stop_timeout(move: Move) -> float:
-    stop = move.spec.stop
-    return stop.interrupt_grace + stop.terminate_grace + _STOP_MARGIN
+def _stop_destination(move: Move) -> Stop:
+    return Stop(move.destination, move.destination_host, stop_timeout(move.spec))

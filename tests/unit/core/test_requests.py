@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from rosrm.core import events as happened
-from rosrm.core.model import MigrationPolicy
+from rosrm.core.migration import Move, Plan
+from rosrm.core.model import MigrationPolicy, ProcessSpec
 from tests.unit.core.cluster import Cluster, Machine, job, movable, node, process
 
 # --- submit -----------------------------------------------------------------------------------
@@ -46,6 +47,31 @@ def test_the_name_of_a_process_that_is_over_can_be_used_again() -> None:
     assert cluster.submit(job("p")).accepted
     assert list(cluster.state.processes) == ["q", "p"]
     assert cluster.phase("p") == "running"
+
+
+class Choosy:
+    """Moves nothing, and says so or fails to."""
+
+    def propose(self, move: Move) -> Plan:
+        raise ValueError("it does not")
+
+    def spec_fault(self, spec: ProcessSpec) -> str:
+        if spec.name == "raises":
+            raise RuntimeError("no idea")
+        return "" if spec.migration.options else "it wants options"
+
+
+def test_a_strategy_may_refuse_a_spec_before_it_is_queued() -> None:
+    """With its reason; one that raises is named."""
+    cluster = Cluster("a", strategies={"choosy": Choosy()})
+
+    def message(name: str, **options: int) -> str:
+        policy = MigrationPolicy("choosy", options=options)
+        return cluster.submit(process(name, migration=policy)).message
+
+    assert message("p", fast=1) == "1 process queued"
+    assert message("q") == "q: migration by 'choosy': it wants options. Nothing was queued"
+    assert "cannot say whether it moves this process: RuntimeError: no idea" in message("raises")
 
 
 def test_an_unknown_migration_strategy_refuses_all() -> None:

@@ -1,0 +1,197 @@
+"""`handoff`: a process moves with its state, while both its instances run for a moment.
+
+The destination is started beside the source under an alias, as in the paper (III-C2), and follows
+the source's state in silence. Then the two hand over by themselves, as in
+docs/reference/handoff-protocol.md. A node that only keeps the paper's two constraints is moved as
+the paper does (`protocol: paper`).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final, Literal
+
+from rosrm.config.units import PositiveSeconds
+from rosrm.core.migration import (
+    Commit,
+    Configure,
+    Execute,
+    HandoffPhase,
+    Move,
+    Plan,
+    SetRestart,
+    Start,
+    Stop,
+)
+from rosrm.core.model import ProcessSpec, RestartPolicy
+from rosrm_migration.options import check_seconds, options_of, stop_timeout
+
+#: Name of the executor that hears when a destination of the paper's protocol speaks.
+WATCH: Final = "handoff_watch"
+#: Characters of a node's name in ROS 2.
+_LONGEST: Final = 255
+#: Seconds that a watch may take to come up, beyond the time for which it listens.
+_WATCH_MARGIN: Final = 5.0
+_NEVER: Final = RestartPolicy("never")
+_TOPIC: Final = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
+_TYPE: Final = re.compile(r"[a-z][a-z0-9_]*/msg/[A-Z][A-Za-z0-9]*")
+
+
+@dataclass(frozen=True)
+class HandoffOptions:
+    """What can be set, for all processes or for one.
+
+    Attributes:
+        start_timeout: seconds within which the destination must run, and a slave take an order.
+        ready_timeout: seconds within which the destination must have all that it needs.
+        switch_timeout: seconds from the word to switch until it is active and the source silent.
+        abort_timeout: seconds for which a destination may think about giving up, before it is
+            stopped.
+        resume_timeout: seconds within which a source must say that it goes on.
+        protocol: "rosrm", or "paper" for a node that keeps only the paper's two constraints.
+        state: the topic of its state, with "paper".
+        type: of that topic: "std_msgs/msg/Int64".
+    """
+
+    start_timeout: PositiveSeconds = 10.0
+    ready_timeout: PositiveSeconds = 30.0
+    switch_timeout: PositiveSeconds = 10.0
+    abort_timeout: PositiveSeconds = 2.0
+    resume_timeout: PositiveSeconds = 5.0
+    protocol: Literal["rosrm", "paper"] = "rosrm"
+    state: str = ""
+    type: str = ""
+
+    def __post_init__(self) -> None:
+        """Refuse a wait that is no time, and a watch that could not begin."""
+        check_seconds(
+            self, "start_timeout", "ready_timeout", "switch_timeout", "abort_timeout",
+            "resume_timeout",
+        )  # fmt: skip
+        if self.protocol not in ("rosrm", "paper"):
+            raise ValueError(f"protocol {self.protocol!r}; allowed: rosrm, paper")
+        if self.protocol == "rosrm":
+            if self.state or self.type:
+                raise ValueError("state and type go with `protocol: paper`")
+        elif not _TOPIC.fullmatch(self.state):
+            raise ValueError(
+                f"state is {self.state!r}: with `protocol: paper` it names the topic on which the "
+                f"node publishes its state in every cycle, as /counter/state"
+            )
+        elif not _TYPE.fullmatch(self.type):
+            raise ValueError(
+                f"type is {self.type!r}: with `protocol: paper` it is the type of {self.state}, as "
+                f"std_msgs/msg/Int64"
+            )
+
+
+class Handoff:
+    """Plans a stateful move."""
+
+    def __init__(self, options: HandoffOptions) -> None:
+        self._options = options
+
+    def spec_fault(self, spec: ProcessSpec) -> str:
+        """Why a process cannot be moved so; "" if it can."""
+        try:
+            options = options_of(spec, self._options)
+        except ValueError as fault:
+            return str(fault)
+        if not spec.ros:
+            return "it moves ROS nodes, and this process is none: say `ros: true`"
+        if options.protocol == "paper" and not spec.migration.overlap:
+            return (
+                "with `protocol: paper` both are active for a moment, and `overlap: false` is set"
+            )
+        return ""
+
+    def propose(self, move: Move) -> Plan:
+        """Shadow, switch, commit, stop; with the paper's protocol: listen, commit, stop."""
+        fault = self.spec_fault(move.spec)
+        if fault:
+            raise ValueError(fault)
+        options = options_of(move.spec, self._options)
+        if options.protocol == "paper":
+            return _as_in_the_paper(move, options)
+        return _handing_over(move, options)
+
+
+def _handing_over(move: Move, options: HandoffOptions) -> Plan:
+    resume = Configure(HandoffPhase.RESUME, options.resume_timeout)
+    abort = Configure(HandoffPhase.ABORT, options.abort_timeout)
+    return Plan(
+        (
+            _start(move, options),
+            _suspend(move, options),
+            Configure(HandoffPhase.SHADOW, options.ready_timeout, undo=resume),
+            Configure(HandoffPhase.SWITCH, options.switch_timeout, undo=abort),
+            Commit(),
+            *_after_commit(move, options),
+        )
+    )
+
+
+def _as_in_the_paper(move: Move, options: HandoffOptions) -> Plan:
+    """From the first word of the destination to the end of the source both are active."""
+    listen = {"state": options.state, "type": options.type, "timeout": options.ready_timeout}
+    watch_timeout = options.ready_timeout + _WATCH_MARGIN
+    return Plan(
+        (
+            _start(move, options),
+            _suspend(move, options),
+            Configure(HandoffPhase.SHADOW, options.ready_timeout, awaited=False),
+            Execute(WATCH, move.destination_host, listen, watch_timeout),
+            Commit(),
+            *_after_commit(move, options),
+        ),
+        overlap=watch_timeout + stop_timeout(move.spec),
+    )
+
+
+def _start(move: Move, options: HandoffOptions) -> Start:
+    stop = Stop(move.destination, move.destination_host, stop_timeout(move.spec))
+    return Start(
+        move.destination, move.destination_host, options.start_timeout, alias_of(move), undo=stop,
+        shadow=True,
+    )  # fmt: skip
+
+
+def _suspend(move: Move, options: HandoffOptions) -> SetRestart:
+    """A source that its slave started again by itself would be active beside its successor."""
+    seconds = options.start_timeout
+    give_back = SetRestart(move.source, move.source_host, move.spec.restart, seconds)
+    return SetRestart(move.source, move.source_host, _NEVER, seconds, undo=give_back)
+
+
+def _after_commit(move: Move, options: HandoffOptions) -> tuple[SetRestart, Stop, Configure]:
+    return (
+        SetRestart(
+            move.destination, move.destination_host, move.spec.restart, options.start_timeout
+        ),
+        Stop(move.source, move.source_host, stop_timeout(move.spec)),
+        Configure(HandoffPhase.DONE, options.start_timeout),
+    )
+
+
+def alias_of(move: Move) -> str:
+    """`NAME_<unix time>`, and not the name under which the source runs."""
+    name, at = move.spec.name, move.now
+    while (alias := _suffixed(name, at)) in (name, move.source_node):
+        at += 1
+    return alias
+
+
+def _suffixed(name: str, at: int) -> str:
+    suffix = f"_{at}"
+    return name[: _LONGEST - len(suffix)] + suffix
+
+
+def watch(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Wait on the slave of the destination until a second publisher of the state is heard."""
+    from rosrm.ros.watching import await_second_publisher  # noqa: PLC0415 - the master has no use
+
+    return await_second_publisher(
+        str(arguments["state"]), str(arguments["type"]), float(arguments["timeout"])
+    )

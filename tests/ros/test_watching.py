@@ -1,0 +1,100 @@
+"""The executor `handoff_watch` against real publishers: it hears the second, whatever its QoS."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+
+import pytest
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+from std_msgs.msg import Int64, String
+
+from rosrm_migration.handoff import watch
+
+LATCHED = QoSProfile(
+    depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
+)
+LOSSY = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+TOPIC = "/watched/state"
+
+
+@pytest.fixture(autouse=True)
+def domain(monkeypatch):
+    """One that no cluster of the tests has."""
+    monkeypatch.setenv("ROS_DOMAIN_ID", "97")
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+
+
+@contextlib.contextmanager
+def publishing(name: str, qos: QoSProfile = LATCHED, kind: type = Int64, period: float = 0.02):
+    """A node that publishes its state in every cycle, in a participant of its own."""
+    context = rclpy.Context()
+    rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
+    node = Node(name, context=context)
+    publisher = node.create_publisher(kind, TOPIC, qos)
+    node.create_timer(period, lambda: publisher.publish(kind()))
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+    thread = threading.Thread(target=executor.spin, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        executor.shutdown()
+        thread.join(5.0)
+        node.destroy_node()
+        context.try_shutdown()
+
+
+def listen(timeout: float = 20.0):
+    """As the slave does it."""
+    return watch({"state": TOPIC, "type": "std_msgs/msg/Int64", "timeout": timeout})
+
+
+@pytest.mark.parametrize("qos", [LATCHED, LOSSY])
+def test_a_second_publisher_is_heard(qos):
+    """And not before it has spoken."""
+    heard = []
+    with publishing("source", qos):
+        thread = threading.Thread(target=lambda: heard.append(listen()))
+        thread.start()
+        time.sleep(3.0)
+        assert not heard
+        with publishing("destination", qos):
+            thread.join(15.0)
+    (result,) = heard
+    assert result["heard"] > 50
+    assert result["seconds"] > 2.5
+
+
+def test_a_second_publisher_that_was_first_is_heard():
+    """A watch that begins late: both speak already."""
+    with publishing("source"), publishing("destination"):
+        time.sleep(1.0)
+        assert listen()["heard"] > 1
+
+
+def test_one_publisher_alone_is_said():
+    with publishing("source"), pytest.raises(TimeoutError, match="only one publisher of /watched"):
+        listen(2.0)
+
+
+def test_nobody_is_said():
+    with pytest.raises(TimeoutError, match="nobody publishes /watched/state, in 1 s"):
+        listen(1.0)
+
+
+def test_another_type_is_said():
+    expected = "/watched/state is published as std_msgs/msg/String, not std_msgs/msg/Int64"
+    with publishing("source", kind=String), pytest.raises(TimeoutError, match=expected):
+        listen(2.0)
+
+
+def test_an_unknown_type_is_said():
+    with pytest.raises(ValueError, match="no message type 'no_msgs/msg/Int64' on this host"):
+        watch({"state": TOPIC, "type": "no_msgs/msg/Int64", "timeout": 1.0})

@@ -1,0 +1,107 @@
+"""The strategy `handoff`: its alias, the options of a process, and the paper's protocol."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from rosrm.core.migration import Configure, Execute, Move, Plan, Start, Stop
+from rosrm.core.model import InstanceId, MigrationPolicy, ProcessSpec, StopPolicy
+from rosrm_migration.handoff import Handoff, HandoffOptions, alias_of
+
+PAPER = {"protocol": "paper", "state": "/counter/state", "type": "std_msgs/msg/Int64"}
+
+
+def move(name: str = "counter", source_node: str = "counter", **options: Any) -> Move:
+    """A node moves from a to b."""
+    spec = ProcessSpec(
+        name, command=("run",), ros=True, migration=MigrationPolicy("handoff", options=options),
+        stop=StopPolicy(1.0, 2.0),
+    )  # fmt: skip
+    numbered = [InstanceId(name, number) for number in (1, 2, 3)]
+    return Move(spec, numbered[0], "a", numbered[1], "b", numbered[2], 1_700_000_000, source_node)
+
+
+def of_kind(plan: Plan, kind: type) -> Any:
+    """The only step of a kind."""
+    (step,) = (step for step in plan.steps if isinstance(step, kind))
+    return step
+
+
+def test_the_alias_carries_the_time() -> None:
+    """As the paper has it."""
+    assert alias_of(move()) == "counter_1700000000"
+
+
+def test_the_alias_differs_from_the_name_of_the_source() -> None:
+    """Also when two handoffs follow within a second."""
+    assert alias_of(move(source_node="counter_1700000000")) == "counter_1700000001"
+    assert alias_of(move("n_1700000000", "n_1700000000")) == "n_1700000000_1700000000"
+
+
+def test_a_long_name_is_cut() -> None:
+    """A node's name has 255 characters at most in ROS 2."""
+    alias = alias_of(move("n" * 255))
+    assert len(alias) == 255
+    assert alias.endswith("n_1700000000")
+
+
+def test_options_of_a_process_go_over_those_of_the_cluster() -> None:
+    """The others stay."""
+    strategy = Handoff(HandoffOptions(start_timeout=3.0, ready_timeout=4.0))
+    plan = strategy.propose(move(ready_timeout=60.0))
+    waits = {step.phase.name: step.timeout for step in plan.steps if isinstance(step, Configure)}
+    assert waits == {"SHADOW": 60.0, "SWITCH": 10.0, "DONE": 3.0}
+    assert of_kind(plan, Start).timeout == 3.0
+    assert of_kind(plan, Stop).timeout == 8.0
+
+
+def test_the_papers_protocol_listens_and_declares_its_overlap() -> None:
+    """The destination's slave hears when a second publisher speaks; nobody is asked for silence."""
+    plan = Handoff(HandoffOptions()).propose(move(**PAPER))
+    listen = of_kind(plan, Execute)
+    assert (listen.executor, listen.host) == ("handoff_watch", "b")
+    assert listen.arguments == {
+        "state": "/counter/state", "type": "std_msgs/msg/Int64", "timeout": 30.0,
+    }  # fmt: skip
+    assert listen.timeout > 30.0
+    assert plan.overlap == listen.timeout + 8.0
+    phases = [step.phase.name for step in plan.steps if isinstance(step, Configure)]
+    assert phases == ["SHADOW", "DONE"]
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"fast": True}, "unknown fast"),
+        ({"ready_timeout": -1.0}, "ready_timeout is -1 s"),
+        ({"ready_timeout": "soon"}, "ready_timeout: float is wanted, not 'soon'"),
+        ({"protocol": "mine"}, "protocol 'mine'; allowed: rosrm, paper"),
+        ({"protocol": "paper"}, "names the topic"),
+        ({**PAPER, "state": "counter/state"}, "state is 'counter/state'"),
+        ({**PAPER, "type": "Int64"}, "type is 'Int64'"),
+        ({"type": "std_msgs/msg/Int64"}, "go with `protocol: paper`"),
+    ],
+)
+def test_nonsense_is_refused_when_the_process_is_submitted(given: Any, said: str) -> None:
+    """And no plan is made of it."""
+    strategy = Handoff(HandoffOptions())
+    asked = move(**given)
+    assert said in strategy.spec_fault(asked.spec)
+    with pytest.raises(ValueError, match=r"."):
+        strategy.propose(asked)
+
+
+def test_what_is_no_node_has_no_alias() -> None:
+    """And so cannot be moved so."""
+    spec = replace(move().spec, ros=False)
+    assert "say `ros: true`" in Handoff(HandoffOptions()).spec_fault(spec)
+
+
+def test_the_papers_protocol_needs_an_overlap() -> None:
+    """A process that may never run twice cannot be moved by it."""
+    spec = move(**PAPER).spec
+    spec = replace(spec, migration=replace(spec.migration, overlap=False))
+    assert "`overlap: false`" in Handoff(HandoffOptions()).spec_fault(spec)
