@@ -1,0 +1,100 @@
+"""Nodes that keep only the paper's two constraints, moved with their state by `protocol: paper`."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+
+from rosrm.config.settings import MigrationSettings
+from rosrm.core.model import MigrationPolicy, ProcessSpec, Readiness, RestartPolicy
+from rosrm.errors import Refused
+from tests.ros.clusters import PATIENCE, QUICK, host
+
+#: Plain rclpy: publishes its state in every cycle; a shadow begins with what it hears there.
+COUNTER = """
+import os, rclpy
+from rclpy.node import Node
+from std_msgs.msg import Int64
+rclpy.init()
+node = Node("unnamed")
+count = None if os.environ.get("ROSRM_SHADOW") else 0
+output = node.create_publisher(Int64, "/counter/state", 1)
+
+def initialise(message):
+    global count
+    if count is None:
+        count = message.data
+        print("began with", count, flush=True)
+
+def cycle():
+    global count
+    if count is not None:
+        count += 1
+        output.publish(Int64(data=count))
+
+node.create_subscription(Int64, "/counter/state", initialise, 1)
+node.create_timer(0.02, cycle)
+try:
+    rclpy.spin(node)
+except BaseException:
+    pass
+"""
+PAPER = {"protocol": "paper", "state": "/counter/state", "type": "std_msgs/msg/Int64"}
+
+
+@pytest.fixture(scope="module")
+def cluster(make_shared):
+    strategies = {"handoff": {"start_timeout": 15.0}}
+    return make_shared(
+        host("left"), host("right"),
+        migration=MigrationSettings(strategies=strategies, automatic=False),
+    )  # fmt: skip
+
+
+def counter(name: str = "counter", **options: object) -> ProcessSpec:
+    return ProcessSpec(
+        name, command=(sys.executable, "-c", COUNTER), ros=True, stop=QUICK,
+        readiness=Readiness(timeout=PATIENCE), restart=RestartPolicy("on-failure"),
+        migration=MigrationPolicy("handoff", options={**PAPER, **options}),
+    )  # fmt: skip
+
+
+def test_it_goes_on_counting_there_and_back_again(cluster):
+    """Twice: the second time the source has an alias."""
+    cluster.submit(counter())
+    here = cluster.wait("counter", "running").host
+    there = {"left": "right", "right": "left"}[here]
+    for times, target in enumerate((there, here), start=1):
+        cluster.client.migrate("counter", target)
+        row = moved(cluster, times)
+        assert row.host == target
+        log = cluster.wait_for_log("counter", "began with")
+        assert int(log.split("began with")[1].split()[0]) > 10
+    cluster.cancel("counter")
+
+
+def moved(cluster, times: int):
+    """Its row, once it has moved so many times and runs."""
+    view = cluster.wait_until(
+        f"moved {times} times",
+        lambda v: any(row.migrations == times and row.state == "running" for row in v.processes),
+        PATIENCE,
+    )
+    return view.processes[0]
+
+
+def test_a_topic_on_which_nobody_speaks_leaves_it_where_it_is(cluster):
+    """With the reason, as the slave of the destination heard it."""
+    cluster.submit(counter("lost", state="/wrong/state", ready_timeout=2.0))
+    cluster.wait("lost", "running")
+    cluster.client.migrate("lost", None)
+    event = cluster.wait_for_event("stayed", process="lost")
+    assert "nobody publishes /wrong/state" in event.message
+    cluster.wait("lost", "running")
+    cluster.cancel("lost")
+
+
+def test_options_that_make_no_sense_are_refused_by_the_master(cluster):
+    with pytest.raises(Refused, match="protocol 'mine'; allowed: rosrm, paper"):
+        cluster.submit(counter("odd", protocol="mine"))
