@@ -124,6 +124,11 @@ class InputBuffer:
         track = self._track(topic)
         return not track.held and now - track.heard_at >= for_seconds
 
+    def covers(self, topic: str, stamp: int) -> bool:
+        """Whether a state covers a message."""
+        track = self._tracks.get(topic)
+        return track is not None and _is_covered(track, stamp)
+
     def take(self) -> Kept | None:
         """The oldest message, out of the buffer; None: it is empty."""
         if not self._kept:

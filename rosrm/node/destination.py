@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from functools import partial
+from math import inf
 from typing import Any, Final
 
 from rosrm.node import channel as topics
@@ -17,6 +18,9 @@ from rosrm_msgs.msg import HandoffReport, StateConfig, StateMark
 
 #: Seconds without a message after which an input counts as idle.
 _IDLE: Final = 1.0
+#: Seconds for which all readers have to be matched. A reader learns of a writer after the writer
+#: of it: 0.4 s later on a busy machine.
+_MATCHED: Final = 0.5
 #: Seconds between two looks at what is still waited for.
 _REVIEW: Final = 0.1
 
@@ -45,6 +49,7 @@ class Destination:
         self._cut: Cut | None = None
         self._run = 0
         self._attached = False
+        self._matched_at = inf
         self._was_ready = False
         self._may_switch = False
         self._over = False
@@ -210,14 +215,21 @@ class Destination:
         for covered in self._cut.mark.inputs:
             if not self._follows(covered):
                 return f"until a message on {covered.topic} has been here and in the state"
+        return self._missing_readers(self._cut.mark.outputs)
+
+    def _missing_readers(self, outputs: Any) -> str:
+        """Which readers are not matched, or only just: they may not know it yet themselves."""
+        now = time.monotonic()
         ours = {one.topic_name: one.get_subscription_count() for one in self._member.outputs}
-        for output in self._cut.mark.outputs:
+        for output in outputs:
             if ours.get(output.topic, output.subscriptions) < output.subscriptions:
+                self._matched_at = inf
                 return (
                     f"for the readers of {output.topic}: {ours[output.topic]} of "
                     f"{output.subscriptions} matched"
                 )
-        return ""
+        self._matched_at = min(self._matched_at, now)
+        return "a moment, for its readers" if now - self._matched_at < _MATCHED else ""
 
     def _missing_state(self) -> str:
         missing = self._assembler.missing() if self._assembler is not None else []

@@ -41,7 +41,7 @@ def identity_from(environment: Mapping[str, str]) -> Identity | None:
         instance=int(number),
         node=environment.get("ROSRM_NODE", ""),
         state_config=topic,
-        cluster=environment.get("ROSRM_CLUSTER", ""),
+        cluster=environment.get("ROSRM_MASTER", ""),
         epoch=int(epoch) if epoch.isdecimal() else 0,
         shadow=environment.get("ROSRM_SHADOW", "") == "1",
     )

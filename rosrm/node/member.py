@@ -30,6 +30,9 @@ from rosrm.node.identity import Identity
 BUFFER_LIMIT: Final = 1000
 #: rclpy's own, which every node has for itself.
 _INTERNAL: Final = frozenset({"/parameter_events", "/clock", "/rosout"})
+#: Seconds after becoming active in which a message may still come that the source has processed.
+#: Not longer: the clock of a publisher may be set back.
+_LATE: Final = 10.0
 #: Seconds for which a request waits that was taken just before its node fell silent.
 _PATIENCE: Final = 1.0
 
@@ -64,6 +67,7 @@ class Member:
         self.turn = threading.Condition(threading.RLock())
         self.mode = Mode.SHADOW if identity.shadow else Mode.ACTIVE
         self.sequence = 0
+        self._late_until = 0.0
         self.inputs: list[Input] = []
         self.outputs: list[Any] = []
         self.timers: list[TimerOf] = []
@@ -196,12 +200,22 @@ class Member:
     def _received(self, one: Input, message: Any, info: Any) -> None:
         with self.turn:
             if self.mode is Mode.ACTIVE:
-                one.serve(message, info)
-                self._cycle_ended()
+                if not self._is_late(one, info):
+                    one.serve(message, info)
+                    self._cycle_ended()
             elif one.buffered:
                 stamp, now = info["source_timestamp"], time.monotonic()
                 if not self.buffer.add(one.topic, stamp, (one, message, info), now):
                     self.on_overflow(one.topic)
+
+    def _is_late(self, one: Input, info: Any) -> bool:
+        """It was on its way when this node became active, and the source had processed it."""
+        if not self._late_until:
+            return False
+        if time.monotonic() >= self._late_until:
+            self._late_until = 0.0
+            return False
+        return self.buffer.covers(one.topic, info["source_timestamp"])
 
     def _is_active_soon(self) -> bool:
         """For a request that another thread took in the very moment of falling silent."""
@@ -241,6 +255,7 @@ class Member:
         """
         self.mode = Mode.ACTIVE
         self._gate.is_open = True
+        self._late_until = time.monotonic() + _LATE
         while (kept := self.buffer.take()) is not None:
             one, message, info = kept.item
             one.serve(message, info)

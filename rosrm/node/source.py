@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 import time
 from array import array
-from typing import Final
+from typing import Any, Final
 
 from rclpy.duration import Duration
 
@@ -18,8 +18,12 @@ from rosrm_msgs.msg import CoveredInput, HandoffReport, MatchedOutput, StateConf
 
 #: Most bytes of one part. Fast DDS carried 400 MB, but a node takes 3 s to make 200 MB of them.
 LARGEST_PART: Final = 256 << 20
-#: Seconds that a silent source waits for its last outputs to be acknowledged.
-_LAST_WORDS: Final = 1.0
+#: Seconds that a silent source waits for its last outputs to be acknowledged: readers are asked
+#: every 3 s by Fast DDS's default.
+_LAST_WORDS: Final = 4.0
+#: Seconds between two looks.
+_LOOK: Final = 0.05
+_AT_ONCE: Final = Duration(nanoseconds=0)
 
 
 class Source:
@@ -42,6 +46,7 @@ class Source:
         self._fault = ""
         self._timers_due: list[int] = []
         self._silent_since = 0.0
+        self._look_again: Any = None
         plain = member.plain
         self._marks = plain.create_publisher(StateMark, mark_topic, topics.MARK)
         for part in parts:
@@ -171,18 +176,25 @@ class Source:
                 self._go_on()
                 return
             self._channel.say(HandoffReport.SILENT, member.sequence)
-            self._wait_until_heard()
-            self._channel.say(HandoffReport.RELEASED, member.sequence)
+            self._look_again = member.plain.create_timer(_LOOK, self._release_when_heard)
 
-    def _wait_until_heard(self) -> None:
+    def _release_when_heard(self) -> None:
         """What is not acknowledged is lost when this node is stopped."""
-        until = time.monotonic() + _LAST_WORDS
-        for publisher in self._member.outputs:
-            left = max(0.0, until - time.monotonic())
-            publisher.wait_for_all_acked(Duration(seconds=left))
+        with self._member.turn:
+            heard = all(one.wait_for_all_acked(_AT_ONCE) for one in self._member.outputs)
+            if heard or time.monotonic() - self._silent_since >= _LAST_WORDS:
+                self._look_no_more()
+                if self._channel is not None:
+                    self._channel.say(HandoffReport.RELEASED, self._member.sequence)
+
+    def _look_no_more(self) -> None:
+        if self._look_again is not None:
+            self._member.plain.destroy_timer(self._look_again)
+            self._look_again = None
 
     def _resume(self) -> None:
         self._may_switch = self._asked = self._attached = False
+        self._look_no_more()
         if self._member.mode is Mode.SILENT:
             self._go_on()
         if self._channel is not None:
@@ -201,6 +213,7 @@ class Source:
 
     def close(self) -> None:
         """The handoff is over."""
+        self._look_no_more()
         self._may_switch = self._asked = self._attached = False
         if self._channel is not None:
             self._channel.close()

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -152,17 +152,28 @@ class Participant:
         self.close()
 
 
+def announcements(environment: Mapping[str, str], pace: str) -> dict[str, str]:
+    """Variables that make Fast DDS announce a participant more often; none where a user set one.
+
+    Args:
+        environment: that a user may have set a profile in.
+        pace: "eager" or "steady".
+    """
+    if any(variable in environment for variable in _PROFILE_VARIABLES):
+        return {}
+    return {_PROFILE_VARIABLES[0]: str(Path(__file__).parent / "profiles" / f"{pace}.xml")}
+
+
 @contextlib.contextmanager
 def _announcing(pace: str) -> Iterator[None]:
     """Give Fast DDS a profile while a participant is made, unless the user has given one."""
-    if any(variable in os.environ for variable in _PROFILE_VARIABLES):
-        yield
-        return
-    os.environ[_PROFILE_VARIABLES[0]] = str(Path(__file__).parent / "profiles" / f"{pace}.xml")
+    added = announcements(os.environ, pace)
+    os.environ.update(added)
     try:
         yield
     finally:
-        del os.environ[_PROFILE_VARIABLES[0]]
+        for variable in added:
+            del os.environ[variable]
 
 
 def _nothing() -> None:

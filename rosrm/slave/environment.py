@@ -15,6 +15,7 @@ from typing import Final
 
 from rosrm.core.model import Assignment
 from rosrm.core.slave import qualified_name
+from rosrm.ros.participant import announcements
 
 #: Set where an instance starts as the destination of a handoff.
 SHADOW: Final = "ROSRM_SHADOW"
@@ -25,7 +26,7 @@ _IDENTITY: Final = (
     "ROSRM_HOST",
     "ROSRM_NODE",
     "ROSRM_STATE_CONFIG",
-    "ROSRM_CLUSTER",
+    "ROSRM_MASTER",
     "ROSRM_EPOCH",
     SHADOW,
 )
@@ -70,7 +71,7 @@ def process_environment(
     environment["ROSRM_INSTANCE"] = str(assignment.instance)
     environment["ROSRM_HOST"] = where.host
     environment["ROSRM_STATE_CONFIG"] = where.state_config
-    environment["ROSRM_CLUSTER"] = where.cluster
+    environment["ROSRM_MASTER"] = where.cluster
     environment["ROSRM_EPOCH"] = str(assignment.epoch)
     if spec.ros or spec.package is not None:  # under an alias too it is known by this name
         environment["ROSRM_NODE"] = qualified_name(spec.namespace, spec.name)
@@ -78,6 +79,8 @@ def process_environment(
         environment[SHADOW] = "1"
     environment["PYTHONUNBUFFERED"] = "1"
     environment.update(spec.environment)
+    if assignment.shadow:  # a move waits until it has found everybody
+        environment.update(announcements(environment, "steady"))
     return environment
 
 

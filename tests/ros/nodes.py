@@ -99,7 +99,7 @@ class Stage:
         """A node that was started by a slave, as it sees it."""
         variables = {
             "ROSRM_INSTANCE": f"{name}#{number}", "ROSRM_PROCESS": name, "ROSRM_NODE": f"/{name}",
-            "ROSRM_STATE_CONFIG": TOPIC, "ROSRM_CLUSTER": CLUSTER, "ROSRM_EPOCH": str(EPOCH),
+            "ROSRM_STATE_CONFIG": TOPIC, "ROSRM_MASTER": CLUSTER, "ROSRM_EPOCH": str(EPOCH),
             "ROSRM_SHADOW": "1" if shadow else "",
         }  # fmt: skip
         with pytest.MonkeyPatch.context() as patch:

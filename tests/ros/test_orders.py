@@ -138,6 +138,6 @@ def test_a_process_is_told_who_it_is(cluster) -> None:
     told = json.loads(cluster.log("who"))
     assert told["ROSRM_NODE"] == "/who"
     assert told["ROSRM_STATE_CONFIG"] == "/rosrm/state_config"
-    assert told["ROSRM_CLUSTER"] == cluster.cluster.name
+    assert told["ROSRM_MASTER"] == cluster.cluster.name
     assert told["ROSRM_EPOCH"] == "1"
     assert "ROSRM_SHADOW" not in told

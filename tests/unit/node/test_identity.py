@@ -10,7 +10,7 @@ FULL = {
     "ROSRM_INSTANCE": "robot/p#12",
     "ROSRM_NODE": "/ns/p",
     "ROSRM_STATE_CONFIG": "/rosrm/state_config",
-    "ROSRM_CLUSTER": "lab",
+    "ROSRM_MASTER": "lab",
     "ROSRM_EPOCH": "4",
 }
 

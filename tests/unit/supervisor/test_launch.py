@@ -306,7 +306,7 @@ def test_the_spec_has_the_last_word():
         "ROSRM_INSTANCE": "talker#7",
         "ROSRM_HOST": "robot1",
         "ROSRM_STATE_CONFIG": "/rosrm/state_config",
-        "ROSRM_CLUSTER": "fleet",
+        "ROSRM_MASTER": "fleet",
         "ROSRM_EPOCH": "1",
         "PYTHONUNBUFFERED": "",
     }
