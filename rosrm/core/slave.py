@@ -559,7 +559,8 @@ def _time_passed(state: SlaveState, event: TimePassed, now: float) -> _Commands:
             forgotten.append(instance)
     if forgotten:
         for instance in forgotten:
-            del state.held[instance]
+            held = state.held.pop(instance)
+            commands += [Settle(instance, restart) for restart in held.unsettled]
         commands.append(Forget(tuple(forgotten)))
     return commands
 

@@ -350,6 +350,16 @@ def test_a_restart_policy_of_what_waits_for_a_slot() -> None:
     assert not assignment.shadow
 
 
+def test_a_restart_policy_of_what_is_forgotten_meanwhile() -> None:
+    """The supervisor never says that it has it: the master is answered all the same."""
+    one = running()
+    one.step(slave.Registered(1))
+    one.step(slave.RestartPolicySet(ONE, NEVER))
+    one.step(told(STATE.EXITED))
+    commands = one.step(slave.TimePassed(), after=100.0)
+    assert slave.Settle(ONE, NEVER) in commands
+
+
 def test_stop_and_restart_go_to_the_supervisor(one) -> None:
     """Of what has ended the end is told again; of what is unknown a restart says nothing."""
     instance = InstanceId("p", 1)
