@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import signal
 import sys
 from collections.abc import Callable
 
@@ -17,6 +18,8 @@ def run(role: str, serve: Callable[[Handover], int]) -> int:
         role: "master" or "slave".
         serve: runs until it is told to stop; what it raises for the user is printed.
     """
+    # Who started us held them back (see `interrupts_held`); by now they end us without a word.
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     logging.basicConfig(
         level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(name)s: %(message)s",
         datefmt="%H:%M:%S",

@@ -7,9 +7,11 @@ command, so that a slave on a robot does not carry it.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
-from collections.abc import Sequence
+import signal
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -64,6 +66,19 @@ def hand_over(settings: str) -> int:
 def arguments(descriptor: int) -> list[str]:
     """The runtime's command line."""
     return [_OPTION, str(descriptor)]
+
+
+@contextlib.contextmanager
+def interrupts_held() -> Iterator[None]:
+    """Within, a runtime is started: until it has its own handlers, a Ctrl-C is kept for it.
+
+    Else Python, which handles it from its first moment on, would answer with a traceback.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def take_over(command_line: Sequence[str]) -> Handover:

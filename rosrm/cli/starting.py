@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from rosrm.cli.options import Common, Domain
-from rosrm.handover import arguments, hand_over
+from rosrm.handover import arguments, hand_over, interrupts_held
 
 if TYPE_CHECKING:
     from rosrm.config.settings import ClusterConfig, HostConfig
@@ -78,9 +78,10 @@ def become(module: str, settings: str) -> None:
     sys.stdout.flush()
     sys.stderr.flush()
     interpreter = [sys.executable, *_without_this_folder()]
-    os.execv(  # noqa: S606 - no shell is wanted
-        sys.executable, [*interpreter, "-m", module, *arguments(descriptor)]
-    )
+    with interrupts_held():
+        os.execv(  # noqa: S606 - no shell is wanted
+            sys.executable, [*interpreter, "-m", module, *arguments(descriptor)]
+        )
 
 
 def _without_this_folder() -> list[str]:
