@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Final
 from rosrm.config.settings import ClusterConfig, HostConfig
 from rosrm.core.views import HostRow, ProcessRow, Snapshot
 from rosrm.errors import NoMaster, RosrmError
-from rosrm.handover import arguments, hand_over
+from rosrm.handover import arguments, hand_over, interrupts_held
 from rosrm.ros.client import MasterClient
 from rosrm.ros.settings import RosSettings
 
@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 _END: Final = 30.0
 #: Domains that DDS maps to ports below the ephemeral range.
 _DOMAINS: Final = range(1, 101)
+#: Participants whose ports are looked at: the first of a cluster may have ended, and others live.
+_PARTICIPANTS: Final = range(8)
 _LOOK: Final = 0.02
 #: Seconds for a master to come up and to be found.
 _FIND: Final = 15.0
@@ -47,8 +49,9 @@ def claim_domain() -> tuple[int, socket.socket]:
         claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         try:
             claim.bind(f"\0rosrm-domain-{domain}")
-            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-                probe.bind(("127.0.0.1", 7410 + 250 * domain))
+            for participant in _PARTICIPANTS:
+                with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+                    probe.bind(("127.0.0.1", 7410 + 250 * domain + 2 * participant))
         except OSError:
             claim.close()
             continue
@@ -121,7 +124,7 @@ class LocalCluster:
         log = self.directory / f"{name}.log"
         holder = hand_over(settings)
         try:
-            with log.open("ab") as sink:
+            with log.open("ab") as sink, interrupts_held():
                 process = subprocess.Popen(
                     [sys.executable, "-m", module, *arguments(holder)],
                     pass_fds=[holder], stdin=subprocess.DEVNULL, stdout=sink, stderr=sink,
