@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.ros.clusters import clusters
+from tests.ros.clusters import STEADY, clusters
 
 
 @pytest.fixture
@@ -17,5 +17,5 @@ def make_cluster(tmp_path_factory):
 @pytest.fixture(scope="module")
 def make_shared(tmp_path_factory):
     """Makes clusters that the tests of a module share."""
-    with clusters(lambda: tmp_path_factory.mktemp("c")) as make:
+    with clusters(lambda: tmp_path_factory.mktemp("c"), liveness=STEADY) as make:
         yield make

@@ -15,6 +15,7 @@ import pytest
 from rosrm.core.model import RestartPolicy
 from tests.ros.clusters import (
     PATIENCE,
+    STEADY,
     alive,
     host,
     job,
@@ -96,7 +97,7 @@ def test_interrupted_while_it_starts(make_cluster, role) -> None:
     cluster = make_cluster()
     if role == "master":
         cluster.close()
-    for delay in (0.05, 0.15, 0.3, 0.5, 0.8, 1.2):
+    for delay in (0.0, 0.02, 0.05, 0.1, 0.15, 0.3, 0.5, 0.8, 1.2):
         part = cluster.start_master() if role == "master" else cluster.start_slave(host("h0"))
         time.sleep(delay)  # the instants between are what is tested
         code = end(part, signal.SIGINT)
@@ -161,7 +162,7 @@ def test_of_two_masters_at_once_one_stays(make_cluster) -> None:
 
 def test_a_second_slave_of_a_name_is_refused(make_cluster) -> None:
     """On the same state directory at once; on another one by the master, after a moment."""
-    cluster = make_cluster(host("h0"))
+    cluster = make_cluster(host("h0"), liveness=STEADY)
     cluster.submit(service("p"))
     before = cluster.wait("p", "running")
     first = cluster.slaves["h0"]
