@@ -16,7 +16,8 @@ from rosrm.supervisor import members, record
 from rosrm.supervisor.client import Amended, LaunchOrder, SupervisorClient, log_path
 
 QUICK = StopPolicy(interrupt_grace=0.3, terminate_grace=0.3)
-TIMEOUT = 15.0
+#: Seconds for whatever a busy machine needs; nothing waits so long when all goes well.
+TIMEOUT = 30.0
 
 
 class Host:
