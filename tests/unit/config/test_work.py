@@ -256,3 +256,20 @@ def test_with_a_registry_the_strategy_and_its_options_are_checked(refusal):
     )
     assert "f.yaml:3:38: unknown migration strategy 'relunch'; did you mean 'relaunch'?" in said
     assert "f.yaml:4:69: unknown key 'fast' in options of migration strategy 'relaunch'" in said
+
+
+def test_only_the_options_that_a_process_gives_go_over_those_of_the_cluster(file):
+    """In base units; for the others the cluster's word holds, not the plugin's default."""
+    (spec,) = load_work(
+        file(
+            """
+            processes:
+              - name: a
+                command: x
+                ros: true
+                migration: {strategy: handoff, options: {ready_timeout: 1 min}}
+            """
+        ),
+        Registry.discover(),
+    )
+    assert spec.migration.options == {"ready_timeout": 60.0}

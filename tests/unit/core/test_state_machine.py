@@ -17,7 +17,14 @@ from rosrm.core import events as happened
 from rosrm.core import slave
 from rosrm.core.assigning import demand_of
 from rosrm.core.commands import Assign, Command
-from rosrm.core.model import Kind, MigrationPolicy, ProcessSpec, Readiness, RestartPolicy
+from rosrm.core.model import (
+    InstanceState,
+    Kind,
+    MigrationPolicy,
+    ProcessSpec,
+    Readiness,
+    RestartPolicy,
+)
 from rosrm.core.state import ProcessPhase, Wanted
 from tests.unit.core.cluster import MIB, Cluster, HandOver, Machine, StartFirstOrStopFirst
 from tests.unit.core.nodes import QUIRKS, Node
@@ -279,15 +286,49 @@ class Play(RuleBasedStateMachine):
         self.flow()
 
     @precondition(lambda self: self.nodes())
-    @rule(which=which_one, times=st.integers(1, 6))
-    def migrate_with_state_step_by_step(self, which: int, times: int) -> None:
-        """A handoff goes so far, and what comes next befalls it there."""
+    @rule(
+        which=which_one, until=st.sampled_from(["SHADOW", "SWITCH", "SILENT", "ACTIVE"]),
+        fate=st.sampled_from(["", "source ends", "destination ends", "master is killed"]),
+        seconds=st.sampled_from([0.0, 0.0, 4.0, 7.0]),
+        quirk=st.sampled_from(["", "", "", "never silent", "no abort", "no resume"]),
+    )  # fmt: skip
+    def migrate_with_state(
+        self, which: int, until: str, fate: str, seconds: float, quirk: str
+    ) -> None:
+        """A handoff goes until this was said, and then something befalls it."""
         _, node = self.pick(self.nodes(), which)
-        self.ask(happened.MigrationRequested, node.instance.process, None)
+        name = node.instance.process
+        for machine in self.cluster.machines.values():
+            machine.quirks[name] |= {quirk} - {""}
+        self.ask(happened.MigrationRequested, name, None)
         self.prompt = False
-        for _ in range(times):
-            self.everything_arrives(nodes=False)
-            self.nodes_talk()
+        self.go_on_until(name, until)
+        ours = [one for one in self.nodes() if one[1].instance.process == name]
+        if fate == "master is killed":
+            self.master_is_killed(HOSTS)
+        elif fate and ours:
+            pick = min if fate == "source ends" else max
+            machine, node = pick(ours, key=lambda one: one[1].instance.number)
+            machine._end(node.instance, InstanceState.FAILED, self.cluster.now, code=3)
+            self.failed.add(name)
+        if seconds:
+            self.time_passes(seconds, quiet=False)
+
+    def go_on_until(self, name: str, word: str) -> None:
+        """From SWITCH on the master hears nothing."""
+        for _ in range(40):
+            phases = {one.phase.name for one in self.cluster.air.latched if one.process == name}
+            said = {
+                report.phase.name
+                for _, node in self.nodes()
+                if node.instance.process == name
+                for report in node.said
+            }
+            if word in phases | said:
+                return
+            if "SWITCH" not in phases:
+                self.everything_arrives(nodes=False)
+            self.nodes_talk(heard="SWITCH" not in phases)
 
     # --- the network ---------------------------------------------------------------------
 
@@ -473,14 +514,14 @@ class Play(RuleBasedStateMachine):
     def all_arrives(self) -> None:
         self.everything_arrives()
 
-    def nodes_talk(self) -> bool:
-        """Everything that is on its way between nodes and the master at this moment arrives."""
-        arrivals, heard = self.cluster.air.waiting(), self.cluster.air.next_reports()
+    def nodes_talk(self, *, heard: bool = True) -> bool:
+        """Something arrives at a node, and a report at the master."""
+        arrivals, reports = self.cluster.air.waiting(), self.cluster.air.next_reports()
         for arrive in arrivals[:1]:
             arrive()
-        for at in heard[:1]:
+        for at in reports[: int(heard)]:
             self.tell(self.cluster.air.to_master.pop(at)[1])
-        return bool(arrivals or heard)
+        return bool(arrivals or reports)
 
     def everything_arrives(self, *, nodes: bool = True) -> None:
         for _ in range(3):

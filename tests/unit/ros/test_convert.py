@@ -84,15 +84,34 @@ def test_spec_survives(spec) -> None:
     assert convert.spec_from_msg(over_the_wire(convert.spec_to_msg(spec))) == spec
 
 
-@given(specs(), INSTANCES, UINT64, WORDS)
+@given(specs(), INSTANCES, UINT64, WORDS, st.booleans())
 @settings(max_examples=30, deadline=None)
-def test_assignment_survives(spec, instance, epoch, node_name) -> None:
+def test_assignment_survives(spec, instance, epoch, node_name, shadow) -> None:
     """An order to run an instance arrives as it was given."""
-    assignment = model.Assignment(instance, spec, epoch, node_name)
+    assignment = model.Assignment(instance, spec, epoch, node_name, shadow)
     assert (
         convert.assignment_from_msg(over_the_wire(convert.assignment_to_msg(assignment)))
         == assignment
     )
+
+
+@given(specs())
+@settings(max_examples=30, deadline=None)
+def test_restart_policy_survives(spec) -> None:
+    """Also apart from its spec."""
+    message = over_the_wire(convert.restart_to_msg(spec.restart))
+    assert convert.restart_from_msg(message) == spec.restart
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("when", "sometimes"), ("factor", 0.5), ("delay", -1.0)]
+)
+def test_restart_policy_that_makes_no_sense_is_refused(name, value) -> None:
+    """Nothing of it is used."""
+    message = convert.restart_to_msg(model.RestartPolicy())
+    setattr(message, name, value)
+    with pytest.raises(Refused, match="a restart policy: "):
+        convert.restart_from_msg(message)
 
 
 @given(

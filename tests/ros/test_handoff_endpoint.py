@@ -1,0 +1,119 @@
+"""The master's side of a handoff's topics against a node of plain rclpy."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+
+from rosrm.core.commands import PublishStateConfig
+from rosrm.core.events import HandoffReported
+from rosrm.core.migration import HandoffPhase, ReportPhase
+from rosrm.local_cluster import claim_domain
+from rosrm.ros import qos
+from rosrm.ros.handoff_endpoint import HandoffEndpoint
+from rosrm.ros.participant import Participant
+from rosrm.ros.settings import RosSettings
+from rosrm.version import PROTOCOL_VERSION
+from rosrm_msgs.msg import HandoffReport, StateConfig
+
+CHANNEL = "/rosrm/handoff/p_2"
+
+
+class Stage:
+    """An endpoint, and the node of a destination."""
+
+    def __init__(self) -> None:
+        domain, self.claim = claim_domain()
+        settings = RosSettings(domain=domain)
+        self.master = Participant(settings, "rosrm_master")
+        self.nodes = Participant(settings, "p_1700000000")
+        self.events: list[object] = []
+        self.refused: list[tuple[str, str]] = []
+        self.configs: list[StateConfig] = []
+        self.endpoint = HandoffEndpoint(
+            self.master, "ours", 5, self.events.append, lambda *why: self.refused.append(why)
+        )
+        self.channel = self.nodes.node.create_publisher(HandoffReport, CHANNEL, qos.HANDOFF)
+
+    def listen(self) -> None:
+        self.nodes.node.create_subscription(
+            StateConfig, "/rosrm/state_config", self.nodes.counted(self.configs.append),
+            qos.STATE_CONFIG,
+        )  # fmt: skip
+
+    def say(self, phase: HandoffPhase) -> None:
+        self.endpoint.publish(PublishStateConfig("p", phase, 1, 2, "/p", "/p_1700000000"))
+
+    def report(self, phase: int, **fields: object) -> None:
+        named = {"protocol_version": PROTOCOL_VERSION, "destination": 2, "instance": 2, **fields}
+        self.channel.publish(HandoffReport(phase=phase, **named))
+
+    def spin(self, condition, seconds: float = 10.0) -> bool:
+        deadline = time.monotonic() + seconds
+        while not condition() and time.monotonic() < deadline:
+            self.master.spin(0.02)
+            self.nodes.spin(0.02)
+        return bool(condition())
+
+    def close(self) -> None:
+        self.nodes.close()
+        self.master.close()
+        self.claim.close()
+
+
+@pytest.fixture
+def stage(monkeypatch):
+    one = Stage()
+    yield one
+    one.close()
+
+
+def test_all_that_a_node_must_know_is_said_and_who_comes_late_hears_it(stage):
+    """Cluster, epoch and the name of the channel among it."""
+    stage.say(HandoffPhase.SHADOW)
+    stage.listen()
+    assert stage.spin(lambda: stage.configs)
+    assert stage.configs == [
+        StateConfig(
+            protocol_version=PROTOCOL_VERSION, cluster="ours", epoch=5, phase=1, process="p",
+            source=1, destination=2, source_node="/p", destination_node="/p_1700000000",
+            channel=CHANNEL,
+        )
+    ]  # fmt: skip
+
+
+def test_what_was_reported_before_the_master_listened_is_heard(stage):
+    """As after a restart of it."""
+    stage.report(11, message="waits for /scan")
+    stage.report(14, sequence=7)
+    stage.say(HandoffPhase.SWITCH)
+    assert stage.spin(lambda: len(stage.events) == 2)
+    assert stage.events == [
+        HandoffReported("p", 2, 2, ReportPhase.SHADOWING, 0, "waits for /scan"),
+        HandoffReported("p", 2, 2, ReportPhase.ACTIVE, 7, ""),
+    ]
+
+
+def test_nonsense_and_other_handoffs_are_not_heard(stage):
+    """Another version and an unknown phase are said; another handoff is none of this one's."""
+    stage.say(HandoffPhase.SHADOW)
+    stage.report(14, destination=9)
+    stage.report(14, protocol_version=PROTOCOL_VERSION + 1)
+    stage.report(99)
+    stage.report(12)
+    assert stage.spin(lambda: stage.events)
+    assert stage.events == [HandoffReported("p", 2, 2, ReportPhase.READY, 0, "")]
+    assert [who for who, _ in stage.refused] == ["p#2 in a handoff"] * 2
+    assert stage.refused[1][1] == "unknown phase 99"
+
+
+def test_when_all_is_done_nobody_listens(stage):
+    """The channel has no reader left in the master."""
+    stage.say(HandoffPhase.SHADOW)
+    assert stage.spin(lambda: stage.channel.get_subscription_count() == 1)
+    stage.say(HandoffPhase.DONE)
+    assert stage.spin(lambda: stage.channel.get_subscription_count() == 0)
+    stage.report(12)
+    stage.spin(lambda: stage.events, 0.5)
+    assert not stage.events

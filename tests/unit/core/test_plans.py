@@ -1,0 +1,80 @@
+"""Plans in the journal: every field of every step, and nothing that is not known."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+
+from rosrm.core.migration import (
+    AwaitReady,
+    Commit,
+    Configure,
+    Execute,
+    HandoffPhase,
+    Plan,
+    SetRestart,
+    Start,
+    Stop,
+)
+from rosrm.core.model import InstanceId, RestartPolicy
+from rosrm.core.plans import plan_from_dict, plan_to_dict
+
+ONE = InstanceId("p", 1)
+EVERYTHING = Plan(
+    (
+        Start(ONE, "a", 1.5, "alias", undo=Stop(ONE, "a", 2.0), shadow=True),
+        AwaitReady(ONE, "a", 3.0, undo=Execute("x", "a", {}, 1.0, undo=Commit())),
+        Configure(HandoffPhase.SHADOW, 4.0, awaited=False),
+        SetRestart(ONE, "a", RestartPolicy("always", delay=0.1, attempts=7), 5.0),
+        Execute("dump", "b", {"to": ["x", {"deep": 1}], "n": None}, 6.0),
+        Commit(),
+    ),
+    overlap=7.5,
+    options={"why": "not"},
+)
+
+
+def stored() -> Any:
+    return json.loads(json.dumps(plan_to_dict(EVERYTHING), default=dict))
+
+
+def test_a_plan_survives_the_journal() -> None:
+    """In every field."""
+    assert plan_from_dict(stored()) == EVERYTHING
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "said"),
+    [
+        (("strange",), 1, "unknown field of Plan: strange"),
+        (("overlap",), "long", "'long' is no number"),
+        (("steps", 0, "kind"), "teleport", "teleport"),
+        (("steps", 0, "shadow"), "yes", "'yes' is neither true nor false"),
+        (("steps", 0, "colour"), 1, "unknown field of Start: colour"),
+        (("steps", 0, "undo", "timeout"), None, "None is no number"),
+        (("steps", 0, "instance", "number"), "1", "'1' is no whole number"),
+        (("steps", 2, "phase"), "JUMP", "JUMP"),
+        (("steps", 3, "restart", "colour"), 1, "unknown field of RestartPolicy: colour"),
+        (("steps", 4, "arguments"), [], "[] is no mapping"),
+    ],
+)
+def test_what_is_not_known_is_refused(path: Any, value: Any, said: str) -> None:
+    """Rather than carried out in part."""
+    plain = stored()
+    inner = plain
+    for key in path[:-1]:
+        inner = inner[key]
+    inner[path[-1]] = value
+    with pytest.raises(ValueError, match=r".") as caught:
+        plan_from_dict(plain)
+    assert said in str(caught.value)
+
+
+def test_what_must_be_there_is_missed() -> None:
+    """A step without its host is none."""
+    plain = stored()
+    del plain["steps"][0]["host"]
+    with pytest.raises(ValueError, match="Start has no host"):
+        plan_from_dict(plain)
