@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from types import SimpleNamespace
 
 import pytest
 
 from rosrm.config import load_work
+from rosrm.config.units import PositiveSeconds
 from rosrm.core.model import Kind, MigrationPolicy, Readiness, RestartPolicy, StopPolicy
 from rosrm.hookspecs import hookimpl
 from rosrm.ports import MigrationOffer
@@ -258,18 +260,31 @@ def test_with_a_registry_the_strategy_and_its_options_are_checked(refusal):
     assert "f.yaml:4:69: unknown key 'fast' in options of migration strategy 'relaunch'" in said
 
 
+@dataclass(frozen=True)
+class Waits:
+    """Options with a unit."""
+
+    start: PositiveSeconds = 5.0
+    ready: PositiveSeconds = 10.0
+
+
+@hookimpl
+def register_patient_strategy():
+    return [MigrationOffer("patient", lambda options: options, Waits)]
+
+
 def test_only_the_options_that_a_process_gives_go_over_those_of_the_cluster(file):
     """In base units; for the others the cluster's word holds, not the plugin's default."""
+    registry = Registry.of(
+        ours=SimpleNamespace(register_migration_strategies=register_patient_strategy)
+    )
     (spec,) = load_work(
         file(
             """
             processes:
-              - name: a
-                command: x
-                ros: true
-                migration: {strategy: handoff, options: {ready_timeout: 1 min}}
+              - {name: a, command: x, migration: {strategy: patient, options: {ready: 1 min}}}
             """
         ),
-        Registry.discover(),
+        registry,
     )
-    assert spec.migration.options == {"ready_timeout": 60.0}
+    assert spec.migration.options == {"ready": 60.0}
