@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+from collections import deque
+from typing import Final
+
 import numpy as np
 
 from rosrm_examples.arrays import Arrays, Points
 from rosrm_examples.map_part import MapPart
-from rosrm_examples.poses import Pose
+from rosrm_examples.poses import Pose, inverse, transform
 from rosrm_examples.slam import Slam
+
+#: Scans from which a map can be begun in mid-drive. With the last one alone the next pose may be
+#: 0.12 m off those of the whole map on KITTI 0001; with five 0.03 m, and none later 0.09 m.
+_RECENT_SCANS: Final = 5
+#: Most points of them; who moves again and again would have more and more.
+_RECENT_POINTS: Final = 100_000
 
 
 class LiveSlam:
@@ -15,17 +24,17 @@ class LiveSlam:
 
     Attributes:
         slam: The mapping.
-        last_scan: (N, 3) metres, sensor frame, as seen from the newest pose; None: there was none.
         refused: Scans that were not later than the one before.
     """
 
     def __init__(self) -> None:
         """Begins a new map."""
         self.slam = Slam()
-        self.last_scan: Points | None = None
         self.refused = 0
         self._first_own = 0  # position of the first pose that was not taken over
         self._map_before: Arrays = {}
+        self._recent: deque[tuple[Pose, Points]] = deque(maxlen=_RECENT_SCANS)
+        self._seen_before: Points = np.zeros((0, 3), np.float32)
 
     @property
     def pose(self) -> Pose:
@@ -52,13 +61,22 @@ class LiveSlam:
         else:
             self._begin_map()
         self.slam.add_scan(points, t)
-        self.last_scan = points
+        self._recent.append((self.pose, points))
 
     def _begin_map(self) -> None:
-        """Without a map, but with a pose: the scan that was seen from there is the first of it."""
-        if self.slam.poses and not self.slam.has_map and self.last_scan is not None:
-            self.slam.add_to_map(self.last_scan)
-            self._map_before = self.slam.map_state()  # that scan was mapped by somebody else
+        """Without a map, but with a pose: what was seen around there is the first of it."""
+        if self.slam.poses and not self.slam.has_map:
+            self._recent.append((self.pose, self._seen_before))
+            self.slam.add_to_map(self._seen_before)
+            self._map_before = self.slam.map_state()  # that was mapped by somebody else
+
+    def surroundings(self) -> Points:
+        """Returns the newest scans as if seen at once: (N, 3) float32 metres, sensor frame."""
+        if not self._recent:
+            return self._seen_before
+        here = inverse(self.pose)
+        clouds = [transform(here @ pose, points) for pose, points in reversed(self._recent)]
+        return np.concatenate(clouds)[:_RECENT_POINTS].astype(np.float32)
 
     # --- taking over -----------------------------------------------------------------------
 
@@ -72,10 +90,11 @@ class LiveSlam:
         self.slam.restore_map(state)
         self._map_before = state
 
-    def take_over_scan(self, points: Points | None) -> None:
-        """Goes on without a map, from the last scan: (N, 3) metres, sensor frame."""
+    def take_over_surroundings(self, points: Points) -> None:
+        """Goes on without a map, see `surroundings`; the pose is taken over beside it."""
         self.take_over_map({})
-        self.last_scan = points
+        self._recent.clear()
+        self._seen_before = points
 
     # --- the end ---------------------------------------------------------------------------
 

@@ -1,8 +1,8 @@
-"""The state of the live SLAM on the wire: all of it, or the pose and the last scan alone.
+"""The state of the live SLAM on the wire: all of it, or the pose and the newest scans alone.
 
 `full`: `~/state` and `~/state/map` (rosrm_msgs/Arrays); a successor goes on exactly as the
-original would. `pose`: `~/state` (Odometry) and `~/state/scan` (PointCloud2), messages that others
-can read as well; a successor begins a new map, with the last scan in it.
+original would. `pose`: `~/state` (Odometry) and `~/state/surroundings` (PointCloud2), messages that
+others can read as well; a successor begins a new map with the newest scans.
 
 The trajectory behind the last pose is in neither: nothing that comes depends on it, it would grow
 for ever, and each instance writes its own part of it at its end.
@@ -71,7 +71,7 @@ def full_state(live: LiveSlam) -> list[StateTopic]:
 
 
 def pose_state(live: LiveSlam) -> list[StateTopic]:
-    """Pose and velocity, and the scan that was seen from there, as messages that others know."""
+    """Pose, velocity, and what was seen around there, as messages that others know."""
 
     def save_pose() -> Odometry:
         if live.time is None:
@@ -81,17 +81,15 @@ def pose_state(live: LiveSlam) -> list[StateTopic]:
     def restore_pose(message: Odometry) -> None:
         live.take_over_motion(_motion_of(message))
 
-    def save_scan() -> PointCloud2:
-        if live.last_scan is None or live.time is None:
-            return PointCloud2()
-        return cloud_message(live.last_scan, live.time, LIDAR_FRAME)
+    def save_surroundings() -> PointCloud2:
+        return cloud_message(live.surroundings(), live.time or 0.0, LIDAR_FRAME)
 
-    def restore_scan(message: PointCloud2) -> None:
-        live.take_over_scan(points_of(message) if message.header.frame_id else None)
+    def restore_surroundings(message: PointCloud2) -> None:
+        live.take_over_surroundings(points_of(message))
 
     return [
         StateTopic("~/state", Odometry, save_pose, restore_pose),
-        StateTopic("~/state/scan", PointCloud2, save_scan, restore_scan),
+        StateTopic("~/state/surroundings", PointCloud2, save_surroundings, restore_surroundings),
     ]
 
 
