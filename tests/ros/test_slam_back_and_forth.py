@@ -1,0 +1,87 @@
+"""One drive, mapped live by a SLAM that is sent from host to host ten times meanwhile."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from rosrm.config.settings import MigrationSettings
+from rosrm.core.model import Kind, MigrationPolicy, ProcessSpec
+from rosrm_examples.drives import Drive, default_drive
+from rosrm_examples.map_part import load_parts
+from rosrm_examples.migration_results import LiveRun, differences, summarise, unmigrated_poses
+from rosrm_examples.observer import Observer
+from tests.ros.clusters import PATIENCE, host, wait_until
+
+MOVES = 10
+#: Seconds that the drive takes: so much is needed for ten moves, one after another.
+LONG_S = 90.0
+
+
+@pytest.fixture(scope="module")
+def drive() -> Drive:
+    return default_drive()
+
+
+def slam(out: Path) -> ProcessSpec:
+    return ProcessSpec(
+        "slam", module="rosrm_examples.slam_node", ros=True, parameters={"out": str(out)},
+        environment={"OMP_NUM_THREADS": "1"}, migration=MigrationPolicy("handoff"),
+    )  # fmt: skip
+
+
+def player(drive: Drive, hz: float, report: Path) -> ProcessSpec:
+    command = (
+        sys.executable, "-m", "rosrm_examples.player", "--drive", drive.name, "--hz", f"{hz:.3f}",
+        "--report", str(report),
+    )  # fmt: skip
+    return ProcessSpec("player", command=command, kind=Kind.JOB)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(400)
+def test_ten_moves_in_one_drive_lose_no_scan(make_cluster, drive) -> None:
+    """Every scan is mapped once, and the trajectory is that of the SLAM that stays where it is."""
+    cluster = make_cluster(
+        host("left"), host("right"),
+        migration=MigrationSettings(strategies={"handoff": {}}, automatic=False),
+    )  # fmt: skip
+    out, report = cluster.directory / "parts", cluster.directory / "player.json"
+    hz = len(drive) / LONG_S
+    with Observer(cluster.ros) as observer:
+        cluster.submit(slam(out))
+        cluster.wait("slam", "running")
+        wait_until(observer.publishers, "the SLAM is heard")
+        cluster.submit(player(drive, hz, report))
+        wait_until(lambda: len(observer.heard) >= 2, "the first scans are mapped")
+        for moves in range(1, MOVES + 1):
+            move(cluster, moves)
+            assert cluster.process("player").state == "running", "the drive was over too early"
+        assert cluster.ended("player", timeout=LONG_S + PATIENCE).state == "finished"
+        wait_until(lambda: len(observer.heard) >= len(drive), "all scans are mapped")
+        time.sleep(1.0)  # one more would be one too many
+        heard = list(observer.heard)
+    cluster.cancel("slam")
+    sent = json.loads(report.read_text())["scans_sent"]
+    run = LiveRun(drive, sent, heard, load_parts(out), 1.0 / hz)
+    summary = summarise(run, unmigrated_poses(drive), cluster.process("slam").migrations)
+    assert differences(summary, "full", migrations=MOVES) == [], summary
+    assert (summary["scans_sent"], summary["scans_processed"]) == (len(drive), len(drive))
+
+
+def move(cluster, moves: int) -> None:
+    """Send the SLAM to the other host; until it is there, for the so manieth time."""
+    there = {"left": "right", "right": "left"}[cluster.process("slam").host]
+    cluster.client.migrate("slam", there)
+    view = cluster.wait_until(
+        f"slam moved {moves} times",
+        lambda v: any(
+            row.name == "slam" and row.migrations == moves and row.state == "running"
+            for row in v.processes
+        ),
+    )
+    assert next(row for row in view.processes if row.name == "slam").host == there
