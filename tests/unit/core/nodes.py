@@ -101,7 +101,8 @@ class Node:
             self.switched = True
             self._maybe_silent()
         elif phase is HandoffPhase.RESUME:
-            self.resumed = self.active = True
+            self.resumed = True
+            self._be_active()
             if "no resume" not in self.quirks:
                 self.say(ReportPhase.RESUMED)
 
@@ -151,8 +152,15 @@ class Node:
             self._become_active()
 
     def _become_active(self) -> None:
-        self.active = True
+        self._be_active()
         self.say(ReportPhase.ACTIVE)
+
+    def _be_active(self) -> None:
+        """The promise of all this: no other is, at this very moment."""
+        self.active = True
+        if self.air is not None:
+            others = [str(one.instance) for one in self.air.others(self) if one.active]
+            assert not others, f"{self.instance} becomes active beside {others}"
 
 
 class Air:
@@ -210,6 +218,11 @@ class Air:
         for _, node in self.nodes():
             if node is not listener and _together(node, listener):
                 listener.reports.extend(node.said)
+
+    def others(self, node: Node) -> list[Node]:
+        """The other nodes of a process that run."""
+        name = node.instance.process
+        return [one for _, one in self.nodes() if one.instance.process == name and one is not node]
 
     def master_is_gone(self) -> None:
         """What it has said and nobody has heard is lost."""
