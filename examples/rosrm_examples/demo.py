@@ -29,7 +29,15 @@ from typing import Any, Final
 
 from rosrm.core.views import ProcessRow
 from rosrm.local_cluster import LocalCluster
-from rosrm_examples.demo_frame import CLUSTER, Stage, Unfit, free_memory, own_folder, run_demo
+from rosrm_examples.demo_frame import (
+    CLUSTER,
+    Stage,
+    Unfit,
+    demo_parser,
+    free_memory,
+    own_folder,
+    run_demo,
+)
 from rosrm_examples.demo_job import (
     HOSTS,
     LEAST_BUDGET,
@@ -63,13 +71,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        prog="python -m rosrm_examples.demo",
-        description="Three hosts on this machine map a LiDAR drive while memory runs short.",
-    )
-    parser.add_argument("--out", required=True, type=Path, help="folder to write to")
-    parser.add_argument(
-        "--drive", help="name or path of the drive; else KITTI 0001 where it is, else the street"
+    parser = demo_parser(
+        "demo", "Three hosts on this machine map a LiDAR drive while memory runs short."
     )
     parser.add_argument("--pieces", type=int, default=9, help="number of pieces (default: 9)")
     parser.add_argument(  # with this default every host comes close to its limit

@@ -1,7 +1,8 @@
-"""What every demo is around its work: signals, exit status, the folder of results, free memory."""
+"""What every demo is around its work: arguments, exit status, the folder of results, memory."""
 
 from __future__ import annotations
 
+import argparse
 import fcntl
 import shutil
 import sys
@@ -59,6 +60,18 @@ def run_demo(name: str, out: Path, demonstrate: Callable[[Stage], None]) -> int:
         print(f"{name}: {error}; see the logs in {out / CLUSTER}", file=sys.stderr)
         return 1
     return 0
+
+
+def demo_parser(name: str, description: str) -> argparse.ArgumentParser:
+    """The arguments that every demo takes."""
+    parser = argparse.ArgumentParser(
+        prog=f"python -m rosrm_examples.{name}", description=description
+    )
+    parser.add_argument("--out", required=True, type=Path, help="folder to write to")
+    parser.add_argument(
+        "--drive", help="name or path of the drive; else KITTI 0001 where it is, else the street"
+    )
+    return parser
 
 
 def own_folder(out: Path, left: Iterable[str], folders: Iterable[str] = ()) -> TextIO:

@@ -36,7 +36,15 @@ from matplotlib.colors import to_rgb
 
 from rosrm.core.views import Snapshot
 from rosrm.local_cluster import LocalCluster
-from rosrm_examples.demo_frame import CLUSTER, Stage, Unfit, free_memory, own_folder, run_demo
+from rosrm_examples.demo_frame import (
+    CLUSTER,
+    Stage,
+    Unfit,
+    demo_parser,
+    free_memory,
+    own_folder,
+    run_demo,
+)
 from rosrm_examples.demo_job import MEMORY_LIMIT
 from rosrm_examples.demo_record import EVENTS_FILE, SAMPLES_FILE, Record
 from rosrm_examples.demo_run import Demo, DemoFailed
@@ -80,19 +88,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        prog="python -m rosrm_examples.demo_migration",
-        description="A drive is mapped live, and in mid-drive the SLAM moves to another host.",
-    )
-    parser.add_argument("--out", required=True, type=Path, help="folder to write to")
-    parser.add_argument(
-        "--drive", help="name or path of the drive; else KITTI 0001 where it is, else the street"
+    parser = demo_parser(
+        "demo_migration", "A drive is mapped live, and in mid-drive the SLAM moves to another host."
     )
     parser.add_argument(
         "--state", choices=sorted(STATES), default="full", help="what moves (default: full)"
     )
     parser.add_argument(
-        "--rate", type=_rate, help="times as fast as it was driven (default: 1, or 15 s in all)"
+        "--rate",
+        type=_rate,
+        help="times as fast as it was driven (default: 1, or less, for 20 s in all)",
     )
     return parser.parse_args(arguments)
 

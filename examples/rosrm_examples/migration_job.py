@@ -39,7 +39,7 @@ _FAST_DISK: Final = {"disk": "fast"}
 _SCANNER: Final = {"scanner": "yes"}
 
 #: A drive that is shorter is played slower, for a process needs its time to start: seconds.
-_SHORTEST_S: Final = 15.0
+_SHORTEST_S: Final = 20.0
 #: The recorder comes when this part of the drive is over, and the SLAM moves soon after.
 _RECORDER_AT: Final = 0.15
 #: Seconds without a pose after which nothing more is expected.

@@ -5,8 +5,7 @@ from __future__ import annotations
 import os
 import threading
 from dataclasses import dataclass
-from types import TracebackType
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import rclpy
 from nav_msgs.msg import Odometry
@@ -19,9 +18,6 @@ from rosrm_examples.clouds import SCANS_QOS
 from rosrm_examples.odometry import pose_of
 from rosrm_examples.poses import Pose
 from rosrm_examples.stamps import nanoseconds_of
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
 
 _LOOK_S: Final = 0.1
 
@@ -42,7 +38,7 @@ class Heard:
 
 
 class Observer:
-    """Keeps every message on `odometry`; a context manager.
+    """Keeps every message on `odometry`, until it is closed.
 
     DDS notes the time at which a message comes, in a thread of its own: it does not matter what
     this process is doing at that moment.
@@ -91,14 +87,3 @@ class Observer:
         self._thread.join()
         self._executor.shutdown()
         self._context.shutdown()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()

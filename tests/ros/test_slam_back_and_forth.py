@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 import time
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -52,7 +53,7 @@ def test_ten_moves_in_one_drive_lose_no_scan(make_cluster, drive) -> None:
     )  # fmt: skip
     out, report = cluster.directory / "parts", cluster.directory / "player.json"
     hz = len(drive) / LONG_S
-    with Observer(cluster.ros) as observer:
+    with closing(Observer(cluster.ros)) as observer:
         cluster.submit(slam(out))
         cluster.wait("slam", "running")
         wait_until(observer.publishers, "the SLAM is heard")

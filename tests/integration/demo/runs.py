@@ -10,6 +10,8 @@ import subprocess
 import sys
 import time
 import uuid
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -105,3 +107,19 @@ class Run:
 
 def read_lines(path: Path) -> list[dict]:
     return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+@contextmanager
+def runs_of(module: str, out: Path) -> Iterator[Callable[..., Run]]:
+    """Starts a demo with the arguments given; what is left of it at the end is killed."""
+    started: list[Run] = []
+
+    def start(*arguments: str) -> Run:
+        started.append(Run(module, out, *arguments))
+        return started[-1]
+
+    try:
+        yield start
+    finally:
+        for one in started:
+            one.kill()

@@ -11,22 +11,15 @@ from pathlib import Path
 import pytest
 
 from rosrm_examples.street import Street
-from tests.integration.demo.runs import Run, read_lines
+from tests.integration.demo.runs import Run, read_lines, runs_of
 
 Start = Callable[..., Run]
 
 
 @pytest.fixture
 def start(tmp_path: Path) -> Iterator[Start]:
-    started: list[Run] = []
-
-    def run(*arguments: str) -> Run:
-        started.append(Run("demo", tmp_path / "out", *arguments))
-        return started[-1]
-
-    yield run
-    for one in started:
-        one.kill()
+    with runs_of("demo", tmp_path / "out") as runs:
+        yield runs
 
 
 @pytest.mark.slow
