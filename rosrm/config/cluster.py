@@ -62,9 +62,11 @@ def _with_options(root: Node, config: ClusterConfig, plugins: PluginCheck) -> Cl
     checkpoint = _given(root, "checkpoint")
     named = root.get("migration", "strategies")
     if named is None:
+        # Of the default ones those that are installed; with none of them the first is missed.
+        default = list(config.migration.strategies)
+        there = [name for name in default if plugins.has("migration", name)]
         strategies = {
-            name: plugins.choice("migration", name, root, None)
-            for name in config.migration.strategies
+            name: plugins.choice("migration", name, root, None) for name in there or default[:1]
         }
     else:
         strategies = plugins.by_name("migration", named)

@@ -22,6 +22,10 @@ class PluginCheck:
         self._registry = registry
         self._problems = problems
 
+    def has(self, kind: str, name: str) -> bool:
+        """Whether a plugin is installed; without a registry it is taken to be."""
+        return self._registry is None or self._registry.has(kind, name)
+
     def choice(self, kind: str, name: str, named: Node, options: Node | None) -> Mapping[str, Any]:
         """The options of one chosen plugin.
 

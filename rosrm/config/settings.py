@@ -78,7 +78,7 @@ class MigrationSettings:
     """
 
     strategies: Annotated[Mapping[str, Options], OptionsByName()] = field(
-        default_factory=lambda: {"relaunch": {}}
+        default_factory=lambda: {"relaunch": {}, "handoff": {}}
     )
     cooldown: Seconds = _CORE.cooldown
     hysteresis: Seconds = _CORE.hysteresis

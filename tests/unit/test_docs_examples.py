@@ -74,6 +74,22 @@ def test_every_yaml_block_says_what_it_is(page):
     assert not unmarked
 
 
+# --- programs ---------------------------------------------------------------------------------
+
+PROGRAMS = [
+    pytest.param(mark, text, id=f"{name_of(page)}:{mark}")
+    for page in PAGES
+    for mark, _, text in blocks(page, "python")
+    if mark.endswith(".py") and not mark.startswith("file:")
+]
+
+
+@pytest.mark.parametrize(("mark", "text"), PROGRAMS)
+def test_a_program_is_shown_as_it_is(mark, text):
+    """The mark before it names the file, which other tests run."""
+    assert text == (ROOT / mark).read_text(encoding="utf-8")
+
+
 # --- links ------------------------------------------------------------------------------------
 
 

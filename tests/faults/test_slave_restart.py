@@ -1,0 +1,22 @@
+"""A slave that was killed is started again: its processes are not its to end."""
+
+from __future__ import annotations
+
+import signal
+
+from rosrm.config.settings import LivenessSettings
+from tests.ros.clusters import PATIENCE, alive, host, service
+
+
+def test_a_master_that_is_slow_to_notice_costs_no_process(make_cluster) -> None:
+    """It takes the former run for alive for longer than a slave waits for a name in use."""
+    cluster = make_cluster(host("h0"), liveness=LivenessSettings(suspect=8.0, lease=60.0))
+    cluster.submit(service("p"))
+    pid = cluster.wait("p", "running").pid
+    slave = cluster.slaves["h0"].process
+    slave.send_signal(signal.SIGKILL)
+    slave.wait(PATIENCE)
+    cluster.start_slave(cluster.hosts[0])
+    cluster.wait_for_event("host_registered", host="h0", after=cluster.events()[-1].sequence)
+    row = cluster.wait("p", "running")
+    assert (row.pid, alive(pid)) == (pid, True)
