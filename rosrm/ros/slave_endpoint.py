@@ -39,6 +39,9 @@ _FIRST_POLL_ANEW: Final = 1.0
 #: Seconds for which a name that is taken is asked for again: the former run of this slave may
 #: have been killed a moment ago.
 _NAME_TAKEN: Final = 5.0
+#: The same where that run has left processes behind: they are not given up before a master with a
+#: long `liveness.suspect` has noticed that it is gone.
+_NAME_TAKEN_BY_FORMER: Final = 60.0
 #: Seconds for the last statuses to reach the master.
 _LAST_WORDS: Final = 2.0
 #: Beats of a master in its silence before it counts as gone; and before another run of a master
@@ -254,11 +257,15 @@ class SlaveEndpoint:
         """A name may still be held by a former run of this very slave: ask again for a moment."""
         if self._taken_since is None:
             self._taken_since = now
-        if answer.code != "name_taken" or now - self._taken_since >= _NAME_TAKEN:
+        if answer.code != "name_taken" or now - self._taken_since >= self._patience():
             self.failure = answer.message
             self.superseded = answer.code == "name_taken"
             return
         self.link = Link.SEARCHING
+
+    def _patience(self) -> float:
+        found = any(not status.state.ended for status in self._host.statuses())
+        return _NAME_TAKEN_BY_FORMER if found and not self.host_id else _NAME_TAKEN
 
     def _lose_master(self, reason: str) -> None:
         self.link = Link.SEARCHING
