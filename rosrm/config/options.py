@@ -24,7 +24,7 @@ class PluginCheck:
 
     def has(self, kind: str, name: str) -> bool:
         """Whether a plugin is installed; without a registry it is taken to be."""
-        return self._registry is None or self._registry.has(kind, name)
+        return self._registry is None or name in self._registry.names(kind)
 
     def choice(self, kind: str, name: str, named: Node, options: Node | None) -> Mapping[str, Any]:
         """The options of one chosen plugin.
