@@ -89,10 +89,10 @@ class Run:
     def left(self, path: Path) -> bool:
         """A file of ours alone, and newer than the demo.
 
-        The tracing of ROS keeps its own on purpose, and the ports from 7000 on are shared by all
-        DDS participants of the machine, whatever their domain.
+        The tracing of ROS and the mutexes of the ports keep theirs on purpose, and the ports from
+        7000 on are shared by all DDS participants of the machine, whatever their domain.
         """
-        if re.match("lttng|fastrtps_port70", path.name) or not path.exists():
+        if re.match(r"lttng|sem\.fastrtps_port|fastrtps_port70", path.name) or not path.exists():
             return False
         return path.stat().st_ctime > self.began
 
