@@ -67,16 +67,19 @@ class Stage:
 
     Args:
         beside: another stage: in its domain, spun with it, and a DDS participant of its own.
+        domain: of a cluster that is there already.
     """
 
-    def __init__(self, beside: Stage | None = None) -> None:
+    def __init__(self, beside: Stage | None = None, domain: int | None = None) -> None:
         self._claim = None
         self._beside: list[Stage] = []
-        if beside is None:
-            self.domain, self._claim = claim_domain()
-        else:
+        if beside is not None:
             self.domain = beside.domain
             beside._beside.append(self)
+        elif domain is not None:
+            self.domain = domain
+        else:
+            self.domain, self._claim = claim_domain()
         self.context = rclpy.Context()
         rclpy.init(
             context=self.context,

@@ -1,0 +1,196 @@
+"""Handoffs by a real master and real slaves; one that cannot be done says why, clearly."""
+
+from __future__ import annotations
+
+import sys
+import time
+
+import pytest
+from std_msgs.msg import Int64
+
+from rosrm.core.model import MigrationPolicy, ProcessSpec, Readiness, RestartPolicy
+from rosrm.errors import Refused
+from rosrm.node.channel import STATE_CONFIG
+from rosrm.version import PROTOCOL_VERSION
+from rosrm_msgs.msg import StateConfig
+from tests.ros.clusters import NODE, PATIENCE, QUICK, alive, host
+from tests.ros.nodes import Stage
+
+#: A counter with something wrong with it: `{fault}` stands at the end of its constructor.
+COUNTER = """
+import os, sys, rclpy
+from rclpy.executors import ExternalShutdownException
+from std_msgs.msg import Int64, String
+from rosrm.node import Node, source
+
+class Counter(Node):
+    def __init__(self):
+        super().__init__("counter")
+        self.count = 0
+        self.output = self.create_publisher(Int64, "~/count", 10)
+        self.create_timer(0.02, self.tick)
+        self.shadow = "ROSRM_SHADOW" in os.environ
+        {fault}
+
+    def tick(self):
+        self.count += 1
+        self.output.publish(Int64(data=self.count))
+
+    def keep(self, save=None, restore=None, kind=Int64):
+        self.keep_state("~/state", kind, save or self.save, restore or self.restore)
+
+    def save(self):
+        return Int64(data=self.count)
+
+    def restore(self, state):
+        self.count = state.data
+
+rclpy.init()
+try:
+    rclpy.spin(Counter())
+except (KeyboardInterrupt, ExternalShutdownException):
+    pass
+"""
+
+
+def spec(name: str, code: str, **options) -> ProcessSpec:
+    return ProcessSpec(
+        name, command=(sys.executable, "-c", code), ros=True, stop=QUICK,
+        readiness=Readiness(timeout=PATIENCE),
+        migration=MigrationPolicy("handoff", options=options),
+        restart=RestartPolicy("on-failure", delay=0.2),
+    )  # fmt: skip
+
+
+def counter(name: str, fault: str = "self.keep()", **options) -> ProcessSpec:
+    return spec(name, COUNTER.replace("{fault}", fault), **options)
+
+
+@pytest.fixture(scope="module")
+def cluster(make_shared):
+    return make_shared(host("h0"), host("h1"))
+
+
+def moved(cluster, name: str):
+    """Order a move, and wait for its end; returns the row before and the event."""
+    before = cluster.wait(name, "running")
+    cluster.client.migrate(name)
+    deadline = time.monotonic() + PATIENCE
+    while time.monotonic() < deadline:
+        for event in cluster.events(process=name):
+            if event.kind in ("migrated", "stayed"):
+                return before, event
+        cluster.client.spin(0.05)
+    raise AssertionError(f"no end of the move: {cluster.kinds(name)}")
+
+
+def test_the_state_goes_along(cluster) -> None:
+    """The counter counts on, on another host; it is listed under its own name."""
+    cluster.submit(counter("good"))
+    before, event = moved(cluster, "good")
+    assert event.kind == "migrated", event.message
+    after = cluster.wait("good", "running")
+    assert {before.host, after.host} == {"h0", "h1"}
+    assert not alive(before.pid)
+    cluster.cancel("good")
+
+
+@pytest.mark.parametrize(
+    ("name", "fault", "message"),
+    [
+        (
+            "unrestorable", "self.keep(restore=lambda state: 1 // 0)",
+            "restoring /unrestorable/state raised ZeroDivisionError",
+        ),
+        (
+            "unsavable", "self.keep(save=lambda: 1 // 0)",
+            "saving /unsavable/state raised ZeroDivisionError",
+        ),
+        (
+            "mistyped", "self.keep(save=lambda: String())",
+            "saving /mistyped/state returned a String, not a std_msgs/msg/Int64",
+        ),
+        (
+            "torn", "self.keep(kind=String if self.shadow else Int64)",
+            "/torn/state is std_msgs/msg/Int64 at the source, and std_msgs/msg/String here",
+        ),
+        (
+            "huge",
+            "source.LARGEST_PART = 500; self.keep(lambda: String(data='x' * 1000), print, String)",
+            "the state on /huge/state has 1009 bytes, more than the 500 that may travel",
+        ),
+        (
+            "dying", "self.keep(); self.shadow and sys.exit(3)",
+            "ended on h",
+        ),
+    ],
+)  # fmt: skip
+def test_a_move_that_fails_leaves_the_source_running(cluster, name, fault, message) -> None:
+    """With one clear message, and nothing else left."""
+    cluster.submit(counter(name, fault))
+    before, event = moved(cluster, name)
+    assert event.kind == "stayed"
+    assert message in event.message
+    after = cluster.wait(name, "running")
+    assert (after.host, after.pid, alive(after.pid)) == (before.host, before.pid, True)
+    cluster.cancel(name)
+
+
+@pytest.mark.parametrize(
+    ("name", "code", "message"),
+    [
+        ("stranger", NODE, "Do they use rosrm.node?"),
+        (
+            "silent", COUNTER.replace("{fault}", "self.shadow and __import__('time').sleep(60)"),
+            "Do they use rosrm.node?",
+        ),
+    ],
+)  # fmt: skip
+def test_a_destination_that_is_never_ready_is_given_up_in_time(cluster, name, code, message):
+    """Within `ready_timeout`; what to check is said."""
+    cluster.submit(spec(name, code, ready_timeout=2.0))
+    before, event = moved(cluster, name)
+    assert event.kind == "stayed"
+    assert message in event.message
+    assert event.facts["seconds"] < 2.0 + PATIENCE / 2
+    after = cluster.wait(name, "running")
+    assert (after.pid, alive(after.pid)) == (before.pid, True)
+    cluster.cancel(name)
+
+
+def test_a_process_that_is_moving_is_not_moved_again(cluster) -> None:
+    """The second order is refused, and says where the first one goes."""
+    cluster.submit(counter("twice"))
+    cluster.wait("twice", "running")
+    cluster.client.migrate("twice")
+    with pytest.raises(Refused, match="twice is moving already, to h"):
+        cluster.client.migrate("twice")
+    cluster.wait_for_event("migrated", process="twice")
+    cluster.cancel("twice")
+
+
+def test_a_stranger_moves_nothing(cluster, monkeypatch) -> None:
+    """Whoever says `state_config` without being the master: the node says so, and counts on."""
+    cluster.submit(counter("steady"))
+    row = cluster.wait("steady", "running")
+    stage = Stage(domain=cluster.domain)
+    try:
+        counts = stage.listen(Int64, "/steady/count")
+        stage.spin_until(lambda: len(counts) > 5, "counts")
+        stranger = stage.plain.create_publisher(StateConfig, "/rosrm/state_config", STATE_CONFIG)
+        stage.spin_until(lambda: stranger.get_subscription_count() > 0, "the node's ear")
+        for phase in (StateConfig.SHADOW, StateConfig.SWITCH, StateConfig.TAKE_OVER):
+            stranger.publish(
+                StateConfig(
+                    protocol_version=PROTOCOL_VERSION, cluster="another", epoch=99, phase=phase,
+                    process="steady", source=row.number, destination=999, channel="/strange",
+                )
+            )  # fmt: skip
+        cluster.wait_for_log("steady", "it is of 'another', and 'rosrm' started this node")
+        before = len(counts)
+        stage.spin_until(lambda: len(counts) > before + 20, "more counts")
+    finally:
+        stage.close()
+    numbers = [message.data for message in counts]
+    assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+    cluster.cancel("steady")
