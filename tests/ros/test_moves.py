@@ -220,13 +220,11 @@ def test_cancel_during_a_move(cluster) -> None:
 
 # --- by a limit -------------------------------------------------------------------------------
 
-#: Holds 50 MiB, and MIB more as soon as the file is there.
+#: Holds 50 MiB, and MIB more as soon as the file is there: all at once, on a busy machine too.
 GROWS = """
 import mmap, os, sys, time
 def hold(mib):
-    block = mmap.mmap(-1, mib << 20)
-    for at in range(0, len(block), 4096): block[at] = 1
-    return block
+    return mmap.mmap(-1, mib << 20, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | mmap.MAP_POPULATE)
 first = hold(50)
 while not os.path.exists(sys.argv[1]): time.sleep(0.02)
 if os.environ["ROSRM_HOST"] == sys.argv[2]: second = hold(int(sys.argv[3]))
@@ -242,7 +240,7 @@ def grower(cluster, name: str, where: str, mib: int, **options):
 
 def test_a_host_over_its_limit_is_relieved(make_cluster) -> None:
     """What relieves it most and fits elsewhere leaves, after the hysteresis; the rest stays."""
-    hysteresis = 2.0
+    hysteresis = 4.0  # by then the master knows how large each of them is
     limits = {"memory": 0.5, "cpu": 1.0}
     cluster = make_cluster(
         host("full", memory=1000 * MIB, limits=limits),
@@ -288,7 +286,14 @@ def test_nothing_moves_when_every_host_is_full(make_cluster) -> None:
     cluster.client.set_host_state("b", "cordon")
     cluster.submit(specs[0])
     assert cluster.wait("on-a", "running").host == "a"
-    cluster.wait_until("a over", lambda v: not any(row.accepting for row in v.hosts[:1]))
+    # Before it is known how large it is, it would fit on the other host.
+    cluster.wait_until(
+        "a over its limit, and all of on-a seen",
+        lambda v: (
+            v.processes[0].memory > 245 * MIB
+            and not any(row.accepting for row in v.hosts if row.description.name == "a")
+        ),
+    )
     cluster.client.set_host_state("b", "uncordon")
     cluster.submit(specs[1])
     assert cluster.wait("on-b", "running").host == "b"

@@ -78,7 +78,8 @@ def test_every_input_is_processed_once(stage, pair):
     pair.conductor.say(C.DONE)
     stage.remove(pair.first)
     stage.plain.destroy_timer(next(iter(stage.plain.timers)))
-    stage.spin_until(lambda: pair.second.total == len(sent), "the last sum")
+    stage.spin_until(lambda: numbers(pair.sums)[-1:] == [len(sent)], "the last sum")
+    assert pair.second.total == len(sent)
     assert numbers(pair.sums) == list(range(pair.sums[0].data, len(sent) + 1))
 
 
