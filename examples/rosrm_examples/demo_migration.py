@@ -204,10 +204,11 @@ def _closing(summary: dict[str, Any], out: Path) -> str:
     gap, error = summary["gap_ms"], summary["end_error_percent"]
     quality = "" if error is None else f"; its end {error:.2f} % of the path off the truth"
     hosts = ", ".join(f"{part['scans']} on {part['host']}" for part in summary["parts"])
+    moves = summary["migrations"]
     scans = (
         f"{summary['scans_processed']} of {summary['scans_sent']} scans mapped ({hosts}): "
         f"{summary['scans_lost']} lost, {summary['scans_repeated']} repeated, "
-        f"{summary['migrations']} migrations"
+        f"{moves} migration{'' if moves == 1 else 's'}"
     )
     move = (
         f"gap {'?' if gap is None else format(gap, '.1f')} ms beyond the period of "
