@@ -26,7 +26,7 @@ def arrays_message(arrays: Mapping[str, npt.ArrayLike]) -> Arrays:
     packed = io.BytesIO()
     # The names go in as a mapping's, so that an array may be called "file" too.
     np.savez(packed, **{f"_{name}": value for name, value in plain.items()})  # type: ignore[arg-type]
-    return Arrays(npz=array("B", packed.getbuffer()))
+    return Arrays(npz=array("B", packed.getvalue()))
 
 
 def arrays_of(message: Arrays) -> dict[str, npt.NDArray[Any]]:
