@@ -26,8 +26,9 @@ CALM = StopPolicy(interrupt_grace=20.0, terminate_grace=5.0)
 #: Seconds for whatever a busy machine needs; nothing waits so long when all goes well.
 PATIENCE = 30.0
 #: For what is not about liveness: a busy machine may stall a slave for longer than the usual
-#: second, and then the host gets no work, or its name is given away.
-STEADY = LivenessSettings(suspect=10.0, lease=60.0)
+#: second, and then the host gets no work, or its name is given away. (Not longer than a slave that
+#: was started again waits for its name.)
+STEADY = LivenessSettings(suspect=3.0, lease=30.0)
 
 
 def host(name: str, memory: float = 2048 * MIB, cpu: float = 16.0, **options) -> HostConfig:

@@ -13,7 +13,7 @@ from rosrm.errors import Refused
 from rosrm.node.channel import STATE_CONFIG
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs.msg import StateConfig
-from tests.ros.clusters import NODE, PATIENCE, QUICK, alive, host
+from tests.ros.clusters import CALM, NODE, PATIENCE, alive, host
 from tests.ros.nodes import Stage
 
 #: A counter with something wrong with it: `{fault}` stands at the end of its constructor.
@@ -55,7 +55,7 @@ except (KeyboardInterrupt, ExternalShutdownException):
 
 def spec(name: str, code: str, **options) -> ProcessSpec:
     return ProcessSpec(
-        name, command=(sys.executable, "-c", code), ros=True, stop=QUICK,
+        name, command=(sys.executable, "-c", code), ros=True, stop=CALM,
         readiness=Readiness(timeout=PATIENCE),
         migration=MigrationPolicy("handoff", options=options),
         restart=RestartPolicy("on-failure", delay=0.2),

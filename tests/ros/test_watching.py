@@ -14,6 +14,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import Int64, String
 
+from rosrm.local_cluster import claim_domain
 from rosrm_migration.handoff import watch
 
 LATCHED = QoSProfile(
@@ -26,8 +27,11 @@ TOPIC = "/watched/state"
 @pytest.fixture(autouse=True)
 def domain(monkeypatch):
     """One that no cluster of the tests has."""
-    monkeypatch.setenv("ROS_DOMAIN_ID", "97")
+    number, claim = claim_domain()
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    with claim:
+        yield
 
 
 @contextlib.contextmanager
@@ -81,7 +85,7 @@ def test_a_second_publisher_that_was_first_is_heard():
 
 def test_one_publisher_alone_is_said():
     with publishing("source"), pytest.raises(TimeoutError, match="only one publisher of /watched"):
-        listen(2.0)
+        listen(5.0)
 
 
 def test_nobody_is_said():
@@ -92,7 +96,7 @@ def test_nobody_is_said():
 def test_another_type_is_said():
     expected = "/watched/state is published as std_msgs/msg/String, not std_msgs/msg/Int64"
     with publishing("source", kind=String), pytest.raises(TimeoutError, match=expected):
-        listen(2.0)
+        listen(5.0)
 
 
 def test_an_unknown_type_is_said():
