@@ -6,11 +6,16 @@ import os
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 HERE = Path(__file__).parent
 
 # By default DDS multicasts on every interface: what a test starts stays on this machine.
 os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+
+# A busy machine may take its time for one example.
+settings.register_profile("rosrm", deadline=None)
+settings.load_profile("rosrm")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -50,25 +50,25 @@ def test_one_that_answers_is_passed_on() -> None:
     time.sleep(0.15)
 
 
-@pytest.mark.parametrize("act", [spin, lambda: time.sleep(10), swallow])
+@pytest.mark.parametrize("act", [spin, lambda: time.sleep(100), swallow])
 def test_one_that_hangs_is_ended(act) -> None:
     """Also one that sleeps, and one that swallows the error."""
     guard, _ = guarded(act)
     began = time.monotonic()
     with pytest.raises(TimeoutError, match=r"longer than 0\.1 s"):
         guard.score(None, None)
-    assert time.monotonic() - began < 2.0
+    assert time.monotonic() - began < 30.0
     time.sleep(0.15)  # no alarm is left
 
 
 def test_one_that_hung_is_left_alone_for_a_while() -> None:
     """It costs its deadline once, not once for every reading that comes."""
-    guard, policy = guarded(spin)
+    guard, policy = guarded(spin, pause=1.0)
     for _ in range(5):
         with pytest.raises(TimeoutError, match="not asked again"):
             guard.score(None, None)
     assert policy.asked == 1
     policy.act = lambda: "scores"
-    time.sleep(0.35)
+    time.sleep(1.05)
     assert guard.score(None, None) == "scores"
     assert policy.asked == 2

@@ -82,7 +82,7 @@ def test_two_distributions_with_one_name_are_both_named(install):
 
 
 def test_a_plugin_that_takes_long_to_import_is_named_in_the_log(install, caplog):
-    install("vx_slow", "import time; time.sleep(0.3)")
+    install("vx_slow", "import time; time.sleep(1.0)")
     with caplog.at_level(logging.WARNING, "rosrm.plugins"):
         Registry.discover(slow_after=0.1)
     assert "plugin 'vx_slow' of vx-slow 1.0 is still being loaded after 0.1 s" in caplog.text
