@@ -119,15 +119,15 @@ class InputBuffer:
         """Whether a message was received that the state covers: from there on none is missing."""
         return self._track(topic).overlap
 
-    def is_idle(self, topic: str, now: float, for_seconds: float) -> bool:
-        """Whether nothing waits, and nothing came for so long."""
+    def is_idle(self, topic: str, now: float, since: float, for_seconds: float) -> bool:
+        """Whether nothing waits, and nothing came for so long, `since` then at the earliest."""
         track = self._track(topic)
-        return not track.held and now - track.heard_at >= for_seconds
+        return not track.held and now - max(track.heard_at, since) >= for_seconds
 
-    def covers(self, topic: str, stamp: int) -> bool:
-        """Whether a state covers a message."""
+    def is_marked(self, topic: str, stamp: int) -> bool:
+        """Whether a mark has named this very message."""
         track = self._tracks.get(topic)
-        return track is not None and _is_covered(track, stamp)
+        return track is not None and stamp in track.covered
 
     def take(self) -> Kept | None:
         """The oldest message, out of the buffer; None: it is empty."""

@@ -32,6 +32,7 @@ class Channel:
         topic: as the master named it.
         destination: instance number that names the handoff.
         instance: our own number.
+        peer: instance number of the other side.
         heard: called with each report of the other side.
     """
 
@@ -41,11 +42,13 @@ class Channel:
         topic: str,
         destination: int,
         instance: int,
+        peer: int,
         heard: Callable[[HandoffReport], None],
     ) -> None:
         self._plain = plain
         self._destination = destination
         self._instance = instance
+        self._peer = peer
         self._heard = heard
         self._last: HandoffReport | None = None
         self.topic = topic
@@ -53,8 +56,8 @@ class Channel:
         self._subscription = plain.create_subscription(HandoffReport, topic, self._take, CHANNEL)
 
     def _take(self, report: HandoffReport) -> None:
-        ours = report.instance == self._instance or report.destination != self._destination
-        if not ours and report.protocol_version == PROTOCOL_VERSION:
+        theirs = report.instance == self._peer and report.destination == self._destination
+        if theirs and report.protocol_version == PROTOCOL_VERSION:
             self._heard(report)
 
     def say(self, phase: int, sequence: int = 0, message: str = "") -> None:

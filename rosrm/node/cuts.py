@@ -5,7 +5,10 @@ from __future__ import annotations
 import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
+
+#: Newest parts of one topic that are kept although no mark names them yet.
+_KEPT: Final = 8
 
 
 class PartKey(NamedTuple):
@@ -31,11 +34,13 @@ class Cut:
 
     Attributes:
         mark: as it came.
+        passed: marks before it that were given up; what they cover, it covers too.
         parts: serialised messages by topic.
         arrived: of the mark, monotonic seconds.
     """
 
     mark: Any
+    passed: tuple[Any, ...]
     parts: Mapping[str, bytes]
     arrived: float
 
@@ -57,6 +62,10 @@ class CutAssembler:
         key = part_key(data)
         at_hand.pop(key, None)  # it counts as new again
         at_hand[key] = data
+        marked = {_key_of(mark, topic) for mark, _ in self._waiting}
+        for old in list(at_hand)[:-_KEPT]:
+            if old not in marked:
+                del at_hand[old]
 
     def add_mark(self, mark: Any, now: float) -> None:
         """A mark came, newer than those before."""
@@ -69,9 +78,11 @@ class CutAssembler:
             wanted = {part.topic: PartKey(part.size, part.digest) for part in mark.parts}
             parts = {topic: self._at_hand[topic].get(key) for topic, key in wanted.items()}
             if all(data is not None for data in parts.values()):
+                passed = tuple(older for older, _ in self._waiting[:index])
                 del self._waiting[: index + 1]
                 self._forget_older(wanted)
-                return Cut(mark, {t: d for t, d in parts.items() if d is not None}, arrived)
+                found = {topic: data for topic, data in parts.items() if data is not None}
+                return Cut(mark, passed, found, arrived)
         return None
 
     def missing(self) -> list[str]:
@@ -91,3 +102,9 @@ class CutAssembler:
             at_hand = self._at_hand[topic]
             while next(iter(at_hand)) != key:
                 del at_hand[next(iter(at_hand))]
+
+
+def _key_of(mark: Any, topic: str) -> PartKey | None:
+    """What a mark says of the part on a topic."""
+    part = next((part for part in mark.parts if part.topic == topic), None)
+    return None if part is None else PartKey(part.size, part.digest)

@@ -18,6 +18,8 @@ from rosrm_msgs.msg import HandoffReport, StateConfig, StateMark
 
 #: Seconds without a message after which an input counts as idle.
 _IDLE: Final = 1.0
+#: Seconds without a part or mark after which nothing more of an ended source is to come.
+_QUIET: Final = 0.2
 #: Seconds for which all readers have to be matched. A reader learns of a writer after the writer
 #: of it: 0.4 s later on a busy machine.
 _MATCHED: Final = 0.5
@@ -32,7 +34,7 @@ class Destination:
         member: the node.
         parts: of its state.
         mark_topic: fully qualified.
-        activated: called when the node is active, with the sequence from which on.
+        activated: called when the node is active.
     """
 
     def __init__(
@@ -49,6 +51,10 @@ class Destination:
         self._cut: Cut | None = None
         self._run = 0
         self._attached = False
+        self._silent_at: int | None = None
+        self._alone = False
+        self._active = False
+        self._heard_at = 0.0
         self._matched_at = inf
         self._was_ready = False
         self._may_switch = False
@@ -60,28 +66,34 @@ class Destination:
 
     def configure(self, config: StateConfig) -> None:
         """The master says something of the handoff to here."""
-        if self._channel is None:
-            self._open(config)
+        channel = self._channel
+        if channel is None:
+            channel = self._open(config)
         else:
-            self._channel.repeat()  # perhaps another master asks, after the first was lost
-        if self._over:
-            return
-        if config.phase == StateConfig.SWITCH:
+            channel.repeat()  # perhaps another master asks, after the first was lost
+        if config.phase == StateConfig.DONE:
+            self.close()
+        elif self._over:
+            if config.phase == StateConfig.ABORT and not self._active:
+                channel.say(HandoffReport.ABORTED, self._sequence(), self._fault)
+        elif config.phase == StateConfig.SWITCH:
             self._may_switch = True
             self._review()
         elif config.phase == StateConfig.TAKE_OVER:
-            self._take_over()
+            self._alone = True
+            self._review()
         elif config.phase in (StateConfig.ABORT, StateConfig.RESUME):
             self._end(HandoffReport.ABORTED, "the master called it off")
 
-    def _open(self, config: StateConfig) -> None:
+    def _open(self, config: StateConfig) -> Channel:
         member = self._member
-        self._channel = Channel(
-            member.plain, config.channel, config.destination, member.identity.instance, self._heard
-        )
+        channel = self._channel = Channel(
+            member.plain, config.channel, config.destination, member.identity.instance,
+            config.source, self._heard,
+        )  # fmt: skip
         if self._over:
-            self._channel.say(HandoffReport.FAILED, 0, self._fault)
-            return
+            channel.say(HandoffReport.FAILED, 0, self._fault)
+            return channel
         self._assembler = CutAssembler(part.topic for part in self._parts)
         for part in self._parts:
             self._follow(
@@ -92,6 +104,7 @@ class Destination:
         if not self._over:
             self._timer = member.plain.create_timer(_REVIEW, self._look)
             self._review()
+        return channel
 
     def _follow(
         self, message_type: Any, topic: str, callback: Callable[[Any], None], qos: Any, *,
@@ -114,6 +127,8 @@ class Destination:
                 return
             if report.phase == HandoffReport.ATTACHED:
                 self._attached = True
+            elif report.phase == HandoffReport.SILENT:
+                self._silent_at = report.sequence
             elif report.phase == HandoffReport.FAILED:
                 self._end(HandoffReport.FAILED, f"the source cannot go on: {report.message}")
             self._go_on()
@@ -121,6 +136,7 @@ class Destination:
     def _part_came(self, topic: str, data: bytes) -> None:
         with self._member.turn:
             if self._assembler is not None and not self._over:
+                self._heard_at = time.monotonic()
                 self._assembler.add_part(topic, data)
                 self._go_on()
 
@@ -133,7 +149,8 @@ class Destination:
                 self._end(HandoffReport.FAILED, fault)
                 return
             self._run = mark.run
-            self._assembler.add_mark(mark, time.monotonic())
+            self._heard_at = time.monotonic()
+            self._assembler.add_mark(mark, self._heard_at)
             self._go_on()
 
     def _fault_of(self, mark: StateMark) -> str:
@@ -179,15 +196,19 @@ class Destination:
             self._end(HandoffReport.FAILED, str(error))
             return False
         self._cut = cut
-        for covered in cut.mark.inputs:
-            self._member.buffer.cover(
-                covered.topic, covered.covered, single=covered.publishers <= 1
-            )
+        for mark in (*cut.passed, cut.mark):
+            for covered in mark.inputs:
+                self._member.buffer.cover(
+                    covered.topic, covered.covered, single=covered.publishers <= 1
+                )
         return True
 
     def _review(self) -> None:
         """Say how far it is, ask for silence when it may, and become active on it."""
-        if self._channel is None:
+        if self._channel is None or self._over:
+            return
+        if self._alone:
+            self._take_over_when_quiet()
             return
         if not self._was_ready:
             missing = self._still_missing()
@@ -198,10 +219,14 @@ class Destination:
             self._channel.say(HandoffReport.READY, self._sequence())
         if not self._may_switch:
             return
-        if self._cut is not None and self._cut.mark.last:
+        if self._cut is not None and self._is_last(self._cut):
             self._activate()
         else:
             self._channel.say(HandoffReport.SWITCHING, self._sequence())
+
+    def _is_last(self, cut: Cut) -> bool:
+        """Of this handoff: what an earlier one ended with is latched too."""
+        return bool(cut.mark.last) and cut.mark.sequence == self._silent_at
 
     def _sequence(self) -> int:
         return int(self._cut.mark.sequence) if self._cut is not None else 0
@@ -212,24 +237,36 @@ class Destination:
             return "for the source to answer: is it up, and does it use rosrm.node?"
         if self._cut is None:
             return self._missing_state()
-        for covered in self._cut.mark.inputs:
-            if not self._follows(covered):
-                return f"until a message on {covered.topic} has been here and in the state"
-        return self._missing_readers(self._cut.mark.outputs)
-
-    def _missing_readers(self, outputs: Any) -> str:
-        """Which readers are not matched, or only just: they may not know it yet themselves."""
         now = time.monotonic()
-        ours = {one.topic_name: one.get_subscription_count() for one in self._member.outputs}
-        for output in outputs:
-            if ours.get(output.topic, output.subscriptions) < output.subscriptions:
-                self._matched_at = inf
+        missing = self._missing_peers(self._cut.mark)
+        if missing:
+            self._matched_at = inf
+            return missing
+        self._matched_at = min(self._matched_at, now)
+        if now - self._matched_at < _MATCHED:
+            return "a moment: its peers may not know it yet"
+        for covered in self._cut.mark.inputs:
+            if not self._follows(covered.topic, now):
+                return f"until a message on {covered.topic} has been here and in the state"
+        return ""
+
+    def _missing_peers(self, mark: StateMark) -> str:
+        """Who is matched with the source, and not with this node."""
+        readers = {one.topic_name: one.get_subscription_count() for one in self._member.outputs}
+        for output in mark.outputs:
+            if readers.get(output.topic, output.subscriptions) < output.subscriptions:
                 return (
-                    f"for the readers of {output.topic}: {ours[output.topic]} of "
+                    f"for the readers of {output.topic}: {readers[output.topic]} of "
                     f"{output.subscriptions} matched"
                 )
-        self._matched_at = min(self._matched_at, now)
-        return "a moment, for its readers" if now - self._matched_at < _MATCHED else ""
+        writers = {one.topic: one.subscription.get_publisher_count() for one in self._member.inputs}
+        for covered in mark.inputs:
+            if writers.get(covered.topic, covered.publishers) < covered.publishers:
+                return (
+                    f"for the publishers of {covered.topic}: {writers[covered.topic]} of "
+                    f"{covered.publishers} matched"
+                )
+        return ""
 
     def _missing_state(self) -> str:
         missing = self._assembler.missing() if self._assembler is not None else []
@@ -237,39 +274,43 @@ class Destination:
             return f"for the state on {', '.join(missing)}"
         return f"for the first state, marked on {self._mark_topic}"
 
-    def _follows(self, covered: Any) -> bool:
+    def _follows(self, topic: str, now: float) -> bool:
         """Whether no message of an input can be missing both here and in the state."""
         buffer = self._member.buffer
-        own = next((one for one in self._member.inputs if one.topic == covered.topic), None)
-        if own is None or buffer.overlaps(covered.topic):
+        if all(one.topic != topic for one in self._member.inputs) or buffer.overlaps(topic):
             return True
-        return (
-            buffer.is_idle(covered.topic, time.monotonic(), _IDLE)
-            and own.subscription.get_publisher_count() >= covered.publishers
-        )
+        return buffer.is_idle(topic, now, self._matched_at, _IDLE)
 
     # --- the end ---------------------------------------------------------------------------
 
-    def _take_over(self) -> None:
-        """The source is no more: its last state is the newest there is."""
+    def _take_over_when_quiet(self) -> None:
+        """The source is no more: what of its state is on its way still counts."""
+        if time.monotonic() - self._heard_at < _QUIET:
+            return
         if self._cut is None:
             self._end(HandoffReport.FAILED, "the source ended before a state of it was here")
         else:
             self._activate()
 
     def _activate(self) -> None:
-        member, channel, cut = self._member, self._channel, self._cut
-        if channel is None or cut is None:
+        member, cut = self._member, self._cut
+        if cut is None:
             return
-        self._over = True
+        self._over = self._active = True
         member.sequence = self._sequence()
         for covered in cut.mark.inputs:
             member.inherit(covered.topic, covered.covered)
         passed = time.monotonic() - cut.arrived
-        member.become_active([None if ns < 0 else ns / 1e9 - passed for ns in cut.mark.timers_due])
-        channel.say(HandoffReport.ACTIVE, self._sequence())
-        self._unfollow()
-        self._activated()
+        due = [None if ns < 0 else ns / 1e9 - passed for ns in cut.mark.timers_due]
+        try:
+            member.become_active(due, self._say_active)
+        finally:
+            self._unfollow()
+            self._activated()
+
+    def _say_active(self) -> None:
+        if self._channel is not None:
+            self._channel.say(HandoffReport.ACTIVE, self._sequence())
 
     def _end(self, phase: int, message: str) -> None:
         """It will never be active; only its slave ends it."""
@@ -295,6 +336,7 @@ class Destination:
             self._member.plain.destroy_timer(self._timer)
             self._timer = None
         self._assembler = None
+        self._cut = None
 
     def close(self) -> None:
         """The handoff is over."""

@@ -11,7 +11,7 @@ from typing import Any, Final
 from rclpy.publisher import Publisher
 
 #: Source time stamps of the newest messages of each input that go with every mark.
-COVERED_KEPT: Final = 64
+COVERED_KEPT: Final = 256
 
 
 @dataclass(slots=True)
@@ -40,6 +40,7 @@ class Input:
         topic: fully qualified.
         callback: the author's.
         with_info: it wants the message's information too.
+        buffered: in a handoff its messages are kept.
         covered: source time stamps of the newest messages that were processed, ns.
         subscription: rclpy's.
     """

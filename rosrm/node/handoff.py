@@ -81,12 +81,15 @@ class Handoff:
             self._refuse(fault)
             return
         self._epoch = config.epoch
+        role = self._destination if own.instance == config.destination else self._source
+        if role is None:
+            return
         with self.member.turn:
-            if own.instance == config.destination:
-                if self._destination is not None:
-                    self._destination.configure(config)
-            elif self._source is not None:
-                self._source.configure(config)
+            try:
+                role.configure(config)
+            except Exception as error:  # noqa: BLE001 - no word of the master ends the author's node
+                what = f"{type(error).__name__}: {error}"
+                self.member.node.get_logger().error(f"a state_config cannot be followed: {what}")
 
     def _fault_of(self, config: StateConfig) -> str:
         """Why this is not our master's word; "": it is."""

@@ -97,8 +97,6 @@ class Member:
 
     def create_publisher(self, message_type: Any, topic: str, qos: Any, **rest: Any) -> Any:
         """Create a publisher that can fall silent."""
-        if topic in _INTERNAL:
-            return self.plain.create_publisher(message_type, topic, qos, **rest)
         wanted = rest.pop("publisher_class", GatedPublisher)
         if not issubclass(wanted, GatedPublisher):
             wanted = type(wanted.__name__, (GatedPublisher, wanted), {})
@@ -107,7 +105,8 @@ class Member:
             message_type, topic, qos, publisher_class=wanted, **rest
         )
         publisher.gate = self._gate
-        self.outputs.append(publisher)
+        if topic not in _INTERNAL:
+            self.outputs.append(publisher)
         return publisher
 
     def create_subscription(
@@ -130,9 +129,16 @@ class Member:
         return one.subscription
 
     def create_timer(
-        self, period: float, callback: Callable[..., Any], *rest: Any, autostart: bool, **named: Any
+        self,
+        period: float,
+        callback: Callable[..., Any] | None,
+        *rest: Any,
+        autostart: bool,
+        **named: Any,
     ) -> Any:
         """Create a timer that runs while this node is active."""
+        if callback is None:  # rclpy's Rate puts its own in later, and is no cycle
+            return self.plain.create_timer(period, None, *rest, autostart=autostart, **named)
         refuse_coroutine(callback, f"a timer of {period} s")
 
         def tick(*arguments: Any) -> None:
@@ -142,12 +148,12 @@ class Member:
                     self._cycle(callback, *arguments)
 
         active = self.mode is Mode.ACTIVE
-        timer = self.plain.create_timer(
+        one = TimerOf(None, autostart)
+        one.timer = self.plain.create_timer(
             period, tick, *rest, autostart=autostart and active, **named
         )
-        one = TimerOf(timer, autostart)
         self.timers.append(one)
-        return timer
+        return one.timer
 
     def create_service(
         self, service_type: Any, name: str, callback: Callable[..., Any], **rest: Any
@@ -215,7 +221,7 @@ class Member:
         if time.monotonic() >= self._late_until:
             self._late_until = 0.0
             return False
-        return self.buffer.covers(one.topic, info["source_timestamp"])
+        return self.buffer.is_marked(one.topic, info["source_timestamp"])
 
     def _is_active_soon(self) -> bool:
         """For a request that another thread took in the very moment of falling silent."""
@@ -233,8 +239,15 @@ class Member:
             timer.started = not timer.timer.is_canceled()
             timer.stop()
         for opening in self._openings:
-            opening.close()
+            self._close(opening)
         return due
+
+    def _close(self, opening: ServiceOf | OpeningOf) -> None:
+        try:
+            opening.close()
+        except Exception as error:  # noqa: BLE001 - the author's code: anything may come
+            what = f"{type(error).__name__}: {error}"
+            self.node.get_logger().error(f"falling silent, and closing raised {what}")
 
     def inherit(self, topic: str, covered: Iterable[int]) -> None:
         """What the source had processed of an input is processed here too."""
@@ -246,24 +259,28 @@ class Member:
         """Nanoseconds until each timer is due, in the order of creation; -1: cancelled."""
         return [timer.due_ns() for timer in self.timers]
 
-    def become_active(self, timers_due: list[float | None]) -> None:
-        """Serve what was kept, then go on.
+    def become_active(self, timers_due: list[float | None], announce: Callable[[], None]) -> None:
+        """Go on: first say so, then serve what was kept.
 
         Args:
             timers_due: seconds until each timer is due, negative where it is late; None: it was
                 cancelled. Timers beyond the list start now.
+            announce: called at once, as serving may take long.
         """
         self.mode = Mode.ACTIVE
         self._gate.is_open = True
         self._late_until = time.monotonic() + _LATE
-        while (kept := self.buffer.take()) is not None:
-            one, message, info = kept.item
-            one.serve(message, info)
-            self._cycle_ended()
+        announce()
         self._start_timers(timers_due)
-        for opening in self._openings:
-            opening.open()
-        self.turn.notify_all()
+        try:
+            while (kept := self.buffer.take()) is not None:
+                one, message, info = kept.item
+                one.serve(message, info)
+                self._cycle_ended()
+        finally:
+            for opening in self._openings:
+                opening.open()
+            self.turn.notify_all()
 
     def _start_timers(self, due: list[float | None]) -> None:
         for index, timer in enumerate(list(self.timers)):

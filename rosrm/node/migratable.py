@@ -152,6 +152,12 @@ class Migratable(_Base):  # type: ignore[misc]  # rclpy brings no types
         self._forget(timer)
         return bool(super().destroy_timer(timer))
 
+    def destroy_node(self) -> None:
+        """As rclpy's."""
+        if self._rosrm is not None:
+            self._rosrm.close()
+        super().destroy_node()
+
     def _forget(self, entity: Any) -> None:
         if self._rosrm is not None:
             self._rosrm.member.destroyed(entity)

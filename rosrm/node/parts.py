@@ -41,6 +41,7 @@ class Part:
         self._restore = restore
         self._key: PartKey | None = None
         self._restored: PartKey | None = None
+        self._inherited: bytes | None = None
         self.publisher: Any = None
 
     def has_reader(self) -> bool:
@@ -56,28 +57,38 @@ class Part:
         Raises:
             StateError: it cannot be saved, or is too large.
         """
-        message = self._saved()
-        if message is None:
+        data = self._saved()
+        if data is None:
             return
-        data = serialize_message(message)
         if len(data) > largest:
+            self._key = None  # what was saved is not what was published last
             raise StateError(
                 f"the state on {self.topic} has {len(data)} bytes, more than the {largest} that "
                 f"may travel in one message: split it in several topics, or keep less"
             )
+        self._inherited = None
         key = part_key(data)
         if key != self._key:
             self._key = key
             self.publisher.publish(data)
 
-    def _saved(self) -> Any:
+    def _saved(self) -> bytes | None:
+        """The state now, serialised; None: it is what was published last."""
         try:
             message = self._save()
+            self._check(message)
+            return self._inherited if message is None else bytes(serialize_message(message))
+        except StateError:
+            self._key = None
+            raise
         except Exception as error:  # the author's code: anything may come
+            self._key = None
             raise StateError(
                 f"saving {self.topic} raised {type(error).__name__}: {error}"
             ) from error
-        if message is None and self._key is None:
+
+    def _check(self, message: Any) -> None:
+        if message is None and self._key is None and self._inherited is None:
             raise StateError(
                 f"saving {self.topic} returned None (unchanged) before it had returned any state"
             )
@@ -85,7 +96,6 @@ class Part:
             raise StateError(
                 f"saving {self.topic} returned a {type(message).__name__}, not a {self.type_name}"
             )
-        return message
 
     def described(self) -> StatePart:
         """What a mark says of it. It was published before."""
@@ -108,6 +118,7 @@ class Part:
                 f"restoring {self.topic} raised {type(error).__name__}: {error}"
             ) from error
         self._restored = key
+        self._inherited = data  # "unchanged" may be the first that the author says of it
 
 
 def type_name(message_type: Any) -> str:

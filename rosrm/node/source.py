@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 import time
 from array import array
+from collections.abc import Callable
 from typing import Any, Final
 
 from rclpy.duration import Duration
@@ -91,7 +92,7 @@ class Source:
                 try:
                     part.publish(LARGEST_PART)
                 except StateError as error:
-                    self._failed(str(error))
+                    self._member.node.get_logger().error(str(error), throttle_duration_sec=10.0)
 
     def _failed(self, fault: str) -> None:
         """The state cannot be shown: this handoff fails, the node goes on."""
@@ -131,7 +132,7 @@ class Source:
             if config.phase not in (StateConfig.SHADOW, StateConfig.SWITCH, StateConfig.RESUME):
                 return
             self._open(config)
-        elif self._channel is not None:
+        else:
             self._channel.repeat()
         if config.phase == StateConfig.SWITCH:
             self._may_switch = True
@@ -146,7 +147,7 @@ class Source:
         self._fault = ""
         self._channel = Channel(
             self._member.plain, config.channel, config.destination,
-            self._member.identity.instance, self._heard,
+            self._member.identity.instance, config.destination, self._heard,
         )  # fmt: skip
 
     def _heard(self, report: HandoffReport) -> None:
@@ -161,8 +162,8 @@ class Source:
         if self._channel is None or self._attached or self._member.mode is not Mode.ACTIVE:
             return
         self._attached = True
-        self._channel.say(HandoffReport.ATTACHED, self._member.sequence)
-        self._show()
+        if self._show():
+            self._channel.say(HandoffReport.ATTACHED, self._member.sequence)
 
     def _switch(self) -> None:
         """Fall silent, once both the master and the destination want it."""
@@ -173,7 +174,7 @@ class Source:
             self._timers_due = member.fall_silent()
             self._silent_since = time.monotonic()
             if not self._show(last=True):
-                self._go_on()
+                self._go_on(_nothing)
                 return
             self._channel.say(HandoffReport.SILENT, member.sequence)
             self._look_again = member.plain.create_timer(_LOOK, self._release_when_heard)
@@ -196,14 +197,20 @@ class Source:
         self._may_switch = self._asked = self._attached = False
         self._look_no_more()
         if self._member.mode is Mode.SILENT:
-            self._go_on()
+            # A shadow of a later handoff must not take the last mark for its own.
+            self._marks.publish(self._mark(last=False))
+            self._go_on(self._say_resumed)
+        else:
+            self._say_resumed()
+
+    def _say_resumed(self) -> None:
         if self._channel is not None:
             self._channel.say(HandoffReport.RESUMED, self._member.sequence)
 
-    def _go_on(self) -> None:
+    def _go_on(self, announce: Callable[[], None]) -> None:
         passed = time.monotonic() - self._silent_since
         due = [None if ns < 0 else ns / 1e9 - passed for ns in self._timers_due]
-        self._member.become_active(due)
+        self._member.become_active(due, announce)
 
     def _overflowed(self, topic: str) -> None:
         self._member.node.get_logger().error(
@@ -213,8 +220,13 @@ class Source:
 
     def close(self) -> None:
         """The handoff is over."""
+        self._fault = ""
         self._look_no_more()
         self._may_switch = self._asked = self._attached = False
         if self._channel is not None:
             self._channel.close()
             self._channel = None
+
+
+def _nothing() -> None:
+    """The failure has been told."""

@@ -83,12 +83,13 @@ def test_an_input_overlaps_once_a_message_was_here_and_in_the_state():
 def test_an_input_is_idle_when_nothing_waits_and_nothing_came_for_a_while():
     """From the beginning of the buffer on."""
     buffer = InputBuffer(10, 100.0)
-    assert not buffer.is_idle(A, 100.5, 1.0)
-    assert buffer.is_idle(A, 101.0, 1.0)
+    assert not buffer.is_idle(A, 100.5, 0.0, 1.0)
+    assert buffer.is_idle(A, 101.0, 0.0, 1.0)
+    assert not buffer.is_idle(A, 101.0, 100.5, 1.0)
     buffer.add(A, 1, None, 101.0)
-    assert not buffer.is_idle(A, 103.0, 1.0)
+    assert not buffer.is_idle(A, 103.0, 0.0, 1.0)
     buffer.cover(A, [1], single=True)
-    assert buffer.is_idle(A, 103.0, 1.0)
+    assert buffer.is_idle(A, 103.0, 0.0, 1.0)
 
 
 @given(st.data())
