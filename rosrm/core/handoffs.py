@@ -146,7 +146,8 @@ def _fault(state: MasterState, run: Run) -> str:
 
 
 def _aborting(state: MasterState, run: Run) -> str | None:
-    aborted = ReportPhase.ABORTED in run.phases_of(run.destination)
+    said = run.phases_of(run.destination)
+    aborted = ReportPhase.ABORTED in said or ReportPhase.FAILED in said
     return DONE if aborted or run.destination.number not in state.instances else None
 
 

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time
 
-from rosrm.version import __version__
+from rosrm.version import PROTOCOL_VERSION, __version__
 
 
 def run(code):
@@ -16,7 +16,7 @@ def run(code):
 
 
 def test_version_and_help(rosrm):
-    assert rosrm("--version").out == f"rosrm {__version__} (protocol 1)\n"
+    assert rosrm("--version").out == f"rosrm {__version__} (protocol {PROTOCOL_VERSION})\n"
     out = rosrm("--help").out
     for command in ("master", "slave", "submit", "status", "ps", "logs", "explain", "config"):
         assert f"\n  {command} " in out

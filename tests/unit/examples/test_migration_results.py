@@ -75,7 +75,9 @@ def test_a_scan_that_was_mapped_twice() -> None:
 def test_poses_out_of_order() -> None:
     seen = run()
     heard = [*seen.heard[:4], seen.heard[5], seen.heard[4]]
-    assert wrong(replace(seen, heard=heard)) == ["out_of_order is 1, not 0"]
+    late = replace(seen, heard=heard)
+    assert summarise(late, POSES, 1)["out_of_order"] == 1
+    assert wrong(late) == []  # two writers: what DDS has to send again comes late
 
 
 def test_no_migration() -> None:
