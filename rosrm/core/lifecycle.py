@@ -62,11 +62,13 @@ def reconcile(
     An assignment of which the host has said nothing may be on its way, unless the host is
     `registering`: a slave takes up nothing that was sent before its registration.
     """
-    held = {status.instance.number: status for status in statuses}
+    held = {status.instance: status for status in statuses}
+    state.skip_numbers(max((one.number for one in held), default=0))
     for status in held.values():
         take_status(state, host, status, now)
-    for number in sorted(host.instances - held.keys()):
-        instance = state.instances[number]
+    for instance in [state.instances[number] for number in sorted(host.instances)]:
+        if instance.id in held:
+            continue
         if instance.state is None and (not registering or _yet_to_start(state, instance)):
             continue
         gone(state, instance, now, f"{host.name} does not hold it any more")
@@ -83,7 +85,7 @@ def _yet_to_start(state: MasterState, instance: Instance) -> bool:
 def take_status(state: MasterState, host: Host, status: InstanceStatus, now: float) -> None:
     """One instance changed."""
     instance = state.instances.get(status.instance.number)
-    if instance is None or instance.host is not host:
+    if instance is None or instance.host is not host or instance.id != status.instance:
         _take_stranger(state, host, status, now)
         return
     before = instance.state
@@ -141,7 +143,7 @@ def _take_stranger(state: MasterState, host: Host, status: InstanceStatus, now: 
     """
     if status.state.ended:
         return
-    if status.instance.number in state.instances:  # it is intended, but on another host
+    if status.instance.number in state.instances:  # it is intended, but elsewhere
         if status.state is not InstanceState.STOPPING:
             state.emit(Order(state.order_id(), host.host_id, "stop", status.instance))
         return

@@ -68,9 +68,14 @@ class Awaited:
 
 @dataclass(frozen=True, slots=True)
 class Registered:
-    """The master took this host in."""
+    """The master took this host in.
+
+    Attributes:
+        renumbers: it has lost its journal, and gives numbers again that were given before.
+    """
 
     epoch: int
+    renumbers: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -323,6 +328,8 @@ def _registered(state: SlaveState, event: Registered, now: float) -> _Commands:
     # Not the highest that was ever heard: a master whose journal was lost begins at 1 again.
     state.epoch = event.epoch
     state.registered = True
+    if event.renumbers:
+        state.tombstones.clear()
     for held in state.held.values():
         held.ended_at = max(held.ended_at, now)  # told with the registration, not before
     return []

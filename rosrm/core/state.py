@@ -24,6 +24,8 @@ from rosrm.ports import Intent, MigrationStrategy, Record, ScoringPolicy
 _HISTORY: Final = 12
 #: Instance numbers are made durable by so many at a time.
 _RESERVED: Final = 1000
+#: No instance gets a number as large as this.
+_LARGEST: Final = 2**53
 
 __all__ = ["Instance", "MasterState", "Process", "ProcessPhase", "Run", "Wanted", "larger"]
 
@@ -182,6 +184,14 @@ class MasterState:
             self.emit(Intent("cluster", "instances", {"next": self.reserved_instances}))
         self.next_instance += 1
         return InstanceId(process.name, self.next_instance - 1)
+
+    def skip_numbers(self, seen: int) -> None:
+        """A slave holds an instance that was not numbered by us: our journal was lost.
+
+        Others may have been numbered after it, and have ended.
+        """
+        if self.next_instance <= seen < _LARGEST:
+            self.next_instance = seen + _RESERVED
 
     def add_instance(
         self, instance: InstanceId, spec: ProcessSpec, host: Host, now: float

@@ -130,6 +130,7 @@ class SlaveEndpoint:
         self._greeted_at = 0.0
         self._newest_beat: msg.MasterBeat | None = None
         self._incarnation = 0  # of the master that we are registered with, or about to be
+        self._registered_with = 0  # the incarnation of the newest that took us in
         self._taken_since: float | None = None
         self._told = ""
         self._poll_open = False
@@ -240,13 +241,15 @@ class SlaveEndpoint:
             return
         self._taken_since = None
         self.host_id = response.host_id
-        self._epoch = answer.epoch
+        another = self._registered_with not in (0, self._incarnation)
+        renumbers = another and answer.epoch <= self._epoch
+        self._registered_with, self._epoch = self._incarnation, answer.epoch
         self._beat_period = response.beat_period
         self._beat_at = now
         self._poll_anew = _FIRST_POLL_ANEW
         self._row["host_id"] = self.host_id
         self.link = Link.REGISTERED
-        self._host.take(core.Registered(answer.epoch))
+        self._host.take(core.Registered(answer.epoch, renumbers))
         greeting = self._greeting
         self._host.say(
             f"registered with master {greeting.master} (pid {greeting.pid} on {greeting.hostname}) "

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from rosrm.core import events as happened
+from rosrm.core.model import InstanceId, InstanceState, InstanceStatus
 from tests.unit.core.cluster import MIB, Cluster, Machine, job, movable, process
 
 
@@ -166,3 +167,32 @@ def test_a_source_that_was_told_to_stop_has_not_finished() -> None:
     cluster.wait(1.0)
     assert cluster.phase("p") == "running"
     assert len(cluster.where("p")) == 1
+
+
+def test_a_number_that_is_held_somewhere_is_not_given_again_by_a_lost_journal() -> None:
+    """What is said of the instance that had it would be taken for the new one's."""
+    cluster = Cluster("a")
+    cluster.submit(process("p"), process("q"))
+    held = max(instance.number for instance in cluster.machines["a"].programs)
+    cluster.intents.clear()
+    cluster.restart_master()
+    cluster.submit(process("new"))
+    assert cluster["new"].owner > held
+    assert (cluster.where("p"), cluster.where("new")) == ([], ["a"])
+
+
+def test_what_is_said_of_a_namesake_in_number_is_not_taken_for_an_instance() -> None:
+    """A process of another life of the cluster: it is stopped, and harms nobody."""
+    cluster = Cluster("a")
+    cluster.submit(process("p"))
+    machine, number = cluster.machines["a"], cluster["p"].owner
+    for state in (InstanceState.STOPPING, InstanceState.FAILED):
+        machine.batches += 1
+        cluster.tell(
+            happened.StatusesReceived(
+                machine.host_id, machine.incarnation, machine.batches, False,
+                (InstanceStatus(InstanceId("former", number), state),),
+            )
+        )  # fmt: skip
+    cluster.settle()
+    assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])

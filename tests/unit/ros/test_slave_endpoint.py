@@ -195,7 +195,7 @@ def test_another_run_of_the_master_is_told_whatever_its_epoch(slave, epoch) -> N
     new.take_in()
     asked = len(slave.sent(srv.RequestProcess))
     slave.pass_time(PERIOD, new)
-    assert slave.host.events[-1] == core.Registered(epoch)
+    assert slave.host.events[-1] == core.Registered(epoch, renumbers=epoch <= 2)
     assert len(slave.sent(srv.RegisterHost)) == 2
     assert len(slave.sent(srv.RequestProcess)) == asked + 1
     assert slave.newest(srv.RequestProcess).request.envelope.epoch == epoch
@@ -223,9 +223,15 @@ def test_a_run_in_the_place_of_the_first_is_told(slave) -> None:
     assert slave.link is Link.GREETING
     new.greet()
     new.take_in()
+    assert slave.host.events[-1] == core.Registered(1, renumbers=True)
     slave.pass_time(5.0, new)
     assert slave.link is Link.REGISTERED
     assert len(slave.sent(srv.RegisterHost)) == 2
+    slave.pass_time(3.0)  # it is silent for a while
+    slave.pass_time(PERIOD, new)
+    new.greet()
+    new.take_in()
+    assert slave.host.events[-1] == core.Registered(1, renumbers=False)
 
 
 def test_of_two_masters_the_one_that_lives_is_kept(slave) -> None:

@@ -111,6 +111,17 @@ def test_a_dead_number_stays_dead(one, end) -> None:
     assert [type(c) for c in one.step(assigned(number=2))] == [slave.Launch]
 
 
+def test_dead_numbers_are_given_again_by_a_master_that_has_lost_its_journal(one) -> None:
+    """It knows nothing of them; another registration with the same one changes nothing."""
+    one.step(slave.StopOrdered(InstanceId("p", 1)))
+    one.step(slave.Registered(1))
+    one.step(slave.TimePassed(), after=slave.REMEMBER_END)
+    assert states(one.step(assigned())) == [STATE.REFUSED]
+    one.step(slave.Registered(1, renumbers=True))
+    one.step(slave.TimePassed(), after=slave.REMEMBER_END)
+    assert [type(c) for c in one.step(assigned())] == [slave.Launch]
+
+
 def test_an_end_is_kept_while_no_master_is_heard(one) -> None:
     """However long the master is away, it is told of a job that finished meanwhile."""
     one.step(assigned())
