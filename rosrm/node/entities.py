@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import inspect
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -103,6 +104,10 @@ class TimerOf:
         due = None if self.timer.is_canceled() else self.timer.time_until_next_call()
         return -1 if due is None else max(0, due)
 
+    def follows_ros_time(self) -> bool:
+        """Whether its clock is a simulation's (`use_sim_time`)."""
+        return bool(getattr(self.timer.clock, "ros_time_is_active", False))
+
     def start_in(self, seconds: float) -> None:
         """Run first after so long, and in its own period from then on."""
         self.period_ns = self.timer.timer_period_ns
@@ -137,6 +142,7 @@ class ServiceOf:
         self._create = create
         self._destroy = destroy
         self._service: Any = None
+        self._requests = 0
         self.srv_name = name
 
     def open(self) -> None:
@@ -144,9 +150,18 @@ class ServiceOf:
         if self._service is None:
             self._service = self._create()
 
+    @contextmanager
+    def serving(self) -> Iterator[None]:
+        """A request has been taken: the server must be there for its answer."""
+        self._requests += 1
+        try:
+            yield
+        finally:
+            self._requests -= 1
+
     def close(self) -> None:
-        """Serve no more."""
-        if self._service is not None:
+        """Serve no more, unless a request was taken in this very moment: it has to wait."""
+        if self._service is not None and not self._requests:
             self._destroy(self._service)
             self._service = None
 

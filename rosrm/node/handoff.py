@@ -29,7 +29,7 @@ class Handoff:
 
     def __init__(self, node: Any, plain: Any, identity: Identity) -> None:
         self.member = Member(node, plain, identity)
-        self._identity = identity
+        self.identity = identity
         self._epoch = identity.epoch
         self._parts: list[Part] = []
         self._source: Source | None = None
@@ -41,14 +41,14 @@ class Handoff:
         """The node is made; its author's constructor may go on."""
         node = self.member.node
         self._parts.append(ParametersPart(self._own(_PARAMETERS), node))
-        if self._identity.shadow:
+        if self.identity.shadow:
             self._destination = Destination(
                 self.member, self._parts, self._own(_MARK), self._become_source
             )
         else:
             self._become_source()
         self._subscription = self.member.plain.create_subscription(
-            StateConfig, self._identity.state_config, self._configured, topics.STATE_CONFIG
+            StateConfig, self.identity.state_config, self._configured, topics.STATE_CONFIG
         )
 
     def _own(self, path: str) -> str:
@@ -73,7 +73,7 @@ class Handoff:
     # --- state_config ----------------------------------------------------------------------
 
     def _configured(self, config: StateConfig) -> None:
-        own = self._identity
+        own = self.identity
         if config.process != own.process or own.instance not in (config.source, config.destination):
             return
         fault = self._fault_of(config)
@@ -97,8 +97,8 @@ class Handoff:
             return (
                 f"its protocol version is {config.protocol_version}, this node's {PROTOCOL_VERSION}"
             )
-        if config.cluster != self._identity.cluster:
-            return f"it is of {config.cluster!r}, and {self._identity.cluster!r} started this node"
+        if config.cluster != self.identity.cluster:
+            return f"it is of {config.cluster!r}, and {self.identity.cluster!r} started this node"
         if config.epoch < self._epoch:
             return f"it is of epoch {config.epoch}, and this is epoch {self._epoch}"
         if not config.channel:

@@ -33,8 +33,8 @@ _INTERNAL: Final = frozenset({"/parameter_events", "/clock", "/rosout"})
 #: Seconds after becoming active in which a message may still come that the source has processed.
 #: Not longer: the clock of a publisher may be set back.
 _LATE: Final = 10.0
-#: Seconds for which a request waits that was taken just before its node fell silent.
-_PATIENCE: Final = 1.0
+#: Seconds between two looks of a request that waits at whether its node ends.
+_LOOK: Final = 0.5
 
 
 class Mode(Enum):
@@ -163,10 +163,9 @@ class Member:
         name = self.visible(name, self.node.resolve_service_name)
 
         def serve(request: Any, response: Any) -> Any:
-            with self.turn:
-                if not self._is_active_soon():
-                    self.node.get_logger().error(f"silent: a request of {name} is not served")
-                    return response
+            with service.serving(), self.turn:
+                while not self._may_serve():
+                    self.turn.wait(_LOOK)
                 return self._cycle(callback, request, response)
 
         service = ServiceOf(
@@ -223,9 +222,12 @@ class Member:
             return False
         return self.buffer.is_marked(one.topic, info["source_timestamp"])
 
-    def _is_active_soon(self) -> bool:
-        """For a request that another thread took in the very moment of falling silent."""
-        return self.turn.wait_for(lambda: self.mode is Mode.ACTIVE, _PATIENCE)
+    def _may_serve(self) -> bool:
+        """For a request that another thread took in the very moment of falling silent.
+
+        It is served if the node goes on, and else when it ends: an answer would be invented.
+        """
+        return self.mode is Mode.ACTIVE or not self.node.context.ok()
 
     # --- changes of the mode ---------------------------------------------------------------
 
@@ -291,6 +293,8 @@ class Member:
             seconds = due[index]
             if seconds is None:
                 timer.timer.cancel()
+            elif timer.follows_ros_time():
+                timer.timer.reset()  # its seconds are not ours
             else:
                 timer.start_in(seconds)
 

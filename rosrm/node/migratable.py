@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import rclpy.node
 
 from rosrm.node.entities import ServiceOf
 from rosrm.node.handoff import Handoff
-from rosrm.node.identity import identity_from
+from rosrm.node.identity import Identity, identity_from
 
 if TYPE_CHECKING:
     _Base = Any
 else:
     _Base = object
+
+
+#: The migratable node of this process, by the number of its instance.
+_NODES: Final[dict[int, Any]] = {}
 
 
 class Migratable(_Base):  # type: ignore[misc]  # rclpy brings no types
@@ -37,10 +41,25 @@ class Migratable(_Base):  # type: ignore[misc]  # rclpy brings no types
     def __init__(self, *arguments: Any, **named: Any) -> None:
         identity = identity_from(os.environ)
         if identity is not None:
+            self._be_the_only_one(identity)
             self._rosrm = Handoff(self, super(), identity)
         super().__init__(*arguments, **named)
         if self._rosrm is not None:
             self._rosrm.begin()
+
+    def _be_the_only_one(self, identity: Identity) -> None:
+        """An instance has one state, so one node of its process can have it.
+
+        Raises:
+            RuntimeError: another node of this process is migratable already.
+        """
+        other = _NODES.get(identity.instance)
+        _NODES[identity.instance] = self
+        if other is not None and other.context.ok():
+            raise RuntimeError(
+                f"rosrm moves a process by one node, and {other.get_name()!r} is it already: make "
+                f"the others of this process rclpy's nodes, or run each in a process of its own"
+            )
 
     # --- for authors -----------------------------------------------------------------------
 
@@ -156,6 +175,7 @@ class Migratable(_Base):  # type: ignore[misc]  # rclpy brings no types
         """As rclpy's."""
         if self._rosrm is not None:
             self._rosrm.close()
+            _NODES.pop(self._rosrm.identity.instance, None)
         super().destroy_node()
 
     def _forget(self, entity: Any) -> None:

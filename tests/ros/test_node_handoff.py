@@ -532,6 +532,15 @@ def test_async_callbacks_are_refused(stage):
         stage.instance(Async, 1)
 
 
+def test_a_second_node_of_a_process_is_refused(stage):
+    """It would answer for the first, with a state of its own."""
+    stage.instance(Counter, 1)
+    with pytest.raises(
+        RuntimeError, match="rosrm moves a process by one node, and 'counter' is it"
+    ):
+        stage.instance(Counter, 1)
+
+
 def test_a_state_topic_is_named_once(stage):
     """Each part has a topic of its own."""
     node = stage.instance(Counter, 1)
