@@ -85,7 +85,7 @@ def test_map_piece_publishes_the_pose_of_every_scan(start: Start, tmp_path: Path
     executor.add_node(listener)
     heard: list[Odometry] = []
     listener.create_subscription(Odometry, "/car/odometry", heard.append, 10)
-    arguments = ["--drive", "street:30", "--piece", "1", "--of", "1", "--out", str(tmp_path)]
+    arguments = ["--drive", "street:150", "--piece", "1", "--of", "1", "--out", str(tmp_path)]
     start("map_piece", *arguments, "--rate", "10", "--ros-args", "-r", "__ns:=/car")
     try:
         deadline = time.monotonic() + 15
