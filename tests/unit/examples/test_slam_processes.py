@@ -150,7 +150,8 @@ def test_a_played_drive_is_mapped_as_one_that_is_read(
     slam.send_signal(signal.SIGINT)
     output, errors = slam.communicate(timeout=10)
     assert (slam.returncode, errors) == (0, "")
-    assert output == f"wrote {tmp_path / 'parts' / 'slam.npz'}\n"
+    # Fast DDS may have said something of its shared memory before.
+    assert output.endswith(f"wrote {tmp_path / 'parts' / 'slam.npz'}\n")
     (part,) = load_parts(tmp_path / "parts")
     assert part.poses.tolist() == unmigrated_poses(load_drive("street:20")).tolist()
 
