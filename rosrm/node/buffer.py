@@ -11,6 +11,18 @@ from typing import Any, Final, NamedTuple
 _REMEMBERED: Final = 4096
 
 
+class Sent(NamedTuple):
+    """When a message was sent.
+
+    Attributes:
+        stamp: source time stamp, ns.
+        number: in the order of its publisher, which leaves none out; None: not known.
+    """
+
+    stamp: int
+    number: int | None = None
+
+
 class Kept(NamedTuple):
     """One message in the buffer.
 
@@ -32,17 +44,23 @@ class _Track:
     Attributes:
         covered: newest covered time stamps, in the order in which they were told.
         newest: covered; None: none was.
+        mixed: time stamps are not in one order: several publishers, or one that was started again
+            where the clock is behind.
         overlap: a message was received that the source has processed too.
         heard_at: when the last message came, seconds.
         held: messages in the buffer.
+        last: message of the one publisher.
+        after_gap: time stamp of the message before which one is missing; None: none is.
     """
 
     heard_at: float
     covered: dict[int, None] = field(default_factory=dict)
     newest: int | None = None
-    single: bool = True
+    mixed: bool = False
     overlap: bool = False
     held: int = 0
+    last: Sent | None = None
+    after_gap: int | None = None
 
 
 class InputBuffer:
@@ -65,7 +83,7 @@ class InputBuffer:
             track = self._tracks[topic] = _Track(self._since)
         return track
 
-    def add(self, topic: str, stamp: int, item: Any, now: float) -> bool:
+    def add(self, topic: str, sent: Sent, item: Any, now: float) -> bool:
         """Keep a message, unless a state covers it already.
 
         Returns:
@@ -73,13 +91,14 @@ class InputBuffer:
         """
         track = self._track(topic)
         track.heard_at = now
-        if _is_covered(track, stamp):
+        _note_order(track, sent)
+        if _is_covered(track, sent.stamp):
             track.overlap = True
             return True
         if track.held >= self._limit:
             return False
         track.held += 1
-        self._kept.append(Kept(topic, stamp, item))
+        self._kept.append(Kept(topic, sent.stamp, item))
         return True
 
     def cover(self, topic: str, stamps: Iterable[int], *, single: bool) -> None:
@@ -92,7 +111,8 @@ class InputBuffer:
                 that is older than the newest covered was passed over by the source.
         """
         track = self._track(topic)
-        track.single = single
+        stamps = list(stamps)
+        track.mixed = track.mixed or not single or stamps != sorted(stamps)
         new = [stamp for stamp in stamps if stamp not in track.covered]
         if not new:
             return
@@ -119,6 +139,13 @@ class InputBuffer:
         """Whether a message was received that the state covers: from there on none is missing."""
         return self._track(topic).overlap
 
+    def misses_one(self, topic: str) -> bool:
+        """Whether a message was sent that has not come, and no state covers it."""
+        track = self._track(topic)
+        if track.after_gap is None or track.mixed:
+            return False
+        return track.newest is None or track.newest < track.after_gap
+
     def is_idle(self, topic: str, now: float, since: float, for_seconds: float) -> bool:
         """Whether nothing waits, and nothing came for so long, `since` then at the earliest."""
         track = self._track(topic)
@@ -142,7 +169,17 @@ class InputBuffer:
         return len(self._kept)
 
 
+def _note_order(track: _Track, sent: Sent) -> None:
+    last, track.last = track.last, sent
+    if last is None:
+        return
+    if sent.stamp < last.stamp:
+        track.mixed = True
+    elif last.number is not None and sent.number is not None and sent.number > last.number + 1:
+        track.after_gap = sent.stamp
+
+
 def _is_covered(track: _Track, stamp: int) -> bool:
     if stamp in track.covered:
         return True
-    return track.single and track.newest is not None and stamp <= track.newest
+    return not track.mixed and track.newest is not None and stamp <= track.newest

@@ -21,6 +21,9 @@ def _latched(depth: int) -> QoSProfile:
 STATE_CONFIG: Final = _latched(100)
 CHANNEL: Final = _latched(20)
 STATE: Final = _latched(1)
+#: Of who follows a state of several parts: newer ones of one must not hide the one that belongs to
+#: the others.
+STATE_FOLLOWED: Final = _latched(10)
 MARK: Final = _latched(100)
 
 

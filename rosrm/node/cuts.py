@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 #: Newest parts of one topic that are kept although no mark names them yet.
-_KEPT: Final = 8
+_KEPT: Final = 16
 
 
 class PartKey(NamedTuple):

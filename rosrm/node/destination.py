@@ -11,6 +11,7 @@ from typing import Any, Final
 from rosrm.node import channel as topics
 from rosrm.node.channel import Channel
 from rosrm.node.cuts import Cut, CutAssembler
+from rosrm.node.entities import waiting
 from rosrm.node.member import Member
 from rosrm.node.parts import Part, StateError
 from rosrm.version import PROTOCOL_VERSION
@@ -46,7 +47,7 @@ class Destination:
         self._activated = activated
         self._channel: Channel | None = None
         self._assembler: CutAssembler | None = None
-        self._subscriptions: list[Any] = []
+        self._followed: list[tuple[Any, Callable[[Any], None]]] = []
         self._timer: Any = None
         self._cut: Cut | None = None
         self._run = 0
@@ -94,27 +95,29 @@ class Destination:
         if self._over:
             channel.say(HandoffReport.FAILED, 0, self._fault)
             return channel
-        self._assembler = CutAssembler(part.topic for part in self._parts)
+        assembler = self._assembler = CutAssembler(part.topic for part in self._parts)
+        # Marks first, also in catching up: they say which parts are worth keeping.
+        self._follow(StateMark, self._mark_topic, self._take_mark, topics.MARK)
         for part in self._parts:
             self._follow(
-                part.message_type, part.topic, partial(self._part_came, part.topic), topics.STATE,
-                raw=True,
+                part.message_type, part.topic, partial(assembler.add_part, part.topic),
+                topics.STATE_FOLLOWED, raw=True,
             )  # fmt: skip
-        self._follow(StateMark, self._mark_topic, self._mark_came, topics.MARK)
         if not self._over:
             self._timer = member.plain.create_timer(_REVIEW, self._look)
             self._review()
         return channel
 
     def _follow(
-        self, message_type: Any, topic: str, callback: Callable[[Any], None], qos: Any, *,
+        self, message_type: Any, topic: str, take: Callable[[Any], None], qos: Any, *,
         raw: bool = False,
     ) -> None:  # fmt: skip
         if self._over:
             return
         subscribe = self._member.plain.create_subscription
         try:
-            self._subscriptions.append(subscribe(message_type, topic, callback, qos, raw=raw))
+            subscription = subscribe(message_type, topic, partial(self._came, take), qos, raw=raw)
+            self._followed.append((subscription, take))
         except Exception as error:  # noqa: BLE001 - rclpy raises what the middleware says
             # An entity of the author's may have another type on that topic.
             self._end(HandoffReport.FAILED, f"{topic} cannot be followed: {error}")
@@ -133,25 +136,30 @@ class Destination:
                 self._end(HandoffReport.FAILED, f"the source cannot go on: {report.message}")
             self._go_on()
 
-    def _part_came(self, topic: str, data: bytes) -> None:
+    def _came(self, take: Callable[[Any], None], message: Any) -> None:
         with self._member.turn:
-            if self._assembler is not None and not self._over:
-                self._heard_at = time.monotonic()
-                self._assembler.add_part(topic, data)
-                self._go_on()
-
-    def _mark_came(self, mark: StateMark) -> None:
-        with self._member.turn:
-            if self._assembler is None or self._over:
+            if self._over:
                 return
-            fault = self._fault_of(mark)
-            if fault:
-                self._end(HandoffReport.FAILED, fault)
-                return
-            self._run = mark.run
+            take(message)
+            self._catch_up()
             self._heard_at = time.monotonic()
-            self._assembler.add_mark(mark, self._heard_at)
             self._go_on()
+
+    def _catch_up(self) -> None:
+        """Take all that has come: one by one, a source of many cycles would always be ahead."""
+        for subscription, take in self._followed:
+            for message, _ in waiting(subscription):
+                if self._over:
+                    return
+                take(message)
+
+    def _take_mark(self, mark: StateMark) -> None:
+        fault = self._fault_of(mark)
+        if fault:
+            self._end(HandoffReport.FAILED, fault)
+        elif self._assembler is not None:
+            self._run = mark.run
+            self._assembler.add_mark(mark, time.monotonic())
 
     def _fault_of(self, mark: StateMark) -> str:
         """Why the source's state cannot be this node's; "": it can."""
@@ -220,7 +228,7 @@ class Destination:
         if not self._may_switch:
             return
         if self._cut is not None and self._is_last(self._cut):
-            self._activate()
+            self._activate_if_complete()
         else:
             self._channel.say(HandoffReport.SWITCHING, self._sequence())
 
@@ -248,6 +256,9 @@ class Destination:
         for covered in self._cut.mark.inputs:
             if not self._follows(covered.topic, now):
                 return f"until a message on {covered.topic} has been here and in the state"
+        lossy = self._member.input_with_gap()
+        if lossy:
+            return f"until the state covers a message on {lossy} that did not come here"
         return ""
 
     def _missing_peers(self, mark: StateMark) -> str:
@@ -292,6 +303,18 @@ class Destination:
         else:
             self._activate()
 
+    def _activate_if_complete(self) -> None:
+        self._member.catch_up()
+        lossy = self._member.input_with_gap()
+        if lossy:
+            self._end(
+                HandoffReport.FAILED,
+                f"a message on {lossy} did not come here, and the source has not processed it: "
+                f"its subscription needs a greater depth, or this host is too busy",
+            )
+        elif not self._over:
+            self._activate()
+
     def _activate(self) -> None:
         member, cut = self._member, self._cut
         if cut is None:
@@ -329,9 +352,9 @@ class Destination:
 
     def _unfollow(self) -> None:
         destroy = self._member.plain.destroy_subscription
-        for subscription in self._subscriptions:
+        for subscription, _ in self._followed:
             destroy(subscription)
-        self._subscriptions = []
+        self._followed = []
         if self._timer is not None:
             self._member.plain.destroy_timer(self._timer)
             self._timer = None

@@ -10,9 +10,12 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from rclpy.publisher import Publisher
+from rclpy.qos import HistoryPolicy, ReliabilityPolicy
 
 #: Source time stamps of the newest messages of each input that go with every mark.
 COVERED_KEPT: Final = 256
+#: Most messages of one input that are kept for a successor.
+BUFFER_LIMIT: Final = 1000
 
 
 @dataclass(slots=True)
@@ -42,6 +45,7 @@ class Input:
         callback: the author's.
         with_info: it wants the message's information too.
         buffered: in a handoff its messages are kept.
+        wants_all: every message counts, not only the newest.
         covered: source time stamps of the newest messages that were processed, ns.
         subscription: rclpy's.
     """
@@ -49,6 +53,7 @@ class Input:
     callback: Callable[..., Any]
     with_info: bool
     buffered: bool
+    wants_all: bool
     topic: str = ""
     covered: deque[int] = field(default_factory=lambda: deque(maxlen=COVERED_KEPT))
     subscription: Any = None
@@ -60,6 +65,30 @@ class Input:
         else:
             self.callback(message)
         self.covered.append(info["source_timestamp"])
+
+
+def wants_all(qos: Any) -> bool:
+    """Whether an input is to have every message, and not only the newest."""
+    if isinstance(qos, int):
+        return qos > 1
+    if qos.reliability is ReliabilityPolicy.BEST_EFFORT:
+        return False
+    return qos.history is HistoryPolicy.KEEP_ALL or qos.depth > 1
+
+
+def waiting(subscription: Any) -> Iterator[tuple[Any, Any]]:
+    """Messages that have come and that the executor has not served yet, with their information.
+
+    They are taken, as the executor would have taken them, at most as many as a buffer has room for:
+    there is an end even where they come faster than they are taken.
+    """
+    handle = subscription.handle
+    with handle:
+        for _ in range(BUFFER_LIMIT):
+            taken = handle.take_message(subscription.msg_type, subscription.raw)
+            if taken is None:
+                return
+            yield taken
 
 
 def wants_info(callback: Callable[..., Any]) -> bool:

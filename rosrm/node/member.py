@@ -13,8 +13,9 @@ from collections.abc import Callable, Iterable
 from enum import Enum
 from typing import Any, Final
 
-from rosrm.node.buffer import InputBuffer
+from rosrm.node.buffer import InputBuffer, Kept, Sent
 from rosrm.node.entities import (
+    BUFFER_LIMIT,
     Gate,
     GatedPublisher,
     Input,
@@ -22,12 +23,12 @@ from rosrm.node.entities import (
     ServiceOf,
     TimerOf,
     refuse_coroutine,
+    waiting,
+    wants_all,
     wants_info,
 )
 from rosrm.node.identity import Identity
 
-#: Most messages of one input that are kept for a successor.
-BUFFER_LIMIT: Final = 1000
 #: rclpy's own, which every node has for itself.
 _INTERNAL: Final = frozenset({"/parameter_events", "/clock", "/rosout"})
 #: Seconds after becoming active in which a message may still come that the source has processed.
@@ -117,7 +118,7 @@ class Member:
         if topic in _INTERNAL:
             return self.plain.create_subscription(message_type, topic, callback, qos, **rest)
         refuse_coroutine(callback, topic)
-        one = Input(callback, wants_info(callback), buffer)
+        one = Input(callback, wants_info(callback), buffer, wants_all(qos))
 
         def take(message: Any, info: Any) -> None:
             self._received(one, message, info)
@@ -209,9 +210,30 @@ class Member:
                     one.serve(message, info)
                     self._cycle_ended()
             elif one.buffered:
-                stamp, now = info["source_timestamp"], time.monotonic()
-                if not self.buffer.add(one.topic, stamp, (one, message, info), now):
-                    self.on_overflow(one.topic)
+                self._keep(one, message, info)
+                self._catch_up(one)
+
+    def _keep(self, one: Input, message: Any, info: Any) -> None:
+        """For who goes on: this node when it becomes active, or again."""
+        sent = Sent(info["source_timestamp"], info["publication_sequence_number"] or None)
+        if not self.buffer.add(one.topic, sent, (one, message, info), time.monotonic()):
+            self.on_overflow(one.topic)
+
+    def _catch_up(self, one: Input) -> None:
+        """Keep what has come: a reader has less room than the buffer, and drops the oldest."""
+        for message, info in waiting(one.subscription):
+            self._keep(one, message, info)
+
+    def input_with_gap(self) -> str:
+        """An input that is to have every message, and misses one for good; "": there is none."""
+        topics = (one.topic for one in self.inputs if one.buffered and one.wants_all)
+        return next((topic for topic in topics if self.buffer.misses_one(topic)), "")
+
+    def catch_up(self) -> None:
+        """Keep what has come on every input that is kept at all."""
+        for one in self.inputs:
+            if one.buffered:
+                self._catch_up(one)
 
     def _is_late(self, one: Input, info: Any) -> bool:
         """It was on its way when this node became active, and the source had processed it."""
@@ -275,7 +297,7 @@ class Member:
         announce()
         self._start_timers(timers_due)
         try:
-            while (kept := self.buffer.take()) is not None:
+            while (kept := self._next_kept()) is not None:
                 one, message, info = kept.item
                 one.serve(message, info)
                 self._cycle_ended()
@@ -283,6 +305,10 @@ class Member:
             for opening in self._openings:
                 opening.open()
             self.turn.notify_all()
+
+    def _next_kept(self) -> Kept | None:
+        self.catch_up()
+        return self.buffer.take()
 
     def _start_timers(self, due: list[float | None]) -> None:
         for index, timer in enumerate(list(self.timers)):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosrm.node.buffer import InputBuffer
+from rosrm.node.buffer import InputBuffer, Sent
 
 A, B = "/a", "/b"
 
@@ -17,7 +17,7 @@ def drained(buffer):
 def filled(*messages, limit=100):
     buffer = InputBuffer(limit, 0.0)
     for topic, stamp in messages:
-        assert buffer.add(topic, stamp, None, 0.0)
+        assert buffer.add(topic, Sent(stamp), None, 0.0)
     return buffer
 
 
@@ -38,8 +38,8 @@ def test_a_message_may_come_after_the_state_that_covers_it():
     """Marks and inputs take different ways."""
     buffer = filled()
     buffer.cover(A, [5], single=False)
-    assert buffer.add(A, 5, None, 0.0)
-    assert buffer.add(A, 6, None, 0.0)
+    assert buffer.add(A, Sent(5), None, 0.0)
+    assert buffer.add(A, Sent(6), None, 0.0)
     assert drained(buffer) == [(A, 6)]
 
 
@@ -57,13 +57,60 @@ def test_the_clocks_of_several_publishers_are_not_compared():
     assert drained(buffer) == [(A, 3)]
 
 
+def test_a_publisher_that_moves_to_a_clock_behind_is_not_taken_for_covered():
+    """Seen by its own time stamps, or by those that the source has processed."""
+    buffer = filled((A, 1000))
+    buffer.cover(A, [1000], single=True)
+    assert buffer.add(A, Sent(3), None, 0.0)
+    assert drained(buffer) == [(A, 3)]
+    buffer = filled()
+    buffer.cover(A, [1000, 3], single=True)
+    assert buffer.add(A, Sent(4), None, 0.0)
+    assert drained(buffer) == [(A, 4)]
+
+
+def test_a_publisher_that_is_alone_again_is_not_measured_by_one_that_left():
+    """Its clock may have been ahead."""
+    buffer = filled()
+    buffer.cover(A, [10, 1000], single=False)
+    buffer.cover(A, [11], single=True)
+    assert buffer.add(A, Sent(12), None, 0.0)
+    assert drained(buffer) == [(A, 12)]
+
+
+def test_a_message_that_did_not_come_is_missed_until_a_state_covers_it():
+    """Told by the numbers of its publisher."""
+    buffer = InputBuffer(10, 0.0)
+    for stamp, number in ((10, 1), (20, 2), (40, 4)):
+        assert not buffer.misses_one(A)
+        buffer.add(A, Sent(stamp, number), None, 0.0)
+    assert buffer.misses_one(A)
+    assert not buffer.misses_one(B)
+    buffer.cover(A, [10, 20, 30], single=True)
+    assert buffer.misses_one(A)  # 40 may be the second that is missing
+    buffer.cover(A, [40], single=True)
+    assert not buffer.misses_one(A)
+
+
+def test_numbers_of_several_publishers_say_nothing_of_a_loss():
+    """Nor do those of one that was started again."""
+    buffer = InputBuffer(10, 0.0)
+    buffer.cover(A, [5], single=False)
+    for stamp, number in ((10, 1), (20, 70), (30, 2)):
+        buffer.add(A, Sent(stamp, number), None, 0.0)
+    assert not buffer.misses_one(A)
+    for stamp, number in ((10, 7), (20, 8), (30, 1)):
+        buffer.add(B, Sent(stamp, number), None, 0.0)
+    assert not buffer.misses_one(B)
+
+
 def test_the_buffer_is_bounded_for_each_input():
     """One that floods does not push out another."""
     buffer = filled((A, 1), (A, 2), limit=2)
-    assert not buffer.add(A, 3, None, 0.0)
-    assert buffer.add(B, 3, None, 0.0)
+    assert not buffer.add(A, Sent(3), None, 0.0)
+    assert buffer.add(B, Sent(3), None, 0.0)
     buffer.cover(A, [1], single=True)
-    assert buffer.add(A, 3, None, 0.0)
+    assert buffer.add(A, Sent(3), None, 0.0)
     assert drained(buffer) == [(A, 2), (B, 3), (A, 3)]
 
 
@@ -76,7 +123,7 @@ def test_an_input_overlaps_once_a_message_was_here_and_in_the_state():
     assert buffer.overlaps(A)
     buffer.cover(B, [7], single=True)
     assert not buffer.overlaps(B)
-    buffer.add(B, 7, None, 0.0)
+    buffer.add(B, Sent(7), None, 0.0)
     assert buffer.overlaps(B)
 
 
@@ -86,7 +133,7 @@ def test_an_input_is_idle_when_nothing_waits_and_nothing_came_for_a_while():
     assert not buffer.is_idle(A, 100.5, 0.0, 1.0)
     assert buffer.is_idle(A, 101.0, 0.0, 1.0)
     assert not buffer.is_idle(A, 101.0, 100.5, 1.0)
-    buffer.add(A, 1, None, 101.0)
+    buffer.add(A, Sent(1), None, 101.0)
     assert not buffer.is_idle(A, 103.0, 0.0, 1.0)
     buffer.cover(A, [1], single=True)
     assert buffer.is_idle(A, 103.0, 0.0, 1.0)
@@ -107,7 +154,7 @@ def test_source_and_successor_together_process_each_message_once(data):
     buffer = InputBuffer(100, 0.0)
     for kind, value in events:
         if kind == "message":
-            assert buffer.add(A, value, None, 0.0)
+            assert buffer.add(A, Sent(value), None, 0.0)
         else:
             buffer.cover(A, range(value)[-3:], single=True)
     assert drained(buffer) == [(A, stamp) for stamp in range(stopped, total)]
