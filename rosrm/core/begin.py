@@ -37,7 +37,7 @@ def begin_move(
         return plan
     run = Run(
         process.name, plan, name, source.id, source.host, move.destination, destination, cause,
-        now, move.source_node, _destination_node(plan, move),
+        now, move.source_node, _destination_node(plan, move), state.wall,
     )  # fmt: skip
     state.runs[process.name] = run
     demand = ranking.demand

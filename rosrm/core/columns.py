@@ -41,6 +41,7 @@ class HostColumns:
         closed: (H,) cordoned or draining.
         stale: (H,) bit i: the reading of slot i, which has a limit, is stale.
         heard: (H,) time of the newest message.
+        period: (H,) seconds between its readings.
         processes, bound: (H,) held or promised; most of them.
         incarnation, sequence: (H,) of the slave's run; of its newest reading.
         reported: (H,) sequence of the newest status batch that it says it has sent.
@@ -67,6 +68,7 @@ class HostColumns:
             "closed": np.zeros(columns, np.bool_),
             "stale": np.zeros(columns, np.uint32),
             "heard": np.zeros(columns),
+            "period": np.zeros(columns),
             "processes": np.zeros(columns, np.int64),
             "bound": np.full(columns, NO_BOUND, np.int64),
             "incarnation": np.zeros(columns, np.uint64),
@@ -111,6 +113,7 @@ class HostColumns:
         self.closed: BoolArray = used["closed"]
         self.stale: npt.NDArray[np.uint32] = used["stale"]
         self.heard: FloatArray = used["heard"]
+        self.period: FloatArray = used["period"]
         self.processes: IntArray = used["processes"]
         self.bound: IntArray = used["bound"]
         self.incarnation: npt.NDArray[np.uint64] = used["incarnation"]

@@ -122,6 +122,7 @@ class HostTable(HostColumns):
         self.stale[column] = 0
         self.heard[column] = now
         self.bound[column] = description.max_processes or NO_BOUND
+        self.period[column] = description.period
         self.incarnation[column] = description.incarnation
         self.sequence[column] = self.reported[column] = self.status_sequence[column] = 0
         self._labelled.clear()
@@ -280,12 +281,12 @@ class HostTable(HostColumns):
 
     def over_limit(self, column: int) -> list[str]:
         """Names of the resources whose reading is at or over the limit of a host."""
-        over = self.usage[:, column] >= self.limit[:, column]  # NaN, no such resource: False
+        over = _over(self.usage[:, column], self.limit[:, column])
         return [self.resources[row] for row in np.flatnonzero(over)]
 
     def hosts_over_limit(self) -> IntArray:
         """Columns of the hosts that are up and at or over any limit."""
-        over = (self.usage >= self.limit).any(axis=0)
+        over = _over(self.usage, self.limit).any(axis=0)
         return np.flatnonzero(over & (self.condition == HostCondition.UP))
 
     def statuses_missing(self) -> IntArray:
@@ -310,6 +311,11 @@ class HostTable(HostColumns):
     def is_accepting(self, host: Host) -> bool:
         """Under all its limits, and it has asked."""
         return bool(self.accepting[host.column] and self.asking[host.column])
+
+
+def _over(usage: FloatArray, limit: FloatArray) -> BoolArray:
+    """True: at or over its limit. A limit of 1 is none; NaN, no such resource, is over nothing."""
+    return np.asarray((usage >= limit) & (limit < 1.0))
 
 
 def description_fault(description: HostDescription) -> str:

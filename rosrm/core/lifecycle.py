@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Final
 
 from rosrm.core import events as happened
@@ -32,6 +33,8 @@ _PHASE: Final = {
     InstanceState.BACKOFF: ProcessPhase.BACKOFF,
     InstanceState.STOPPING: ProcessPhase.STOPPING,
 }
+#: What a slave says of an instance whose restart it has begun.
+_RESTARTS: Final = frozenset({InstanceState.STOPPING, InstanceState.STARTING})
 _ALIVE: Final = frozenset({InstanceState.STARTING, InstanceState.RUNNING, InstanceState.READY})
 
 
@@ -97,6 +100,8 @@ def take_status(state: MasterState, host: Host, status: InstanceStatus, now: flo
         return
     if status.state in _ALIVE:
         instance.recalled = False
+    if status.state in _RESTARTS:
+        instance.restarting = False
     process = state.owned_by(instance)
     if process is None:
         return
@@ -200,8 +205,12 @@ def _ended(
         requeue_if_clear(state, process, now)
         return
     process.exit_code = status.exit_code or -status.exit_signal
-    if run is None:  # else the plan in hand knows what this end means
-        conclude(state, process, end, instance.host, now)
+    if run is not None:
+        return  # the plan in hand knows what this end means
+    if instance.restarting:  # its end was on its way when the restart was ordered
+        missed = replace(status, message="it ended before it was restarted")
+        end = End(missed, gone=True)
+    conclude(state, process, end, instance.host, now)
 
 
 def _end(

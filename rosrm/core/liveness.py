@@ -1,9 +1,12 @@
 """Silence: a host is first suspect (no new work), then, after its lease, lost.
 
-Ages are judged by the master's own monotonic clock alone, and never by the ROS graph.
+Ages are judged by the master's own monotonic clock alone, and never by the ROS graph. A host that
+reports seldom, by its own word, is given as much more time as it needs for a few reports.
 """
 
 from __future__ import annotations
+
+from typing import Final
 
 import numpy as np
 
@@ -13,6 +16,9 @@ from rosrm.core.commands import Order
 from rosrm.core.hosts import Host, HostCondition
 from rosrm.core.state import MasterState
 
+#: Reports that a host may owe before it is suspect, however seldom it reports.
+_REPORTS_MISSED: Final = 3
+
 
 def review_liveness(state: MasterState, now: float) -> None:
     """Move every host between up, suspect and lost by the age of its newest message."""
@@ -21,8 +27,10 @@ def review_liveness(state: MasterState, now: float) -> None:
         return
     age = now - table.heard
     condition = table.condition
-    fresh = age < state.settings.suspect
-    gone = age >= state.settings.lease
+    grace = np.maximum(0.0, _REPORTS_MISSED * table.period - state.settings.suspect)
+    fresh = age < state.settings.suspect + grace
+    lease = state.settings.lease + grace
+    gone = age >= lease
     up, suspect = condition == HostCondition.UP, condition == HostCondition.SUSPECT
     lost = condition == HostCondition.LOST
     # Of a host that left nothing more is expected, unless it still holds something; one that is
@@ -32,7 +40,7 @@ def review_liveness(state: MasterState, now: float) -> None:
     for column in np.flatnonzero(up & ~fresh & ~past_lease):
         _suspect(state, table.hosts[column], float(age[column]), now)
     for column in np.flatnonzero(past_lease):
-        _lose(state, table.hosts[column], float(age[column]), now)
+        _lose(state, table.hosts[column], float(age[column]), float(lease[column]), now)
     for column in np.flatnonzero((suspect | lost) & fresh):
         welcome_back(state, table.hosts[column], now)
 
@@ -45,11 +53,11 @@ def _suspect(state: MasterState, host: Host, age: float, now: float) -> None:
     )  # fmt: skip
 
 
-def _lose(state: MasterState, host: Host, age: float, now: float) -> None:
+def _lose(state: MasterState, host: Host, age: float, lease: float, now: float) -> None:
     state.hosts.set_condition(host, HostCondition.LOST)
     state.record(
         now, "host_lost",
-        f"{host.name} is lost: silent for {age:.1f} s, its lease is {state.settings.lease:g} s",
+        f"{host.name} is lost: silent for {age:.1f} s, its lease is {lease:g} s",
         host=host.name,
     )  # fmt: skip
     lifecycle.lost_sight(state, host, now)

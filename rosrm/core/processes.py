@@ -62,6 +62,7 @@ class Instance:
         seen: newest usage in base units.
         peak: highest usage seen.
         settled: its estimates stopped counting.
+        restarting: it was ordered to restart, and has not been seen to do so yet.
         recalled: a master ordered it to stop and was itself restarted: its end is not its own.
         order: of an unanswered stop, 0: none.
         order_at: when it was given.
@@ -80,6 +81,7 @@ class Instance:
     seen: dict[str, float] = field(default_factory=dict)
     peak: dict[str, float] = field(default_factory=dict)
     stopping: bool = False
+    restarting: bool = False
     settled: bool = False
     recalled: bool = False
     order: int = 0

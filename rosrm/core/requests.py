@@ -38,8 +38,7 @@ def submission_received(state: MasterState, event: happened.SubmissionReceived, 
     for spec in event.specs:
         process = Process(spec, state.next_order, ProcessPhase.QUEUED, now)
         state.next_order += 1
-        state.processes.pop(spec.name, None)  # listings are in order of submission
-        state.processes[spec.name] = process
+        state.add_process(process)
         state.enqueue(process, now)
         state.record(now, "submitted", f"{spec.name} was submitted", process=spec.name)
         state.save(process)
@@ -203,6 +202,7 @@ def _restart(state: MasterState, process: Process, now: float) -> None:
     elif (owner := state.instances[process.owner]).state is not None:
         # One that its slave has not taken up yet is about to start anyway: a restart that came
         # before it would keep it from ever starting.
+        owner.restarting = True
         state.emit(Order(state.order_id(), owner.host.host_id, "restart", owner.id))
     state.save(process)
 

@@ -23,7 +23,7 @@ def restore(state: MasterState, intents: Callable[[str], _Table], now: float) ->
     compared with what those hold when their slaves register. A migration under way goes on with the
     step that was in hand, which is given once more; every step can be.
 
-    `intents` gives the journal's table of a name.
+    `intents` gives the journal's table of a name; the state must know the wall clock.
     """
     by_id = sorted(intents("host").items(), key=lambda item: int(item[1]["host_id"]))
     for name, host in by_id:
@@ -52,7 +52,7 @@ def _restore_process(state: MasterState, item: Mapping[str, Any], now: float) ->
         migrations=int(item["migrations"]), exit_code=int(item["exit_code"]),
         restarts=int(item["restarts"]),
     )  # fmt: skip
-    state.processes[process.name] = process
+    state.add_process(process)
     return process
 
 
@@ -135,11 +135,13 @@ def _restore_move(
 def _run_of(state: MasterState, process: Process, move: Mapping[str, Any], now: float) -> Run:
     hosts = state.hosts.by_name
     plan = plan_from_dict(move["plan"])
+    wall = float(move.get("wall", state.wall))  # older journals say nothing of it
+    started = now - max(0.0, state.wall - wall)  # it may have been set back
     run = Run(
         process.name, plan, move["strategy"], InstanceId(process.name, int(move["source"])),
         hosts[move["source_host"]], InstanceId(process.name, int(move["destination"])),
-        hosts[move["destination_host"]], move["cause"], now, move["source_node"],
-        move["destination_node"], index=int(move["index"]), turned_at=int(move["turned_at"]),
+        hosts[move["destination_host"]], move["cause"], started, move["source_node"],
+        move["destination_node"], wall, index=int(move["index"]), turned_at=int(move["turned_at"]),
         committed=bool(move["committed"]), failure=move["failure"],
         launched=set(move["launched"]), suspended=set(move["suspended"]),
     )  # fmt: skip

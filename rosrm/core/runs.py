@@ -61,6 +61,8 @@ class Run:
     """A plan that is being carried out.
 
     Attributes:
+        started: when it began, by this master's clock; before its own start, where it was taken up.
+        wall: unix time at which it began.
         source_node, destination_node: names of their nodes, without the namespace.
         index: of the step in hand, in the plan or, going back, in `undo`.
         undo: steps still to be done on the way back; None: going forward.
@@ -90,6 +92,7 @@ class Run:
     started: float
     source_node: str
     destination_node: str
+    wall: float
     index: int = 0
     undo: Sequence[Step] | None = None
     turned_at: int = 0
@@ -166,7 +169,7 @@ def run_to_dict(run: Run, stopping: Sequence[int]) -> dict[str, Any]:
         stopping: numbers of its instances that were ordered to stop.
     """
     return {
-        "strategy": run.strategy, "cause": run.cause, "plan": run.plain_plan,
+        "strategy": run.strategy, "cause": run.cause, "wall": run.wall, "plan": run.plain_plan,
         "source": run.source.number, "source_host": run.source_host.name,
         "source_node": run.source_node, "destination": run.destination.number,
         "destination_host": run.destination_host.name, "destination_node": run.destination_node,

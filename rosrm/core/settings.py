@@ -24,6 +24,7 @@ class CoreSettings:
         max_migrations: most migrations in flight.
         automatic: the core moves processes from hosts that are over a limit.
         order_retry: seconds after which an unanswered order is given again.
+        keep_ended: most processes that are over and still known.
     """
 
     backfill: bool = False
@@ -40,3 +41,4 @@ class CoreSettings:
     max_migrations: int = 2
     automatic: bool = True
     order_retry: float = 2.0
+    keep_ended: int = 10_000

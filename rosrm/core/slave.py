@@ -332,7 +332,8 @@ def _registered(state: SlaveState, event: Registered, now: float) -> _Commands:
         state.tombstones.clear()
     for held in state.held.values():
         held.ended_at = max(held.ended_at, now)  # told with the registration, not before
-    return []
+    # What has changed since the registration was sent went nowhere.
+    return [Report(state.statuses(), complete=True)] if state.held else []
 
 
 def _master_lost(state: SlaveState, event: MasterLost, now: float) -> _Commands:

@@ -31,7 +31,11 @@ __all__ = ["Instance", "MasterState", "Process", "ProcessPhase", "Run", "Wanted"
 
 
 class MasterState:
-    """The state of the master's core, with the few moves that every handler shares."""
+    """The state of the master's core, with the few moves that every handler shares.
+
+    Attributes:
+        over: names of the processes that are over, in the order in which they ended.
+    """
 
     def __init__(
         self,
@@ -52,6 +56,7 @@ class MasterState:
         self.hosts = HostTable()
         self.queue = Queue()
         self.processes: dict[str, Process] = {}
+        self.over: dict[str, None] = {}
         self.instances: dict[int, Instance] = {}
         self.runs: dict[str, Run] = {}
         self.runs_by_order: dict[int, str] = {}
@@ -158,6 +163,32 @@ class MasterState:
             process.since = now
         process.phase = phase
         process.reason = reason
+        self._note_whether_over(process)
+
+    def add_process(self, process: Process) -> None:
+        """One more is known; of a name that was known, this one is from now on."""
+        self.processes.pop(process.name, None)  # listings are in order of submission
+        self.processes[process.name] = process
+        self._note_whether_over(process)
+
+    def _note_whether_over(self, process: Process) -> None:
+        """Keep `over` in the order in which they ended."""
+        if not process.phase.over:
+            self.over.pop(process.name, None)
+        else:
+            self.over.setdefault(process.name)
+
+    def forget_oldest(self) -> None:
+        """Of what is over keep the youngest `keep_ended`, and what is not quite gone."""
+        excess = len(self.over) - self.settings.keep_ended
+        if excess <= 0:
+            return
+        gone = [name for name in self.over if not self.processes[name].instances]
+        for name in gone[:excess]:
+            del self.over[name]
+            del self.processes[name]
+            self._unsaved.pop(name, None)
+            self.emit(Intent("process", name, None))
 
     def enqueue(self, process: Process, now: float, reason: str = "") -> None:
         """Queue a process at its place in the line."""

@@ -31,6 +31,7 @@ def time_passed(state: MasterState, event: happened.TimePassed, now: float) -> N
     _ask_for_missing_statuses(state, now)
     relieve_hosts(state, now)
     reconsider_set_aside(state, now)
+    state.forget_oldest()
 
 
 def _review_instance(state: MasterState, instance: Instance, now: float) -> None:

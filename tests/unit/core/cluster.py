@@ -183,7 +183,16 @@ class Cluster:
             self.add(machine)
 
     def _new_state(self, epoch: int) -> MasterState:
-        return MasterState(self.settings, "eq1", self.policy, self.strategies, epoch, self.fallback)
+        state = MasterState(
+            self.settings, "eq1", self.policy, self.strategies, epoch, self.fallback
+        )
+        state.wall = self.wall
+        return state
+
+    @property
+    def wall(self) -> float:
+        """Unix time."""
+        return 1.7e9 + self.now
 
     def __getitem__(self, name: str) -> Process:
         return self.state.processes[name]
@@ -192,6 +201,7 @@ class Cluster:
 
     def decide(self, event: happened.Event) -> list[Command]:
         """The core takes an event in; nothing of the outcome is carried out."""
+        self.state.wall = self.wall
         return step(self.state, event, self.now)
 
     def tell(self, event: happened.Event) -> list[Command]:

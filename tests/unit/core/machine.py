@@ -67,6 +67,7 @@ class Machine:
     cpu: float = 8.0
     limits: Mapping[str, float] = field(default_factory=lambda: {"memory": 0.8, "cpu": 0.9})
     labels: Mapping[str, str] = field(default_factory=lambda: EMPTY)
+    period: float = 0.1
     max_processes: int = 0
     resources: tuple[ResourceDescription, ...] = ()
     executors: dict[str, Callable[[Mapping[str, Any]], Any]] = field(default_factory=dict)
@@ -107,7 +108,7 @@ class Machine:
         return HostDescription(
             self.name, self.incarnation, hostname=f"{self.name}.local", pid=7, labels=self.labels,
             resources=self.resources, max_processes=self.max_processes,
-            executors=tuple(self.executors),
+            executors=tuple(self.executors), period=self.period,
         )  # fmt: skip
 
     def begin_to_register(self) -> None:

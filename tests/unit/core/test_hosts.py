@@ -236,6 +236,22 @@ def test_a_silent_host_is_suspect_and_gets_no_work() -> None:
     assert cluster.where("q") == ["a"]
 
 
+def test_a_host_that_reports_slowly_by_its_own_word_is_not_silent() -> None:
+    """It has three of its own periods before it is suspect, and its lease is as much longer."""
+    cluster = Cluster(Machine("slow", period=4.0), "quick", suspect=1.0, lease=10.0)
+    for name in cluster.machines:
+        cluster.machines[name].connected = False
+    cluster.wait(11.9)
+    assert [told.split()[0] for told in cluster.told("host_suspect")] == ["quick"]
+    assert [told.split()[0] for told in cluster.told("host_lost")] == ["quick"]
+    cluster.wait(0.3)
+    assert cluster.told("host_suspect")[-1].startswith("slow has been silent for 12.")
+    cluster.wait(8.6)
+    assert len(cluster.told("host_lost")) == 1
+    cluster.wait(0.4)
+    assert cluster.told("host_lost")[-1].startswith("slow is lost: silent for 21.")
+
+
 def test_a_host_that_is_silent_past_its_lease_is_lost() -> None:
     """Its processes are out of reach, not gone, and nothing is started in their place."""
     cluster = Cluster("a", "b", lease=10.0)

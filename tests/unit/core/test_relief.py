@@ -79,6 +79,20 @@ def test_nothing_moves_when_every_host_is_at_its_limits() -> None:
     assert cluster.told("nothing_moves")[0] == "nothing can leave a: no host has room for p"
 
 
+def test_a_full_resource_without_a_limit_is_no_reason_to_move() -> None:
+    """A reading of exactly 1 is not over a limit that was never set."""
+    cluster = cluster_of(Machine("a", limits={"memory": 0.8}))
+    cluster.machines["a"].shown["p"] = {"cpu": 0.8}
+    cluster.submit(movable("p"))
+    cluster.wait(1.5)
+    cluster.add(machine("b"))
+    cluster.machines["a"].busy["cpu"] = 0.9
+    assert cluster.machines["a"].usage()["cpu"] == 1.0
+    cluster.wait(5.0)
+    assert cluster.told("over_limit") == []
+    assert cluster.where("p") == ["a"]
+
+
 def test_a_host_that_is_over_for_a_moment_only_is_left_alone() -> None:
     """Hysteresis: less than that long, nothing moves."""
     cluster = cluster_of(machine("a"), hysteresis=2.0)

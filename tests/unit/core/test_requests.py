@@ -5,8 +5,15 @@ from __future__ import annotations
 import pytest
 
 from rosrm.core import events as happened
+from rosrm.core import slave
 from rosrm.core.migration import Move, Plan
-from rosrm.core.model import MigrationPolicy, ProcessSpec
+from rosrm.core.model import (
+    InstanceId,
+    InstanceState,
+    InstanceStatus,
+    MigrationPolicy,
+    ProcessSpec,
+)
 from tests.unit.core.cluster import Cluster, Machine, job, movable, node, process
 
 # --- submit -----------------------------------------------------------------------------------
@@ -220,6 +227,74 @@ def test_restart_of_one_that_is_on_its_way_does_not_keep_it_from_starting() -> N
     cluster.carry_out(cluster.decide(happened.SubmissionReceived(1, (process("p"),))))
     assert cluster.restart("p").accepted
     assert cluster.phase("p") == "running"
+
+
+@pytest.mark.parametrize("code", [0, 3])
+def test_restart_of_one_whose_end_is_on_its_way_is_not_lost(code: int) -> None:
+    """The slave told of the end before it heard of the restart: the process is queued again."""
+    cluster = Cluster("a")
+    cluster.submit(job("p"))
+    cluster.machines["a"].finish("p", cluster.now, code=code)
+    assert cluster.restart("p").accepted
+    assert (cluster.phase("p"), cluster["p"].owner) == ("running", 2)
+    assert cluster.told("queued") == ["p returns to the queue: it ended before it was restarted"]
+
+
+def test_an_end_after_a_restart_is_an_end() -> None:
+    """The restart was carried out: what comes of it counts."""
+    cluster = Cluster("a")
+    cluster.submit(job("p"))
+    cluster.restart("p")
+    cluster.machines["a"].finish("p", cluster.now)
+    cluster.settle()
+    assert (cluster.phase("p"), len(cluster.assigned())) == ("finished", 1)
+
+
+def test_the_oldest_of_what_is_over_is_forgotten() -> None:
+    """`keep_ended` of them are kept, in memory and in the journal; what goes on always is."""
+    cluster = Cluster("a", keep_ended=2)
+    cluster.submit(job("first"), process("lives"), job("second"), job("third"), job("fourth"))
+    for name in ("second", "first", "fourth", "third"):
+        cluster.machines["a"].finish(name, cluster.now)
+    cluster.wait(0.5)
+    assert list(cluster.state.processes) == ["lives", "third", "fourth"]
+    assert set(cluster.intents["process"]) == {"lives", "third", "fourth"}
+    cluster.restart_master()
+    assert list(cluster.state.processes) == ["lives", "third", "fourth"]
+
+
+def test_what_is_over_is_kept_while_something_of_it_is_being_stopped() -> None:
+    """Its name must not be given to another one meanwhile."""
+    cluster = Cluster("a", keep_ended=1)
+    cluster.submit(process("p"), job("q"))
+    cluster.cancel("p")
+    assert cluster.phase("p") == "cancelled"
+    # A late word of the slave: something of it runs on.
+    machine = cluster.machines["a"]
+    late = InstanceStatus(InstanceId("p", 77), InstanceState.RUNNING, pid=5)
+    machine.stubborn.add("p")
+    machine.tell(slave.SupervisorReported((late,)), cluster.now)
+    cluster.settle()
+    machine.finish("q", cluster.now)
+    cluster.wait(0.5)
+    assert list(cluster.state.processes) == ["p"]
+    assert not cluster.submit(process("p")).accepted
+
+
+def test_one_that_runs_again_is_not_among_those_that_are_over() -> None:
+    """Restarted or submitted anew, it is the youngest when it ends again."""
+    cluster = Cluster("a", keep_ended=1)
+    cluster.submit(job("p"))
+    cluster.machines["a"].finish("p", cluster.now)
+    cluster.settle()
+    cluster.restart("p")
+    cluster.submit(job("q"))
+    cluster.machines["a"].finish("q", cluster.now)
+    cluster.wait(0.5)
+    assert set(cluster.state.processes) == {"q", "p"}
+    cluster.machines["a"].finish("p", cluster.now)
+    cluster.wait(0.5)
+    assert list(cluster.state.processes) == ["p"]
 
 
 def test_restart_is_refused_where_it_makes_no_sense() -> None:

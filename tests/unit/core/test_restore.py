@@ -155,6 +155,22 @@ def test_a_move_that_was_under_way_goes_on(overlap: bool, first: str, ready: boo
     assert not cluster.intents["migration"]
 
 
+def test_how_long_a_move_took_counts_from_its_beginning() -> None:
+    """Also when the master was killed on the way, and was away for a while."""
+    cluster = Cluster("a", Machine("b", busy={"memory": 0.5}))
+    cluster.submit(movable("p", ros=True))
+    cluster.machines["a"].seen_in_graph("p", cluster.now)
+    cluster.settle()
+    cluster.migrate("p")
+    cluster.wait(2.0)
+    cluster.now += 3.0
+    cluster.restart_master()
+    cluster.machines["b"].seen_in_graph("p", cluster.now)
+    cluster.wait(0.5)
+    (moved,) = [record for record in cluster.records if record.kind == "migrated"]
+    assert moved.facts["seconds"] == pytest.approx(5.0, abs=0.3)
+
+
 def test_a_source_that_was_told_to_stop_has_not_finished() -> None:
     """The master died after the order: that the source exits with 0 is not its own end."""
     cluster = Cluster("a", Machine("b", busy={"memory": 0.5}))

@@ -75,6 +75,16 @@ def test_an_assignment_is_launched_once(one) -> None:
     assert one.step(assigned()) == []
 
 
+def test_what_changed_while_the_registration_was_on_its_way_is_told(one) -> None:
+    """It stood otherwise in the request, and no batch was published without a link."""
+    one.step(assigned())
+    one.step(told(STATE.RUNNING, pid=5))
+    one.step(slave.MasterLost())
+    one.step(told(STATE.FAILED, exit_signal=9))
+    (report,) = one.step(slave.Registered(1))
+    assert (states([report]), report.complete) == ([STATE.FAILED], True)
+
+
 def test_an_older_epoch_starts_nothing(one) -> None:
     """A master that was replaced gives no orders; the refusal says which epochs."""
     one.step(slave.Registered(3))
