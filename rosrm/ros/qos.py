@@ -32,6 +32,17 @@ BEAT: Final = QoSProfile(
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )  # fmt: skip
 
+#: For those that need no word of a beat that was lost: the next one comes soon. A thousand reliable
+#: readers would each acknowledge each beat.
+BEAT_IN: Final = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.BEST_EFFORT
+)
+
+#: Whoever looks at how the master keeps up.
+LOAD: Final = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST, depth=5, reliability=ReliabilityPolicy.RELIABLE
+)
+
 #: The newest words of the master about every handoff: who comes late hears them at once.
 STATE_CONFIG: Final = QoSProfile(
     history=HistoryPolicy.KEEP_LAST, depth=100, reliability=ReliabilityPolicy.RELIABLE,

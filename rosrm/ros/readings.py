@@ -7,7 +7,7 @@ of this module compares every field with rclpy's own serialisation.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -32,6 +32,28 @@ LAYOUT: Final = np.dtype(
 )  # fmt: skip
 
 ACCEPTING: Final = 1
+#: Bits 8 to 15 of the flags: cycles since the message before that brought nothing new.
+_QUIET_SHIFT: Final = 8
+MOST_QUIET: Final = 255
+
+
+@dataclass(frozen=True, slots=True)
+class Runs:
+    """What a batch says of each run of a slave, in parallel arrays (R,).
+
+    Attributes:
+        host_id, incarnation: which run.
+        first: sequence of the earliest cycle that is told.
+        sequence, beat: of its newest message; the beat in ns.
+        cycles: of the slave, that its messages in this batch account for.
+    """
+
+    host_id: npt.NDArray[np.int64]
+    incarnation: npt.NDArray[np.uint64]
+    first: npt.NDArray[np.int64]
+    sequence: npt.NDArray[np.int64]
+    beat: npt.NDArray[np.uint64]
+    cycles: npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,15 +62,25 @@ class Decoded:
 
     Attributes:
         readings: the newest of each run of a host; None: there is none.
-        beats: (host id, incarnation) to the newest beat of that run of a slave, ns.
+        runs: beside the readings, row by row.
         strangers: one line for each kind of message that was refused.
         received: messages of our version.
     """
 
     readings: ReadingsReceived | None = None
-    beats: dict[tuple[int, int], int] = field(default_factory=dict)
+    runs: Runs | None = None
     strangers: tuple[str, ...] = ()
     received: int = 0
+
+
+def flags(*, accepting: bool, quiet: int) -> int:
+    """The flags of a message.
+
+    Args:
+        accepting: the slave is under all its limits and takes work.
+        quiet: cycles since the message before that brought nothing new, at most `MOST_QUIET`.
+    """
+    return (ACCEPTING if accepting else 0) | quiet << _QUIET_SHIFT
 
 
 def encode(row: npt.NDArray[np.void]) -> bytes:
@@ -72,36 +104,45 @@ def decode(messages: Sequence[bytes]) -> Decoded:
         return Decoded(strangers=tuple(strangers))
     rows = np.frombuffer(b"".join(fit), LAYOUT)
     ours = rows["protocol_version"] == PROTOCOL_VERSION
-    strangers += [
-        f"a resource_info of protocol version {version}; this side speaks {PROTOCOL_VERSION}"
-        for version in np.unique(rows["protocol_version"][~ours])
-    ]
-    rows = _newest_of_each_run(rows[ours])
-    if not len(rows):
-        return Decoded(strangers=tuple(strangers))
-    return Decoded(
-        _event(rows),
-        dict(
-            zip(
-                zip(rows["host_id"].tolist(), rows["incarnation"].tolist(), strict=True),
-                rows["beat"].tolist(),
-                strict=True,
-            )
-        ),
-        tuple(strangers),
-        int(ours.sum()),
+    if not ours.all():
+        strangers += [
+            f"a resource_info of protocol version {version}; this side speaks {PROTOCOL_VERSION}"
+            for version in np.unique(rows["protocol_version"][~ours])
+        ]
+        rows = rows[ours]
+        if not len(rows):
+            return Decoded(strangers=tuple(strangers))
+    order, begins = _by_run(rows)
+    newest = rows[order[np.append(begins[1:], len(rows)) - 1]]
+    return Decoded(_event(newest), _runs(rows[order], begins, newest), tuple(strangers), len(rows))
+
+
+def _by_run(rows: npt.NDArray[np.void]) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+    """A former run that still speaks must not hide the readings of the present one.
+
+    Returns:
+        The order of the rows by run of a slave, the oldest of each first, and where runs begin.
+    """
+    run = rows["host_id"].astype(np.uint64) << np.uint64(32)
+    run |= rows["incarnation"] & np.uint64(0xFFFFFFFF)
+    order = np.argsort(run, kind="stable")
+    another = np.diff(run[order]) != 0
+    return order, np.append(0, np.flatnonzero(another) + 1)
+
+
+def _runs(
+    rows: npt.NDArray[np.void], begins: npt.NDArray[np.intp], newest: npt.NDArray[np.void]
+) -> Runs:
+    sequence = rows["sequence"].astype(np.int64)
+    spans = (rows["flags"] >> _QUIET_SHIFT).astype(np.int64) + 1
+    return Runs(
+        host_id=newest["host_id"].astype(np.int64),
+        incarnation=newest["incarnation"].copy(),
+        first=sequence[begins] - spans[begins] + 1,
+        sequence=newest["sequence"].astype(np.int64),
+        beat=newest["beat"].copy(),
+        cycles=np.add.reduceat(spans, begins),
     )
-
-
-def _newest_of_each_run(rows: npt.NDArray[np.void]) -> npt.NDArray[np.void]:
-    """A former run that still speaks must not hide the readings of the present one."""
-    if len(rows) < 2:
-        return rows
-    newest_first = rows[::-1]
-    run = newest_first["host_id"].astype(np.uint64) << np.uint64(32)
-    run |= newest_first["incarnation"] & np.uint64(0xFFFFFFFF)
-    _, index = np.unique(run, return_index=True)
-    return newest_first[index]
 
 
 def _event(rows: npt.NDArray[np.void]) -> ReadingsReceived:

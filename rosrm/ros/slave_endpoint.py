@@ -26,7 +26,7 @@ from rosrm.ros.control import (
     version_refusal,
 )
 from rosrm.ros.participant import OpenRequest, Participant
-from rosrm.ros.readings import ACCEPTING, LAYOUT, encode
+from rosrm.ros.reporting import Reporter
 from rosrm.version import PROTOCOL_VERSION, __version__
 from rosrm_msgs import msg, srv
 
@@ -135,11 +135,7 @@ class SlaveEndpoint:
         self._told = ""
         self._poll_open = False
         self._poll_anew = _FIRST_POLL_ANEW
-        self._sequence = 0
         self._status_sequence = 0
-        self._row = np.zeros((), LAYOUT)
-        self._row["protocol_version"] = PROTOCOL_VERSION
-        self._row["incarnation"] = description.incarnation
         self._control = ControlClient(participant, f"slave {description.name}")
         self._names = names.Names(participant.settings.namespace)
         self._join(max_age)
@@ -155,9 +151,11 @@ class SlaveEndpoint:
                 (srv.Leave, names.LEAVE),
             )
         }
-        self._readings = node.create_publisher(
+        readings = node.create_publisher(
             msg.ResourceInfo, path(names.RESOURCE_INFO), qos.READING_OUT
         )
+        description = self._description
+        self._reporter = Reporter(readings.publish, description.incarnation, description.period)
         self._statuses = node.create_publisher(
             msg.ProcessStatusBatch, path(names.PROCESS_STATUS), qos.STATUSES
         )
@@ -166,7 +164,7 @@ class SlaveEndpoint:
         )
         node.create_subscription(
             msg.MasterBeat, path(names.MASTER_BEAT),
-            self._participant.counted(self._take_beat), qos.BEAT,
+            self._participant.counted(self._take_beat), qos.BEAT_IN,
         )  # fmt: skip
         host = self._description.name
         server = ControlServer(
@@ -247,7 +245,7 @@ class SlaveEndpoint:
         self._beat_period = response.beat_period
         self._beat_at = now
         self._poll_anew = _FIRST_POLL_ANEW
-        self._row["host_id"] = self.host_id
+        self._reporter.begin(self.host_id, self._beat_period)
         self.link = Link.REGISTERED
         self._host.take(core.Registered(answer.epoch, renumbers))
         greeting = self._greeting
@@ -297,7 +295,7 @@ class SlaveEndpoint:
 
     def _note_beat(self, beat: int, now: float) -> None:
         self._master_beat, self._beat_at = beat, now
-        self._row["master_beat"] = beat
+        self._reporter.note_master(beat)
 
     # --- asking for work -----------------------------------------------------------------
 
@@ -393,19 +391,13 @@ class SlaveEndpoint:
         self, usage: npt.NDArray[np.float32], limit: npt.NDArray[np.float32], present: int,
         stale: int, *, accepting: bool, processes: int,
     ) -> None:  # fmt: skip
-        """Say the utilisation and limits of this host; (slots,) fractions."""
-        if self.link is not Link.REGISTERED:
-            return
-        self._sequence += 1
-        row = self._row
-        row["flags"] = ACCEPTING if accepting else 0
-        row["sequence"] = self._sequence
-        row["beat"] = time.monotonic_ns()
-        row["status_sequence"] = self._status_sequence
-        row["processes"] = processes
-        row["present"], row["stale"] = present, stale
-        row["usage"], row["limit"] = usage, limit
-        self._readings.publish(encode(row))
+        """Say the utilisation and limits of this host, (slots,) fractions, once in every cycle.
+
+        What brings nothing new goes out with a later cycle (`rosrm.ros.reporting`).
+        """
+        if self.link is Link.REGISTERED:
+            facts = (accepting, processes, present, stale, self._status_sequence)
+            self._reporter.cycle(usage, limit, facts)
 
     def publish_statuses(self, statuses: Sequence[InstanceStatus], *, complete: bool) -> None:
         """Say what became of instances."""
@@ -423,8 +415,12 @@ class SlaveEndpoint:
     def publish_usage(
         self, numbers: Sequence[int], cpu: Sequence[float], memory: Sequence[int]
     ) -> None:
-        """Say what each instance uses: cores and bytes, in parallel."""
+        """Say what each instance uses: cores and bytes, in parallel.
+
+        The newest reading goes first: a need that is met must show in the readings.
+        """
         if self.link is Link.REGISTERED:
+            self._reporter.tell()
             self._usages.publish(
                 msg.ProcessUsage(
                     protocol_version=PROTOCOL_VERSION, host_id=self.host_id,

@@ -7,7 +7,7 @@ import pytest
 from rclpy.serialization import deserialize_message, serialize_message
 
 from rosrm.core.model import RESOURCE_SLOTS
-from rosrm.ros.readings import ACCEPTING, LAYOUT, decode, encode
+from rosrm.ros.readings import ACCEPTING, LAYOUT, MOST_QUIET, decode, encode, flags
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs import msg
 
@@ -29,6 +29,13 @@ def row(**changes) -> np.ndarray:
     for name, value in {**NUMBERS, "usage": USAGE, "limit": LIMIT, **changes}.items():
         record[name] = value
     return record
+
+
+def beats(decoded) -> dict:
+    """(host id, incarnation) to the newest beat of that run."""
+    runs = decoded.runs
+    hosts = zip(runs.host_id.tolist(), runs.incarnation.tolist(), strict=True)
+    return dict(zip(hosts, runs.beat.tolist(), strict=True))
 
 
 def test_encoding_is_what_rclpy_writes() -> None:
@@ -69,7 +76,7 @@ def test_decoding_what_rclpy_writes() -> None:
     assert readings.stale.tolist() == [0b101]
     np.testing.assert_array_equal(readings.usage[0], USAGE)
     np.testing.assert_array_equal(readings.limit[0], LIMIT)
-    assert decoded.beats == {(5, 9): 2**63 + 5}
+    assert beats(decoded) == {(5, 9): 2**63 + 5}
 
 
 def test_newest_of_each_host_counts() -> None:
@@ -88,6 +95,25 @@ def test_newest_of_each_host_counts() -> None:
     assert decoded.received == 6
 
 
+def test_quiet_cycles_are_told_by_the_next_message() -> None:
+    """A message stands for its own cycle and the quiet ones before it, the most that fit too."""
+    batch = [
+        serialize_message(info(host_id=host, sequence=sequence, flags=flags(**said)))
+        for host, sequence, said in (
+            (1, 3, {"accepting": True, "quiet": 2}),
+            (2, 9, {"accepting": False, "quiet": MOST_QUIET}),
+            (1, 4, {"accepting": False, "quiet": 0}),
+        )
+    ]
+
+    decoded = decode(batch)
+
+    assert decoded.runs.host_id.tolist() == [1, 2]
+    assert decoded.runs.sequence.tolist() == [4, 9]
+    assert decoded.runs.cycles.tolist() == [4, 1 + MOST_QUIET]
+    assert decoded.readings.accepting.tolist() == [False, False]
+
+
 def test_a_former_run_hides_no_reading() -> None:
     """What a former run of a slave still sends replaces neither reading nor beat of the new one."""
     now = serialize_message(info(host_id=1, incarnation=20, sequence=1, beat=100))
@@ -96,7 +122,7 @@ def test_a_former_run_hides_no_reading() -> None:
     decoded = decode([now, late])
 
     assert sorted(decoded.readings.incarnation.tolist()) == [10, 20]
-    assert decoded.beats == {(1, 20): 100, (1, 10): 5}
+    assert beats(decoded) == {(1, 20): 100, (1, 10): 5}
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,325 @@
+"""Many slaves in one process: what they say is said by a real slave's own code.
+
+Each simulated slave is a real `SlaveEndpoint` (handshake, registration, readings, requests for
+work, statuses) over a real slave's core. Simulated is what it stands on: its readings come from a
+random walk instead of probes, and what it is given to run is said to run, and to end, without a
+process.
+
+All slaves of a process share one DDS participant, one node, the clients by which they shake hands,
+register and leave, and the reader of `master_beat`. Each has its own publishers, its own services
+and its own client of `request_process`: each answer reaches all readers, as it does in a fleet.
+
+Spoken to by lines: it prints one JSON object when all are registered and accepted; a line on its
+standard input begins and the next one ends what is counted; the last line says what was sent.
+"""
+
+from __future__ import annotations
+
+import argparse
+import heapq
+import json
+import os
+import resource
+import select
+import socket
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from rosrm.core import slave as core
+from rosrm.core.model import (
+    RESOURCE_SLOTS,
+    HostDescription,
+    InstanceId,
+    InstanceState,
+    InstanceStatus,
+    ResourceDescription,
+    RestartPolicy,
+)
+from rosrm.errors import Refused
+from rosrm.ros.participant import OpenRequest, Participant
+from rosrm.ros.settings import RosSettings
+from rosrm.ros.slave_endpoint import Link, LogSlice, SlaveEndpoint
+from rosrm_msgs import srv
+
+#: Most seconds between two looks at standard input.
+_LOOK = 0.05
+#: Slaves that shake hands at a time: each answer reaches all readers of this process.
+_AT_ONCE = 20
+_LIMIT = 0.8
+_RESOURCES = (("memory", "B", 2.0**34), ("cpu", "core", 16.0), ("disk", "B", 2.0**40))
+_PRESENT = (1 << len(_RESOURCES)) - 1
+
+
+class Berth:
+    """One slave's place in the participant that it shares with others.
+
+    Stands in for a `Participant` and for its node towards one `SlaveEndpoint`.
+    """
+
+    def __init__(self, shared: SharedParticipant) -> None:
+        self._shared = shared
+        self.node = self
+        self.settings = shared.participant.settings
+
+    def create_client(self, kind: Any, name: str, *, qos_profile: Any) -> Any:
+        """A client; of its own only where answers come to many."""
+        return self._shared.client(kind, name, qos_profile)
+
+    def create_publisher(self, kind: Any, name: str, qos: Any) -> Any:
+        """A publisher of its own."""
+        return self._shared.participant.node.create_publisher(kind, name, qos)
+
+    def create_subscription(
+        self, kind: Any, name: str, take: Callable[[Any], None], qos: Any
+    ) -> None:
+        """A place among those that hear a topic."""
+        self._shared.hear(kind, name, take, qos)
+
+    def counted(self, callback: Callable[..., None]) -> Callable[..., None]:
+        """As the participant's."""
+        return self._shared.participant.counted(callback)
+
+    def serve(self, kind: Any, name: str, handle: Callable[[Any, OpenRequest], None]) -> None:
+        """A service of its own."""
+        self._shared.participant.serve(kind, name, handle)
+
+
+class SharedParticipant:
+    """One participant for many slaves."""
+
+    def __init__(self, settings: RosSettings, name: str) -> None:
+        self.participant = Participant(settings, name, pace="steady")
+        self._clients: dict[Any, Any] = {}
+        self._hearers: dict[Any, list[Callable[[Any], None]]] = {}
+
+    def client(self, kind: Any, name: str, qos_profile: Any) -> Any:
+        """The shared client of a service, or a new one for `request_process`."""
+        if kind in self._clients:
+            return self._clients[kind]
+        made = self.participant.node.create_client(kind, name, qos_profile=qos_profile)
+        if kind is not srv.RequestProcess:
+            self._clients[kind] = made
+        return made
+
+    def hear(self, kind: Any, name: str, take: Callable[[Any], None], qos: Any) -> None:
+        """Pass each message of a topic to `take`, by one subscription for all."""
+        if kind in self._hearers:
+            self._hearers[kind].append(take)
+            return
+        hearers = self._hearers[kind] = [take]
+
+        def pass_on(message: Any) -> None:
+            for hearer in hearers:
+                hearer(message)
+
+        self.participant.node.create_subscription(kind, name, pass_on, qos)
+
+
+@dataclass
+class Tally:
+    """What the slaves of a process did.
+
+    Attributes:
+        cycles: readings sent.
+        late: of those, sent more than a period after they were due.
+        taken: unix times at which assignments came.
+    """
+
+    cycles: int = 0
+    late: int = 0
+    taken: dict[str, float] = field(default_factory=dict)
+
+
+class SimulatedSlave:
+    """A slave whose readings and processes are made up."""
+
+    def __init__(self, berth: Berth, name: str, period: float, seed: int, tally: Tally) -> None:
+        self.name = name
+        self._tally = tally
+        self._state = core.SlaveState()
+        self._events: list[core.Event] = []
+        self._random = np.random.default_rng(seed)
+        self._usage = np.zeros(RESOURCE_SLOTS, np.float32)
+        self._usage[: len(_RESOURCES)] = self._random.uniform(0.1, 0.5, len(_RESOURCES))
+        self._limit = np.ones(RESOURCE_SLOTS, np.float32)
+        self._limit[: len(_RESOURCES)] = _LIMIT
+        resources = tuple(ResourceDescription(*one) for one in _RESOURCES)
+        description = HostDescription(
+            name, int.from_bytes(os.urandom(7), "big") | 1, hostname=socket.gethostname(),
+            pid=os.getpid(), resources=resources, period=period,
+        )  # fmt: skip
+        self.endpoint = SlaveEndpoint(berth, self, description, max_age=5.0)  # type: ignore[arg-type]
+
+    @property
+    def registered(self) -> bool:
+        """Whether the master has taken it in."""
+        return self.endpoint.link is Link.REGISTERED
+
+    def cycle(self, now: float) -> None:
+        """What a slave does at the rate of `resource_info`."""
+        self.endpoint.go_on(now)
+        used = self._usage[: len(_RESOURCES)]
+        np.clip(used + self._random.normal(0.0, 0.005, len(used)), 0.05, 0.7, out=used)
+        accepting = core.under_limits(self._usage, self._limit, _PRESENT, 0)
+        self.endpoint.publish_reading(
+            self._usage, self._limit, _PRESENT, 0, accepting=accepting, processes=self._state.live()
+        )
+        self._events.append(core.TimePassed())
+        self.work(now)
+
+    def work(self, now: float) -> None:
+        """Let the core decide about what happened, and say that what it launches runs and ends."""
+        while self._events:
+            events, self._events = self._events, []
+            for command in core.step_all(self._state, events, now):
+                if isinstance(command, core.Report):
+                    self.endpoint.publish_statuses(command.statuses, complete=command.complete)
+                elif isinstance(command, core.Launch):
+                    self._run([one.instance for one in command.assignments])
+        self.endpoint.ask(now)
+
+    def _run(self, instances: Sequence[InstanceId]) -> None:
+        for instance in instances:
+            self._tally.taken[instance.process] = time.time()
+            for state in (InstanceState.RUNNING, InstanceState.EXITED):
+                status = InstanceStatus(instance, state, pid=os.getpid())
+                self._events.append(core.SupervisorReported((status,)))
+
+    # --- what the endpoint asks ----------------------------------------------------------
+
+    def take(self, event: core.Event) -> None:
+        """Something happened; work is begun at once, as a slave's loop does."""
+        self._events.append(event)
+        if isinstance(event, core.AssignmentsReceived):
+            self.work(time.monotonic())
+
+    def statuses(self) -> Sequence[InstanceStatus]:
+        """All that this slave holds."""
+        return self._state.statuses()
+
+    def read_log(self, process: str, number: int, offset: int, max_bytes: int) -> LogSlice:
+        """No process, no log."""
+        raise Refused(f"{self.name} is simulated: it has no logs", "unknown")
+
+    def set_restart(
+        self, instance: InstanceId, restart: RestartPolicy, settled: Callable[[str], None]
+    ) -> None:
+        """No process, no policy."""
+        settled(f"{self.name} is simulated: {instance} does not run")
+
+    def execute(
+        self, executor: str, arguments: dict[str, Any], done: Callable[[bool, str, str], None]
+    ) -> None:
+        """No executors."""
+        raise Refused(f"{self.name} is simulated: it has no executor {executor!r}", "unknown")
+
+    def say(self, message: str) -> None:
+        """Nobody listens to one of a thousand."""
+
+
+class Fleet:
+    """The slaves of this process, each in its own time."""
+
+    def __init__(self, settings: RosSettings, first: int, count: int, period: float) -> None:
+        self.tally = Tally()
+        self._period = period
+        self._shared = SharedParticipant(settings, f"rosrm_simulated_{first}")
+        self.slaves = [
+            SimulatedSlave(Berth(self._shared), f"sim{number:05d}", period, number, self.tally)
+            for number in range(first, first + count)
+        ]
+        self._due: list[tuple[float, int]] = []
+
+    def bring_up(self, timeout: float) -> None:
+        """Register all, a few at a time.
+
+        Raises:
+            TimeoutError: not all were taken in in time.
+        """
+        deadline = time.monotonic() + timeout
+        coming = list(range(len(self.slaves)))
+        while coming or not all(slave.registered for slave in self.slaves):
+            greeting = [i for _, i in self._due if not self.slaves[i].registered]
+            for index in coming[: max(0, _AT_ONCE - len(greeting))]:
+                coming.remove(index)
+                delay = self._period * index / len(self.slaves)
+                heapq.heappush(self._due, (time.monotonic() + delay, index))
+            self.go_on(_LOOK)
+            failures = [slave.endpoint.failure for slave in self.slaves if slave.endpoint.failure]
+            if failures:
+                raise RuntimeError(failures[0])
+            if time.monotonic() >= deadline:
+                there = sum(slave.registered for slave in self.slaves)
+                raise TimeoutError(f"{there} of {len(self.slaves)} registered in {timeout:g} s")
+
+    def go_on(self, seconds: float) -> None:
+        """Do what falls due for a while."""
+        end = time.monotonic() + seconds
+        while (now := time.monotonic()) < end:
+            while self._due and self._due[0][0] <= now:
+                self._cycle(now)
+            wake = min(end, self._due[0][0]) if self._due else end
+            self._shared.participant.spin(max(0.0, wake - time.monotonic()))
+
+    def _cycle(self, now: float) -> None:
+        due, index = self._due[0]
+        if now - due > self._period:
+            self.tally.late += 1
+            due = now
+        heapq.heapreplace(self._due, (due + self._period, index))
+        self.slaves[index].cycle(now)
+        self.tally.cycles += 1
+
+    def close(self) -> None:
+        """Leave ROS."""
+        self._shared.participant.close()
+
+
+def _told_to_go_on(fleet: Fleet) -> bool:
+    """Go on until a line comes on standard input; False: it was closed."""
+    while not select.select([sys.stdin], [], [], 0.0)[0]:
+        fleet.go_on(_LOOK)
+    return bool(sys.stdin.readline())
+
+
+def main() -> None:
+    """Be so many slaves until standard input is closed."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--domain", type=int, required=True)
+    parser.add_argument("--first", type=int, required=True)
+    parser.add_argument("--slaves", type=int, required=True)
+    parser.add_argument("--hz", type=float, required=True)
+    parser.add_argument("--timeout", type=float, default=120.0)
+    arguments = parser.parse_args()
+    settings = RosSettings(domain=arguments.domain, discovery_range="localhost")
+    fleet = Fleet(settings, arguments.first, arguments.slaves, 1.0 / arguments.hz)
+    fleet.bring_up(arguments.timeout)
+    print(json.dumps({"registered": len(fleet.slaves)}), flush=True)
+    while _told_to_go_on(fleet):
+        fleet.tally.cycles = fleet.tally.late = 0
+        used = resource.getrusage(resource.RUSAGE_SELF)
+        began, cpu = time.monotonic(), used.ru_utime + used.ru_stime
+        goes_on = _told_to_go_on(fleet)
+        used = resource.getrusage(resource.RUSAGE_SELF)
+        print(
+            json.dumps(
+                {
+                    "seconds": time.monotonic() - began, "cycles": fleet.tally.cycles,
+                    "late": fleet.tally.late, "cpu": used.ru_utime + used.ru_stime - cpu,
+                    "taken": fleet.tally.taken,
+                }
+            ),
+            flush=True,
+        )  # fmt: skip
+        if not goes_on:
+            break
+    fleet.close()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,98 @@
+"""The books of the readings: cycles that came, cycles that were missed, and the oldest reading."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rosrm.ros.ledger import Ledger
+from rosrm.ros.readings import Runs
+
+RUN = 500
+
+
+def runs(*rows: tuple[int, int, int], incarnation: int = RUN, beat: int = 9) -> Runs:
+    """Of (host id, sequence, cycles)."""
+    hosts, sequences, cycles = (np.array(column, np.int64) for column in zip(*rows, strict=True))
+    return Runs(
+        hosts, np.full(len(rows), incarnation, np.uint64), sequences - cycles + 1, sequences,
+        np.full(len(rows), beat, np.uint64), cycles,
+    )  # fmt: skip
+
+
+@pytest.fixture
+def ledger() -> Ledger:
+    made = Ledger()
+    for host in (1, 2):
+        made.begin(host, RUN)
+    return made
+
+
+def test_what_came_is_accounted_for(ledger: Ledger) -> None:
+    """Cycles count, not messages; nothing is missed before the first message of a run."""
+    ledger.take(runs((1, 40, 1), (2, 3, 3)), 0.0)
+    ledger.take(runs((1, 42, 2)), 0.1)
+
+    assert (ledger.cycles, ledger.missed) == (6, 0)
+
+
+def test_a_gap_in_the_sequence_is_missed(ledger: Ledger) -> None:
+    """By as many cycles as no message stands for."""
+    ledger.take(runs((1, 1, 1)), 0.0)
+    ledger.take(runs((1, 9, 2)), 0.1)
+
+    assert (ledger.cycles, ledger.missed) == (3, 6)
+
+
+def test_what_comes_late_is_missed_no_more(ledger: Ledger) -> None:
+    """DDS may deliver in another order."""
+    ledger.take(runs((1, 1, 1)), 0.0)
+    ledger.take(runs((1, 4, 1)), 0.1)
+    assert ledger.missed == 2
+    ledger.take(runs((1, 3, 2)), 0.2)
+
+    assert (ledger.cycles, ledger.missed) == (4, 0)
+    ledger.take(runs((1, 5, 1)), 0.3)
+    assert (ledger.cycles, ledger.missed) == (5, 0)
+
+
+@pytest.mark.parametrize("host", [0, 3, 10_000_000])
+def test_who_is_not_registered_is_not_entered(ledger: Ledger, host: int) -> None:
+    """Nor a former run of who is."""
+    assert ledger.take(runs((host, 5, 5)), 0.0).tolist() == []
+    assert ledger.take(runs((1, 5, 5), incarnation=RUN + 1), 0.0).tolist() == []
+    assert (ledger.cycles, ledger.missed) == (0, 0)
+    assert ledger.ages(0.0) == (0, 0.0)
+
+
+def test_a_new_run_begins_anew(ledger: Ledger) -> None:
+    """Its sequence starts over, its beat is by another clock; what was counted stays."""
+    ledger.take(runs((1, 100, 1), beat=10**15), 0.0)
+    ledger.begin(1, RUN + 1)
+    assert not ledger.beat[1]
+    ledger.take(runs((1, 2, 2), incarnation=RUN + 1, beat=7), 0.1)
+
+    assert ledger.beat[1] == 7
+    assert (ledger.cycles, ledger.missed) == (3, 0)
+
+
+def test_the_oldest_reading_is_that_of_the_most_silent_host(ledger: Ledger) -> None:
+    """A host that left, or has been silent for long, is no longer awaited."""
+    ledger.take(runs((1, 1, 1)), 0.0)
+    ledger.take(runs((2, 1, 1)), 2.0)
+    assert ledger.ages(3.0) == (2, 3.0)
+    assert ledger.ages(11.0) == (1, 9.0)
+
+    ledger.forget(2)
+    assert ledger.ages(3.0) == (1, 3.0)
+
+
+def test_the_books_grow(ledger: Ledger) -> None:
+    """And keep what is in them."""
+    ledger.take(runs((1, 7, 1), beat=3), 1.0)
+    ledger.begin(5000, RUN)
+    ledger.take(runs((5000, 1, 1), (1, 8, 1), beat=4), 1.5)
+
+    assert ledger.beat[[1, 5000]].tolist() == [4, 4]
+    assert (ledger.cycles, ledger.missed) == (3, 0)
+    assert ledger.ages(2.0) == (2, 0.5)
