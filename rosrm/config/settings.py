@@ -146,10 +146,12 @@ class JournalSettings:
     Attributes:
         sync: "normal" survives a SIGKILL of the master; "full" a power failure too.
         keep_events: newest events kept.
+        keep_ended: processes that are over and still known, those that ended last.
     """
 
     sync: Literal["normal", "full"] = "normal"
     keep_events: PositiveCount = 100_000
+    keep_ended: PositiveCount = _CORE.keep_ended
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,6 +206,7 @@ class ClusterConfig:
             max_migrations=self.migration.max_in_flight,
             automatic=self.migration.automatic,
             order_retry=self.control.order_retry,
+            keep_ended=self.journal.keep_ended,
         )
 
     def to_json(self) -> str:
@@ -233,6 +236,18 @@ class LogSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class HostControlSettings:
+    """The requests that a slave takes.
+
+    Attributes:
+        max_age: seconds, by the slave's clock, after which a request is refused as stale; never
+            less than three readings take.
+    """
+
+    max_age: PositiveSeconds = 5.0
+
+
+@dataclass(frozen=True, slots=True)
 class HostConfig:
     """A slave's settings: `host.yaml`.
 
@@ -249,6 +264,7 @@ class HostConfig:
         probes: chosen by name, each with its options; None: the default ones.
         max_processes: most processes held at a time; 0: no bound.
         logs: of the processes.
+        control: of requests.
         on_stop: a slave that is stopped stops its processes, or keeps them with the supervisor.
     """
 
@@ -263,6 +279,7 @@ class HostConfig:
     probes: Annotated[Mapping[str, Options] | None, OptionsByName()] = None
     max_processes: Count = 0
     logs: LogSettings = field(default_factory=LogSettings)
+    control: HostControlSettings = field(default_factory=HostControlSettings)
     on_stop: Literal["stop", "keep"] = "stop"
 
     def __post_init__(self) -> None:

@@ -15,6 +15,7 @@ import sys
 from rosrm.config.settings import ClusterConfig
 from rosrm.entry import run
 from rosrm.handover import Handover
+from rosrm.master.fallback import fallback_of
 from rosrm.master.policy_guard import GuardedPolicy
 from rosrm.master.runtime import MasterRuntime
 from rosrm.registry import Registry
@@ -29,7 +30,8 @@ def serve(handover: Handover) -> int:
     strategies = registry.migrations(config.migration.strategies)
     registry.checkpoint(config.checkpoint.policy, config.checkpoint.options)
     rows = registry.rows("scoring", "migration", "checkpoint")
-    return MasterRuntime(config, policy, strategies, rows).run()
+    fallback = fallback_of(registry, name)
+    return MasterRuntime(config, policy, strategies, rows, fallback).run()
 
 
 if __name__ == "__main__":

@@ -54,6 +54,7 @@ class MasterRuntime:
         policy: the scoring policy that the configuration names.
         strategies: the migration strategies that it names.
         plugins: what `rosrm plugins` shows of the master.
+        fallback: the scoring policy that decides where the first fails, with its name.
 
     Raises:
         Refused: another master runs on this domain, or on this state directory.
@@ -66,8 +67,10 @@ class MasterRuntime:
         policy: ScoringPolicy,
         strategies: dict[str, MigrationStrategy],
         plugins: Sequence[PluginRow] = (),
+        fallback: tuple[str, ScoringPolicy] | None = None,
     ) -> None:
         self._config = config
+        self._fallback = fallback
         self._plugins = list(plugins)
         self._started = time.monotonic()
         self._stopping = ""
@@ -115,8 +118,10 @@ class MasterRuntime:
             0.0,
         )
         state = MasterState(
-            self._config.core(), self._config.scoring.policy or "", policy, strategies, epoch
-        )
+            self._config.core(), self._config.scoring.policy or "", policy, strategies, epoch,
+            self._fallback,
+        )  # fmt: skip
+        state.wall = time.time()
         restore.restore(state, self._journal.intents, self._now())
         return state
 

@@ -64,8 +64,7 @@ _USAGE_PERIOD: Final = 1.0
 _PATIENCE_TOLD: Final = 10.0
 #: Seconds beyond the processes' own grace that a stop may take before it is said.
 _STOP_MARGIN: Final = 5.0
-#: Age of a request that is still meant, seconds; at slow rates so many of our own beats.
-_MAX_AGE: Final = 5.0
+#: At slow rates a request is still meant after so many of our own beats.
 _BEATS_MISSED: Final = 3
 #: Readings that go out between looking at what each instance uses and saying it: so the master
 #: never takes a need for met that does not show in the readings which it has.
@@ -134,7 +133,7 @@ class SlaveRuntime:
                 self._participant,
                 self,
                 self._description(probes.absent),
-                max(_MAX_AGE, _BEATS_MISSED * config.period),
+                max(config.control.max_age, _BEATS_MISSED * config.period),
             )
             self._closing = opened.pop_all()
         self._adopt()

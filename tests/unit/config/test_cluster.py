@@ -75,7 +75,7 @@ def test_every_setting_is_read(file, tmp_path):
             defaults: {needs: {memory: 1GiB, cpu: 1}, settle: 5s}
             liveness: {suspect: 2s, lease: 20s}
             control: {max_age: 3s, beat_period: 100ms, order_retry: 1s}
-            journal: {sync: full, keep_events: 10}
+            journal: {sync: full, keep_events: 10, keep_ended: 20}
             checkpoint: {policy: often, options: {b: 2}}
             delivery_timeout: 4s
             """
@@ -100,6 +100,7 @@ def test_every_setting_is_read(file, tmp_path):
         max_migrations=3,
         automatic=False,
         order_retry=1.0,
+        keep_ended=20,
     )
     assert (config.control.max_age, config.control.beat_period) == (3.0, 0.1)
     assert (config.journal.sync, config.journal.keep_events) == ("full", 10)

@@ -54,6 +54,7 @@ def test_every_setting_is_read(file, tmp_path, registry):
             probes: {disk: {path: /data}}
             max_processes: 4
             logs: {max_bytes: 1MB, keep: 1}
+            control: {max_age: 8s}
             on_stop: keep
             """
         ),
@@ -67,6 +68,7 @@ def test_every_setting_is_read(file, tmp_path, registry):
     assert config.probes == {"disk": {"path": "/data"}}
     assert (config.max_processes, config.on_stop) == (4, "keep")
     assert (config.logs.max_bytes, config.logs.keep) == (1_000_000, 1)
+    assert config.control.max_age == 8.0
     assert HostConfig.from_json(config.to_json()) == config
 
 
