@@ -1,0 +1,42 @@
+"""Which scoring policy decides where the chosen one fails."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+from rosrm.hookspecs import hookimpl
+from rosrm.master.fallback import fallback_of
+from rosrm.ports import ScoringOffer
+from rosrm.registry import Registry
+
+
+def registry_of(**policies):
+    """Policies by name, each with what makes it."""
+
+    @hookimpl
+    def register_scoring():
+        return [ScoringOffer(name, create) for name, create in policies.items()]
+
+    return Registry.of(ours=SimpleNamespace(register_scoring=register_scoring))
+
+
+def broken(options):
+    raise RuntimeError("out of order")
+
+
+def test_the_default_policy_stands_in_for_another() -> None:
+    """It is made with its own default options."""
+    weighted = object()
+    registry = registry_of(weighted=lambda options: weighted, other=lambda options: object())
+    assert fallback_of(registry, "other") == ("weighted", weighted)
+
+
+def test_nothing_stands_in_for_the_default_policy_itself() -> None:
+    """It would fail in the same way."""
+    assert fallback_of(registry_of(weighted=lambda options: object()), "weighted") is None
+
+
+def test_a_default_policy_that_is_not_there_or_broken_is_not_missed() -> None:
+    """The chosen one goes on without: hosts that fit are then taken in order."""
+    assert fallback_of(registry_of(other=lambda options: object()), "other") is None
+    assert fallback_of(registry_of(other=broken, weighted=broken), "other") is None
