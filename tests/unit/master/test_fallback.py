@@ -14,10 +14,10 @@ def registry_of(**policies):
     """Policies by name, each with what makes it."""
 
     @hookimpl
-    def register_scoring():
+    def register_scoring_policies():
         return [ScoringOffer(name, create) for name, create in policies.items()]
 
-    return Registry.of(ours=SimpleNamespace(register_scoring=register_scoring))
+    return Registry.of(ours=SimpleNamespace(register_scoring_policies=register_scoring_policies))
 
 
 def broken(options):
