@@ -7,7 +7,8 @@ RosrmError                  what a user reads: no traceback is shown for it
 ├── NoMaster                no master answered in time
 ├── LaunchError             a process that cannot be started on this host
 ├── JournalError            the durable record cannot be read or written
-└── SupervisorError         the supervisor cannot be started or reached
+├── SupervisorError         the supervisor cannot be started or reached
+└── LabError                a virtual host or its network cannot be made, or is not there
 
 SkipPlugin                  not an error: a plugin says that it is absent here, and why
 """
@@ -60,6 +61,10 @@ class JournalError(RosrmError):
 
 class SupervisorError(RosrmError):
     """The supervisor of this host cannot be started or reached."""
+
+
+class LabError(RosrmError):
+    """A virtual host or its network cannot be made, changed or found."""
 
 
 class SkipPlugin(Exception):

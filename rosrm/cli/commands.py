@@ -21,6 +21,7 @@ from typer.core import TyperGroup
 
 from rosrm.cli import acting, checking, following, listing, starting
 from rosrm.cli.app import INTERRUPTED
+from rosrm.cli.lab import lab
 from rosrm.cli.options import Common, Domain
 from rosrm.errors import RosrmError
 from rosrm.version import PROTOCOL_VERSION, __version__
@@ -84,3 +85,4 @@ for module in (starting, acting, listing, following):
     for function in module.COMMANDS:
         app.command()(function)
 app.add_typer(checking.config, name="config")
+app.add_typer(lab, name="lab")

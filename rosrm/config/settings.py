@@ -28,6 +28,7 @@ from rosrm.config.units import (
 )
 from rosrm.core.model import EMPTY
 from rosrm.core.settings import CoreSettings
+from rosrm.errors import ConfigError
 from rosrm.ros.settings import RosSettings
 
 #: Upper limits where the file sets none: memory as in the paper, CPU and disk with a reserve.
@@ -37,12 +38,26 @@ _CORE: Final = CoreSettings()
 
 Options = Annotated[Mapping[str, Any], NullIsEmpty()]
 Ros = Annotated[RosSettings, RosSection()]
+Scope = Literal["machine", "cgroup", "slice"]
 
 
 def default_state(name: str, role: str) -> Path:
     """Where a master or slave of a name keeps its files when nothing else is said."""
     base = os.environ.get("XDG_STATE_HOME") or str(Path.home() / ".local" / "state")
     return Path(base) / "rosrm" / name / role
+
+
+def default_scope() -> Scope:
+    """What a slave measures when its file does not say: ROSRM_SCOPE, or the machine.
+
+    Raises:
+        ConfigError: the variable has another word.
+    """
+    scopes: Mapping[str, Scope] = {"": "machine", "machine": "machine", "cgroup": "cgroup"}
+    word = os.environ.get("ROSRM_SCOPE", "")
+    if word not in scopes:
+        raise ConfigError(f"ROSRM_SCOPE={word!r}; allowed: machine, cgroup")
+    return scopes[word]
 
 
 # --- cluster.yaml -----------------------------------------------------------------------------
@@ -272,7 +287,7 @@ class HostConfig:
     ros: Ros = field(default_factory=RosSettings)
     state: Path = Path()
     labels: Mapping[str, Annotated[str, PlainWord()]] = field(default_factory=lambda: EMPTY)
-    scope: Literal["machine", "cgroup", "slice"] = "machine"
+    scope: Scope = field(default_factory=default_scope)
     budget: Mapping[str, Amount] = field(default_factory=lambda: EMPTY)
     limits: Mapping[str, Fraction] = field(default_factory=lambda: dict(DEFAULT_LIMITS))
     rate: Annotated[float, Quantity(low=0.1, high=1000.0, hint="Hz")] = 10.0

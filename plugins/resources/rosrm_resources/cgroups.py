@@ -11,6 +11,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from rosrm.errors import ConfigError
+
 
 @dataclass(frozen=True)
 class Group:
@@ -44,21 +46,34 @@ class _Mount:
     controllers: frozenset[str]
 
 
-def find_group(controller: str, root: Path = Path("/"), pid: str = "self") -> Group | None:
+def find_group(
+    controller: str, root: Path = Path("/"), pid: str = "self", path: str | None = None
+) -> Group | None:
     """The group of a process for a controller; None: no such hierarchy is mounted.
 
     Args:
         controller: "memory", "cpu", "cpuacct", "cpuset".
         root: of the file system, for recorded trees.
         pid: whose group; "self" for this process.
+        path: of another group, as /proc/PID/cgroup would write it; None: that of the process.
+
+    Raises:
+        ConfigError: there is no group at `path`.
     """
     mounts = _mounts(root, pid)
     paths = _paths(root, pid)
+    if path is not None:
+        paths = dict.fromkeys(paths, path)
     # A controller that is mounted as version 1 is not available to version 2 at the same time.
     for mount in sorted(mounts, key=lambda mount: mount.version):
         name = controller if mount.version == 1 else ""
         if (mount.version == 2 or controller in mount.controllers) and name in paths:
             directory = _below(mount, paths[name])
+            if path is not None and directory.name != Path(path).name:
+                raise ConfigError(
+                    f"there is no control group {path!r} under {mount.point}; "
+                    "write it as /proc/PID/cgroup does for a process in it"
+                )
             return Group(mount.version, mount.point, directory)
     return None
 

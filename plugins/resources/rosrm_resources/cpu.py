@@ -14,7 +14,7 @@ from annotated_types import Gt, Le
 from rosrm.ports import ProbeContext, Sessions
 from rosrm_resources.cgroups import Group, count_cpus, find_group, read_number
 from rosrm_resources.files import KeptFile, ProcessFiles
-from rosrm_resources.gauge import Gauge, GaugeProbe, Scope, budget
+from rosrm_resources.gauge import Gauge, GaugeProbe, Scope, budget, check_group
 from rosrm_resources.rate import Rate
 
 _TICKS: Final = float(os.sysconf("SC_CLK_TCK"))
@@ -29,20 +29,27 @@ class CpuOptions:
     Attributes:
         scope: what is measured; None: as the host's configuration says.
         window: seconds over which the usage is a mean.
+        group: the control group to measure instead of the slave's own, as /proc/PID/cgroup writes
+            it for a process in it; None: the slave's own. Sets the scope to "cgroup".
     """
 
     scope: Scope | None = None
     window: Annotated[float, Gt(0), Le(60)] = 1.0
+    group: str | None = None
+
+    def __post_init__(self) -> None:
+        """A group and another scope contradict each other."""
+        check_group(self.group, self.scope)
 
 
 def create(options: CpuOptions, context: ProbeContext) -> GaugeProbe:
     """Make the probe for the scope that is set."""
-    scope = options.scope or context.scope
+    scope = "cgroup" if options.group else options.scope or context.scope
     gauge: Gauge | None = None
     if scope == "slice":
         gauge = SliceCpu(budget(context, "cpu", "cores"), context.sessions, options.window)
     elif scope == "cgroup":
-        gauge = CgroupCpu.find(options.window)
+        gauge = CgroupCpu.find(options.window, path=options.group)
     return GaugeProbe("cpu", "core", gauge or MachineCpu(options.window))
 
 
@@ -128,6 +135,7 @@ class CgroupCpu:
         window: float,
         root: Path = Path("/"),
         clock: Callable[[], float] = time.monotonic,
+        path: str | None = None,
     ) -> CgroupCpu | None:
         """For the group of this process; None: it may use the whole machine.
 
@@ -135,8 +143,9 @@ class CgroupCpu:
             window: seconds.
             root: of the file system, for recorded trees.
             clock: monotonic seconds.
+            path: of another group.
         """
-        group = find_group("cpu", root)
+        group = find_group("cpu", root, path=path)
         if group is None:
             return None
         limits = _cpu_limits(group, root)

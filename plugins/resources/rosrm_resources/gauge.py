@@ -63,6 +63,14 @@ class GaugeProbe:
         self._gauge.close()
 
 
+def check_group(group: str | None, scope: Scope | None) -> None:
+    """Raise `ValueError` where the option `group` of a probe does not go with its `scope`."""
+    if group is not None and scope not in (None, "cgroup"):
+        raise ValueError(f"group: goes with the scope 'cgroup', not with {scope!r}")
+    if group is not None and not group.startswith("/"):
+        raise ValueError(f"group: {group!r} does not begin with '/'")
+
+
 def budget(context: ProbeContext, resource: str, unit: str) -> float:
     """What the host's slice may use of a resource.
 

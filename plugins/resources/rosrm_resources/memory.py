@@ -10,7 +10,7 @@ from typing import Final
 from rosrm.ports import ProbeContext, Sessions
 from rosrm_resources.cgroups import Group, find_group, read_number
 from rosrm_resources.files import KeptFile, ProcessFiles
-from rosrm_resources.gauge import Gauge, GaugeProbe, Scope, budget
+from rosrm_resources.gauge import Gauge, GaugeProbe, Scope, budget, check_group
 
 _PAGE: Final = os.sysconf("SC_PAGE_SIZE")
 
@@ -21,19 +21,26 @@ class MemoryOptions:
 
     Attributes:
         scope: what is measured; None: as the host's configuration says.
+        group: the control group to measure instead of the slave's own, as /proc/PID/cgroup writes
+            it for a process in it; None: the slave's own. Sets the scope to "cgroup".
     """
 
     scope: Scope | None = None
+    group: str | None = None
+
+    def __post_init__(self) -> None:
+        """A group and another scope contradict each other."""
+        check_group(self.group, self.scope)
 
 
 def create(options: MemoryOptions, context: ProbeContext) -> GaugeProbe:
     """Make the probe for the scope that is set."""
-    scope = options.scope or context.scope
+    scope = "cgroup" if options.group else options.scope or context.scope
     gauge: Gauge | None = None
     if scope == "slice":
         gauge = SliceMemory(budget(context, "memory", "bytes"), context.sessions)
     elif scope == "cgroup":
-        gauge = CgroupMemory.find()
+        gauge = CgroupMemory.find(path=options.group)
     return GaugeProbe("memory", "B", gauge or MachineMemory())
 
 
@@ -83,13 +90,14 @@ class CgroupMemory:
         self._levels = [(limit, _GroupBytes(directory, version)) for directory, limit in limits]
 
     @classmethod
-    def find(cls, root: Path = Path("/")) -> CgroupMemory | None:
+    def find(cls, root: Path = Path("/"), path: str | None = None) -> CgroupMemory | None:
         """For the group of this process; None: it may use the whole machine.
 
         Args:
             root: of the file system, for recorded trees.
+            path: of another group.
         """
-        group = find_group("memory", root)
+        group = find_group("memory", root, path=path)
         if group is None:
             return None
         machine = MachineMemory(root / "proc")

@@ -5,10 +5,11 @@ from pathlib import Path
 
 import pytest
 
+from rosrm.errors import ConfigError
 from rosrm.testing import FakeClock
 from rosrm_resources.cgroups import count_cpus, find_group, read_number
-from rosrm_resources.cpu import CgroupCpu
-from rosrm_resources.memory import CgroupMemory
+from rosrm_resources.cpu import CgroupCpu, CpuOptions
+from rosrm_resources.memory import CgroupMemory, MemoryOptions
 
 TREES = Path(__file__).parents[2] / "data" / "cgroup_v2"
 RECORDED = sorted(path.name for path in TREES.iterdir() if (path / "proc").is_dir())
@@ -191,3 +192,26 @@ def test_reads_limits(tmp_path, text, number):
     (tmp_path / "limit").write_text(text)
     assert read_number(tmp_path / "limit") == number
     assert read_number(tmp_path / "missing") is None
+
+
+def test_another_group_is_measured_instead_of_the_own():
+    """The option `group` counts that group and those above it, not the slave's own."""
+    gauge = CgroupMemory.find(TREES / "systemd", "/robot.slice")
+    assert gauge.capacity == 4 * GIB
+    assert gauge.usage() == pytest.approx(3600 / 4096)
+    gauge.close()
+
+
+def test_another_group_that_is_not_there_is_refused():
+    """A group that cannot be seen must not silently become the one above it."""
+    with pytest.raises(ConfigError, match="no control group '/robot.slice/jobs' under"):
+        CgroupMemory.find(TREES / "systemd", "/robot.slice/jobs")
+
+
+@pytest.mark.parametrize("options", [MemoryOptions, CpuOptions])
+def test_a_group_goes_with_no_other_scope(options):
+    """A probe is told one thing to measure."""
+    with pytest.raises(ValueError, match="goes with the scope 'cgroup', not with 'slice'"):
+        options(scope="slice", group="/a")
+    with pytest.raises(ValueError, match="does not begin with '/'"):
+        options(group="a")

@@ -1,0 +1,351 @@
+"""`rosrm lab`: virtual hosts on this machine, to try a cluster before the robots do."""
+
+# Each command imports what it needs when it runs, so that `rosrm --help` is quick.
+# ruff: noqa: PLC0415
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict
+from enum import Enum
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from rosrm.cli.options import AsJson
+from rosrm.errors import ConfigError
+
+if TYPE_CHECKING:
+    from rosrm.lab import HostPlan, HostStatus, Lab
+
+lab = typer.Typer(
+    no_args_is_help=True,
+    help="Virtual hosts on this machine, each with its own limits. Needs root.",
+)
+
+
+class Way(str, Enum):
+    """A direction, as seen from the host."""
+
+    IN = "in"
+    OUT = "out"
+    BOTH = "both"
+
+
+Named = Annotated[
+    str,
+    typer.Option("--lab", metavar="NAME", envvar="ROSRM_LAB", help="Which lab, if not `lab`."),
+]
+Host = Annotated[str, typer.Argument(metavar="HOST", help="Name of a host of the lab.")]
+Direction = Annotated[
+    Way, typer.Option("--direction", help="What the host hears, what is heard of it, or both.")
+]
+
+
+@lab.callback()
+def _group() -> None:
+    """Virtual hosts on this machine, each with its own limits. Needs root."""
+
+
+@lab.command()
+def up(  # noqa: PLR0917 - typer calls it, by name
+    number: Annotated[
+        int, typer.Option("-n", "--hosts", metavar="N", help="How many: host1, host2, ...")
+    ] = 3,
+    memory: Annotated[
+        str, typer.Option("--memory", metavar="SIZE", help="Of each host; `none`: no limit.")
+    ] = "none",
+    cpu: Annotated[
+        str, typer.Option("--cpu", metavar="CORES", help="Of each host; `none`: no limit.")
+    ] = "none",
+    disk: Annotated[str, typer.Option("--disk", metavar="SIZE", help="Of each host.")] = "1GiB",
+    host: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--host",
+            metavar="NAME[:LIMITS]",
+            help="One more host, or other limits for one: `desk:memory=none,cpu=2,disk=4GiB`. "
+            "What is not said is as for the others. May be repeated.",
+        ),
+    ] = None,
+    subnet: Annotated[
+        str,
+        typer.Option("--subnet", metavar="RANGE", help="Of the addresses; default: a free one."),
+    ] = "",
+    name: Named = "lab",
+) -> None:
+    """Make a lab. What a killed attempt left behind is removed first."""
+    from rosrm.lab import Lab
+    from rosrm.lab.needs import overbooked
+    from rosrm.lab.plan import parse_subnet
+
+    limits = {"memory": memory, "cpu": cpu, "disk": disk}
+    hosts = planned(number, limits, host or [])
+    made = Lab(name, hosts, subnet=parse_subnet(subnet) if subnet else None)
+    made.up()
+    warning = overbooked(hosts)
+    if warning:
+        typer.echo(f"rosrm: note: {warning}", err=True)
+    told = ", ".join(f"{one.name} {made.address(one.name)}" for one in hosts)
+    typer.echo(f"lab {name!r} is up: {told}")
+
+
+@lab.command(
+    "exec",
+    context_settings={"ignore_unknown_options": True, "allow_interspersed_args": False},
+)
+def execute(
+    host: Host,
+    command: Annotated[list[str], typer.Argument(metavar="CMD...", help="Program and arguments.")],
+    user: Annotated[
+        str, typer.Option("-u", "--user", metavar="USER", help="Run as this user, not as root.")
+    ] = "",
+    variable: Annotated[
+        list[str] | None,
+        typer.Option("-e", "--env", metavar="NAME=VALUE", help="Set a variable. May be repeated."),
+    ] = None,
+    name: Named = "lab",
+) -> None:
+    """Run a command on a host, as if it were typed there.
+
+    Standard input, terminal and signals are the command's; its exit code is ours.
+    """
+    words = command[1:] if command[0] == "--" else command
+    opened(name).become(host, words, user=user, env=dict(map(_variable, variable or [])))
+
+
+@lab.command()
+def cut(host: Host, direction: Direction = Way.BOTH, name: Named = "lab") -> None:
+    """Cut a host's network, in one direction or both."""
+    opened(name).cut(host, direction.value)
+    _say_link(name, host)
+
+
+@lab.command()
+def heal(host: Host, name: Named = "lab") -> None:
+    """End what cut, loss and delay did to a host."""
+    opened(name).heal(host)
+    _say_link(name, host)
+
+
+@lab.command()
+def loss(
+    host: Host,
+    share: Annotated[str, typer.Argument(metavar="SHARE", help="Of the packets: 1% or 0.01.")],
+    direction: Direction = Way.BOTH,
+    name: Named = "lab",
+) -> None:
+    """Lose a share of the packets to and from a host; 0 ends it."""
+    opened(name).loss(host, fraction(share), direction.value)
+    _say_link(name, host)
+
+
+@lab.command()
+def delay(
+    host: Host,
+    time: Annotated[str, typer.Argument(metavar="TIME", help="Of each packet: 50ms.")],
+    direction: Direction = Way.BOTH,
+    name: Named = "lab",
+) -> None:
+    """Let packets to and from a host be late; 0 ends it. Needs a kernel with netem."""
+    opened(name).delay(host, _quantity("duration", time, "TIME"), direction.value)
+    _say_link(name, host)
+
+
+@lab.command()
+def kill(host: Host, name: Named = "lab") -> None:
+    """Cut a host's power: all its processes end at once. `boot` switches it on again."""
+    opened(name).kill(host)
+    typer.echo(f"{host} is off; `rosrm lab boot {host}` switches it on again")
+
+
+@lab.command()
+def boot(host: Host, name: Named = "lab") -> None:
+    """Switch a host on again after `kill`. Its disk is as it was; nothing runs yet."""
+    opened(name).boot(host)
+    typer.echo(f"{host} is up")
+
+
+@lab.command()
+def status(
+    as_json: AsJson = False,
+    name: Annotated[
+        str, typer.Option("--lab", metavar="NAME", help="Only this lab, if not all of them.")
+    ] = "",
+) -> None:
+    """List the labs and their hosts."""
+    from rosrm.cli import json_forms, tables
+    from rosrm.errors import LabError
+    from rosrm.lab import all_labs
+
+    _check_rights()
+    rows: list[HostStatus] = []
+    for one in [opened(name)] if name else all_labs():
+        try:
+            rows += one.status()
+        except LabError as error:
+            if name:
+                raise
+            typer.echo(f"rosrm: note: {error}", err=True)
+    if as_json:
+        json_forms.show([asdict(row) for row in rows])
+    elif rows:
+        tables.console().print(_table(rows))
+    else:
+        typer.echo("no lab; `rosrm lab up` makes one")
+
+
+@lab.command()
+def down(
+    name: Named = "lab",
+    everything: Annotated[bool, typer.Option("--all", help="Every lab on this machine.")] = False,
+) -> None:
+    """Remove a lab: its processes end at once, and its disks are deleted."""
+    from rosrm.lab import Lab, all_labs
+
+    _check_rights()
+    chosen = list(all_labs()) if everything else [Lab(name)]
+    removed = [one.name for one in chosen if one.down()]
+    if removed:
+        typer.echo(f"removed: {', '.join(removed)}")
+    else:
+        typer.echo("no lab" if everything else f"no lab {name!r}: nothing to remove")
+
+
+# --- inner parts ------------------------------------------------------------------------------
+
+
+def opened(name: str) -> Lab:
+    """A lab that a command works on."""
+    from rosrm.lab import Lab
+
+    _check_rights()
+    return Lab(name)
+
+
+def planned(number: int, limits: dict[str, str], more: Sequence[str]) -> list[HostPlan]:
+    """The hosts that the options of `up` ask for; raises `ConfigError`.
+
+    Args:
+        number: of hosts alike.
+        limits: theirs, as text, by resource.
+        more: further hosts, or other limits, as `--host` takes them.
+    """
+    from rosrm.lab.plan import MOST_HOSTS
+
+    if not 0 <= number <= MOST_HOSTS or (number == 0 and not more):
+        raise ConfigError(f"-n {number}; allowed are 1 to {MOST_HOSTS} hosts, 0 with --host")
+    wanted = {f"host{i}": limits for i in range(1, number + 1)}
+    for text in more:
+        name, own = _named_limits(text)
+        wanted[name] = {**wanted.get(name, limits), **own}
+    return [_host(name, one) for name, one in wanted.items()]
+
+
+def fraction(text: str) -> float:
+    """`1%` or `0.01`; raises `ConfigError`."""
+    from rosrm.lab.wires import check_loss
+
+    try:
+        value = float(text[:-1]) / 100.0 if text.endswith("%") else float(text)
+    except ValueError:
+        raise ConfigError(f"SHARE {text!r}: give percent (1%) or a fraction (0.01)") from None
+    check_loss(value)
+    return value
+
+
+def _named_limits(text: str) -> tuple[str, dict[str, str]]:
+    name, _, rest = text.partition(":")
+    pairs = [part.partition("=") for part in rest.split(",") if part]
+    strange = [key for key, equals, _ in pairs if not equals or key not in _MEASURES]
+    if strange:
+        raise ConfigError(
+            f"--host {text!r}: {strange[0]!r} is no limit; "
+            f"allowed: {', '.join(f'{key}=...' for key in _MEASURES)}"
+        )
+    return name, {key: value for key, _, value in pairs}
+
+
+def _host(name: str, limits: dict[str, str]) -> HostPlan:
+    from rosrm.lab import HostPlan
+
+    memory = _limit(name, "memory", limits["memory"])
+    cpu = _limit(name, "cpu", limits["cpu"])
+    disk = _limit(name, "disk", limits["disk"])
+    if disk is None:
+        raise ConfigError(f"host {name}: a disk has a size; give one, for example 1GiB")
+    return HostPlan(name, None if memory is None else int(memory), cpu, int(disk))
+
+
+#: As `rosrm.config.units` calls what is measured.
+_MEASURES = {"memory": "size", "cpu": "cores", "disk": "size"}
+
+
+def _limit(host: str, what: str, text: str) -> float | None:
+    if text == "none":
+        return None
+    return _quantity(_MEASURES[what], text, f"{what} of {host}")
+
+
+def _quantity(measures: str, text: str, where: str) -> float:
+    """A number with or without a unit; what a shell hands over is always text."""
+    from rosrm.config.units import Quantity
+
+    try:
+        return Quantity(measures).parse(_number(text))
+    except ValueError as error:
+        raise ConfigError(f"{where}: {error}") from None
+
+
+def _number(text: str) -> float | str:
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+def _variable(text: str) -> tuple[str, str]:
+    name, equals, value = text.partition("=")
+    if not equals or not name:
+        raise ConfigError(f"--env {text!r}: give NAME=VALUE")
+    return name, value
+
+
+def _check_rights() -> None:
+    from rosrm.lab.needs import check_rights
+
+    check_rights()
+
+
+def _say_link(name: str, host: str) -> None:
+    (row,) = [row for row in opened(name).status() if row.name == host]
+    typer.echo(f"{host}: {row.network or 'the network is as it should be'}")
+
+
+def _table(rows: Iterable[HostStatus]) -> Any:
+    from rich.text import Text
+
+    from rosrm.cli import tables
+
+    numbers = ("MEMORY", "CPU", "DISK", "RUNS")
+    made = tables.table("LAB", "HOST", "STATE", "ADDRESS", *numbers, "NETWORK", right=numbers)
+    for row in rows:
+        made.add_row(
+            Text(row.lab),
+            Text(row.name),
+            Text(row.state, "green" if row.state == "up" else "red"),
+            row.address,
+            _used(row.memory_used, row.memory),
+            "" if row.cpu is None else f"{row.cpu:g}",
+            _used(row.disk_used, row.disk),
+            str(row.processes),
+            Text(row.network or "ok", "yellow" if row.network else ""),
+        )
+    return made
+
+
+def _used(used: int | None, limit: int | None) -> str:
+    from rosrm.cli import formats
+
+    said = "?" if used is None else formats.size(used)
+    return said if limit is None else f"{said}/{formats.size(limit)}"

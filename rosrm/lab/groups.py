@@ -1,0 +1,268 @@
+"""The control groups of a lab, version 1 or 2.
+
+Each host has one group with two in it: `limited`, where its processes run within memory and CPU
+quota, and `free`, for what shall be on the host without counting against them. (Version 2 wants
+processes in leaves only.)
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import signal
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, Literal
+
+from rosrm.errors import LabError
+from rosrm.lab.plan import PREFIX, HostPlan
+
+Leaf = Literal["limited", "free"]
+LEAVES: Final[tuple[Leaf, ...]] = ("limited", "free")
+
+#: cpuacct: version 1 keeps the CPU time of a group there.
+_NEEDED: Final = ("memory", "cpu", "cpuacct")
+#: Seconds. Shorter than the kernel's 100 ms: a host that has used up its share stands still for
+#: a moment that ROS does not notice.
+_PERIOD: Final = 0.02
+_LONG_PERIOD: Final = 0.1
+#: Below this the share of a short period is less than the least millisecond.
+_SHORT_ENOUGH: Final = 0.05
+#: A kernel without swap, or that does not count it, has none of these.
+_ABOUT_SWAP: Final = ("memory.memsw.limit_in_bytes", "memory.swap.max")
+#: Seconds for killed processes to leave their group, and for the kernel to give up the group.
+_GONE: Final = 10.0
+_LOOK: Final = 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class Hierarchy:
+    """A tree of control groups that is mounted here.
+
+    Attributes:
+        version: 1 or 2.
+        mount: its top.
+        controllers: those of ours that it has.
+    """
+
+    version: int
+    mount: Path
+    controllers: tuple[str, ...]
+
+    @property
+    def top(self) -> Path:
+        """The group of all labs."""
+        return self.mount / PREFIX
+
+    def group(self, lab: str, host: str, leaf: Leaf) -> Path:
+        """One of a host's two groups."""
+        return self.top / lab / host / leaf
+
+
+def find_hierarchies(root: Path = Path("/")) -> list[Hierarchy]:
+    """Where the controllers are that a lab needs.
+
+    Args:
+        root: of the file system, for recorded trees.
+
+    Raises:
+        LabError: one is not there; the message says which.
+    """
+    found: dict[Path, Hierarchy] = {}
+    missing = set(_NEEDED)
+    for version, mount, offered in _mounted(root):
+        ours = tuple(name for name in _NEEDED if name in offered and name in missing)
+        if version == 2 and "cpu" in ours:
+            missing.discard("cpuacct")  # in version 2 `cpu` keeps the time itself
+        if ours:
+            found[mount] = Hierarchy(version, mount, ours)
+            missing -= set(ours)
+    if missing:
+        raise LabError(
+            f"no control group (cgroup) with {' and '.join(sorted(missing))} is mounted here: "
+            "without them a host has no limits. On a usual Linux they are under /sys/fs/cgroup; "
+            "a container gets them with `docker run --privileged`"
+        )
+    return list(found.values())
+
+
+def make(hierarchies: Iterable[Hierarchy], lab: str, host: HostPlan) -> None:
+    """Make a host's groups and set its limits; raises `LabError`."""
+    for hierarchy in hierarchies:
+        try:
+            for leaf in LEAVES:
+                _make_group(hierarchy, hierarchy.group(lab, host.name, leaf))
+            limited = hierarchy.group(lab, host.name, "limited")
+            for name, value in limits(hierarchy, host):
+                if name not in _ABOUT_SWAP or (limited / name).exists():
+                    (limited / name).write_text(value)
+        except OSError as error:
+            raise LabError(_cannot(hierarchy, error)) from None
+
+
+def limits(hierarchy: Hierarchy, host: HostPlan) -> Iterator[tuple[str, str]]:
+    """The control files that make a host's limits, in this order, and what to write there."""
+    if "memory" in hierarchy.controllers and host.memory is not None:
+        if hierarchy.version == 1:
+            yield "memory.limit_in_bytes", str(host.memory)
+            yield "memory.memsw.limit_in_bytes", str(host.memory)
+        else:
+            yield "memory.max", str(host.memory)
+            yield "memory.swap.max", "0"
+    if "cpu" in hierarchy.controllers and host.cpu is not None:
+        period = _PERIOD if host.cpu >= _SHORT_ENOUGH else _LONG_PERIOD
+        quota, period_us = round(host.cpu * period * 1e6), round(period * 1e6)
+        if hierarchy.version == 1:
+            yield "cpu.cfs_period_us", str(period_us)
+            yield "cpu.cfs_quota_us", str(quota)
+        else:
+            yield "cpu.max", f"{quota} {period_us}"
+
+
+def doors(hierarchies: Iterable[Hierarchy], lab: str, host: str, leaf: Leaf) -> list[Path]:
+    """The files through which a process enters one of a host's groups."""
+    return [h.group(lab, host, leaf) / "cgroup.procs" for h in hierarchies]
+
+
+def members(hierarchies: Iterable[Hierarchy], lab: str, host: str = "") -> set[int]:
+    """The processes in the groups of a host, or of all the lab's hosts."""
+    found: set[int] = set()
+    for hierarchy in hierarchies:
+        for door in (hierarchy.top / lab / host).rglob("cgroup.procs"):
+            with contextlib.suppress(FileNotFoundError, OSError):
+                found.update(int(line) for line in door.read_text().split())
+    found.discard(0)  # from outside our own namespace of processes
+    return found
+
+
+def kill(hierarchies: Sequence[Hierarchy], lab: str, host: str = "") -> None:
+    """End every process in the groups of a host or lab, and wait until they have gone.
+
+    Raises:
+        LabError: some would not go.
+    """
+    deadline = time.monotonic() + _GONE
+    while pids := members(hierarchies, lab, host):
+        for pid in pids:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        if time.monotonic() > deadline:
+            raise LabError(
+                f"processes of lab {lab!r} do not end, {_GONE:g} s after SIGKILL: "
+                f"{', '.join(map(str, sorted(pids)))}. Look at them (`ps`), then repeat this"
+            )
+        time.sleep(_LOOK)
+
+
+def remove(hierarchies: Iterable[Hierarchy], lab: str) -> None:
+    """Remove the groups of a lab, whose processes have ended; raises `LabError`."""
+    for hierarchy in hierarchies:
+        tree = hierarchy.top / lab
+        # Deepest first. The kernel gives a group up a moment after its last process has gone.
+        inner = [Path(folder) for folder, _, _ in os.walk(tree, topdown=False)]
+        for folder in inner:
+            _remove_group(folder)
+        with contextlib.suppress(OSError):  # other labs have theirs in it
+            hierarchy.top.rmdir()
+
+
+def labs(hierarchies: Iterable[Hierarchy]) -> set[str]:
+    """The labs that have groups."""
+    return {
+        entry.name
+        for hierarchy in hierarchies
+        if hierarchy.top.is_dir()
+        for entry in hierarchy.top.iterdir()
+        if entry.is_dir()
+    }
+
+
+def memory_used(hierarchies: Iterable[Hierarchy], lab: str, host: str) -> int | None:
+    """Bytes that a host's limited processes use, without cache that can be dropped at once."""
+    for hierarchy in hierarchies:
+        if "memory" not in hierarchy.controllers:
+            continue
+        group = hierarchy.group(lab, host, "limited")
+        name, key = (
+            ("memory.usage_in_bytes", "total_inactive_file")
+            if hierarchy.version == 1
+            else ("memory.current", "inactive_file")
+        )
+        try:
+            used, details = (group / name).read_text(), (group / "memory.stat").read_text()
+        except OSError:
+            return None
+        cache = re.search(rf"^{key} (\d+)$", details, re.MULTILINE)
+        return max(0, int(used) - (int(cache[1]) if cache else 0))
+    return None
+
+
+# --- inner parts ------------------------------------------------------------------------------
+
+
+def _mounted(root: Path) -> Iterator[tuple[int, Path, frozenset[str]]]:
+    """Version, mount point and controllers of each hierarchy; version 1 first."""
+    found = []
+    for line in (root / "proc/self/mountinfo").read_text().splitlines():
+        before, _, after = line.partition(" - ")
+        kind, _, options = after.split(" ", 2)
+        if kind not in ("cgroup", "cgroup2"):
+            continue
+        inside = re.sub(r"\\([0-7]{3})", lambda code: chr(int(code[1], 8)), before.split(" ")[4])
+        mount = root / inside.lstrip("/")
+        if kind == "cgroup":
+            found.append((1, mount, frozenset(options.split(","))))
+        else:
+            with contextlib.suppress(OSError):
+                names = (mount / "cgroup.controllers").read_text().split()
+                found.append((2, mount, frozenset(names)))
+    yield from sorted(found, key=lambda one: one[0])
+
+
+def _make_group(hierarchy: Hierarchy, group: Path) -> None:
+    """Make a group and those above it; in version 2 each hands our controllers on to the next."""
+    above = hierarchy.mount
+    for part in group.relative_to(hierarchy.mount).parts:
+        if hierarchy.version == 2:
+            _hand_on(above, hierarchy.controllers)
+        above = above / part
+        above.mkdir(exist_ok=True)
+
+
+def _hand_on(group: Path, controllers: Sequence[str]) -> None:
+    switch = group / "cgroup.subtree_control"
+    missing = set(controllers) - set(switch.read_text().split())
+    if missing:
+        switch.write_text(" ".join(f"+{name}" for name in sorted(missing)))
+
+
+def _remove_group(group: Path) -> None:
+    deadline = time.monotonic() + _GONE
+    while True:
+        try:
+            group.rmdir()
+        except FileNotFoundError:
+            return
+        except OSError as error:
+            if time.monotonic() > deadline:
+                raise LabError(
+                    f"the control group {group} cannot be removed: {error.strerror}"
+                ) from None
+            time.sleep(_LOOK)
+        else:
+            return
+
+
+def _cannot(hierarchy: Hierarchy, error: OSError) -> str:
+    where = f"control groups cannot be made under {hierarchy.mount}: {error.strerror}"
+    if isinstance(error, PermissionError) or "Read-only" in str(error):
+        return f"{where}. A container gets the right with `docker run --privileged`"
+    if hierarchy.version == 2:
+        return (
+            f"{where} ({error.filename}). In version 2 a group with processes in it hands nothing "
+            "on: inside a container, first move its processes into a group of their own"
+        )
+    return f"{where} ({error.filename})"

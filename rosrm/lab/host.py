@@ -1,0 +1,265 @@
+"""A virtual host as processes: its first one, how others get in, and how all of them end."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import select
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from rosrm.bootstrapper import without_bootstrapper
+from rosrm.errors import ConfigError, LabError
+from rosrm.lab import groups, network, store
+from rosrm.lab import plan as names
+from rosrm.lab.groups import Hierarchy, Leaf
+from rosrm.lab.needs import find_command
+from rosrm.lab.plan import HostPlan
+from rosrm.lab.store import Birth
+
+#: Where a host has its disk, as its processes see it.
+DATA: Final = Path("/run/data")
+
+_INSIDE: Final = Path(__file__).parent / "inside"
+#: Seconds for the namespaces and mounts of a host.
+_BOOT: Final = 30.0
+#: Seconds for a kernel to end the processes of a host.
+_END: Final = 10.0
+#: Enters groups of control, then executes the rest: N FILE... COMMAND...
+_ENTER: Final = (
+    'n=$1; shift; while [ "$n" -gt 0 ]; do echo 0 > "$1" || exit 125; shift; n=$((n - 1)); done; '
+    'exec "$@"'
+)
+#: Would lead discovery to where the lab cannot reach, or make it deaf.
+_NOT_INHERITED: Final = (
+    "ROS_LOCALHOST_ONLY",
+    "ROS_STATIC_PEERS",
+    "ROS_DISCOVERY_SERVER",
+    "ROS_SUPER_CLIENT",
+    "XDG_RUNTIME_DIR",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Entrance:
+    """How to execute a command on a host.
+
+    Attributes:
+        command: the whole command line.
+        environment: all variables.
+        descriptors: that it must inherit; whoever made this closes them.
+    """
+
+    command: list[str]
+    environment: dict[str, str]
+    descriptors: list[int]
+
+
+def boot(hierarchies: Sequence[Hierarchy], lab: str, host: HostPlan, hosts_file: str) -> Birth:
+    """Start the first process of a host, whose network and groups are there.
+
+    Raises:
+        LabError: a namespace or mount could not be made.
+    """
+    reader, writer = os.pipe()
+    settings = {
+        "ready": writer,
+        "hostname": host.name,
+        "image": str(store.image(lab, host.name)),
+        "shm_options": f"size={host.memory // 2}" if host.memory else "",
+        "hosts_file": hosts_file,
+    }
+    doors = [str(door) for door in groups.doors(hierarchies, lab, host.name, "free")]
+    namespace = network.namespace_path(names.host_namespace(lab, host.name))
+    command = [
+        *("sh", "-c", _ENTER, "rosrm-lab", str(len(doors)), *doors),
+        *(find_command("nsenter"), f"--net={namespace}", "--"),
+        *(find_command("unshare"), "--mount", "--uts", "--ipc", "--pid"),
+        *("--propagation", "private", "--"),
+        *(sys.executable, "-I", "-S", str(_INSIDE / "init.py"), json.dumps(settings)),
+    ]
+    with os.fdopen(reader, "rb", buffering=0) as ready:
+        # A session of its own: Ctrl-C while it boots is for us, who then remove everything.
+        launcher = subprocess.Popen(
+            command,
+            pass_fds=[writer],
+            env=without_bootstrapper(os.environ),
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )
+        os.close(writer)
+        told = _until_ready(ready.fileno(), time.monotonic() + _BOOT)
+        said = _last_words(launcher)
+    pid = next((int(line[4:]) for line in told if line.startswith("pid ")), 0)
+    birth = Birth.of(pid) if pid and told[-1] == "ready" else None
+    if birth is None:
+        reasons = [line[7:] for line in told if line.startswith("failed ")]
+        reason = "; ".join([*reasons, said]).strip("; ") or f"not ready in {_BOOT:g} s"
+        raise LabError(f"host {host.name} of lab {lab!r} could not be booted: {reason}")
+    return birth
+
+
+def entrance(
+    hierarchies: Sequence[Hierarchy],
+    record: store.Record,
+    host: str,
+    command: Sequence[str],
+    *,
+    leaf: Leaf = "limited",
+    user: str = "",
+    environment: Mapping[str, str] | None = None,
+    directory: str | None = None,
+) -> Entrance:
+    """How to execute a command on a host.
+
+    Args:
+        leaf: of the host's groups.
+        user: name of the user to be; "": stay who we are.
+        environment: variables on top of our own and those of the host.
+        directory: to start in; None: ours. Where the host has none such, its disk.
+
+    Raises:
+        LabError: the host is off.
+        ConfigError: no command, or an unknown user.
+    """
+    lab = record.plan.name
+    record.plan.host(host)
+    if not command:
+        raise ConfigError("no command was given to execute")
+    birth = record.inits.get(host)
+    if birth is None or not birth.alive:
+        raise LabError(f"host {host} of lab {lab!r} is off; `rosrm lab boot {host}` switches it on")
+    identity, of_user = _identity(user)
+    descriptors: list[int] = []
+    try:
+        for door in groups.doors(hierarchies, lab, host, leaf):
+            descriptors.append(os.open(door, os.O_WRONLY))  # noqa: PERF401 - closed if one fails
+    except OSError as error:
+        _close(descriptors)
+        raise LabError(f"host {host} of lab {lab!r} has lost its control group: {error}") from None
+    order = {
+        "host": host,
+        "doors": descriptors,
+        "directory": directory or _working_directory(),
+        "data": str(DATA),
+        "identity": identity,
+    }
+    words = [
+        *(find_command("nsenter"), "--target", str(birth.pid), "--no-fork"),
+        *("--mount", "--uts", "--ipc", "--net", "--pid", "--"),
+        *(sys.executable, "-I", "-S", str(_INSIDE / "relay.py"), json.dumps(order), *command),
+    ]
+    variables = {**host_environment(os.environ, host), **of_user, **(environment or {})}
+    return Entrance(words, variables, descriptors)
+
+
+def host_environment(base: Mapping[str, str], host: str) -> dict[str, str]:
+    """The variables of a process on a host.
+
+    Args:
+        base: of whoever starts it; what it says of ROS discovery does not hold in a lab.
+        host: its name.
+    """
+    environment = without_bootstrapper(base)
+    for name in _NOT_INHERITED:
+        environment.pop(name, None)
+    environment.update(
+        ROS_AUTOMATIC_DISCOVERY_RANGE="SUBNET",
+        ROSRM_SCOPE="cgroup",
+        HOSTNAME=host,
+        XDG_STATE_HOME=str(DATA / "state"),
+        TMPDIR=str(DATA / "tmp"),
+        ROS_HOME=str(DATA / "ros"),
+    )
+    environment.pop("ROS_LOG_DIR", None)  # below ROS_HOME
+    return environment
+
+
+def power_off(hierarchies: Sequence[Hierarchy], lab: str, host: str, birth: Birth | None) -> None:
+    """End all processes of a host at once; raises `LabError` where they do not end.
+
+    Args:
+        birth: of its first process; None: not known.
+    """
+    if birth is not None and birth.alive:
+        with contextlib.suppress(ProcessLookupError), _pid_descriptor(birth.pid) as descriptor:
+            if birth.alive:  # the descriptor is its, not a later process's
+                signal.pidfd_send_signal(descriptor, signal.SIGKILL)
+                # PID 1 of a namespace ends last: when it has, all of them have.
+                if not _readable(descriptor, _END):
+                    raise LabError(f"host {host} of lab {lab!r} did not end within {_END:g} s")
+    groups.kill(hierarchies, lab, host)
+
+
+@contextlib.contextmanager
+def _pid_descriptor(pid: int) -> Iterator[int]:
+    descriptor = os.pidfd_open(pid)
+    try:
+        yield descriptor
+    finally:
+        os.close(descriptor)
+
+
+def _readable(descriptor: int, timeout: float) -> bool:
+    poll = select.poll()
+    poll.register(descriptor, select.POLLIN)
+    return bool(poll.poll(timeout * 1000.0))
+
+
+def _until_ready(reader: int, deadline: float) -> list[str]:
+    """The lines that the first process says, until it is ready, has failed or takes too long."""
+    said = b""
+    while not (said.endswith(b"\n") and said.split(b"\n")[-2].startswith((b"ready", b"failed"))):
+        if not _readable(reader, max(0.0, deadline - time.monotonic())):
+            break
+        part = os.read(reader, 4096)
+        if not part:
+            break
+        said += part
+    return said.decode(errors="replace").splitlines() or [""]
+
+
+def _last_words(launcher: subprocess.Popen[bytes]) -> str:
+    """What the launcher printed; its first child lets go of its output when it is ready."""
+    try:
+        output, _ = launcher.communicate(timeout=5.0)
+    except subprocess.TimeoutExpired:
+        launcher.kill()
+        launcher.wait()
+        return "it holds on to its output"
+    return output.decode(errors="replace").strip()
+
+
+def _identity(user: str) -> tuple[list[str], dict[str, str]]:
+    """Options of setpriv, and variables, that make a process one of a user."""
+    if not user:
+        return [], {}
+    import pwd  # noqa: PLC0415 - seldom needed
+
+    try:
+        entry = pwd.getpwnam(user)
+    except KeyError:
+        raise ConfigError(f"there is no user {user!r} on this machine") from None
+    options = [f"--reuid={entry.pw_uid}", f"--regid={entry.pw_gid}", "--init-groups"]
+    return options, {"HOME": entry.pw_dir, "USER": user, "LOGNAME": user}
+
+
+def _working_directory() -> str:
+    try:
+        return str(Path.cwd())
+    except FileNotFoundError:  # it was removed under us
+        return "/"
+
+
+def _close(descriptors: Sequence[int]) -> None:
+    for descriptor in descriptors:
+        os.close(descriptor)

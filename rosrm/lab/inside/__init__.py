@@ -1,0 +1,1 @@
+"""Programs that run within a virtual host, by their path, with the standard library alone."""

@@ -1,0 +1,107 @@
+"""Runs a command on a virtual host and stands for it outside: signals in, exit status out.
+
+Executed within the host's namespaces, but as a process of the machine: its child is the first to
+be one of the host. What the terminal sends, the child gets by itself; what somebody sends to this
+process is passed on. When this process is killed, so is the child. Standard library only.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import shutil
+import signal
+import sys
+from typing import Any
+
+#: What is passed on. SIGTSTP is not here: it stops this process, as a shell expects.
+PASSED = frozenset(
+    {
+        signal.SIGHUP,
+        signal.SIGINT,
+        signal.SIGQUIT,
+        signal.SIGTERM,
+        signal.SIGUSR1,
+        signal.SIGUSR2,
+        signal.SIGALRM,
+        signal.SIGWINCH,
+    }
+)
+#: As shells say it.
+NOT_FOUND = 127
+NOT_EXECUTABLE = 126
+NO_HOST = 125
+
+
+def main() -> None:
+    """Start the command, relay, and end as it ends."""
+    order = json.loads(sys.argv[1])
+    command = sys.argv[2:]
+    os.chdir(order["directory"] if os.path.isdir(order["directory"]) else order["data"])
+    check(command[0], order["host"])
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, PASSED | {signal.SIGCHLD})
+    child = os.fork()
+    if child == 0:
+        become(order, command, before)
+    for door in order["doors"]:
+        os.close(door)
+    end_like(relay(child))
+
+
+def check(program: str, host: str) -> None:
+    """Say on whose behalf, when there is no such program."""
+    if shutil.which(program) is not None:
+        return
+    there = os.path.exists(program) and "/" in program
+    why = "cannot be executed" if there else "no such command"
+    print(f"rosrm: on {host}: {program}: {why}", file=sys.stderr)
+    sys.exit(NOT_EXECUTABLE if there else NOT_FOUND)
+
+
+def become(order: dict[str, Any], command: list[str], mask: set[int]) -> None:
+    """In the child: enter the control groups, and be the command."""
+    try:
+        for door in order["doors"]:
+            os.write(door, b"0")
+            os.close(door)
+    except OSError as error:
+        print(f"rosrm: {order['host']} has gone: {error.strerror}", file=sys.stderr)
+        os._exit(NO_HOST)
+    for number in (signal.SIGPIPE, signal.SIGXFSZ):  # Python ignores them; others should not
+        signal.signal(number, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+    words = ["setpriv", "--pdeathsig", "KILL", *order["identity"], "--", *command]
+    os.execvp(words[0], words)  # noqa: S606 - no shell is wanted
+
+
+def relay(child: int) -> int:
+    """Pass signals on until the child has ended; returns its wait status."""
+    while True:
+        told = signal.sigwaitinfo(PASSED | {signal.SIGCHLD})
+        if told.si_signo != signal.SIGCHLD:
+            if told.si_code <= 0:  # a process sent it; the kernel's own went to the child as well
+                os.kill(child, told.si_signo)
+            continue
+        pid, status = os.waitpid(child, os.WNOHANG | os.WUNTRACED)
+        if pid and os.WIFSTOPPED(status):
+            os.kill(os.getpid(), signal.SIGSTOP)
+            os.kill(child, signal.SIGCONT)
+        elif pid:
+            return status
+
+
+def end_like(status: int) -> None:
+    """Exit with the same code, or by the same signal."""
+    if os.WIFEXITED(status):
+        os._exit(os.WEXITSTATUS(status))
+    number = os.WTERMSIG(status)
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    if number != signal.SIGKILL:
+        signal.signal(number, signal.SIG_DFL)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {number})
+    os.kill(os.getpid(), number)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,437 @@
+"""`Lab`: several virtual hosts on this machine, made, used, disturbed and removed."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from collections.abc import Iterator, Mapping, Sequence
+from ipaddress import IPv4Network
+from pathlib import Path
+from types import TracebackType
+from typing import IO, TYPE_CHECKING, Any, Final
+
+from rosrm.errors import ConfigError, LabError
+from rosrm.lab import disks, groups, needs, store
+from rosrm.lab.host import DATA, boot, entrance, power_off
+from rosrm.lab.plan import (
+    HostPlan,
+    LabPlan,
+    check_free,
+    check_name,
+    free_subnet,
+    host_namespace,
+    namespaces_of,
+    switch_namespace,
+)
+from rosrm.lab.status import HostStatus, host_status
+from rosrm.lab.store import Birth, Record
+from rosrm.lab.wires import Direction, Link, check_delay, check_loss
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+DEFAULT_NAME: Final = "lab"
+
+File = int | IO[Any] | None
+
+
+class Lab:
+    """Virtual hosts in one network of their own; as a context manager it removes them at the end.
+
+    ::
+
+        with Lab("test", uniform(2, memory=GIB, cpu=0.5) + [HostPlan("desk")]) as lab:
+            lab.exec("host1", ["hostname"])
+            lab.cut("host2", "in")
+
+    A lab whose `with` block's process was killed counts as left behind: the next of its name
+    removes it first. One that is made by `up` stays until `down`.
+
+    Args:
+        name: of the lab.
+        hosts: to be made; for a lab that is up, none.
+        subnet: IPv4 range of their addresses; None: a free one.
+
+    Attributes:
+        name: of the lab.
+    """
+
+    def __init__(
+        self,
+        name: str = DEFAULT_NAME,
+        hosts: Sequence[HostPlan] = (),
+        *,
+        subnet: IPv4Network | None = None,
+    ) -> None:
+        check_name(name, "lab")
+        self.name: Final = name
+        self._hosts = tuple(hosts)
+        self._subnet = subnet
+        self._known: list[groups.Hierarchy] | None = None
+
+    # --- begin and end ------------------------------------------------------------------------
+
+    def up(self, *, owner: Birth | None = None) -> None:
+        """Make the lab; what a killed attempt left is removed first.
+
+        Args:
+            owner: the process whose end makes it one that was left behind.
+
+        Raises:
+            LabError: it is up already, or something is missing on this machine; nothing is left.
+            ConfigError: the hosts or the subnet cannot be.
+        """
+        from rosrm.lab import network  # noqa: PLC0415 - pyroute2 is looked for first
+
+        needs.check_rights(self._hosts)
+        needs.check_machine(self._hosts, store.IMAGES)
+        with store.lock(self.name):
+            self._refuse_if_up()
+            self._remove()
+            with store.lock(""):  # two labs at once must not choose the same addresses
+                subnet = self._choose_subnet(network.ranges_in_use())
+                plan = LabPlan(self.name, self._hosts, subnet)
+                links = {name: Link() for name in plan.names}
+                record = Record(plan, boot=store.boot_id(), owner=owner, links=links)
+                store.write(record)
+            try:
+                network.make_switch(plan)
+                for host in plan.hosts:
+                    self._make_host(host)
+                    self._switch_on(record, host.name)
+                record.complete = True
+                store.write(record)
+            except BaseException:
+                self._remove()
+                raise
+
+    def down(self) -> bool:
+        """Remove the lab: end its processes, delete its disks. False: there was nothing of it.
+
+        Raises:
+            LabError: something could not be removed; repeating it goes on.
+        """
+        needs.check_rights()
+        with store.lock(self.name):
+            return self._remove()
+
+    def __enter__(self) -> Self:
+        """Make the lab; it ends with this process at the latest when the next one is made."""
+        self.up(owner=Birth.of(os.getpid()))
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.down()
+
+    # --- looking ------------------------------------------------------------------------------
+
+    @property
+    def plan(self) -> LabPlan:
+        """What the lab consists of; raises `LabError` where it is not up."""
+        return self._record().plan
+
+    def address(self, host: str) -> str:
+        """A host's IPv4 address in the lab."""
+        return str(self.plan.address(host))
+
+    def is_up(self, host: str) -> bool:
+        """Whether a host is switched on."""
+        record = self._record()
+        return record.is_up(record.plan.host(host).name)
+
+    def status(self) -> list[HostStatus]:
+        """How each host is."""
+        record = self._record()
+        return [host_status(self._hierarchies, record, host) for host in record.plan.hosts]
+
+    def outside(self, host: str, path: str | Path) -> Path:
+        """A file of a host, as this machine reaches it while the host is up.
+
+        Args:
+            path: as the host has it; a relative one is on its disk.
+        """
+        record = self._record()
+        if not record.is_up(record.plan.host(host).name):
+            raise LabError(f"host {host} of lab {self.name!r} is off: its files are out of reach")
+        return record.outside(host, DATA / path)
+
+    def group(self, host: str) -> str:
+        """The control group with a host's limits, as the option `group` of a probe wants it."""
+        self.plan.host(host)
+        hierarchy = self._hierarchies[0]
+        limited = hierarchy.group(self.name, host, "limited")
+        return f"/{limited.relative_to(hierarchy.mount)}"
+
+    def pids(self, host: str) -> set[int]:
+        """The processes of a host, by their numbers on this machine."""
+        self.plan.host(host)
+        return groups.members(self._hierarchies, self.name, host)
+
+    # --- commands on a host -------------------------------------------------------------------
+
+    def popen(  # noqa: PLR0913 - see below: most are Popen's
+        self,
+        host: str,
+        command: Sequence[str],
+        *,
+        limited: bool = True,
+        user: str = "",
+        env: Mapping[str, str] | None = None,
+        cwd: str | None = None,
+        stdin: File = None,
+        stdout: File = None,
+        stderr: File = None,
+        pass_fds: Sequence[int] = (),
+    ) -> subprocess.Popen[bytes]:
+        """Start a command on a host; the other arguments are those of `subprocess.Popen`.
+
+        What is returned stands for it: signals reach the command, its exit status is the
+        command's, and killing the one kills the other.
+
+        Args:
+            limited: it counts against the host's memory and CPU; False: it is on the host, but
+                beside its limits.
+            user: to run as; "": as this process.
+            env: variables on top of this process's and the host's.
+            cwd: directory to start in; None: this process's.
+        """
+        way = entrance(
+            self._hierarchies,
+            self._record(),
+            host,
+            command,
+            leaf="limited" if limited else "free",
+            user=user,
+            environment=env,
+            directory=cwd,
+        )
+        try:
+            return subprocess.Popen(
+                way.command,
+                env=way.environment,
+                stdin=stdin,
+                stdout=stdout,
+                stderr=stderr,
+                pass_fds=[*way.descriptors, *pass_fds],
+            )
+        finally:
+            for descriptor in way.descriptors:
+                os.close(descriptor)
+
+    def exec(
+        self,
+        host: str,
+        command: Sequence[str],
+        *,
+        limited: bool = True,
+        user: str = "",
+        env: Mapping[str, str] | None = None,
+        input: str | None = None,  # noqa: A002 - as subprocess.run calls it
+        timeout: float = 60.0,
+        check: bool = True,
+    ) -> subprocess.CompletedProcess[str]:
+        """Run a command on a host to its end, and return what it said.
+
+        Args:
+            input: what it reads.
+            timeout: seconds, after which it is killed and `subprocess.TimeoutExpired` raised.
+            check: raise `LabError` where it fails.
+        """
+        process = self.popen(
+            host,
+            command,
+            limited=limited,
+            user=user,
+            env=env,
+            stdin=subprocess.DEVNULL if input is None else subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+        )
+        with process:
+            try:
+                out, err = process.communicate((input or "").encode() or None, timeout)
+            except BaseException:
+                process.kill()
+                raise
+        said, troubles = out.decode(errors="replace"), err.decode(errors="replace")
+        if check and process.returncode:
+            raise LabError(
+                f"{command[0]} on {host} ended with {process.returncode}: "
+                f"{troubles.strip() or said.strip() or 'it said nothing'}"
+            )
+        return subprocess.CompletedProcess(list(command), process.returncode, said, troubles)
+
+    def become(
+        self, host: str, command: Sequence[str], *, user: str = "", env: Mapping[str, str]
+    ) -> None:
+        """Put a command on a host in this process's place; returns only by raising."""
+        way = entrance(self._hierarchies, self._record(), host, command, user=user, environment=env)
+        for descriptor in way.descriptors:
+            os.set_inheritable(descriptor, True)
+        os.execve(way.command[0], way.command, way.environment)  # noqa: S606 - no shell is wanted
+
+    # --- disturbing ---------------------------------------------------------------------------
+
+    def cut(self, host: str, direction: Direction = "both") -> None:
+        """Let nothing pass to the host ("in"), from it ("out"), or both."""
+        self._change_link(host, direction, cut=True)
+
+    def loss(self, host: str, fraction: float, direction: Direction = "both") -> None:
+        """Lose a fraction (0..1) of the packets to and from a host; 0 ends it."""
+        check_loss(fraction)
+        self._change_link(host, direction, loss=fraction)
+
+    def delay(self, host: str, seconds: float, direction: Direction = "both") -> None:
+        """Let each packet to and from a host be late; 0 ends it.
+
+        Raises:
+            LabError: this kernel cannot delay; nothing was changed.
+        """
+        check_delay(seconds)
+        self._change_link(host, direction, delay=seconds)
+
+    def heal(self, host: str) -> None:
+        """End cuts, losses and delays of a host."""
+        self._change_link(host, "both", cut=False, loss=0.0, delay=0.0)
+
+    def kill(self, host: str) -> None:
+        """Cut a host's power: all its processes end at once, and the network hears no farewell.
+
+        Its disk keeps what was written; memory, /run and /dev/shm are lost. `boot` ends it.
+        """
+        from rosrm.lab import network  # noqa: PLC0415 - see `up`
+
+        with store.lock(self.name):
+            record = self._record()
+            network.unplug(record.plan, record.plan.host(host).name)
+            power_off(self._hierarchies, self.name, host, record.inits.pop(host, None))
+            network.remove(_of_host(record.plan, host, network.existing()))
+            store.write(record)
+
+    def boot(self, host: str) -> None:
+        """Switch a host on again after `kill`; nothing runs there yet. Raises `LabError`."""
+        with store.lock(self.name):
+            record = self._record()
+            if self.is_up(host):
+                raise LabError(f"host {host} of lab {self.name!r} is up already")
+            self._switch_on(record, host)
+            store.write(record)
+
+    # --- inner parts --------------------------------------------------------------------------
+
+    @property
+    def _hierarchies(self) -> list[groups.Hierarchy]:
+        if self._known is None:
+            self._known = groups.find_hierarchies()
+        return self._known
+
+    def _record(self) -> Record:
+        record = store.read(self.name)
+        if record is None:
+            others = ", ".join(sorted(store.labs())) or "none"
+            raise LabError(
+                f"there is no lab {self.name!r} (labs: {others}); `rosrm lab up` makes one"
+            )
+        if not record.complete:
+            raise LabError(
+                f"lab {self.name!r} was not made to the end: `rosrm lab up` begins anew, "
+                "`rosrm lab down` removes what there is"
+            )
+        if record.boot != store.boot_id():
+            raise LabError(
+                f"lab {self.name!r} did not survive the restart of this machine: `rosrm lab up` "
+                "makes it anew, `rosrm lab down` removes the rest of it"
+            )
+        return record
+
+    def _refuse_if_up(self) -> None:
+        record = store.read(self.name)
+        if record is None or not record.complete or record.boot != store.boot_id():
+            return
+        if record.owner is not None and not record.owner.alive:
+            return
+        raise LabError(
+            f"lab {self.name!r} is up already, with {', '.join(record.plan.names)}. "
+            "`rosrm lab down` removes it; another name (`--lab NAME`) makes a second one"
+        )
+
+    def _choose_subnet(self, machine: list[tuple[IPv4Network, str]]) -> IPv4Network:
+        labs = [(one, store.read(one)) for one in store.labs()]
+        taken = [
+            *machine,
+            *((known.plan.subnet, f"lab {name!r}") for name, known in labs if known is not None),
+        ]
+        if self._subnet is None:
+            return free_subnet([subnet for subnet, _ in taken])
+        check_free(self._subnet, taken)
+        return self._subnet
+
+    def _make_host(self, host: HostPlan) -> None:
+        groups.make(self._hierarchies, self.name, host)
+        disks.make(store.image(self.name, host.name), host)
+
+    def _switch_on(self, record: Record, host: str) -> None:
+        from rosrm.lab import network  # noqa: PLC0415 - see `up`
+
+        plan = record.plan
+        # What an earlier life may have left, were it killed in the midst.
+        network.unplug(plan, host)
+        power_off(self._hierarchies, self.name, host, record.inits.pop(host, None))
+        network.remove(_of_host(plan, host, network.existing()))
+        network.plug_in(plan, host, record.links[host])
+        record.inits[host] = boot(self._hierarchies, self.name, plan.host(host), plan.hosts_file())
+
+    def _remove(self) -> bool:
+        """Remove all there is of a lab of this name, whatever is known of it."""
+        from rosrm.lab import network  # noqa: PLC0415 - see `up`
+
+        namespaces = list(namespaces_of(self.name, network.existing()))
+        found = bool(namespaces) or self.name in store.labs() | groups.labs(self._hierarchies)
+        if not found:
+            return False
+        # The groups hold every process of the lab: first ones, and all that were started there.
+        groups.kill(self._hierarchies, self.name)
+        network.remove(namespaces)
+        groups.remove(self._hierarchies, self.name)
+        store.forget(self.name)
+        return True
+
+    def _change_link(self, host: str, direction: Direction, **values: Any) -> None:
+        from rosrm.lab import network  # noqa: PLC0415 - see `up`
+
+        with store.lock(self.name):
+            record = self._record()
+            before = record.links[record.plan.host(host).name]
+            after = before.changed(direction, **values)
+            if self.is_up(host):
+                network.set_delays(record.plan, host, before, after)
+            record.links[host] = after
+            network.set_rules(record.plan, record.links)
+            store.write(record)
+
+
+def all_labs() -> Iterator[Lab]:
+    """Every lab of which there is something on this machine, killed attempts too."""
+    from rosrm.lab import network  # noqa: PLC0415 - pyroute2 may be missing
+
+    found = store.labs() | groups.labs(groups.find_hierarchies())
+    prefix = switch_namespace("")
+    found |= {
+        name.removeprefix(prefix).partition(":")[0]
+        for name in network.existing()
+        if name.startswith(prefix)
+    }
+    for name in sorted(found):
+        try:
+            yield Lab(name)
+        except ConfigError:  # a folder that somebody else put there
+            continue
+
+
+def _of_host(plan: LabPlan, host: str, existing: list[str]) -> list[str]:
+    return [name for name in existing if name == host_namespace(plan.name, host)]

@@ -1,0 +1,178 @@
+"""The network of a lab: a bridge in a namespace of its own, and a cable from it to each host.
+
+The bridge has no address, and nothing else hangs on it: nothing a host sends gets out of the lab.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import subprocess
+from collections.abc import Iterator, Mapping
+from ipaddress import IPv4Network
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from pyroute2 import IPRoute, NetlinkError, netns
+
+from rosrm.errors import LabError
+from rosrm.lab import plan as names
+from rosrm.lab.needs import find_command
+from rosrm.lab.plan import LabPlan
+from rosrm.lab.wires import Link, Wire, ruleset
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+_BRIDGE: Final = "bridge"
+#: How a host calls its one interface.
+INTERFACE: Final = "eth0"
+_NAMESPACES: Final = Path("/run/netns")
+_MAIN_TABLE: Final = 254
+_IPV4: Final = 2
+
+
+def namespace_path(name: str) -> Path:
+    """The file that stands for a network namespace."""
+    return _NAMESPACES / name
+
+
+def existing() -> list[str]:
+    """All named network namespaces of this machine."""
+    return list(netns.listnetns())
+
+
+def ranges_in_use() -> list[tuple[IPv4Network, str]]:
+    """The address ranges that this machine reaches directly or by a route, and how."""
+    found = []
+    with IPRoute() as machine:
+        interfaces = {link["index"]: link.get("ifname") for link in machine.get_links()}
+        for route in machine.get_routes(family=_IPV4, table=_MAIN_TABLE):
+            target = route.get("dst")
+            if target:  # the default route is nobody's range
+                owner = interfaces.get(route.get("oif"), "a route of this machine")
+                found.append((IPv4Network(f"{target}/{route['dst_len']}"), f"{owner}"))
+    return found
+
+
+def make_switch(lab: LabPlan) -> None:
+    """Make the namespace with the bridge."""
+    name = names.switch_namespace(lab.name)
+    netns.create(name)
+    with _inside(name) as switch:
+        # Without a querier in the lab, snooping would forget who listens to multicast.
+        switch.link("add", ifname=_BRIDGE, kind="bridge", br_mcast_snooping=0, br_stp_state=0)
+        switch.link("set", index=_index(switch, _BRIDGE), state="up")
+
+
+def plug_in(lab: LabPlan, host: str, link: Link) -> None:
+    """Make a host's namespace, and the cable to the switch.
+
+    Args:
+        link: what is wrong with the cable from the beginning.
+    """
+    name, port = names.host_namespace(lab.name, host), lab.port(host)
+    netns.create(name)
+    with _inside(names.switch_namespace(lab.name)) as switch, _inside(name) as inside:
+        peer = {"ifname": INTERFACE, "net_ns_fd": name, "address": lab.mac(host)}
+        switch.link("add", ifname=port, kind="veth", peer=peer)
+        switch.link("set", index=_index(switch, port), master=_index(switch, _BRIDGE), state="up")
+        mine = _index(inside, INTERFACE)
+        inside.addr(
+            "add",
+            index=mine,
+            address=str(lab.address(host)),
+            prefixlen=lab.subnet.prefixlen,
+            broadcast=str(lab.subnet.broadcast_address),
+        )
+        for index in (_index(inside, "lo"), mine):
+            inside.link("set", index=index, state="up")
+    if Link() != link:
+        set_delays(lab, host, Link(), link)
+
+
+def unplug(lab: LabPlan, host: str) -> None:
+    """Take a host's cable away; nothing that its dying processes send is heard any more."""
+    if names.switch_namespace(lab.name) not in existing():
+        return
+    with _inside(names.switch_namespace(lab.name)) as switch:
+        for index in switch.link_lookup(ifname=lab.port(host)):
+            switch.link("del", index=index)
+
+
+def remove(namespaces: Iterable[str]) -> None:
+    """Remove namespaces with all that is in them."""
+    for name in namespaces:
+        with contextlib.suppress(FileNotFoundError):
+            netns.remove(name)
+
+
+def set_rules(lab: LabPlan, links: Mapping[str, Link]) -> None:
+    """Put cuts and losses in force, all at once.
+
+    Args:
+        links: by host.
+
+    Raises:
+        LabError: nft is missing, or the kernel refuses.
+    """
+    nft = find_command("nft")
+    switch = namespace_path(names.switch_namespace(lab.name))
+    rules = ruleset({lab.port(host): link for host, link in links.items()})
+    command = [find_command("nsenter"), f"--net={switch}", "--", nft, "-f", "-"]
+    done = subprocess.run(command, input=rules, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise LabError(
+            f"the firewall of lab {lab.name!r} could not be set, and nothing was changed: "
+            f"{done.stderr.strip()}"
+        )
+
+
+def set_delays(lab: LabPlan, host: str, before: Link, after: Link) -> None:
+    """Delay what goes to and from a host.
+
+    Raises:
+        LabError: the kernel has no netem; nothing was changed.
+    """
+    ends = (
+        (names.switch_namespace(lab.name), lab.port(host), before.incoming, after.incoming),
+        (names.host_namespace(lab.name, host), INTERFACE, before.outgoing, after.outgoing),
+    )
+    with contextlib.ExitStack() as undo:
+        for name, interface, old, new in ends:
+            if old.delay != new.delay:
+                _set_delay(name, interface, new)
+                undo.callback(_set_delay, name, interface, old)
+        undo.pop_all()
+
+
+def _set_delay(name: str, interface: str, wire: Wire) -> None:
+    with _inside(name) as namespace:
+        index = _index(namespace, interface)
+        try:
+            if wire.delay:
+                # limit: packets on their way; netem drops what is more than that.
+                namespace.tc(
+                    "replace", "netem", index=index, delay=round(wire.delay * 1e6), limit=100_000
+                )
+            else:
+                namespace.tc("del", index=index, root=True)
+        except NetlinkError as error:
+            if error.code in (errno.ENOENT, errno.EOPNOTSUPP):
+                raise LabError(
+                    "this kernel cannot delay packets: it has no netem (CONFIG_NET_SCH_NETEM, on "
+                    "Debian and Ubuntu the module sch_netem: `modprobe sch_netem`). Nothing was "
+                    "changed"
+                ) from None
+            raise
+
+
+@contextlib.contextmanager
+def _inside(name: str) -> Iterator[Any]:
+    """A netlink connection within a namespace."""
+    with IPRoute(netns=name) as connection:
+        yield connection
+
+
+def _index(connection: Any, interface: str) -> int:
+    return int(connection.link_lookup(ifname=interface)[0])

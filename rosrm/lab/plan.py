@@ -1,0 +1,226 @@
+"""What a lab consists of: its hosts, their sizes, addresses and names. Pure: makes nothing."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from ipaddress import IPv4Address, IPv4Network
+from typing import Any, Final
+
+from rosrm.errors import ConfigError
+
+MIB: Final = 2**20
+GIB: Final = 2**30
+
+#: A Python program with ROS needs several times as much; below this not even a shell is sure.
+LEAST_MEMORY: Final = 16 * MIB
+#: The kernel gives out CPU time by the millisecond, in periods of 100 ms at most.
+LEAST_CPU: Final = 0.01
+#: Below this ext4 leaves hardly any room for files.
+LEAST_DISK: Final = 16 * MIB
+MOST_HOSTS: Final = 250
+DEFAULT_DISK: Final = GIB
+
+#: Labs take their addresses from here, one /24 each.
+POOL: Final = IPv4Network("10.213.0.0/16")
+_POOL_PREFIX: Final = 24
+
+#: What a host name may be; interface names, namespaces and control groups are made of them.
+_NAME: Final = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9-]{0,30}[A-Za-z0-9])?")
+
+
+@dataclass(frozen=True, slots=True)
+class HostPlan:
+    """One virtual host.
+
+    Attributes:
+        name: its host name.
+        memory: bytes that its processes may use together; None: no limit.
+        cpu: cores that its processes may use together; None: no limit.
+        disk: bytes of the file system that holds its data.
+    """
+
+    name: str
+    memory: int | None = None
+    cpu: float | None = None
+    disk: int = DEFAULT_DISK
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be made; raises `ConfigError`."""
+        check_name(self.name, "host")
+        _check_least(self, "memory", self.memory, LEAST_MEMORY, "16MiB")
+        _check_least(self, "cpu", self.cpu, LEAST_CPU, "0.01 cores")
+        _check_least(self, "disk", self.disk, LEAST_DISK, "16MiB")
+
+
+@dataclass(frozen=True, slots=True)
+class LabPlan:
+    """A lab: hosts in one network of their own.
+
+    Attributes:
+        name: several labs with different names live side by side.
+        hosts: in the order of their addresses.
+        subnet: of their addresses.
+    """
+
+    name: str
+    hosts: tuple[HostPlan, ...]
+    subnet: IPv4Network
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be made; raises `ConfigError`."""
+        check_name(self.name, "lab")
+        if not 1 <= len(self.hosts) <= MOST_HOSTS:
+            raise ConfigError(
+                f"lab {self.name!r}: {len(self.hosts)} hosts; allowed are 1 to {MOST_HOSTS}"
+            )
+        twice = sorted({one for one in self.names if self.names.count(one) > 1})
+        if twice:
+            raise ConfigError(f"lab {self.name!r}: host {', '.join(twice)} is given twice")
+        room = self.subnet.num_addresses - 2
+        if len(self.hosts) > room:
+            raise ConfigError(
+                f"the subnet {self.subnet} has {max(0, room)} addresses for {len(self.hosts)} "
+                "hosts; give a larger one, for example a /24"
+            )
+
+    @property
+    def names(self) -> list[str]:
+        """The hosts' names."""
+        return [host.name for host in self.hosts]
+
+    def host(self, name: str) -> HostPlan:
+        """One host by its name; raises `ConfigError` where there is none."""
+        for host in self.hosts:
+            if host.name == name:
+                return host
+        raise ConfigError(
+            f"lab {self.name!r} has no host {name!r}; it has: {', '.join(self.names)}"
+        )
+
+    def number(self, name: str) -> int:
+        """Of a host, from 1 on."""
+        return self.names.index(self.host(name).name) + 1
+
+    def address(self, name: str) -> IPv4Address:
+        """Of a host on the lab's network."""
+        return self.subnet.network_address + self.number(name)
+
+    def mac(self, name: str) -> str:
+        """A host's hardware address; it stays when the host is booted again."""
+        low = int(self.address(name)).to_bytes(4, "big")
+        return "02:00:" + ":".join(f"{byte:02x}" for byte in low)
+
+    def port(self, name: str) -> str:
+        """The interface of the switch that a host hangs on."""
+        return f"port{self.number(name)}"
+
+    def hosts_file(self) -> str:
+        """What each host's /etc/hosts says."""
+        lines = ["127.0.0.1 localhost", "::1 localhost"]
+        lines += [f"{self.address(name)} {name}" for name in self.names]
+        return "\n".join(lines) + "\n"
+
+    def to_plain(self) -> dict[str, Any]:
+        """For the lab's state file."""
+        return {
+            "name": self.name,
+            "subnet": str(self.subnet),
+            "hosts": [[host.name, host.memory, host.cpu, host.disk] for host in self.hosts],
+        }
+
+    @classmethod
+    def from_plain(cls, plain: Mapping[str, Any]) -> LabPlan:
+        """What `to_plain` made."""
+        hosts = tuple(HostPlan(*fields) for fields in plain["hosts"])
+        return cls(plain["name"], hosts, IPv4Network(plain["subnet"]))
+
+
+def uniform(
+    number: int, *, memory: int | None = None, cpu: float | None = None, disk: int = DEFAULT_DISK
+) -> list[HostPlan]:
+    """Hosts alike: host1, host2, ..., in the units of `HostPlan`."""
+    if not 1 <= number <= MOST_HOSTS:
+        raise ConfigError(f"{number} hosts; allowed are 1 to {MOST_HOSTS}")
+    return [HostPlan(f"host{i}", memory, cpu, disk) for i in range(1, number + 1)]
+
+
+def check_name(name: str, what: str) -> None:
+    """Raise `ConfigError` for a name that a host or lab cannot have."""
+    if not _NAME.fullmatch(name):
+        raise ConfigError(
+            f"{name!r} cannot be the name of a {what}. Allowed: at most 32 letters, digits and "
+            "'-', a letter or digit at both ends"
+        )
+
+
+def parse_subnet(text: str) -> IPv4Network:
+    """A subnet such as 10.9.0.0/24; raises `ConfigError`."""
+    try:
+        return IPv4Network(text)
+    except ValueError as error:
+        raise ConfigError(
+            f"--subnet {text!r}: {error}; give an IPv4 range such as 10.9.0.0/24"
+        ) from None
+
+
+def free_subnet(taken: Sequence[IPv4Network]) -> IPv4Network:
+    """The first of the pool that overlaps with nothing; raises `ConfigError` when all are taken.
+
+    Args:
+        taken: what this machine and other labs use.
+    """
+    for subnet in POOL.subnets(new_prefix=_POOL_PREFIX):
+        if not any(subnet.overlaps(other) for other in taken):
+            return subnet
+    raise ConfigError(f"every /24 of {POOL} is in use on this machine; choose one with --subnet")
+
+
+def check_free(subnet: IPv4Network, taken: Iterable[tuple[IPv4Network, str]]) -> None:
+    """Raise `ConfigError` for a subnet that is in use.
+
+    Args:
+        subnet: that was asked for.
+        taken: ranges, and who has them.
+    """
+    for other, owner in taken:
+        if subnet.overlaps(other):
+            raise ConfigError(
+                f"the address range {subnet} is in use: {owner} has {other}. Choose another "
+                "--subnet, or leave it out: then a free one is taken"
+            )
+
+
+def total(amounts: Iterable[float | None]) -> float:
+    """The sum of what is limited."""
+    return sum(amount for amount in amounts if amount is not None)
+
+
+def _check_least(host: HostPlan, what: str, amount: float | None, least: float, words: str) -> None:
+    if amount is not None and amount < least:
+        raise ConfigError(f"host {host.name}: {what} {amount:g} is too little; at least {words}")
+
+
+# --- names on the machine ---------------------------------------------------------------------
+
+#: Namespaces and control groups of all labs begin with this.
+PREFIX: Final = "rosrm-lab"
+
+
+def switch_namespace(lab: str) -> str:
+    """The network namespace with the bridge between a lab's hosts."""
+    return f"{PREFIX}:{lab}"
+
+
+def host_namespace(lab: str, host: str) -> str:
+    """The network namespace of a host."""
+    return f"{PREFIX}:{lab}:{host}"
+
+
+def namespaces_of(lab: str, existing: Iterable[str]) -> Iterator[str]:
+    """The namespaces that belong to a lab, those of its hosts first."""
+    mine = [name for name in existing if name.startswith(host_namespace(lab, ""))]
+    yield from mine
+    if switch_namespace(lab) in existing:
+        yield switch_namespace(lab)

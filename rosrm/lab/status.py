@@ -1,0 +1,62 @@
+"""How the hosts of a lab are."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from rosrm.lab import disks, groups
+from rosrm.lab.groups import Hierarchy
+from rosrm.lab.host import DATA
+from rosrm.lab.plan import HostPlan
+from rosrm.lab.store import Record
+
+
+@dataclass(frozen=True, slots=True)
+class HostStatus:
+    """How a host is.
+
+    Attributes:
+        lab: the name of its lab.
+        name: of the host.
+        state: "up" or "off".
+        address: on the lab's network.
+        memory: bytes its limited processes may use; None: no limit.
+        memory_used: bytes; None: not known.
+        cpu: cores its limited processes may use; None: no limit.
+        disk: bytes of its disk.
+        disk_used: bytes; None: not known, for the host is off.
+        processes: how many run there.
+        network: what is wrong with its link, in words; "": nothing.
+    """
+
+    lab: str
+    name: str
+    state: str
+    address: str
+    memory: int | None
+    memory_used: int | None
+    cpu: float | None
+    disk: int
+    disk_used: int | None
+    processes: int
+    network: str
+
+
+def host_status(hierarchies: Sequence[Hierarchy], record: Record, host: HostPlan) -> HostStatus:
+    """How one host is now."""
+    lab, alive = record.plan.name, record.is_up(host.name)
+    pids = groups.members(hierarchies, lab, host.name)
+    return HostStatus(
+        lab=lab,
+        name=host.name,
+        state="up" if alive else "off",
+        address=str(record.plan.address(host.name)),
+        memory=host.memory,
+        memory_used=groups.memory_used(hierarchies, lab, host.name),
+        cpu=host.cpu,
+        disk=host.disk,
+        disk_used=disks.used(record.outside(host.name, DATA)) if alive else None,
+        processes=max(0, len(pids) - alive),  # the first one is part of the lab
+        network=record.links[host.name].describe(),
+    )

@@ -1,0 +1,187 @@
+"""What is known of a lab between two commands: one file each, under /run/rosrm-lab.
+
+What a command makes on the machine can be found and removed without the file; it tells the plan,
+the first process of each host, and what is wrong with the network.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import shutil
+import socket
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from rosrm.errors import LabError
+from rosrm.lab import wires
+from rosrm.lab.plan import PREFIX, LabPlan
+from rosrm.lab.wires import Link
+from rosrm.supervisor.members import read_stat
+
+RUN: Final = Path("/run") / PREFIX
+#: Disks go where there is room, not into the memory that /run is made of.
+IMAGES: Final = Path("/var/lib") / PREFIX
+
+_VERSION: Final = 1
+_FILE: Final = "lab.json"
+_LOOK: Final = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Birth:
+    """A process that can be told from a later one of the same number.
+
+    Attributes:
+        pid: its number.
+        started: clock ticks since the machine's boot.
+    """
+
+    pid: int
+    started: int
+
+    @classmethod
+    def of(cls, pid: int) -> Birth | None:
+        """Of a process that lives; None: there is none."""
+        stat = read_stat(pid)
+        return cls(pid, stat.start) if stat is not None and stat.alive else None
+
+    @property
+    def alive(self) -> bool:
+        """It lives on."""
+        return Birth.of(self.pid) == self
+
+
+@dataclass(slots=True)
+class Record:
+    """A lab as its file has it.
+
+    Attributes:
+        plan: what it consists of.
+        complete: it was made to the end; else it is being made, or that was interrupted.
+        boot: the boot of the machine in which it was made.
+        owner: the process whose end makes the lab one that was left behind; None: it stays.
+        inits: the first process of each host that was booted.
+        links: what is wrong with the hosts' network.
+    """
+
+    plan: LabPlan
+    complete: bool = False
+    boot: str = ""
+    owner: Birth | None = None
+    inits: dict[str, Birth] = field(default_factory=dict)
+    links: dict[str, Link] = field(default_factory=dict)
+
+    def is_up(self, host: str) -> bool:
+        """Whether a host is switched on."""
+        birth = self.inits.get(host)
+        return birth is not None and birth.alive
+
+    def outside(self, host: str, path: Path) -> Path:
+        """A file of a host that is up, as this machine reaches it."""
+        return Path(f"/proc/{self.inits[host].pid}/root") / str(path).lstrip("/")
+
+    def to_plain(self) -> dict[str, Any]:
+        """For the file."""
+        return {
+            "version": _VERSION,
+            "plan": self.plan.to_plain(),
+            "complete": self.complete,
+            "boot": self.boot,
+            "owner": _born(self.owner),
+            "inits": {name: _born(birth) for name, birth in self.inits.items()},
+            "links": wires.to_plain(self.links),
+        }
+
+    @classmethod
+    def from_plain(cls, plain: Mapping[str, Any]) -> Record:
+        """What `to_plain` made."""
+        if plain["version"] != _VERSION:
+            raise ValueError(f"version {plain['version']}")
+        owner = plain["owner"]
+        return cls(
+            plan=LabPlan.from_plain(plain["plan"]),
+            complete=bool(plain["complete"]),
+            boot=str(plain["boot"]),
+            owner=Birth(*owner) if owner else None,
+            inits={name: Birth(*birth) for name, birth in plain["inits"].items()},
+            links=wires.from_plain(plain["links"]),
+        )
+
+
+def boot_id() -> str:
+    """Names this boot of the machine."""
+    return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+
+
+def read(lab: str) -> Record | None:
+    """What is known of a lab; None: nothing, or nothing that can be understood."""
+    try:
+        return Record.from_plain(json.loads((RUN / lab / _FILE).read_text()))
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def write(record: Record) -> None:
+    """Keep what is known of a lab; a reader sees the old or the new, never a part."""
+    folder = RUN / record.plan.name
+    folder.mkdir(parents=True, exist_ok=True)
+    part = folder / f"{_FILE}.part"
+    part.write_text(json.dumps(record.to_plain()))
+    part.replace(folder / _FILE)
+
+
+def image(lab: str, host: str) -> Path:
+    """The file that is a host's disk."""
+    return IMAGES / lab / f"{host}.ext4"
+
+
+def forget(lab: str) -> None:
+    """Remove all files of a lab; that of its state goes last."""
+    for folder in (IMAGES / lab, RUN / lab):
+        if folder.exists():
+            shutil.rmtree(folder)
+        with contextlib.suppress(OSError):  # other labs have theirs in it
+            folder.parent.rmdir()
+
+
+def labs() -> set[str]:
+    """The labs that have files."""
+    return {
+        entry.name
+        for folder in (RUN, IMAGES)
+        if folder.is_dir()
+        for entry in folder.iterdir()
+        if entry.is_dir()
+    }
+
+
+@contextlib.contextmanager
+def lock(name: str, timeout: float = 30.0) -> Iterator[None]:
+    """Let one command at a time change a lab; the end of a process frees what it held.
+
+    Args:
+        name: of the lab; "" for what concerns all of them.
+        timeout: seconds to wait for another command.
+    """
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as claim:
+        deadline = time.monotonic() + timeout
+        while True:
+            try:
+                claim.bind(f"\0{PREFIX}:{name}")
+                break
+            except OSError:
+                if time.monotonic() > deadline:
+                    raise LabError(
+                        f"another command is at work on lab {name!r}, for more than {timeout:g} s: "
+                        "wait for its end, or end it"
+                    ) from None
+                time.sleep(_LOOK)  # nothing tells that a name has become free
+        yield
+
+
+def _born(birth: Birth | None) -> list[int] | None:
+    return None if birth is None else [birth.pid, birth.started]

@@ -1,0 +1,134 @@
+"""What is wrong with the network of each host, and the firewall rules that make it so. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Final, Literal
+
+from rosrm.errors import ConfigError
+
+#: "in": what the host hears; "out": what others hear of it.
+Direction = Literal["in", "out", "both"]
+DIRECTIONS: Final = ("in", "out", "both")
+
+_TABLE: Final = "rosrm_lab"
+#: Fractions are rounded to one in so many.
+_DICE: Final = 1_000_000
+#: Seconds; netem keeps microseconds in 32 bits.
+_MOST_DELAY: Final = 60.0
+
+
+@dataclass(frozen=True, slots=True)
+class Wire:
+    """One direction of a host's link.
+
+    Attributes:
+        cut: nothing passes.
+        loss: fraction of the packets that are lost, each by chance.
+        delay: seconds by which each packet is late.
+    """
+
+    cut: bool = False
+    loss: float = 0.0
+    delay: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Link:
+    """Both directions of a host's link.
+
+    Attributes:
+        incoming: to the host.
+        outgoing: from the host.
+    """
+
+    incoming: Wire = field(default_factory=Wire)
+    outgoing: Wire = field(default_factory=Wire)
+
+    def changed(self, direction: Direction, **values: Any) -> Link:
+        """With other values of `Wire` in one direction or both; raises `ConfigError`."""
+        check_direction(direction)
+        incoming, outgoing = self.incoming, self.outgoing
+        if direction != "out":
+            incoming = replace(incoming, **values)
+        if direction != "in":
+            outgoing = replace(outgoing, **values)
+        return Link(incoming, outgoing)
+
+    def describe(self) -> str:
+        """In words; "" for a link without faults."""
+        if self.incoming == self.outgoing:
+            return _words(self.incoming)
+        parts = [("in", self.incoming), ("out", self.outgoing)]
+        return "; ".join(f"{way}: {_words(wire)}" for way, wire in parts if wire != Wire())
+
+
+def check_direction(direction: str) -> None:
+    """Raise `ConfigError` for a word that is no direction."""
+    if direction not in DIRECTIONS:
+        raise ConfigError(f"direction {direction!r}; allowed: {', '.join(DIRECTIONS)}")
+
+
+def check_loss(fraction: float) -> None:
+    """Raise `ConfigError` for what is no fraction."""
+    if not 0.0 <= fraction <= 1.0:
+        raise ConfigError(f"loss {fraction:g} is not within 0..1 (0 % to 100 %)")
+
+
+def check_delay(seconds: float) -> None:
+    """Raise `ConfigError` for a delay that cannot be."""
+    if not 0.0 <= seconds <= _MOST_DELAY:
+        raise ConfigError(f"delay {seconds:g} s is not within 0..{_MOST_DELAY:g} s")
+
+
+def ruleset(links: Mapping[str, Link]) -> str:
+    """The whole firewall of the switch, for `nft -f`, which puts it in force at one stroke.
+
+    Args:
+        links: by the port of the switch.
+    """
+    rules = [rule for port, link in links.items() for rule in _rules(port, link)]
+    # Naming the table before deleting it makes the deletion right when there is none yet.
+    lines = [
+        f"table bridge {_TABLE}",
+        f"delete table bridge {_TABLE}",
+        f"table bridge {_TABLE} {{",
+        "  chain between_hosts {",
+        "    type filter hook forward priority 0; policy accept;",
+        *(f"    {rule}" for rule in rules),
+        "  }",
+        "}",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _rules(port: str, link: Link) -> Iterator[str]:
+    for match, wire in ((f'oifname "{port}"', link.incoming), (f'iifname "{port}"', link.outgoing)):
+        lost = round(wire.loss * _DICE)
+        if wire.cut:
+            yield f"{match} drop"
+        elif lost:
+            yield f"{match} numgen random mod {_DICE} < {lost} drop"
+
+
+def _words(wire: Wire) -> str:
+    parts = ["cut"] if wire.cut else []
+    if wire.loss:
+        parts.append(f"loss {wire.loss * 100:g} %")
+    if wire.delay:
+        parts.append(f"delay {wire.delay * 1000:g} ms")
+    return ", ".join(parts)
+
+
+def to_plain(links: Mapping[str, Link]) -> dict[str, Any]:
+    """For the lab's state file."""
+    return {
+        name: [[wire.cut, wire.loss, wire.delay] for wire in (link.incoming, link.outgoing)]
+        for name, link in links.items()
+    }
+
+
+def from_plain(plain: Mapping[str, Any]) -> dict[str, Link]:
+    """What `to_plain` made."""
+    return {name: Link(Wire(*into), Wire(*out)) for name, (into, out) in plain.items()}
