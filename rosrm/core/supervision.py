@@ -335,6 +335,11 @@ class Supervision:
         """When `TimePassed` is due; None: never, as things are."""
         return min(self._timed.values(), default=None)
 
+    @property
+    def idle(self) -> bool:
+        """Nothing runs, and nothing will unless somebody orders it."""
+        return all(instance.ended for instance in self.instances.values())
+
     def handle(self, event: Event, now: float) -> list[Command]:
         """What follows from `event`."""
         commands = list(self._follow(event, now))

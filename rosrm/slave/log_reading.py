@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 from pathlib import Path
 from typing import Final
@@ -10,8 +9,7 @@ from typing import Final
 from rosrm.core.model import InstanceId
 from rosrm.errors import Refused
 from rosrm.ros.slave_endpoint import LogSlice
-from rosrm.supervisor import paths
-from rosrm.supervisor.client import log_path
+from rosrm.supervisor.client import log_path, newest_log
 
 #: Most bytes in one answer.
 _MOST: Final = 1 << 20
@@ -63,13 +61,7 @@ def newest_instance(state_directory: Path, process: str) -> InstanceId:
     Raises:
         Refused: none has.
     """
-    state = str(state_directory)
-    name = paths.safe_name(process)
-    found: list[tuple[str, int] | None] = []
-    with contextlib.suppress(FileNotFoundError):
-        folder = Path(paths.log_folder(state))
-        found = [paths.log_number(entry.name) for entry in folder.iterdir()]
-    numbers = [one[1] for one in found if one is not None and one[0] == name]
-    if not numbers:
+    newest = newest_log(state_directory, process)
+    if newest is None:
         raise Refused(f"this host has no log of {process}", "unknown")
-    return InstanceId(process, max(numbers))
+    return newest

@@ -56,10 +56,14 @@ class Server:
         self._spawns: deque[Key] = deque()
         self._telling: list[bytes] = []
         self._client: Connection | None = None
+        self._served = False
         self._leaving = False
 
     def run(self) -> None:
-        """Until the shutdown is complete."""
+        """Until the shutdown is complete, or until there is nothing to do and nobody to do it for.
+
+        What has ended stays on record; whoever connects then starts another supervisor.
+        """
         self._watch(self._listener, self._accept)
         self._watch_signals()
         self._take_over()
@@ -84,6 +88,8 @@ class Server:
             self._rewrite_record()
         self._record.flush()
         self._tell()
+        if self._served and self._client is None and self._core.idle:
+            self._leaving = True
 
     def _timeout(self) -> float | None:
         if self._spawns:
@@ -269,6 +275,7 @@ class Server:
                 f"{self._state}; one host has one slave"
             )
         self._client = connection
+        self._served = True
         self._logs.limits = hello.log
         self._telling.clear()  # all that it would say is in the statuses
         statuses = [protocol.Status.of(instance) for instance in self._core.instances.values()]

@@ -322,6 +322,32 @@ def test_sigterm_is_a_shutdown(host, client):
     assert host.alive() == []
 
 
+def test_it_ends_when_nothing_runs_and_nobody_is_there(host):
+    """A slave that keeps its processes leaves no supervisor behind for those that have ended."""
+    first = host.connect()
+    first.start([host.python("p", "import sys; sys.stdin.read(); input()")])
+    assert host.ended(first, "p").exit_code == 1
+    first.close()
+    wait_gone(first.pid)
+    second = host.connect()
+    assert second.pid != first.pid
+    assert [status.exit_code for status in second.instances] == [1]
+
+
+def test_it_stays_for_what_runs_and_ends_with_it(host):
+    """Nobody is there, and its last process ends: then it ends too."""
+    first = host.connect()
+    first.start([host.python("p", "import time; time.sleep(1000)")])
+    pid = host.running(first, "p").pid
+    first.close()
+    second = host.connect()
+    assert second.pid == first.pid
+    second.close()
+    os.kill(pid, signal.SIGKILL)
+    wait_gone(second.pid)
+    assert host.connect().instances[0].exit_signal == signal.SIGKILL
+
+
 def test_a_lost_supervisor_is_told(host, client):
     """A slave that waits hears at once that its supervisor is gone."""
     os.kill(client.pid, signal.SIGKILL)
