@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
@@ -46,15 +46,15 @@ class Cut:
 
 
 class CutAssembler:
-    """Finds the newest state of which every part is at hand.
+    """Finds the newest state of which every part is at hand."""
 
-    Args:
-        topics: of the parts.
-    """
-
-    def __init__(self, topics: Iterable[str]) -> None:
-        self._at_hand: dict[str, dict[PartKey, bytes]] = {topic: {} for topic in topics}
+    def __init__(self) -> None:
+        self._at_hand: dict[str, dict[PartKey, bytes]] = {}
         self._waiting: list[tuple[Any, float]] = []
+
+    def expect(self, topic: str) -> None:
+        """The state has a part on this topic."""
+        self._at_hand.setdefault(topic, {})
 
     def add_part(self, topic: str, data: bytes) -> None:
         """A message came on a state topic."""

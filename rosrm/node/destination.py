@@ -95,18 +95,22 @@ class Destination:
         if self._over:
             channel.say(HandoffReport.FAILED, 0, self._fault)
             return channel
-        assembler = self._assembler = CutAssembler(part.topic for part in self._parts)
+        self._assembler = CutAssembler()
         # Marks first, also in catching up: they say which parts are worth keeping.
         self._follow(StateMark, self._mark_topic, self._take_mark, topics.MARK)
         for part in self._parts:
-            self._follow(
-                part.message_type, part.topic, partial(assembler.add_part, part.topic),
-                topics.STATE_FOLLOWED, raw=True,
-            )  # fmt: skip
+            self.follow_part(part)
         if not self._over:
             self._timer = member.plain.create_timer(_REVIEW, self._look)
             self._review()
         return channel
+
+    def follow_part(self, part: Part) -> None:
+        """A part of the state, perhaps one that the author names later than the others."""
+        if self._assembler is not None:
+            take = partial(self._assembler.add_part, part.topic)
+            self._assembler.expect(part.topic)
+            self._follow(part.message_type, part.topic, take, topics.STATE_FOLLOWED, raw=True)
 
     def _follow(
         self, message_type: Any, topic: str, take: Callable[[Any], None], qos: Any, *,

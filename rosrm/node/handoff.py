@@ -69,6 +69,8 @@ class Handoff:
         self._parts.append(part)
         if self._source is not None:
             self._source.add_part(part)
+        elif self._destination is not None:
+            self._destination.follow_part(part)
 
     # --- state_config ----------------------------------------------------------------------
 

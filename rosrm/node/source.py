@@ -177,6 +177,7 @@ class Source:
                 self._go_on(_nothing)
                 return
             self._channel.say(HandoffReport.SILENT, member.sequence)
+            member.close_services()
             self._look_again = member.plain.create_timer(_LOOK, self._release_when_heard)
 
     def _release_when_heard(self) -> None:

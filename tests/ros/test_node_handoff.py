@@ -392,6 +392,22 @@ def test_a_part_that_did_not_change_goes_on_from_successor_to_successor(stage):
     assert (second.map, third.map) == ("drawn", "drawn")
 
 
+def test_a_part_that_a_shadow_names_late_is_followed(stage):
+    """As long as no state came that has it."""
+
+    def name_another(node):
+        node.keep_state("~/late", String, lambda: String(data="kept"), lambda message: None)
+        return node
+
+    shadow = stage.instance(Counter, 2, alias="counter_17", shadow=True)
+    conductor = Conductor(stage, source=1, destination=2)
+    conductor.say(C.SHADOW)
+    conductor.wait(2, R.SHADOWING)
+    name_another(shadow)
+    name_another(stage.instance(Counter, 1))
+    conductor.hand_over()
+
+
 def test_every_input_is_processed_once_with_several_publishers(stage, pair):
     """Whose clocks do not agree, and of whom the source is ahead and behind."""
     talkers = [stage.plain.create_publisher(Int64, "add", RELIABLE) for _ in range(3)]

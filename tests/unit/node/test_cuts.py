@@ -20,9 +20,16 @@ def mark(sequence, **parts):
     return SimpleNamespace(sequence=sequence, parts=described)
 
 
+def assembler(*topics):
+    cuts = CutAssembler()
+    for topic in topics:
+        cuts.expect(topic)
+    return cuts
+
+
 def test_a_state_is_complete_with_its_mark_and_all_parts():
     """In whichever order they come."""
-    cuts = CutAssembler([A, B])
+    cuts = assembler(A, B)
     cuts.add_part(A, b"a1")
     cuts.add_mark(mark(1, a=b"a1", b=b"b1"), 7.0)
     assert (cuts.take(), cuts.missing()) == (None, [B])
@@ -34,7 +41,7 @@ def test_a_state_is_complete_with_its_mark_and_all_parts():
 
 def test_a_part_that_did_not_change_counts_for_later_states():
     """It is not published again."""
-    cuts = CutAssembler([A, B])
+    cuts = assembler(A, B)
     cuts.add_part(A, b"a1")
     for sequence in (1, 2, 3):
         cuts.add_part(B, b"b%d" % sequence)
@@ -44,7 +51,7 @@ def test_a_part_that_did_not_change_counts_for_later_states():
 
 def test_parts_of_different_cycles_are_never_mixed():
     """A mark whose part was lost waits for the next."""
-    cuts = CutAssembler([A, B])
+    cuts = assembler(A, B)
     cuts.add_part(A, b"a1")
     cuts.add_part(B, b"b2")
     cuts.add_mark(mark(1, a=b"a1", b=b"b1"), 0.0)
@@ -55,7 +62,7 @@ def test_parts_of_different_cycles_are_never_mixed():
 
 def test_no_more_is_kept_than_the_state_in_use_and_what_may_come():
     """A state of megabytes every cycle would fill the memory."""
-    cuts = CutAssembler([A])
+    cuts = assembler(A)
     for sequence in range(100):
         cuts.add_part(A, b"%d" % sequence)
         cuts.add_mark(mark(sequence, a=b"%d" % sequence), 0.0)
@@ -81,7 +88,7 @@ def test_any_order_of_arrival_ends_at_the_last_state(data):
             queues[B].append(b)
         queues["mark"].append(mark(sequence, a=a, b=b))
         before = (a, b)
-    cuts = CutAssembler([A, B])
+    cuts = assembler(A, B)
     taken = []
     while any(queues.values()):
         name = data.draw(st.sampled_from([name for name, queue in queues.items() if queue]))
