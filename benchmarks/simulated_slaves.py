@@ -5,9 +5,10 @@ work, statuses) over a real slave's core. Simulated is what it stands on: its re
 random walk instead of probes, and what it is given to run is said to run, and to end, without a
 process.
 
-All slaves of a process share one DDS participant, one node, the clients by which they shake hands,
-register and leave, and the reader of `master_beat`. Each has its own publishers, its own services
-and its own client of `request_process`: each answer reaches all readers, as it does in a fleet.
+All slaves of a process share one DDS participant, one node, and what is seldom used: the clients
+by which they shake hands, register and leave, the publishers of statuses and usages, and the reader
+of `master_beat`. Each has its own publisher of readings, its own service for orders and its own
+client of `request_process`: each answer reaches all readers, as it does in a fleet.
 
 Spoken to by lines: it prints one JSON object when all are registered and accepted; a line on its
 standard input begins and the next one ends what is counted; the last line says what was sent.
@@ -29,6 +30,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from rosrm.core import slave as core
 from rosrm.core.model import (
@@ -40,17 +42,21 @@ from rosrm.core.model import (
     ResourceDescription,
     RestartPolicy,
 )
-from rosrm.errors import Refused
+from rosrm.errors import Refused, RosrmError
 from rosrm.ros.participant import OpenRequest, Participant
 from rosrm.ros.settings import RosSettings
 from rosrm.ros.slave_endpoint import Link, LogSlice, SlaveEndpoint
-from rosrm_msgs import srv
+from rosrm_msgs import msg, srv
 
 #: Most seconds between two looks at standard input.
 _LOOK = 0.05
 #: Slaves that shake hands at a time: each answer reaches all readers of this process.
 _AT_ONCE = 20
 _LIMIT = 0.8
+#: Standard deviation of a usage's change from one cycle to the next.
+STEP = 0.003
+#: Bounds of the usages, below the limit.
+_BETWEEN = (0.05, 0.7)
 _RESOURCES = (("memory", "B", 2.0**34), ("cpu", "core", 16.0), ("disk", "B", 2.0**40))
 _PRESENT = (1 << len(_RESOURCES)) - 1
 
@@ -71,8 +77,8 @@ class Berth:
         return self._shared.client(kind, name, qos_profile)
 
     def create_publisher(self, kind: Any, name: str, qos: Any) -> Any:
-        """A publisher of its own."""
-        return self._shared.participant.node.create_publisher(kind, name, qos)
+        """A publisher; of its own for the readings."""
+        return self._shared.publisher(kind, name, qos)
 
     def create_subscription(
         self, kind: Any, name: str, take: Callable[[Any], None], qos: Any
@@ -85,8 +91,9 @@ class Berth:
         return self._shared.participant.counted(callback)
 
     def serve(self, kind: Any, name: str, handle: Callable[[Any, OpenRequest], None]) -> None:
-        """A service of its own."""
-        self._shared.participant.serve(kind, name, handle)
+        """A service of its own; none where there is nothing to ask for."""
+        if kind is not srv.ReadLog:
+            self._shared.participant.serve(kind, name, handle)
 
 
 class SharedParticipant:
@@ -95,6 +102,7 @@ class SharedParticipant:
     def __init__(self, settings: RosSettings, name: str) -> None:
         self.participant = Participant(settings, name, pace="steady")
         self._clients: dict[Any, Any] = {}
+        self._publishers: dict[Any, Any] = {}
         self._hearers: dict[Any, list[Callable[[Any], None]]] = {}
 
     def client(self, kind: Any, name: str, qos_profile: Any) -> Any:
@@ -104,6 +112,15 @@ class SharedParticipant:
         made = self.participant.node.create_client(kind, name, qos_profile=qos_profile)
         if kind is not srv.RequestProcess:
             self._clients[kind] = made
+        return made
+
+    def publisher(self, kind: Any, name: str, qos: Any) -> Any:
+        """The shared publisher of a topic, or a new one for `resource_info`."""
+        if kind in self._publishers:
+            return self._publishers[kind]
+        made = self.participant.node.create_publisher(kind, name, qos)
+        if kind is not msg.ResourceInfo:
+            self._publishers[kind] = made
         return made
 
     def hear(self, kind: Any, name: str, take: Callable[[Any], None], qos: Any) -> None:
@@ -135,19 +152,38 @@ class Tally:
     taken: dict[str, float] = field(default_factory=dict)
 
 
+class Walks:
+    """The readings of many slaves: each usage wanders between two bounds.
+
+    Args:
+        slaves: how many.
+        step: standard deviation of a usage's change in one cycle, fraction.
+    """
+
+    def __init__(self, slaves: int, step: float) -> None:
+        self._random = np.random.default_rng(slaves)
+        self._step = step
+        self._used = self._random.uniform(*_BETWEEN, (slaves, len(_RESOURCES)))
+        self.usage = np.zeros((slaves, RESOURCE_SLOTS), np.float32)
+        self.limit = np.ones(RESOURCE_SLOTS, np.float32)
+        self.limit[: len(_RESOURCES)] = _LIMIT
+        self.go_on()
+
+    def go_on(self) -> None:
+        """One more cycle of all."""
+        self._used += self._random.normal(0.0, self._step, self._used.shape)
+        np.clip(self._used, *_BETWEEN, out=self._used)
+        self.usage[:, : len(_RESOURCES)] = self._used
+
+
 class SimulatedSlave:
     """A slave whose readings and processes are made up."""
 
-    def __init__(self, berth: Berth, name: str, period: float, seed: int, tally: Tally) -> None:
+    def __init__(self, berth: Berth, name: str, period: float, tally: Tally) -> None:
         self.name = name
         self._tally = tally
         self._state = core.SlaveState()
         self._events: list[core.Event] = []
-        self._random = np.random.default_rng(seed)
-        self._usage = np.zeros(RESOURCE_SLOTS, np.float32)
-        self._usage[: len(_RESOURCES)] = self._random.uniform(0.1, 0.5, len(_RESOURCES))
-        self._limit = np.ones(RESOURCE_SLOTS, np.float32)
-        self._limit[: len(_RESOURCES)] = _LIMIT
         resources = tuple(ResourceDescription(*one) for one in _RESOURCES)
         description = HostDescription(
             name, int.from_bytes(os.urandom(7), "big") | 1, hostname=socket.gethostname(),
@@ -160,14 +196,14 @@ class SimulatedSlave:
         """Whether the master has taken it in."""
         return self.endpoint.link is Link.REGISTERED
 
-    def cycle(self, now: float) -> None:
+    def cycle(
+        self, usage: npt.NDArray[np.float32], limit: npt.NDArray[np.float32], now: float
+    ) -> None:
         """What a slave does at the rate of `resource_info`."""
         self.endpoint.go_on(now)
-        used = self._usage[: len(_RESOURCES)]
-        np.clip(used + self._random.normal(0.0, 0.005, len(used)), 0.05, 0.7, out=used)
-        accepting = core.under_limits(self._usage, self._limit, _PRESENT, 0)
+        accepting = core.under_limits(usage, limit, _PRESENT, 0)
         self.endpoint.publish_reading(
-            self._usage, self._limit, _PRESENT, 0, accepting=accepting, processes=self._state.live()
+            usage, limit, _PRESENT, 0, accepting=accepting, processes=self._state.live()
         )
         self._events.append(core.TimePassed())
         self.work(now)
@@ -202,6 +238,8 @@ class SimulatedSlave:
         """All that this slave holds."""
         return self._state.statuses()
 
+    # ruff: noqa: ARG002 - the endpoint calls them so, with or without a process
+
     def read_log(self, process: str, number: int, offset: int, max_bytes: int) -> LogSlice:
         """No process, no log."""
         raise Refused(f"{self.name} is simulated: it has no logs", "unknown")
@@ -223,39 +261,56 @@ class SimulatedSlave:
 
 
 class Fleet:
-    """The slaves of this process, each in its own time."""
+    """The slaves of this process, each in its own time.
 
-    def __init__(self, settings: RosSettings, first: int, count: int, period: float) -> None:
+    Args:
+        settings: the domain.
+        first: number of the first slave.
+        count: how many.
+        period: seconds between two cycles of a slave.
+        step: of a usage in one cycle, as `Walks` says.
+    """
+
+    def __init__(
+        self, settings: RosSettings, first: int, count: int, period: float, step: float
+    ) -> None:
         self.tally = Tally()
+        self.slaves: list[SimulatedSlave] = []
+        self._first = first
+        self._count = count
         self._period = period
+        self._walks = Walks(count, step)
+        self._walked = time.monotonic()
         self._shared = SharedParticipant(settings, f"rosrm_simulated_{first}")
-        self.slaves = [
-            SimulatedSlave(Berth(self._shared), f"sim{number:05d}", period, number, self.tally)
-            for number in range(first, first + count)
-        ]
         self._due: list[tuple[float, int]] = []
 
     def bring_up(self, timeout: float) -> None:
-        """Register all, a few at a time.
+        """Make and register all, a few at a time.
 
         Raises:
             TimeoutError: not all were taken in in time.
+            RosrmError: the master refused one.
         """
         deadline = time.monotonic() + timeout
-        coming = list(range(len(self.slaves)))
-        while coming or not all(slave.registered for slave in self.slaves):
-            greeting = [i for _, i in self._due if not self.slaves[i].registered]
-            for index in coming[: max(0, _AT_ONCE - len(greeting))]:
-                coming.remove(index)
-                delay = self._period * index / len(self.slaves)
-                heapq.heappush(self._due, (time.monotonic() + delay, index))
-            self.go_on(_LOOK)
-            failures = [slave.endpoint.failure for slave in self.slaves if slave.endpoint.failure]
-            if failures:
-                raise RuntimeError(failures[0])
-            if time.monotonic() >= deadline:
-                there = sum(slave.registered for slave in self.slaves)
-                raise TimeoutError(f"{there} of {len(self.slaves)} registered in {timeout:g} s")
+        while len(self.slaves) < self._count:
+            self._make_some()
+            while not all(slave.registered for slave in self.slaves):
+                self.go_on(_LOOK)
+                for slave in self.slaves:
+                    if slave.endpoint.failure:
+                        raise RosrmError(slave.endpoint.failure)
+                if time.monotonic() >= deadline:
+                    there = sum(slave.registered for slave in self.slaves)
+                    raise TimeoutError(f"{there} of {self._count} registered in {timeout:g} s")
+
+    def _make_some(self) -> None:
+        now = time.monotonic()
+        for index in range(len(self.slaves), min(len(self.slaves) + _AT_ONCE, self._count)):
+            name = f"sim{self._first + index:05d}"
+            slave = SimulatedSlave(Berth(self._shared), name, self._period, self.tally)
+            self.slaves.append(slave)
+            # Spread over the period, as the cycles of separate slaves are.
+            heapq.heappush(self._due, (now + self._period * index / self._count, index))
 
     def go_on(self, seconds: float) -> None:
         """Do what falls due for a while."""
@@ -272,7 +327,10 @@ class Fleet:
             self.tally.late += 1
             due = now
         heapq.heapreplace(self._due, (due + self._period, index))
-        self.slaves[index].cycle(now)
+        if now - self._walked >= self._period:
+            self._walked = now
+            self._walks.go_on()
+        self.slaves[index].cycle(self._walks.usage[index], self._walks.limit, now)
         self.tally.cycles += 1
 
     def close(self) -> None:
@@ -294,10 +352,12 @@ def main() -> None:
     parser.add_argument("--first", type=int, required=True)
     parser.add_argument("--slaves", type=int, required=True)
     parser.add_argument("--hz", type=float, required=True)
+    parser.add_argument("--step", type=float, default=STEP)
     parser.add_argument("--timeout", type=float, default=120.0)
     arguments = parser.parse_args()
     settings = RosSettings(domain=arguments.domain, discovery_range="localhost")
-    fleet = Fleet(settings, arguments.first, arguments.slaves, 1.0 / arguments.hz)
+    period = 1.0 / arguments.hz
+    fleet = Fleet(settings, arguments.first, arguments.slaves, period, arguments.step)
     fleet.bring_up(arguments.timeout)
     print(json.dumps({"registered": len(fleet.slaves)}), flush=True)
     while _told_to_go_on(fleet):

@@ -92,15 +92,20 @@ class MasterEndpoint:
     # --- what is heard -------------------------------------------------------------------
 
     def poll_readings(self) -> None:
-        """Take all readings that have come."""
+        """Look at the readings, also when nothing else happens; called in every tick."""
+        self._take_readings()
+        self._oldest.append(self._links.ledger.ages(time.monotonic())[1])
+
+    def _take_readings(self) -> None:
         readings = self._hearing.poll_readings()
         if readings is not None:
             # Before all else: a usage must not be judged by readings that are older than it.
             self.events.insert(0, readings)
-        self._oldest.append(self._links.ledger.ages(time.monotonic())[1])
 
     def take_events(self) -> list[happened.Event]:
-        """What happened since the last call, in order."""
+        """What happened since the last call, in order; decided by the newest readings there are."""
+        if self.events and not isinstance(self.events[0], happened.ReadingsReceived):
+            self._take_readings()
         events, self.events = self.events, []
         return events
 
