@@ -19,8 +19,6 @@ from rosrm.core.runs import Heard, Run
 from rosrm.core.state import MasterState
 
 DONE: Final = ""
-#: Beyond a process's own grace: a signal, a report and a message take a moment.
-_STOP_MARGIN: Final = 5.0
 #: What a destination says when it follows the source, or is further still.
 _READY: Final = frozenset({ReportPhase.READY, ReportPhase.SWITCHING, ReportPhase.ACTIVE})
 
@@ -105,8 +103,9 @@ def is_active(state: MasterState, run: Run) -> bool:
 def is_switching(run: Run) -> bool:
     """The step in hand is the one in which the destination becomes active."""
     step = run.step_in_hand
-    forward = run.undo is None and isinstance(step, Configure)
-    return forward and isinstance(step, Configure) and step.phase is HandoffPhase.SWITCH
+    if run.undo is not None or not isinstance(step, Configure):
+        return False
+    return step.phase is HandoffPhase.SWITCH
 
 
 # --- when a phase is done ---------------------------------------------------------------------
@@ -135,7 +134,8 @@ def _switching(state: MasterState, run: Run) -> str | None:
 def _fault(state: MasterState, run: Run) -> str:
     """Why the destination cannot become active any more; "" if it can."""
     if run.destination.number not in state.instances:
-        return f"{run.destination} ended on {run.destination_host.name}: {end_of(run)}"
+        how = run.how_ended(run.destination)
+        return f"{run.destination} ended on {run.destination_host.name}: {how}"
     for instance in (run.destination, run.source):
         said = run.phases_of(instance)
         if ReportPhase.FAILED in said:
@@ -179,15 +179,6 @@ def was_switched(run: Run) -> bool:
     )
 
 
-def end_of(run: Run) -> str:
-    """How the destination ended, for people."""
-    end = run.ended.get(run.destination.number)
-    if end is None:
-        return "it was never started"
-    status = end.status
-    return status.message or f"exit code {status.exit_code}, signal {status.exit_signal}"
-
-
 # --- when its time has passed -----------------------------------------------------------------
 
 
@@ -209,7 +200,7 @@ def _stop_unheard(state: MasterState, run: Run, now: float) -> None:
     """It may become active at any moment, or be so: only its end makes sure that it never is."""
     stop = state.processes[run.process].spec.stop
     lifecycle.stop_instance(state, state.instances[run.destination.number], now)
-    run.deadline = now + stop.interrupt_grace + stop.terminate_grace + _STOP_MARGIN
+    run.deadline = now + stop.timeout
     state.record(
         now, "destination_unheard", f"{run.destination} does not answer to ABORT: stopped",
         process=run.process, host=run.destination_host.name,

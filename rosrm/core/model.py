@@ -60,6 +60,10 @@ class Readiness:
     timeout: float = 30.0
 
 
+#: Seconds beyond a process's own grace: a signal, a report and a message take a moment.
+_STOP_MARGIN: Final = 5.0
+
+
 @dataclass(frozen=True, slots=True)
 class StopPolicy:
     """How a process is stopped: SIGINT, then SIGTERM, then SIGKILL, to its whole process group.
@@ -71,6 +75,11 @@ class StopPolicy:
 
     interrupt_grace: float = 5.0
     terminate_grace: float = 5.0
+
+    @property
+    def timeout(self) -> float:
+        """Seconds from the order to stop until it must be known that it has ended."""
+        return self.interrupt_grace + self.terminate_grace + _STOP_MARGIN
 
 
 @dataclass(frozen=True, slots=True)

@@ -147,6 +147,14 @@ class Run:
         self.undo = way_back(self.plan, self.turned_at)
         self.index, self.begun = 0, False
 
+    def how_ended(self, instance: InstanceId) -> str:
+        """How one of its instances ended, for people."""
+        end = self.ended.get(instance.number)
+        if end is None:
+            return "it was never started"
+        status = end.status
+        return status.message or f"exit code {status.exit_code}, signal {status.exit_signal}"
+
     def phases_of(self, instance: InstanceId) -> Mapping[ReportPhase, str]:
         """All that the source or the destination has said."""
         heard = self.heard.get(instance.number)

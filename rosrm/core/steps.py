@@ -122,7 +122,7 @@ def outcome_of(step: Any, state: MasterState, run: Run) -> str | None:
 @outcome_of.register
 def _(step: Start, state: MasterState, run: Run) -> str | None:
     if step.instance.number in run.ended:
-        return f"{step.instance} ended on {step.host}: {_end_of(run, step.instance.number)}"
+        return f"{step.instance} ended on {step.host}: {run.how_ended(step.instance)}"
     instance = state.instances.get(step.instance.number)
     if instance is None:
         return None  # what is in its way has to end first
@@ -135,7 +135,7 @@ def _(step: Start, state: MasterState, run: Run) -> str | None:
 def _(step: AwaitReady, state: MasterState, run: Run) -> str | None:
     instance = state.instances.get(step.instance.number)
     if instance is None:
-        return f"{step.instance} ended on {step.host}: {_end_of(run, step.instance.number)}"
+        return f"{step.instance} ended on {step.host}: {run.how_ended(step.instance)}"
     return DONE if instance.state is InstanceState.READY else None
 
 
@@ -172,14 +172,6 @@ def _(step: Execute, state: MasterState, run: Run) -> str | None:
         return None
     accepted, message = run.answer
     return DONE if accepted else f"{step.executor} failed on {step.host}: {message}"
-
-
-def _end_of(run: Run, number: int) -> str:
-    end = run.ended.get(number)
-    if end is None:
-        return "it was never started"
-    status = end.status
-    return status.message or f"exit code {status.exit_code}, signal {status.exit_signal}"
 
 
 def title(step: Step) -> str:

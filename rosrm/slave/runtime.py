@@ -62,8 +62,6 @@ _LOOK_AT_GRAPH: Final = 0.05
 _USAGE_PERIOD: Final = 1.0
 #: Seconds between two words to the user that there is no master yet.
 _PATIENCE_TOLD: Final = 10.0
-#: Seconds beyond the processes' own grace that a stop may take before it is said.
-_STOP_MARGIN: Final = 5.0
 #: At slow rates a request is still meant after so many of our own beats.
 _BEATS_MISSED: Final = 3
 #: Readings that go out between looking at what each instance uses and saying it: so the master
@@ -458,7 +456,7 @@ class SlaveRuntime:
             self.say(f"stopping {live} processes ({self._stopping or 'refused'})")
         self._shutting_down = True
         self._endpoint.leave(self._shut_down)
-        deadline = time.monotonic() + self._longest_stop() + _STOP_MARGIN
+        deadline = time.monotonic() + self._longest_stop()
         self._serve(lambda: not self._left and time.monotonic() < deadline)
         return self._ended(failure)
 
@@ -477,7 +475,7 @@ class SlaveRuntime:
     def _longest_stop(self) -> float:
         live = [held for held in self._state.held.values() if not held.status.state.ended]
         rules = [StopPolicy() if held.spec is None else held.spec.stop for held in live]
-        return max((rule.interrupt_grace + rule.terminate_grace for rule in rules), default=0.0)
+        return max((rule.timeout for rule in rules), default=StopPolicy().timeout)
 
 
 def _random_number() -> int:

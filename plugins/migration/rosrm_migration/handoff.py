@@ -26,7 +26,7 @@ from rosrm.core.migration import (
     Stop,
 )
 from rosrm.core.model import ProcessSpec, RestartPolicy
-from rosrm_migration.options import check_seconds, options_of, stop_timeout
+from rosrm_migration.options import check_seconds, options_of
 
 #: Name of the executor that hears when a destination of the paper's protocol speaks.
 WATCH: Final = "handoff_watch"
@@ -146,12 +146,12 @@ def _as_in_the_paper(move: Move, options: HandoffOptions) -> Plan:
             Commit(),
             *_after_commit(move, options),
         ),
-        overlap=watch_timeout + stop_timeout(move.spec),
+        overlap=watch_timeout + move.spec.stop.timeout,
     )
 
 
 def _start(move: Move, options: HandoffOptions) -> Start:
-    stop = Stop(move.destination, move.destination_host, stop_timeout(move.spec))
+    stop = Stop(move.destination, move.destination_host, move.spec.stop.timeout)
     return Start(
         move.destination, move.destination_host, options.start_timeout, alias_of(move), undo=stop,
         shadow=True,
@@ -170,7 +170,7 @@ def _after_commit(move: Move, options: HandoffOptions) -> tuple[SetRestart, Stop
         SetRestart(
             move.destination, move.destination_host, move.spec.restart, options.start_timeout
         ),
-        Stop(move.source, move.source_host, stop_timeout(move.spec)),
+        Stop(move.source, move.source_host, move.spec.stop.timeout),
         Configure(HandoffPhase.DONE, options.start_timeout),
     )
 

@@ -31,12 +31,3 @@ def check_seconds(options: Any, *names: str) -> None:
         seconds = getattr(options, name)
         if not 0.0 < seconds < inf:
             raise ValueError(f"{name} is {seconds:g} s; allowed: more than 0")
-
-
-def stop_timeout(spec: ProcessSpec) -> float:
-    """Seconds until a process has ended that was told to stop."""
-    return spec.stop.interrupt_grace + spec.stop.terminate_grace + _STOP_MARGIN
-
-
-#: Beyond the process's own grace: a signal, a report and a message take a moment.
-_STOP_MARGIN = 5.0

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from rosrm.config.units import PositiveSeconds
 from rosrm.core.migration import AwaitReady, Commit, Move, Plan, Start, Stop
 from rosrm.core.model import ProcessSpec
-from rosrm_migration.options import check_seconds, options_of, stop_timeout
+from rosrm_migration.options import check_seconds, options_of
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Relaunch:
 
 
 def _start_first(move: Move, start_timeout: float) -> Plan:
-    ready, stop = move.spec.readiness.timeout, stop_timeout(move.spec)
+    ready, stop = move.spec.readiness.timeout, move.spec.stop.timeout
     return Plan(
         (
             Start(
@@ -73,7 +73,7 @@ def _stop_first(move: Move, start_timeout: float) -> Plan:
     return Plan(
         (
             Stop(
-                move.source, move.source_host, stop_timeout(move.spec),
+                move.source, move.source_host, move.spec.stop.timeout,
                 undo=Start(move.fallback, move.source_host, start_timeout),
             ),
             Start(
@@ -87,4 +87,4 @@ def _stop_first(move: Move, start_timeout: float) -> Plan:
 
 
 def _stop_destination(move: Move) -> Stop:
-    return Stop(move.destination, move.destination_host, stop_timeout(move.spec))
+    return Stop(move.destination, move.destination_host, move.spec.stop.timeout)

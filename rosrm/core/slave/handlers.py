@@ -1,325 +1,44 @@
-"""The slave's reducer: (state, event, now) -> commands. Each kind of event is one row below.
-
-======================  =========================================================================
-what happened           what the core does
-======================  =========================================================================
-Registered              remembers the master's epoch; older ones are refused from now on
-MasterLost              forgets no end until a master has taken this host in again
-AssignmentsReceived     has them launched, once, or holds them until a slot is free; one that was
-                        stopped before is refused
-LaunchRefused           reports that the host cannot run it, and why
-StopOrdered             has it stopped; one never heard of will never be started
-RestartOrdered          has it stopped and started again here
-RestartPolicySet        has the supervisor keep it, unless it has ended or is not known: settled
-RestartPolicyRecorded   the supervisor has it in its record: settled
-ReportRequested         reports everything
-SupervisorReported      follows the instance; a new run must become ready anew
-SupervisorReplaced      the same; what the new one does not know is gone; reports everything, and
-                        orders again what may have been lost with the former one
-SeenInGraph             the instance is ready; a later run of this slave shall know
-TimePassed              an instance that is not ready in time is stopped; old ends are forgotten
-======================  =========================================================================
-"""
+"""What each kind of event does to the state of a slave."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from types import MappingProxyType
 from typing import Any, Final
 
-import numpy as np
-import numpy.typing as npt
-
-from rosrm.core.model import (
-    RESOURCE_SLOTS,
-    Assignment,
-    InstanceId,
-    InstanceState,
-    InstanceStatus,
-    ProcessSpec,
-    RestartPolicy,
+from rosrm.core.model import Assignment, InstanceId, InstanceState, InstanceStatus
+from rosrm.core.slave.state import Held, SlaveState, awaits_graph, qualified_name
+from rosrm.core.slave.words import (
+    Amend,
+    AssignmentsReceived,
+    Awaited,
+    Command,
+    Forget,
+    Launch,
+    LaunchRefused,
+    MasterLost,
+    Registered,
+    Remember,
+    Report,
+    ReportRequested,
+    Restart,
+    RestartOrdered,
+    RestartPolicyRecorded,
+    RestartPolicySet,
+    SeenInGraph,
+    Settle,
+    Stop,
+    StopOrdered,
+    SupervisorReplaced,
+    SupervisorReported,
+    TimePassed,
 )
 
 #: Seconds for which the end of an instance is kept for a master that did not hear of it.
 REMEMBER_END: Final = 60.0
-_SLOTS: Final = np.left_shift(np.uint32(1), np.arange(RESOURCE_SLOTS, dtype=np.uint32))
 #: Orders to stop what was never heard of that are remembered.
 _TOMBSTONES: Final = 10_000
-
-
-@dataclass(frozen=True, slots=True)
-class Awaited:
-    """How an instance becomes ready by being seen in the ROS graph.
-
-    Attributes:
-        node_name: fully qualified name of its node.
-        timeout: seconds that each of its runs has for it.
-        seen: pid of the run that was seen; 0: none was.
-    """
-
-    node_name: str
-    timeout: float
-    seen: int = 0
-
-
-# --- what can happen --------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class Registered:
-    """The master took this host in.
-
-    Attributes:
-        renumbers: it has lost its journal, and gives numbers again that were given before.
-    """
-
-    epoch: int
-    renumbers: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class MasterLost:
-    """No master is heard, or another one: what ends now it may not have been told."""
-
-
-@dataclass(frozen=True, slots=True)
-class AssignmentsReceived:
-    """The master assigned instances to this host."""
-
-    assignments: tuple[Assignment, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class LaunchRefused:
-    """An instance cannot be started here."""
-
-    instance: InstanceId
-    reason: str
-
-
-@dataclass(frozen=True, slots=True)
-class StopOrdered:
-    """The master wants an instance to end for good."""
-
-    instance: InstanceId
-
-
-@dataclass(frozen=True, slots=True)
-class RestartOrdered:
-    """The master wants an instance to start again here."""
-
-    instance: InstanceId
-
-
-@dataclass(frozen=True, slots=True)
-class RestartPolicySet:
-    """The master wants an instance to have another restart policy; a shadow is none any more."""
-
-    instance: InstanceId
-    restart: RestartPolicy
-
-
-@dataclass(frozen=True, slots=True)
-class RestartPolicyRecorded:
-    """The supervisor has written down which restart policy an instance has."""
-
-    instance: InstanceId
-    restart: RestartPolicy
-
-
-@dataclass(frozen=True, slots=True)
-class ReportRequested:
-    """The master wants to know of every instance."""
-
-
-@dataclass(frozen=True, slots=True)
-class SupervisorReported:
-    """The supervisor says what became of instances."""
-
-    statuses: tuple[InstanceStatus, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class SupervisorReplaced:
-    """Another supervisor took over, or this slave found one at its start.
-
-    Attributes:
-        statuses: all that it knows.
-        awaited: what it was told to remember of instances that become ready in the ROS graph.
-    """
-
-    statuses: tuple[InstanceStatus, ...]
-    awaited: Mapping[InstanceId, Awaited] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, slots=True)
-class SeenInGraph:
-    """This very instance, not a namesake, is in the ROS graph."""
-
-    instance: InstanceId
-
-
-@dataclass(frozen=True, slots=True)
-class TimePassed:
-    """Nothing else happened; deadlines are looked at."""
-
-
-# --- what is asked for ------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class Launch:
-    """Have the supervisor start instances."""
-
-    assignments: tuple[Assignment, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class Stop:
-    """Have the supervisor stop an instance."""
-
-    instance: InstanceId
-
-
-@dataclass(frozen=True, slots=True)
-class Restart:
-    """Have the supervisor restart an instance."""
-
-    instance: InstanceId
-
-
-@dataclass(frozen=True, slots=True)
-class Amend:
-    """Have the supervisor keep another restart policy; `RestartPolicyRecorded` follows."""
-
-    instance: InstanceId
-    restart: RestartPolicy
-
-
-@dataclass(frozen=True, slots=True)
-class Settle:
-    """Answer the order to set this restart policy; `refusal`: why it cannot be; "": it is."""
-
-    instance: InstanceId
-    restart: RestartPolicy
-    refusal: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class Remember:
-    """Have the supervisor keep this for a later run of this slave."""
-
-    instance: InstanceId
-    awaited: Awaited
-
-
-@dataclass(frozen=True, slots=True)
-class Forget:
-    """Let the supervisor forget ended instances."""
-
-    instances: tuple[InstanceId, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class Report:
-    """Tell the master; `complete`: these are all."""
-
-    statuses: tuple[InstanceStatus, ...]
-    complete: bool = False
-
-
-Command = Launch | Stop | Restart | Amend | Settle | Remember | Forget | Report
-
-
-# --- the state --------------------------------------------------------------------------------
-
-
-@dataclass(slots=True)
-class Held:
-    """One instance on this host.
-
-    Attributes:
-        status: as it was reported last.
-        spec: None where this slave found it running at its own start.
-        awaited: None: it is ready as soon as it runs.
-        ready_by: deadline for becoming ready; None: it is ready, or does not run.
-        unready: why it was stopped, where it did not become ready in time.
-        unsettled: restart policies that the master has set and the supervisor has not recorded
-            yet, in order.
-    """
-
-    status: InstanceStatus
-    spec: ProcessSpec | None = None
-    awaited: Awaited | None = None
-    ready_by: float | None = None
-    unready: str = ""
-    unsettled: tuple[RestartPolicy, ...] = ()
-    ended_at: float = 0.0
-
-
-@dataclass(slots=True)
-class SlaveState:
-    """All that the slave's core knows.
-
-    Attributes:
-        max_processes: most that run at a time; 0: no bound.
-        waiting: assignments that are started as soon as a slot is free, in order.
-    """
-
-    max_processes: int = 0
-    epoch: int = 0
-    registered: bool = False
-    held: dict[InstanceId, Held] = field(default_factory=dict)
-    waiting: dict[InstanceId, Assignment] = field(default_factory=dict)
-    tombstones: dict[InstanceId, None] = field(default_factory=dict)
-
-    def awaited_in_graph(self) -> Mapping[InstanceId, Held]:
-        """Instances that become ready by being seen in the ROS graph."""
-        return {instance: held for instance, held in self.held.items() if held.ready_by is not None}
-
-    def statuses(self) -> tuple[InstanceStatus, ...]:
-        """Of every instance, ended ones that are still remembered included."""
-        return tuple(held.status for held in self.held.values())
-
-    def has_slot(self) -> bool:
-        """Whether one more process may run."""
-        return not self.max_processes or self.live() - len(self.waiting) < self.max_processes
-
-    def live(self) -> int:
-        """How many instances have not ended."""
-        return sum(not held.status.state.ended for held in self.held.values())
-
-
-def under_limits(
-    usage: npt.NDArray[np.float32], limit: npt.NDArray[np.float32], present: int, stale: int
-) -> bool:
-    """Whether a host may ask for work: every reading that has a limit is fresh and under it.
-
-    Args:
-        usage, limit: (slots,) fractions; 1 stands for no limit.
-        present, stale: bit i speaks of slot i.
-    """
-    limited = limit < 1.0
-    used = limited & ((present & _SLOTS) != 0)
-    if stale & present and ((stale & _SLOTS) != 0)[used].any():
-        return False
-    return bool((usage < limit)[used].all())
-
-
-def awaits_graph(spec: ProcessSpec) -> bool:
-    """Whether an instance is ready when it is seen in the ROS graph, not as soon as it runs."""
-    kind = spec.readiness.kind
-    return kind == "graph" or (kind == "auto" and spec.ros)
-
-
-def qualified_name(namespace: str, node_name: str) -> str:
-    """A node's name with its namespace: `/robot/camera`."""
-    inside = namespace.strip("/")
-    return f"/{inside}/{node_name}" if inside else f"/{node_name}"
-
-
-# --- handlers ---------------------------------------------------------------------------------
 
 _Commands = list[Command]
 
@@ -593,35 +312,3 @@ HANDLERS: Final[Mapping[type, _Handler]] = MappingProxyType(
         TimePassed: _time_passed,
     }
 )
-
-Event = (
-    Registered
-    | MasterLost
-    | AssignmentsReceived
-    | LaunchRefused
-    | StopOrdered
-    | RestartOrdered
-    | RestartPolicySet
-    | RestartPolicyRecorded
-    | ReportRequested
-    | SupervisorReported
-    | SupervisorReplaced
-    | SeenInGraph
-    | TimePassed
-)
-
-
-def step(state: SlaveState, event: Event, now: float) -> Sequence[Command]:
-    """Take one event in.
-
-    Args:
-        state: changed in place.
-        event: what happened.
-        now: seconds by the slave's monotonic clock; never less than before.
-    """
-    return HANDLERS[type(event)](state, event, now)
-
-
-def step_all(state: SlaveState, events: Iterable[Event], now: float) -> list[Command]:
-    """Take several events in, in order."""
-    return [command for event in events for command in step(state, event, now)]

@@ -1,0 +1,116 @@
+"""The slave's reducer: (state, event, now) -> commands. Each kind of event is one row below.
+
+======================  =========================================================================
+what happened           what the core does
+======================  =========================================================================
+Registered              remembers the master's epoch; older ones are refused from now on
+MasterLost              forgets no end until a master has taken this host in again
+AssignmentsReceived     has them launched, once, or holds them until a slot is free; one that was
+                        stopped before is refused
+LaunchRefused           reports that the host cannot run it, and why
+StopOrdered             has it stopped; one never heard of will never be started
+RestartOrdered          has it stopped and started again here
+RestartPolicySet        has the supervisor keep it, unless it has ended or is not known: settled
+RestartPolicyRecorded   the supervisor has it in its record: settled
+ReportRequested         reports everything
+SupervisorReported      follows the instance; a new run must become ready anew
+SupervisorReplaced      the same; what the new one does not know is gone; reports everything, and
+                        orders again what may have been lost with the former one
+SeenInGraph             the instance is ready; a later run of this slave shall know
+TimePassed              an instance that is not ready in time is stopped; old ends are forgotten
+======================  =========================================================================
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from rosrm.core.slave.handlers import (
+    HANDLERS,
+    REMEMBER_END,
+)
+from rosrm.core.slave.state import (
+    Held,
+    SlaveState,
+    awaits_graph,
+    qualified_name,
+    under_limits,
+)
+from rosrm.core.slave.words import (
+    Amend,
+    AssignmentsReceived,
+    Awaited,
+    Command,
+    Event,
+    Forget,
+    Launch,
+    LaunchRefused,
+    MasterLost,
+    Registered,
+    Remember,
+    Report,
+    ReportRequested,
+    Restart,
+    RestartOrdered,
+    RestartPolicyRecorded,
+    RestartPolicySet,
+    SeenInGraph,
+    Settle,
+    Stop,
+    StopOrdered,
+    SupervisorReplaced,
+    SupervisorReported,
+    TimePassed,
+)
+
+__all__ = [
+    "HANDLERS",
+    "REMEMBER_END",
+    "Amend",
+    "AssignmentsReceived",
+    "Awaited",
+    "Command",
+    "Event",
+    "Forget",
+    "Held",
+    "Launch",
+    "LaunchRefused",
+    "MasterLost",
+    "Registered",
+    "Remember",
+    "Report",
+    "ReportRequested",
+    "Restart",
+    "RestartOrdered",
+    "RestartPolicyRecorded",
+    "RestartPolicySet",
+    "SeenInGraph",
+    "Settle",
+    "SlaveState",
+    "Stop",
+    "StopOrdered",
+    "SupervisorReplaced",
+    "SupervisorReported",
+    "TimePassed",
+    "awaits_graph",
+    "qualified_name",
+    "step",
+    "step_all",
+    "under_limits",
+]
+
+
+def step(state: SlaveState, event: Event, now: float) -> Sequence[Command]:
+    """Take one event in.
+
+    Args:
+        state: changed in place.
+        event: what happened.
+        now: seconds by the slave's monotonic clock; never less than before.
+    """
+    return HANDLERS[type(event)](state, event, now)
+
+
+def step_all(state: SlaveState, events: Iterable[Event], now: float) -> list[Command]:
+    """Take several events in, in order."""
+    return [command for event in events for command in step(state, event, now)]

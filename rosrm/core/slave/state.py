@@ -1,0 +1,106 @@
+"""All that a slave's core knows, and what follows from its readings and from a spec alone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from rosrm.core.model import (
+    RESOURCE_SLOTS,
+    Assignment,
+    InstanceId,
+    InstanceStatus,
+    ProcessSpec,
+    RestartPolicy,
+)
+from rosrm.core.slave.words import Awaited
+
+_SLOTS: Final = np.left_shift(np.uint32(1), np.arange(RESOURCE_SLOTS, dtype=np.uint32))
+
+
+@dataclass(slots=True)
+class Held:
+    """One instance on this host.
+
+    Attributes:
+        status: as it was reported last.
+        spec: None where this slave found it running at its own start.
+        awaited: None: it is ready as soon as it runs.
+        ready_by: deadline for becoming ready; None: it is ready, or does not run.
+        unready: why it was stopped, where it did not become ready in time.
+        unsettled: restart policies that the master has set and the supervisor has not recorded
+            yet, in order.
+    """
+
+    status: InstanceStatus
+    spec: ProcessSpec | None = None
+    awaited: Awaited | None = None
+    ready_by: float | None = None
+    unready: str = ""
+    unsettled: tuple[RestartPolicy, ...] = ()
+    ended_at: float = 0.0
+
+
+@dataclass(slots=True)
+class SlaveState:
+    """All that the slave's core knows.
+
+    Attributes:
+        max_processes: most that run at a time; 0: no bound.
+        waiting: assignments that are started as soon as a slot is free, in order.
+    """
+
+    max_processes: int = 0
+    epoch: int = 0
+    registered: bool = False
+    held: dict[InstanceId, Held] = field(default_factory=dict)
+    waiting: dict[InstanceId, Assignment] = field(default_factory=dict)
+    tombstones: dict[InstanceId, None] = field(default_factory=dict)
+
+    def awaited_in_graph(self) -> Mapping[InstanceId, Held]:
+        """Instances that become ready by being seen in the ROS graph."""
+        return {instance: held for instance, held in self.held.items() if held.ready_by is not None}
+
+    def statuses(self) -> tuple[InstanceStatus, ...]:
+        """Of every instance, ended ones that are still remembered included."""
+        return tuple(held.status for held in self.held.values())
+
+    def has_slot(self) -> bool:
+        """Whether one more process may run."""
+        return not self.max_processes or self.live() - len(self.waiting) < self.max_processes
+
+    def live(self) -> int:
+        """How many instances have not ended."""
+        return sum(not held.status.state.ended for held in self.held.values())
+
+
+def under_limits(
+    usage: npt.NDArray[np.float32], limit: npt.NDArray[np.float32], present: int, stale: int
+) -> bool:
+    """Whether a host may ask for work: every reading that has a limit is fresh and under it.
+
+    Args:
+        usage, limit: (slots,) fractions; 1 stands for no limit.
+        present, stale: bit i speaks of slot i.
+    """
+    limited = limit < 1.0
+    used = limited & ((present & _SLOTS) != 0)
+    if stale & present and ((stale & _SLOTS) != 0)[used].any():
+        return False
+    return bool((usage < limit)[used].all())
+
+
+def awaits_graph(spec: ProcessSpec) -> bool:
+    """Whether an instance is ready when it is seen in the ROS graph, not as soon as it runs."""
+    kind = spec.readiness.kind
+    return kind == "graph" or (kind == "auto" and spec.ros)
+
+
+def qualified_name(namespace: str, node_name: str) -> str:
+    """A node's name with its namespace: `/robot/camera`."""
+    inside = namespace.strip("/")
+    return f"/{inside}/{node_name}" if inside else f"/{node_name}"

@@ -1,0 +1,208 @@
+"""What may happen to a slave, and what its core may ask for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from rosrm.core.model import Assignment, InstanceId, InstanceStatus, RestartPolicy
+
+
+@dataclass(frozen=True, slots=True)
+class Awaited:
+    """How an instance becomes ready by being seen in the ROS graph.
+
+    Attributes:
+        node_name: fully qualified name of its node.
+        timeout: seconds that each of its runs has for it.
+        seen: pid of the run that was seen; 0: none was.
+    """
+
+    node_name: str
+    timeout: float
+    seen: int = 0
+
+
+# --- what can happen --------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Registered:
+    """The master took this host in.
+
+    Attributes:
+        renumbers: it has lost its journal, and gives numbers again that were given before.
+    """
+
+    epoch: int
+    renumbers: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class MasterLost:
+    """No master is heard, or another one: what ends now it may not have been told."""
+
+
+@dataclass(frozen=True, slots=True)
+class AssignmentsReceived:
+    """The master assigned instances to this host."""
+
+    assignments: tuple[Assignment, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class LaunchRefused:
+    """An instance cannot be started here."""
+
+    instance: InstanceId
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class StopOrdered:
+    """The master wants an instance to end for good."""
+
+    instance: InstanceId
+
+
+@dataclass(frozen=True, slots=True)
+class RestartOrdered:
+    """The master wants an instance to start again here."""
+
+    instance: InstanceId
+
+
+@dataclass(frozen=True, slots=True)
+class RestartPolicySet:
+    """The master wants an instance to have another restart policy; a shadow is none any more."""
+
+    instance: InstanceId
+    restart: RestartPolicy
+
+
+@dataclass(frozen=True, slots=True)
+class RestartPolicyRecorded:
+    """The supervisor has written down which restart policy an instance has."""
+
+    instance: InstanceId
+    restart: RestartPolicy
+
+
+@dataclass(frozen=True, slots=True)
+class ReportRequested:
+    """The master wants to know of every instance."""
+
+
+@dataclass(frozen=True, slots=True)
+class SupervisorReported:
+    """The supervisor says what became of instances."""
+
+    statuses: tuple[InstanceStatus, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class SupervisorReplaced:
+    """Another supervisor took over, or this slave found one at its start.
+
+    Attributes:
+        statuses: all that it knows.
+        awaited: what it was told to remember of instances that become ready in the ROS graph.
+    """
+
+    statuses: tuple[InstanceStatus, ...]
+    awaited: Mapping[InstanceId, Awaited] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class SeenInGraph:
+    """This very instance, not a namesake, is in the ROS graph."""
+
+    instance: InstanceId
+
+
+@dataclass(frozen=True, slots=True)
+class TimePassed:
+    """Nothing else happened; deadlines are looked at."""
+
+
+# --- what is asked for ------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Launch:
+    """Have the supervisor start instances."""
+
+    assignments: tuple[Assignment, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Stop:
+    """Have the supervisor stop an instance."""
+
+    instance: InstanceId
+
+
+@dataclass(frozen=True, slots=True)
+class Restart:
+    """Have the supervisor restart an instance."""
+
+    instance: InstanceId
+
+
+@dataclass(frozen=True, slots=True)
+class Amend:
+    """Have the supervisor keep another restart policy; `RestartPolicyRecorded` follows."""
+
+    instance: InstanceId
+    restart: RestartPolicy
+
+
+@dataclass(frozen=True, slots=True)
+class Settle:
+    """Answer the order to set this restart policy; `refusal`: why it cannot be; "": it is."""
+
+    instance: InstanceId
+    restart: RestartPolicy
+    refusal: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Remember:
+    """Have the supervisor keep this for a later run of this slave."""
+
+    instance: InstanceId
+    awaited: Awaited
+
+
+@dataclass(frozen=True, slots=True)
+class Forget:
+    """Let the supervisor forget ended instances."""
+
+    instances: tuple[InstanceId, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """Tell the master; `complete`: these are all."""
+
+    statuses: tuple[InstanceStatus, ...]
+    complete: bool = False
+
+
+Command = Launch | Stop | Restart | Amend | Settle | Remember | Forget | Report
+
+Event = (
+    Registered
+    | MasterLost
+    | AssignmentsReceived
+    | LaunchRefused
+    | StopOrdered
+    | RestartOrdered
+    | RestartPolicySet
+    | RestartPolicyRecorded
+    | ReportRequested
+    | SupervisorReported
+    | SupervisorReplaced
+    | SeenInGraph
+    | TimePassed
+)

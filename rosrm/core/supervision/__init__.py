@@ -1,0 +1,145 @@
+"""What the supervisor of one host does with its instances: a pure state machine.
+
+    phase     event            what follows                                  next phase
+    -         StartOrdered     Spawn                                         starting
+                               its number is dead, or all is stopped: -      refused
+    -         StopOrdered      - (a start that comes late is refused)        refused
+              RestartOrdered   -                                             refused
+              AmendOrdered     -                                             refused
+    starting  Spawned          -                                             running
+                               a stop came in between: SIGINT                stopping
+              SpawnFailed      final, or by policy where it may pass         failed, backoff
+              StopOrdered      Unspawn (one in hand is stopped later)        starting
+              Resumed          Spawn (the supervisor was restarted)          starting
+              AmendOrdered     - (its policy is another from now on)         starting
+    running   Exited           by policy                                     exited, failed, backoff
+                               others of its session live: SIGINT            stopping
+              StopOrdered      SIGINT                                        stopping
+              RestartOrdered   SIGINT, to start again afterwards             stopping
+              AmendOrdered     -                                             running
+    stopping  TimePassed       SIGTERM, then SIGKILL, then SIGKILL again     stopping
+              Exited           as was meant (end, restart, policy)           exited, starting, ...
+                               others of its session live: -                 stopping
+              Cleared          as was meant (end, restart, policy)           exited, starting, ...
+              StopOrdered      now it is meant to end                        stopping
+              RestartOrdered   unless it is meant to end: to start again     stopping
+              AmendOrdered     -                                             stopping
+    backoff   TimePassed       Spawn                                         starting
+              RestartOrdered   Spawn, the count of restarts afresh           starting
+              StopOrdered      -                                             exited
+              AmendOrdered     - (if the policy now allows no restart)       failed, backoff
+    ended     Forgotten        Drop; its number is dead                      -
+
+Whatever is not in the table changes nothing; an order that changes nothing has its status told
+again, as DDS may repeat it. Every change of an instance is told (`Tell`). A signal goes to every
+process that is left of an instance, and none is sent after its end.
+
+This package is imported by the supervisor, which must stay small: so nothing of `rosrm.core.model`
+(dataclasses alone cost 2 MiB); a test compares the values that are in both.
+"""
+
+from __future__ import annotations
+
+from rosrm.core.supervision.instance import (
+    BACKOFF,
+    ENDED,
+    EXITED,
+    FAILED,
+    KILL_AGAIN,
+    MOST_KILLS,
+    REFUSED,
+    RUNNING,
+    STARTING,
+    STEPS,
+    STOPPING,
+    THEN_END,
+    THEN_POLICY,
+    THEN_RESTART,
+    UNKNOWN_EXIT,
+    Instance,
+    signal_name,
+)
+from rosrm.core.supervision.supervision import (
+    MOST_TOMBSTONES,
+    Supervision,
+)
+from rosrm.core.supervision.transitions import (
+    TRANSITIONS,
+    Transition,
+    backoff,
+)
+from rosrm.core.supervision.words import (
+    AmendOrdered,
+    Cleared,
+    ClientLost,
+    Command,
+    Drop,
+    Event,
+    Exited,
+    Forgotten,
+    Key,
+    Leave,
+    RestartOrdered,
+    RestartRule,
+    Resumed,
+    ShutdownOrdered,
+    Signal,
+    Spawn,
+    Spawned,
+    SpawnFailed,
+    StartOrdered,
+    StopOrdered,
+    StopRule,
+    Tell,
+    TimePassed,
+    Unspawn,
+)
+
+__all__ = [
+    "BACKOFF",
+    "ENDED",
+    "EXITED",
+    "FAILED",
+    "KILL_AGAIN",
+    "MOST_KILLS",
+    "MOST_TOMBSTONES",
+    "REFUSED",
+    "RUNNING",
+    "STARTING",
+    "STEPS",
+    "STOPPING",
+    "THEN_END",
+    "THEN_POLICY",
+    "THEN_RESTART",
+    "TRANSITIONS",
+    "UNKNOWN_EXIT",
+    "AmendOrdered",
+    "Cleared",
+    "ClientLost",
+    "Command",
+    "Drop",
+    "Event",
+    "Exited",
+    "Forgotten",
+    "Instance",
+    "Key",
+    "Leave",
+    "RestartOrdered",
+    "RestartRule",
+    "Resumed",
+    "ShutdownOrdered",
+    "Signal",
+    "Spawn",
+    "SpawnFailed",
+    "Spawned",
+    "StartOrdered",
+    "StopOrdered",
+    "StopRule",
+    "Supervision",
+    "Tell",
+    "TimePassed",
+    "Transition",
+    "Unspawn",
+    "backoff",
+    "signal_name",
+]

@@ -1,0 +1,133 @@
+"""One instance of the supervisor: all that is known of it, and how it is said to people."""
+
+from __future__ import annotations
+
+import signal
+from typing import Final
+
+from rosrm.core.supervision.words import Key, RestartRule, StopRule
+
+STARTING: Final = "starting"
+RUNNING: Final = "running"
+BACKOFF: Final = "backoff"
+STOPPING: Final = "stopping"
+EXITED: Final = "exited"
+FAILED: Final = "failed"
+REFUSED: Final = "refused"
+ENDED: Final = frozenset({EXITED, FAILED, REFUSED})
+
+#: What becomes of a stopping instance when nothing of it is left.
+THEN_END: Final = "end"
+THEN_RESTART: Final = "restart"
+THEN_POLICY: Final = "policy"
+
+STEPS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
+_KILL: Final = len(STEPS) - 1
+#: Seconds between one SIGKILL and the next, for members that were forked in between.
+KILL_AGAIN: Final = 1.0
+#: SIGKILLs after which a shutdown no longer waits (a process stuck in the kernel).
+MOST_KILLS: Final = 5
+#: The exit code of a run whose end nobody has seen.
+UNKNOWN_EXIT: Final = -1
+
+
+class Instance:
+    """All that is known of one instance; JSON can hold every field.
+
+    Attributes:
+        then: what becomes of it when nothing of it is left; "" while nobody wants it stopped.
+        pid: of its session leader; 0: none.
+        started: when its last run began.
+        recent: when the restarts within the policy's window were.
+        deadline: of the next step (signal or restart); None: none is due.
+        kills: how often SIGKILL was sent in this stop.
+        step: the last step of the stop, an index of STEPS; -1: none.
+        stop_began: when its stop began.
+        trail: the steps of the stop, for people.
+    """
+
+    __slots__ = (
+        "cpu_time",
+        "deadline",
+        "exit_code",
+        "exit_signal",
+        "key",
+        "kills",
+        "message",
+        "peak_memory",
+        "phase",
+        "pid",
+        "recent",
+        "restart",
+        "restarts",
+        "run_time",
+        "started",
+        "step",
+        "stop",
+        "stop_began",
+        "then",
+        "trail",
+    )
+
+    def __init__(self, key: Key, restart: RestartRule, stop: StopRule) -> None:
+        self.key = key
+        self.restart = restart
+        self.stop = stop
+        self.phase = STARTING
+        self.then = ""
+        self.pid = 0
+        self.exit_code = 0
+        self.exit_signal = 0
+        self.restarts = 0
+        self.recent: list[float] = []
+        self.started = 0.0
+        self.deadline: float | None = None
+        self.step = -1
+        self.kills = 0
+        self.stop_began = 0.0
+        self.trail = ""
+        self.peak_memory = 0.0
+        self.cpu_time = 0.0
+        self.run_time = 0.0
+        self.message = ""
+
+    @property
+    def ended(self) -> bool:
+        """Nothing of it runs, and nothing will."""
+        return self.phase in ENDED
+
+
+def end(instance: Instance, phase: str, message: str) -> None:
+    """Nothing of it runs any more, and nothing will."""
+    instance.phase = phase
+    instance.then = ""
+    instance.pid = 0
+    instance.deadline = None
+    instance.message = message
+
+
+def stopping(instance: Instance) -> str:
+    """Why and how far it is being stopped, for people."""
+    why = {
+        THEN_RESTART: "to restart it: ",
+        THEN_POLICY: f"{ending(instance)}; stopping what it left: ",
+    }.get(instance.then, "")
+    still = f"; still there after {instance.kills} times" if instance.kills > 1 else ""
+    return f"{why}{instance.trail}{still}"
+
+
+def ending(instance: Instance) -> str:
+    """How its last run ended, for people."""
+    if instance.exit_signal:
+        return f"killed by {signal_name(instance.exit_signal)}"
+    if instance.exit_code == UNKNOWN_EXIT:
+        return "ended while no supervisor ran: its exit code is not known"
+    return f"exit code {instance.exit_code}"
+
+
+def signal_name(number: int) -> str:
+    """SIGTERM for 15; a real-time signal by its number."""
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"

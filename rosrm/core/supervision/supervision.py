@@ -1,0 +1,142 @@
+"""All instances of one host, and what each event means for which of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Final
+
+from rosrm.core.supervision.instance import MOST_KILLS, REFUSED, Instance, end
+from rosrm.core.supervision.transitions import TRANSITIONS
+from rosrm.core.supervision.words import (
+    AmendOrdered,
+    ClientLost,
+    Command,
+    Drop,
+    Event,
+    Forgotten,
+    Key,
+    Leave,
+    RestartOrdered,
+    RestartRule,
+    ShutdownOrdered,
+    Spawn,
+    StartOrdered,
+    StopOrdered,
+    StopRule,
+    Tell,
+    TimePassed,
+)
+
+#: Process names whose dead numbers are remembered.
+MOST_TOMBSTONES: Final = 2000
+
+_ORDERS: Final = (StartOrdered, StopOrdered, RestartOrdered, AmendOrdered, Forgotten)
+
+
+class Supervision:
+    """The instances of one host.
+
+    Attributes:
+        instances: all that are not forgotten.
+        dead: process name to the highest number that was forgotten: those up to it never start.
+        closing: a shutdown was ordered.
+    """
+
+    def __init__(self) -> None:
+        self.instances: dict[Key, Instance] = {}
+        self.dead: dict[str, int] = {}
+        self.closing = False
+        self._timed: dict[Key, float] = {}
+
+    def restore(self, instance: Instance) -> None:
+        """Take over what an earlier supervisor of this host recorded."""
+        self.instances[instance.key] = instance
+        self._watch_deadline(instance)
+
+    def deadline(self) -> float | None:
+        """When `TimePassed` is due; None: never, as things are."""
+        return min(self._timed.values(), default=None)
+
+    @property
+    def idle(self) -> bool:
+        """Nothing runs, and nothing will unless somebody orders it."""
+        return all(instance.ended for instance in self.instances.values())
+
+    def handle(self, event: Event, now: float) -> list[Command]:
+        """What follows from `event`."""
+        commands = list(self._follow(event, now))
+        if self.closing and self._nothing_to_wait_for():
+            commands.append(Leave())
+        return commands
+
+    def _follow(self, event: Event, now: float) -> Iterator[Command]:
+        if isinstance(event, TimePassed):
+            due = [key for key, deadline in self._timed.items() if deadline <= now]
+            for key in due:
+                yield from self._apply(self.instances[key], event, now)
+        elif isinstance(event, ShutdownOrdered):
+            self.closing = True
+            for instance in list(self.instances.values()):
+                yield from self._apply(instance, StopOrdered(instance.key), now)
+        elif isinstance(event, ClientLost):
+            return
+        elif event.instance in self.instances:
+            yield from self._known(self.instances[event.instance], event, now)
+        elif isinstance(event, (StartOrdered, StopOrdered, RestartOrdered, AmendOrdered)):
+            yield from self._unknown(event)
+
+    def _known(self, instance: Instance, event: Event, now: float) -> Iterator[Command]:
+        if isinstance(event, Forgotten) and instance.ended:
+            yield self._bury(instance)
+            return
+        commands = self._apply(instance, event, now)
+        yield from commands
+        if not commands and isinstance(event, _ORDERS):
+            yield Tell(instance.key)
+
+    def _unknown(
+        self, event: StartOrdered | StopOrdered | RestartOrdered | AmendOrdered
+    ) -> Iterator[Command]:
+        name, number = event.instance
+        starts = isinstance(event, StartOrdered)
+        restart = event.restart if isinstance(event, StartOrdered) else RestartRule()
+        stop = event.stop if isinstance(event, StartOrdered) else StopRule()
+        instance = Instance(event.instance, restart, stop)
+        self.instances[instance.key] = instance
+        if number <= self.dead.get(name, -1):
+            end(instance, REFUSED, f"{name}#{number} or a later one has ended and was forgotten")
+        elif not starts:
+            end(instance, REFUSED, "it was never started here")
+        elif self.closing:
+            end(instance, REFUSED, "the supervisor of this host is shutting down")
+        yield Tell(instance.key)
+        if not instance.ended:
+            yield Spawn(instance.key)
+
+    def _apply(self, instance: Instance, event: Event, now: float) -> list[Command]:
+        transition = TRANSITIONS.get((instance.phase, type(event)))
+        if transition is None:
+            return []
+        commands = transition(instance, event, now)
+        self._watch_deadline(instance)
+        return commands
+
+    def _watch_deadline(self, instance: Instance) -> None:
+        if instance.deadline is None:
+            self._timed.pop(instance.key, None)
+        else:
+            self._timed[instance.key] = instance.deadline
+
+    def _bury(self, instance: Instance) -> Drop:
+        name, number = instance.key
+        del self.instances[instance.key]
+        newest = max(number, self.dead.pop(name, number))
+        self.dead[name] = newest
+        while len(self.dead) > MOST_TOMBSTONES:
+            del self.dead[next(iter(self.dead))]
+        return Drop(instance.key)
+
+    def _nothing_to_wait_for(self) -> bool:
+        return all(
+            instance.ended or instance.kills > MOST_KILLS for instance in self.instances.values()
+        )
