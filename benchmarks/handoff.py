@@ -48,7 +48,14 @@ _NAME = "moving"
 
 
 class Output(NamedTuple):
-    """One output as the observer got it: when DDS received it, and what it says."""
+    """One output as the observer got it.
+
+    Attributes:
+        received: by DDS, unix time in ns.
+        instance: who said it.
+        sequence: outputs of the node so far, this one included; 0 of one without state.
+        answered: the input that it answers, numbered from 1.
+    """
 
     received: int
     instance: int
@@ -58,7 +65,13 @@ class Output(NamedTuple):
 
 @dataclass
 class Outcome:
-    """What came of the moves: how each ended, and what they were seen to cost."""
+    """What came of the moves: how each ended, and what they were seen to cost.
+
+    Attributes:
+        ends: "migrated" or "stayed", of each move.
+        gaps: seconds beyond one period, of each change of the speaker.
+        lost, repeated, out_of_order: outputs, or inputs that nobody answered or somebody twice.
+    """
 
     ends: list[str]
     gaps: list[float]
@@ -121,6 +134,7 @@ def driver(cluster: LocalCluster, rate: float) -> Iterator[None]:
 
 
 def process_of(strategy: str, program: str, rate: float) -> ProcessSpec:
+    """The node that is moved; `rate` in Hz."""
     return ProcessSpec(
         _NAME, module="benchmarks.handoff_nodes", arguments=(program, "--rate", str(rate)),
         environment={"PYTHONPATH": str(_ROOT)}, ros=True,
@@ -156,6 +170,7 @@ def gaps_of_handoff(outputs: Sequence[Output], period: float) -> list[float]:
 
 
 def outcome_of_handoff(ends: list[str], outputs: Sequence[Output], period: float) -> Outcome:
+    """Of a node that counts its outputs; `period` in seconds."""
     answered = [output.answered for output in outputs]
     sequence = [output.sequence for output in outputs]
     # Both must be gapless: no input without an answer, and no answer that the observer missed.
@@ -168,7 +183,7 @@ def outcome_of_handoff(ends: list[str], outputs: Sequence[Output], period: float
 
 
 def outcome_of_relaunch(ends: list[str], outputs: Sequence[Output], period: float) -> Outcome:
-    """Of a node that says the same in each cycle, whichever instance speaks."""
+    """Of a node that says the same in each cycle; `period` in seconds."""
     by_instance: dict[int, list[float]] = {}
     for output in outputs:
         by_instance.setdefault(output.instance, []).append(output.received / _NS)
@@ -181,6 +196,11 @@ def outcome_of_relaunch(ends: list[str], outputs: Sequence[Output], period: floa
 
 
 def measure(strategy: str, driven: str, rate: float, runs: int) -> Outcome:
+    """Move a node to and fro, `runs` times, on a cluster of two hosts; `rate` in Hz.
+
+    Raises:
+        TimeoutError: a move did not end, or the node fell silent.
+    """
     program = "tick" if strategy == "relaunch" else {"input": "echo", "timer": "count"}[driven]
     period = 1.0 / rate
     settings = ClusterConfig(
