@@ -1,4 +1,4 @@
-"""The examples as real processes: the ROS 2 node that maps, and the process that holds memory."""
+"""The examples as real processes: the ROS 2 nodes that map, and the process that holds memory."""
 
 from __future__ import annotations
 
@@ -47,13 +47,68 @@ def start() -> Iterator[Start]:
         process.communicate()
 
 
+class Listener:
+    """A ROS node of the test: it hears the odometry, and sees who is there."""
+
+    def __init__(self, topic: str) -> None:
+        rclpy = pytest.importorskip("rclpy")
+        from nav_msgs.msg import Odometry
+
+        self._context = rclpy.Context()
+        rclpy.init(context=self._context, domain_id=DOMAIN)
+        self._node = rclpy.create_node("listener", context=self._context)
+        self._executor = rclpy.executors.SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        self.heard: list[Odometry] = []
+        self._node.create_subscription(Odometry, topic, self.heard.append, 100)
+
+    def wait_for(self, count: int, seconds: float = 30.0) -> None:
+        """Until so many messages have come; fails when they do not."""
+        deadline = time.monotonic() + seconds
+        while len(self.heard) < count:
+            left = deadline - time.monotonic()
+            assert left > 0.0, f"{len(self.heard)} of {count} messages came within {seconds} s"
+            self._executor.spin_once(timeout_sec=left)
+
+    def sees(self, name: str) -> bool:
+        """Whether a node of this name is there."""
+        return name in self._node.get_node_names()
+
+    def close(self) -> None:
+        self._executor.shutdown()
+        self._context.shutdown()
+
+
+@pytest.fixture
+def listen() -> Iterator[Callable[[str], Listener]]:
+    """Makes listeners, and ends them. They are there before what they listen to."""
+    made: list[Listener] = []
+
+    def make(topic: str) -> Listener:
+        made.append(Listener(topic))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.close()
+
+
+def peak_mb(process: subprocess.Popen[str]) -> float:
+    """The most private memory that a process was seen to have, MB; waits for its end."""
+    peak = 0.0
+    while process.poll() is None:
+        peak = max(peak, resident_mb(process))
+        time.sleep(0.01)
+    return peak
+
+
 def resident_mb(process: subprocess.Popen[str]) -> float:
     """The private memory that a process really has, MB."""
     pages = Path(f"/proc/{process.pid}/statm").read_text().split()
     return (int(pages[1]) - int(pages[2])) * os.sysconf("SC_PAGESIZE") / 1e6
 
 
-def wait_until(condition: Callable[[], bool], seconds: float = 10.0) -> None:
+def wait_until(condition: Callable[[], bool], seconds: float = 30.0) -> None:
     """Waits for a condition; fails when it does not come true in time."""
     deadline = time.monotonic() + seconds
     while not condition():
@@ -73,28 +128,13 @@ def test_map_piece_maps_its_piece(start: Start, tmp_path: Path) -> None:
     assert load_piece(tmp_path / "piece_02.npz").indices.tolist() == list(range(15, 30))
 
 
-def test_map_piece_publishes_the_pose_of_every_scan(start: Start, tmp_path: Path) -> None:
+def test_map_piece_publishes_the_pose_of_every_scan(start: Start, listen, tmp_path: Path) -> None:
     """A subscriber gets the scans' odometry in order, with the pose and a plausible velocity."""
-    rclpy = pytest.importorskip("rclpy")
-    from nav_msgs.msg import Odometry
-
-    context = rclpy.Context()
-    rclpy.init(context=context, domain_id=DOMAIN)
-    listener = rclpy.create_node("listener", context=context)
-    executor = rclpy.executors.SingleThreadedExecutor(context=context)
-    executor.add_node(listener)
-    heard: list[Odometry] = []
-    listener.create_subscription(Odometry, "/car/odometry", heard.append, 10)
+    listener = listen("/car/odometry")
     arguments = ["--drive", "street:150", "--piece", "1", "--of", "1", "--out", str(tmp_path)]
     start("map_piece", *arguments, "--rate", "10", "--ros-args", "-r", "__ns:=/car")
-    try:
-        deadline = time.monotonic() + 15
-        while len(heard) < 5 and time.monotonic() < deadline:
-            executor.spin_once(timeout_sec=0.2)
-    finally:
-        executor.shutdown()
-        context.shutdown()
-    assert len(heard) >= 5
+    listener.wait_for(5)
+    heard = listener.heard
     tenths = [round(m.header.stamp.sec * 10 + m.header.stamp.nanosec / 1e8) for m in heard]
     assert tenths == list(range(tenths[0], tenths[0] + len(heard)))
     travelled = [message.pose.pose.position.x for message in heard]
@@ -129,10 +169,10 @@ def test_map_piece_says_what_it_cannot_use(start: Start, tmp_path: Path) -> None
 
 @pytest.mark.parametrize("state", ["full", "pose"])
 def test_a_played_drive_is_mapped_as_one_that_is_read(
-    start: Start, tmp_path: Path, state: str
+    start: Start, listen, tmp_path: Path, state: str
 ) -> None:
     """Without rosrm: player and SLAM as two nodes, poses and map to the last bit."""
-    pytest.importorskip("rclpy")
+    listener = listen("/odometry")
     from rosrm_examples.drives import load_drive
     from rosrm_examples.map_part import load_parts
     from rosrm_examples.migration_results import unmigrated_poses
@@ -146,7 +186,7 @@ def test_a_played_drive_is_mapped_as_one_that_is_read(
     assert "10/20 scans" in output
     assert "sent 20 of 20 scans" in output
     assert json.loads(report.read_text()) == {"scans_sent": 20}
-    time.sleep(0.5)  # all has arrived; the last one is being mapped
+    listener.wait_for(20)  # each scan is mapped before its pose is published
     slam.send_signal(signal.SIGINT)
     output, errors = slam.communicate(timeout=10)
     assert (slam.returncode, errors) == (0, "")
@@ -184,10 +224,7 @@ def test_the_slam_node_says_what_it_cannot_use(start: Start) -> None:
 def test_holder_holds_what_it_is_told_until_a_signal(start: Start, stop: signal.Signals) -> None:
     """The memory is really there, beyond the process's own, and a signal ends it with 0."""
     empty, full = start("holder", "--mb", "0"), start("holder", "--mb", "60")
-    wait_until(lambda: resident_mb(full) > 60)
-    wait_until(lambda: resident_mb(empty) > 3)
-    time.sleep(0.2)
-    assert resident_mb(full) - resident_mb(empty) == pytest.approx(60, abs=3)
+    wait_until(lambda: abs(resident_mb(full) - resident_mb(empty) - 60) < 3)
     full.send_signal(stop)
     assert (full.wait(timeout=5), full.communicate()) == (0, ("", ""))
 
@@ -200,12 +237,11 @@ def test_holder_grows_and_ends_by_itself(start: Start) -> None:
 
 
 def test_holder_grows_up_to_its_most(start: Start) -> None:
-    """And holds that."""
-    empty = start("holder", "--mb", "0")
-    holder = start("holder", "--mb", "10", "--grow", "100", "--most", "40")
-    wait_until(lambda: resident_mb(holder) - resident_mb(empty) > 37)
-    time.sleep(0.5)
-    assert resident_mb(holder) - resident_mb(empty) == pytest.approx(40, abs=3)
+    """And holds that: it never had more."""
+    empty = start("holder", "--mb", "0", "--seconds", "0.5")
+    holder = start("holder", "--mb", "10", "--grow", "100", "--most", "40", "--seconds", "1.5")
+    least = peak_mb(empty)
+    assert peak_mb(holder) - least == pytest.approx(40, abs=3)
 
 
 def test_holder_is_small_without_ros() -> None:
@@ -218,12 +254,11 @@ def test_holder_is_small_without_ros() -> None:
     subprocess.run([sys.executable, "-c", code], check=True, timeout=20)
 
 
-def test_holder_can_be_a_ros_node(start: Start) -> None:
+def test_holder_can_be_a_ros_node(start: Start, listen) -> None:
     """With --ros it is in the ROS graph, takes remappings, and still stops by a signal with 0."""
-    pytest.importorskip("rclpy")
+    listener = listen("/nothing")
     holder = start("holder", "--mb", "5", "--ros", "--ros-args", "-r", "__node:=h1")
-    wait_until(lambda: resident_mb(holder) > 15)
-    time.sleep(0.3)
+    wait_until(lambda: listener.sees("h1"))
     holder.send_signal(signal.SIGTERM)
     output, errors = holder.communicate(timeout=5)
     assert (holder.returncode, output, errors) == (0, "", "")

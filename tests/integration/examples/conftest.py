@@ -1,0 +1,7 @@
+"""What the tests of the examples' processes share."""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # as the examples run: one process, one core
