@@ -25,7 +25,6 @@ from rosrm.core.model import (
     Assignment,
     HostDescription,
     InstanceId,
-    InstanceState,
     InstanceStatus,
     RestartPolicy,
     StopPolicy,
@@ -42,7 +41,8 @@ from rosrm.slave.launch import launch_order
 from rosrm.slave.log_reading import NOTHING_YET, newest_instance, read_log
 from rosrm.slave.memos import from_memo, to_memo
 from rosrm.slave.sampling import Sampler
-from rosrm.slave.sessions import SessionTable, SessionUsage
+from rosrm.slave.sessions import SessionTable
+from rosrm.slave.usage import UsageWatch
 from rosrm.state_directory import only_one
 from rosrm.supervisor.client import (
     Amended,
@@ -64,9 +64,6 @@ _USAGE_PERIOD: Final = 1.0
 _PATIENCE_TOLD: Final = 10.0
 #: At slow rates a request is still meant after so many of our own beats.
 _BEATS_MISSED: Final = 3
-#: Readings that go out between looking at what each instance uses and saying it: so the master
-#: never takes a need for met that does not show in the readings which it has.
-_READINGS_FIRST: Final = 3
 
 Executor = Callable[[Mapping[str, Any]], Mapping[str, Any]]
 #: Told of the outcome of an order: why it was refused; "": it is done.
@@ -97,9 +94,6 @@ class SlaveRuntime:
         self._graph_before: dict[InstanceId, frozenset[bytes]] = {}
         self._unsettled: dict[tuple[InstanceId, RestartPolicy], list[Settled]] = {}
         self._executors: Mapping[str, Executor] = registry.executors()
-        self._leaders: dict[InstanceId, int] = {}
-        self._seen: Mapping[int, SessionUsage] = {}
-        self._say_usage_in = 0
         self._supervisor_state = config.state / "supervisor"
         self._closing = contextlib.ExitStack()
         with contextlib.ExitStack() as opened:
@@ -109,6 +103,7 @@ class SlaveRuntime:
                 )
             )
             self._sessions = SessionTable()
+            self._usage = UsageWatch(self._sessions)
             context = ProbeContext(config.scope, config.budget, config.state, self._sessions)
             probes = registry.probes(config.probes, context)
             self._sampler = Sampler(probes.made)
@@ -186,7 +181,7 @@ class SlaveRuntime:
                 self._cycle(now)
             if now >= next_usage:
                 next_usage = now + _USAGE_PERIOD
-                self._look_at_usage(now)
+                self._usage.look(now)
             awaited = self._state.awaited_in_graph()
             if awaited and now >= next_graph:
                 next_graph = now + _LOOK_AT_GRAPH
@@ -221,25 +216,14 @@ class SlaveRuntime:
         self._say_usage()
         self.take(core.TimePassed())
 
-    def _look_at_usage(self, now: float) -> None:
-        """What each instance uses; it is said when enough readings have gone out."""
-        if not self._leaders or self._seen:
-            return
-        self._sessions.refresh(now)
-        usage = self._sessions.usage()
-        self._seen = {one.number: usage[pid] for one, pid in self._leaders.items() if pid in usage}
-        self._say_usage_in = _READINGS_FIRST
-
     def _say_usage(self) -> None:
-        self._say_usage_in -= 1
-        if not self._seen or self._say_usage_in > 0:
-            return
-        seen, self._seen = self._seen, {}
-        self._endpoint.publish_usage(
-            list(seen),
-            [used.cpu for used in seen.values()],
-            [used.memory for used in seen.values()],
-        )
+        seen = self._usage.after_reading()
+        if seen:
+            self._endpoint.publish_usage(
+                list(seen),
+                [used.cpu for used in seen.values()],
+                [used.memory for used in seen.values()],
+            )
 
     def _look_at_graph(self, awaited: Mapping[InstanceId, core.Held]) -> None:
         for instance, held in awaited.items():
@@ -372,17 +356,7 @@ class SlaveRuntime:
                 self.take(core.RestartPolicyRecorded(one.instance, one.restart))
 
     def _follow_session(self, status: InstanceStatus) -> None:
-        """Keep the table of sessions, for probes and usage."""
-        leader = self._leaders.get(status.instance, 0)
-        runs = status.state in (InstanceState.RUNNING, InstanceState.STOPPING) and status.pid
-        if leader and (leader != status.pid or not runs):
-            self._sessions.remove(leader, status.cpu_time)
-            del self._leaders[status.instance]
-        elif status.state.ended:  # too short to have been seen running: its time counts too
-            self._sessions.remove(status.pid, status.cpu_time)
-        if runs and status.instance not in self._leaders:
-            self._sessions.add(status.pid)
-            self._leaders[status.instance] = status.pid
+        self._usage.follow(status)
         if status.state.ended:
             self._graph_before.pop(status.instance, None)
 

@@ -1,0 +1,79 @@
+"""What each instance uses: whose session is followed, and when it is said."""
+
+from __future__ import annotations
+
+import pytest
+
+from rosrm.core.model import InstanceId, InstanceState, InstanceStatus
+from rosrm.slave.sessions import SessionUsage
+from rosrm.slave.usage import UsageWatch
+
+P = InstanceId("p", 7)
+
+
+class Table:
+    """Stands for the table of sessions: who is in it, and what it was told of ends."""
+
+    def __init__(self) -> None:
+        self.leaders: list[int] = []
+        self.removed: list[tuple[int, float]] = []
+        self.looks = 0
+
+    def add(self, leader: int) -> None:
+        self.leaders.append(leader)
+
+    def remove(self, leader: int, cpu_time: float) -> None:
+        self.removed.append((leader, cpu_time))
+        if leader in self.leaders:
+            self.leaders.remove(leader)
+
+    def refresh(self, now: float) -> None:
+        self.looks += 1
+
+    def usage(self) -> dict[int, SessionUsage]:
+        return {leader: SessionUsage(0.5, 1000 + leader) for leader in self.leaders}
+
+
+@pytest.fixture
+def table() -> Table:
+    return Table()
+
+
+def told(state: InstanceState, pid: int = 0, cpu_time: float = 0.0) -> InstanceStatus:
+    return InstanceStatus(P, state, pid=pid, cpu_time=cpu_time)
+
+
+def test_usage_is_said_three_readings_after_it_was_seen(table) -> None:
+    """And only once; what was not said yet is not looked at anew."""
+    watch = UsageWatch(table)
+    watch.follow(told(InstanceState.RUNNING, 40))
+    watch.look(1.0)
+    watch.look(1.5)
+    said = [watch.after_reading() for _ in range(4)]
+    assert said == [{}, {}, {7: SessionUsage(0.5, 1040)}, {}]
+    assert table.looks == 1
+
+
+def test_nothing_is_looked_at_while_nothing_runs(table) -> None:
+    """An idle host pays nothing."""
+    watch = UsageWatch(table)
+    watch.look(1.0)
+    assert (table.looks, watch.after_reading()) == (0, {})
+
+
+def test_a_session_is_followed_from_its_start_to_its_end(table) -> None:
+    """A restart is another one; what ended hands its CPU time over."""
+    watch = UsageWatch(table)
+    watch.follow(told(InstanceState.RUNNING, 40))
+    watch.follow(told(InstanceState.BACKOFF, cpu_time=2.0))
+    watch.follow(told(InstanceState.RUNNING, 41))
+    watch.follow(told(InstanceState.STOPPING, 41))
+    assert table.leaders == [41]
+    watch.follow(told(InstanceState.EXITED, cpu_time=3.0))
+    assert (table.leaders, table.removed) == ([], [(40, 2.0), (41, 3.0)])
+
+
+def test_one_that_was_never_seen_running_counts_too(table) -> None:
+    """It ended before anybody looked."""
+    UsageWatch(table).follow(told(InstanceState.FAILED, 40, cpu_time=0.1))
+    assert table.removed == [(40, 0.1)]
