@@ -7,6 +7,7 @@ RosrmError                  what a user reads: no traceback is shown for it
 ├── NoMaster                no master answered in time
 ├── LaunchError             a process that cannot be started on this host
 ├── JournalError            the durable record cannot be read or written
+├── RecordError             the record of a master's run cannot be read
 ├── SupervisorError         the supervisor cannot be started or reached
 └── LabError                a virtual host or its network cannot be made, or is not there
 
@@ -57,6 +58,12 @@ class LaunchError(RosrmError):
 
 class JournalError(RosrmError):
     """The durable record cannot be read or written."""
+
+
+class RecordError(RosrmError):
+    """The record of a master's run is none, damaged, cut short, or of another version."""
+
+    exit_code = 2
 
 
 class SupervisorError(RosrmError):

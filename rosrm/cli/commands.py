@@ -19,7 +19,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from rosrm.cli import acting, checking, following, listing, starting
+from rosrm.cli import acting, checking, following, listing, simulate, starting
 from rosrm.cli.app import INTERRUPTED
 from rosrm.cli.lab import lab
 from rosrm.cli.options import Common, Domain
@@ -81,7 +81,7 @@ def common(
     ctx.obj = Common(domain, cluster)
 
 
-for module in (starting, acting, listing, following):
+for module in (starting, acting, listing, following, simulate):
     for function in module.COMMANDS:
         app.command()(function)
 app.add_typer(checking.config, name="config")

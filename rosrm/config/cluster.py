@@ -23,20 +23,24 @@ def load_cluster(path: str | Path, registry: Registry | None = None) -> ClusterC
         registry: the installed plugins; without it the names of plugins and their options are taken
             as they are.
     """
-    return _checked(read(path), path, registry)
+    return checked_cluster(read(path), path, registry)
 
 
 def default_cluster(registry: Registry | None = None) -> ClusterConfig:
     """The settings of a master without a file, its plugins checked as those of one."""
-    return _checked(parse("", "the default settings"), "", registry)
+    return checked_cluster(parse("", "the default settings"), "", registry)
 
 
-def _checked(root: Node, path: str | Path, registry: Registry | None) -> ClusterConfig:
+def checked_cluster(root: Node, path: str | Path, registry: Registry | None) -> ClusterConfig:
+    """A master's settings from a document that was read; otherwise as `load_cluster`."""
     problems = Problems()
     config = validated(ClusterConfig, root, problems)
     _check_rules(root, config, problems)
     config = _with_options(root, config or ClusterConfig(), PluginCheck(registry, problems))
     problems.raise_any()
+    if config.record.directory != Path():
+        directory = settled(config.record.directory, path)
+        config = replace(config, record=replace(config.record, directory=directory))
     return replace(config, state=settled(config.state, path))
 
 

@@ -27,15 +27,16 @@ def merged(defaults: Node, entry: Node) -> Node:
         under = {name: node for name, node in under.items() if name not in _PROGRAM}
     if entry.get("migration", "strategy") is not None and "migration" in under:
         under["migration"] = _without(under["migration"], "options")
-    return _in_depth(Node(under, entry.place), entry)
+    return in_depth(Node(under, entry.place), entry)
 
 
-def _in_depth(under: Node, over: Node) -> Node:
+def in_depth(under: Node, over: Node) -> Node:
+    """One document over another: mappings in depth, anything else as a whole."""
     if not isinstance(under.value, Mapping) or not isinstance(over.value, Mapping):
         return over
     members = dict(under.items)
     for name, node in over.items.items():
-        members[name] = _in_depth(members[name], node) if name in members else node
+        members[name] = in_depth(members[name], node) if name in members else node
     return Node(members, over.place, over.key_place)
 
 

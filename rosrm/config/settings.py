@@ -170,6 +170,21 @@ class JournalSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class RecordSettings:
+    """The record of a run, for `rosrm simulate`.
+
+    Attributes:
+        directory: for the files, one for each run; empty: nothing is recorded.
+        max_size: bytes of one file; then the record ends, and the master goes on.
+        keep: newest files kept.
+    """
+
+    directory: Path = Path()
+    max_size: Annotated[int, Quantity("size", low=65536, whole=True)] = 256_000_000
+    keep: PositiveCount = 3
+
+
+@dataclass(frozen=True, slots=True)
 class ClusterConfig:
     """A master's settings: `cluster.yaml`.
 
@@ -184,6 +199,7 @@ class ClusterConfig:
         liveness: of hosts.
         control: of requests.
         journal: of events and intent.
+        record: of everything that the master is told, to be replayed.
         checkpoint: the policy that keeps states of processes, if any.
         delivery_timeout: seconds within which a slave must take up an assignment.
     """
@@ -198,6 +214,7 @@ class ClusterConfig:
     liveness: LivenessSettings = field(default_factory=LivenessSettings)
     control: ControlSettings = field(default_factory=ControlSettings)
     journal: JournalSettings = field(default_factory=JournalSettings)
+    record: RecordSettings = field(default_factory=RecordSettings)
     checkpoint: CheckpointChoice = field(default_factory=CheckpointChoice)
     delivery_timeout: PositiveSeconds = _CORE.delivery_timeout
 

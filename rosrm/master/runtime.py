@@ -11,6 +11,7 @@ import signal
 import socket
 import time
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, Final
 
 from rosrm.config.settings import ClusterConfig
@@ -22,11 +23,14 @@ from rosrm.core.state import MasterState
 from rosrm.core.views import EventRow, PluginRow, Snapshot
 from rosrm.errors import Refused
 from rosrm.journal import SqliteJournal
+from rosrm.master.recorder import Recorder
 from rosrm.ports import Intent, MigrationStrategy, Record, ScoringPolicy, StoredRecord
+from rosrm.recording.reading import TABLES, Header
 from rosrm.ros.client import find_master
 from rosrm.ros.master_endpoint import Identity, MasterEndpoint
 from rosrm.ros.participant import Participant
 from rosrm.state_directory import only_one
+from rosrm.version import __version__
 
 _log = logging.getLogger("rosrm.master")
 
@@ -60,6 +64,7 @@ class MasterRuntime:
     Raises:
         Refused: another master runs on this domain, or on this state directory.
         JournalError: the journal cannot be used.
+        ConfigError: a record is wanted and cannot be written.
     """
 
     def __init__(
@@ -75,6 +80,7 @@ class MasterRuntime:
         self._plugins = list(plugins)
         self._started = time.monotonic()
         self._stopping = ""
+        self._recorder: Recorder | None = None
         self._closing = contextlib.ExitStack()
         with contextlib.ExitStack() as opened:
             opened.enter_context(
@@ -91,6 +97,7 @@ class MasterRuntime:
             self._participant = Participant(config.ros, "rosrm_master")
             opened.callback(self._participant.close)
             self._refuse_second()
+            opened.callback(self._end_record)
             self._state = self._restored(policy, strategies)
             self._endpoint = self._new_endpoint()
             self._closing = opened.pop_all()
@@ -123,8 +130,25 @@ class MasterRuntime:
             self._fallback,
         )  # fmt: skip
         state.wall = time.time()
-        restore.restore(state, self._journal.intents, self._now())
+        now = self._now()
+        restore.restore(state, self._journal.intents, now)
+        self._record_from(now)
         return state
+
+    def _record_from(self, now: float) -> None:
+        """Begin the record of this run, if one is wanted, with what the state was restored from."""
+        wanted, config = self._config.record, self._config
+        if wanted.directory == Path():
+            return
+        intents = {table: self._journal.intents(table) for table in TABLES}
+        epoch = int(intents["cluster"]["epoch"]["epoch"])
+        header = Header(__version__, config.name, json.loads(config.to_json()), epoch, now, intents)
+        self._recorder = Recorder(wanted.directory, header, wanted.max_size, wanted.keep)
+        _log.info("recording into %s", self._recorder.path)
+
+    def _end_record(self) -> None:
+        if self._recorder is not None:
+            self._recorder.close(f"the master stopped: {self._stopping or 'it failed'}")
 
     def _new_endpoint(self) -> MasterEndpoint:
         identity = Identity(
@@ -194,7 +218,10 @@ class MasterRuntime:
         while events := self._endpoint.take_events():
             commands: list[Command] = []
             for event in events:
-                commands += step(self._state, event, now)
+                decided = step(self._state, event, now)
+                if self._recorder is not None:
+                    self._recorder.note(event, now, self._state.wall, decided)
+                commands += decided
             if commands:
                 self._carry_out(commands, now)
 

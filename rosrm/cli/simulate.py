@@ -1,0 +1,82 @@
+"""`rosrm simulate`: what would have been, with other policies, weights and hosts."""
+
+# Each command imports what it needs when it runs, so that `rosrm --help` is quick.
+# ruff: noqa: PLC0415
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+
+from rosrm.cli.options import AsJson
+
+
+def simulate(  # noqa: PLR0913, PLR0917 - an argument for each option
+    file: Annotated[
+        Path,
+        typer.Argument(metavar="FILE", help="A workload (YAML), or the record of a master's run."),
+    ],
+    variants: Annotated[
+        Path | None,
+        typer.Option("--variants", metavar="FILE", help="YAML: a list of `variants` to compare."),
+    ] = None,
+    variant: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--variant", metavar="YAML", help="One more, such as 'scoring: {policy: threshold}'."
+        ),
+    ] = None,
+    policy: Annotated[
+        list[str] | None,
+        typer.Option("--policy", metavar="NAME", help="One more: another scoring policy."),
+    ] = None,
+    hosts: Annotated[
+        list[int] | None,
+        typer.Option("--hosts", metavar="N", help="One more: another number of hosts."),
+    ] = None,
+    until: Annotated[
+        str, typer.Option("--until", metavar="TIME", help="End each run here, such as 10min.")
+    ] = "",
+    seed: Annotated[
+        int | None,
+        typer.Option("--seed", metavar="N", min=0, help="For what a workload draws by chance."),
+    ] = None,
+    cut: Annotated[
+        bool, typer.Option("--cut", help="Take what is there of a record that is cut short.")
+    ] = False,
+    plot: Annotated[
+        Path | None,
+        typer.Option("--plot", metavar="FILE", help="Draw the runs: .png, .svg or .pdf."),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Run a workload on virtual time, and compare policies, weights and numbers of hosts.
+
+    The first row is the workload as it is given; each variant is one row more. Of a record the
+    first row is the real run.
+    """
+    from rosrm.cli import simulation_picture, simulation_tables
+    from rosrm.cli.simulation_runs import Request, carry_out
+
+    if plot is not None:
+        simulation_picture.check(plot)
+    request = Request(
+        file, variants, tuple(variant or ()), tuple(policy or ()), tuple(hosts or ()), until, seed,
+        cut,
+    )  # fmt: skip
+    report = carry_out(request)
+    if plot is not None:
+        simulation_picture.draw(report, plot)
+    if as_json:
+        from rosrm.cli.json_forms import show
+
+        show(simulation_tables.report_form(report))
+        return
+    simulation_tables.show(report)
+    if plot is not None:
+        typer.echo(f"drawn: {plot}")
+
+
+COMMANDS: Final = (simulate,)

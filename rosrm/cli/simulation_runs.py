@@ -1,0 +1,257 @@
+"""Carries out what `rosrm simulate` is asked for: reads the file, runs every variant, compares."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+from rosrm.config.documents import Node
+from rosrm.config.settings import ClusterConfig
+from rosrm.config.units import Quantity
+from rosrm.config.variants import (
+    Variant,
+    load_variants,
+    read_variants,
+    settings_node,
+    variant_in_text,
+)
+from rosrm.config.workload import load_workload
+from rosrm.core.placement import NamedPolicy
+from rosrm.errors import ConfigError, RecordError
+from rosrm.ports import MigrationStrategy
+from rosrm.recording.frames import is_record
+from rosrm.recording.reading import Recording, read_record
+from rosrm.registry import Registry
+from rosrm.simulation.agreement import Agreement, compare
+from rosrm.simulation.engine import Progress, Simulation
+from rosrm.simulation.extraction import Extraction
+from rosrm.simulation.meter import Outcome
+from rosrm.simulation.replay import Replay, replay
+from rosrm.simulation.workload import Workload
+
+#: Seconds after which progress is shown.
+_SHOWN_AFTER: Final = 2.0
+_LONGEST_OPENING: Final = 64
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """What the command line asks for; the fields are its options."""
+
+    file: Path
+    variants: Path | None = None
+    variant: tuple[str, ...] = ()
+    policy: tuple[str, ...] = ()
+    hosts: tuple[int, ...] = ()
+    until: str = ""
+    seed: int | None = None
+    cut: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """One row of the comparison.
+
+    Attributes:
+        hosts: how many there were.
+        seconds: of real time that it took; 0: nothing was simulated.
+    """
+
+    name: str
+    hosts: int
+    outcome: Outcome
+    seconds: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """What came of it.
+
+    Attributes:
+        recording: None: a workload was simulated.
+        replayed: the record told to the core again, with the recorded settings.
+        agreement: of the recorded run with its simulation.
+    """
+
+    workload: Workload
+    runs: tuple[Run, ...]
+    recording: Recording | None = None
+    replayed: Replay | None = None
+    agreement: Agreement | None = None
+
+
+def carry_out(request: Request) -> Report:
+    """Simulate; raises `ConfigError` or `RecordError` for what is wrong with the files."""
+    registry = Registry.discover()
+    changes = _changes(request)
+    if _holds_record(request.file):
+        return _of_record(request, changes, registry)
+    if request.cut:
+        raise ConfigError(f"--cut is for records, and {request.file} is a workload")
+    comparison = load_workload(request.file, registry, changes, request.seed)
+    workload = _ended(comparison.workload, request.until)
+    with _progress() as shown:
+        runs = [run(workload, one, registry, shown) for one in comparison.variants]
+    return Report(workload, tuple(runs))
+
+
+def _changes(request: Request) -> list[Node]:
+    listed = read_variants(request.variants) if request.variants is not None else []
+    return [
+        *listed,
+        *map(variant_in_text, request.variant),
+        *(
+            variant_in_text(f"scoring: {{policy: {json.dumps(name)}}}", "--policy")
+            for name in request.policy
+        ),
+        *(variant_in_text(f"hosts: {count}", "--hosts") for count in request.hosts),
+    ]
+
+
+def _holds_record(path: Path) -> bool:
+    try:
+        with path.open("rb") as file:
+            return is_record(file.read(_LONGEST_OPENING))
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def _ended(workload: Workload, until: str) -> Workload:
+    if not until:
+        return workload
+    try:
+        seconds = Quantity("duration", above=True).parse(until)
+    except ValueError as error:
+        raise ConfigError(f"--until: {error}") from None
+    return replace(workload, until=min(seconds, workload.until))
+
+
+# --- a record ---------------------------------------------------------------------------------
+
+
+def _of_record(request: Request, changes: Sequence[Node], registry: Registry) -> Report:
+    if request.seed is not None:
+        raise ConfigError(f"--seed is for workloads: the record {request.file} leaves no chance")
+    recording = load_record(request.file, cut=request.cut)
+    name = f"settings in {request.file}"
+    base = settings_node(recording.header.config, name)
+    variants = load_variants(base, changes, request.file, registry, title="simulated")
+    replayed, workload = replay_record(recording, registry)
+    hosts = len(replayed.outcome.curves.hosts)
+    runs = [Run("recorded", hosts, replayed.outcome)]
+    workload = _ended(workload, request.until)
+    if not workload.hosts:
+        raise RecordError(f"{request.file}: no host ever registered in it: nothing to simulate")
+    with _progress() as shown:
+        runs += [run(workload, one, registry, shown) for one in variants]
+    return Report(
+        workload, tuple(runs), recording, replayed, compare(runs[0].outcome, runs[1].outcome)
+    )
+
+
+def load_record(path: Path, *, cut: bool = False) -> Recording:
+    """Read a record; raises `RecordError` or `ConfigError`.
+
+    Args:
+        path: of its file.
+        cut: take what is there of one that is cut short.
+    """
+    try:
+        with path.open("rb") as file:
+            return read_record(file, str(path), cut=cut)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def replay_record(recording: Recording, registry: Registry) -> tuple[Replay, Workload]:
+    """Replay a record with its own settings, and make a workload of it.
+
+    Raises:
+        RecordError: its settings are not those of this version.
+        ConfigError, PluginError: a plugin that it names is not here.
+    """
+    try:
+        config = ClusterConfig.from_json(json.dumps(dict(recording.header.config)))
+    except ValueError as fault:
+        raise RecordError(
+            f"{recording.name}: its settings do not fit this rosrm (it was written by "
+            f"{recording.header.software}): {fault}"
+        ) from None
+    extraction = Extraction(recording)
+    policy, strategies = _plugins(config, registry)
+    replayed = replay(recording, config.core(), policy, strategies, extraction.watch)
+    return replayed, extraction.workload()
+
+
+# --- runs -------------------------------------------------------------------------------------
+
+
+def run(
+    workload: Workload, variant: Variant, registry: Registry, shown: Shown | None = None
+) -> Run:
+    """Simulate one variant of a workload."""
+    if variant.hosts is not None:
+        workload = workload.with_hosts(variant.hosts)
+    policy, strategies = _plugins(variant.cluster, registry)
+    simulation = Simulation(workload, variant.cluster.core(), policy, strategies)
+    began = time.perf_counter()
+    outcome = simulation.run(None if shown is None else shown.named(variant.name))
+    return Run(variant.name, len(workload.hosts), outcome, time.perf_counter() - began)
+
+
+def _plugins(
+    config: ClusterConfig, registry: Registry
+) -> tuple[NamedPolicy, dict[str, MigrationStrategy]]:
+    name = config.scoring.policy
+    policy = registry.scoring(name, config.scoring.options)
+    return (name, policy), registry.migrations(config.migration.strategies)
+
+
+class Shown:
+    """Says on a terminal how far a run is, once it takes longer than a moment."""
+
+    def __init__(self) -> None:
+        from rich.console import Console  # noqa: PLC0415 - only the command line needs rich
+
+        self._console = Console(stderr=True)
+        self._status = self._console.status("")
+        self._began = time.monotonic()
+        self._on = False
+        self._name = ""
+
+    def named(self, name: str) -> Shown:
+        """The run of a variant is next."""
+        self._name = name
+        return self
+
+    def __call__(self, progress: Progress) -> None:
+        """A run is so far."""
+        if not sys.stderr.isatty() or time.monotonic() - self._began < _SHOWN_AFTER:
+            return
+        self._status.update(
+            f"{self._name}: {progress.now:.0f} s simulated, {progress.ended} of "
+            f"{progress.processes} processes have ended, {progress.events} events"
+        )
+        if not self._on:
+            self._on = True
+            self._status.start()
+
+    def close(self) -> None:
+        """All runs are done."""
+        if self._on:
+            self._status.stop()
+
+
+@contextmanager
+def _progress() -> Iterator[Shown]:
+    shown = Shown()
+    try:
+        yield shown
+    finally:
+        shown.close()

@@ -1,0 +1,128 @@
+"""What `rosrm simulate` says: a table for people, and the same as JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+import typer
+from rich.text import Text
+
+from rosrm.cli import formats, tables
+from rosrm.cli.simulation_runs import Report, Run
+from rosrm.config.plain import to_plain
+from rosrm.simulation.agreement import Agreement
+from rosrm.simulation.replay import Replay
+
+#: Processes that were never placed, of which the reason is told.
+_TOLD: Final = 3
+_NUMBERS: Final = ("HOSTS", "PLACED", "DONE", "MAKESPAN", "WAIT", "LONGEST", "MEM GAP", "CPU GAP",
+                   "MOVES", "OVER LIMIT")  # fmt: skip
+
+
+def show(report: Report) -> None:
+    """Print what came of it."""
+    if report.recording is not None and report.replayed is not None:
+        _say_of_record(report, report.replayed)
+    made = tables.table("RUN", *_NUMBERS, right=_NUMBERS)
+    for run in report.runs:
+        made.add_row(Text(run.name), *_cells(run))
+    tables.console().print(made)
+    for run in report.runs:
+        never = list(run.outcome.never_placed.items())
+        if never:
+            some = "; ".join(f"{name}: {reason}" for name, reason in never[:_TOLD])
+            more = f"; and {len(never) - _TOLD} more" if len(never) > _TOLD else ""
+            typer.echo(f"{run.name}: {len(never)} never placed: {some}{more}")
+    if report.agreement is not None:
+        typer.echo(agreement_line(report.agreement))
+    simulated = [run for run in report.runs if run.seconds > 0.0]
+    events = sum(run.outcome.events for run in simulated)
+    seconds = sum(run.seconds for run in simulated)
+    typer.echo(f"{events} events in {seconds:.1f} s, {events / seconds:.0f} a second")
+
+
+def _cells(run: Run) -> list[str]:
+    outcome = run.outcome
+    makespan = "-" if outcome.makespan is None else formats.duration(outcome.makespan)
+    return [
+        str(run.hosts), f"{len(outcome.placements)}/{outcome.processes}", str(outcome.finished),
+        makespan, formats.duration(outcome.wait_mean), formats.duration(outcome.wait_max),
+        f"{outcome.imbalance['memory'] * 100:.1f} %", f"{outcome.imbalance['cpu'] * 100:.1f} %",
+        str(outcome.migrations)
+        + (f" ({outcome.failed_migrations} failed)" if outcome.failed_migrations else ""),
+        formats.duration(outcome.over_limit),
+    ]  # fmt: skip
+
+
+def _say_of_record(report: Report, replayed: Replay) -> None:
+    recording = report.recording
+    assert recording is not None
+    typer.echo(
+        f"record of master {recording.header.master}, epoch {recording.header.epoch}: "
+        f"{recording.length:.1f} s, {len(recording.events)} events, {recording.end}"
+    )
+    if not replayed.different:
+        typer.echo(f"replayed: all {replayed.decisions} decisions are the same")
+        return
+    typer.echo(
+        f"replayed: after {replayed.different} events something else is decided; another version "
+        f"of rosrm or of a plugin?"
+    )
+    for difference in replayed.differences:
+        typer.echo(f"  {difference}")
+
+
+def agreement_line(agreement: Agreement) -> str:
+    """How closely a simulation agrees with its run, in a few sentences."""
+    makespan = "" if agreement.makespan is None else f", makespan {agreement.makespan:.2f} of it"
+    return (
+        f"the simulation and the recorded run: first hosts equal for {agreement.same_host:.0%} of "
+        f"{agreement.processes} processes, numbers of processes by host for "
+        f"{agreement.same_counts:.0%}; {agreement.migrations[0]} moves recorded, "
+        f"{agreement.migrations[1]} simulated{makespan}. Apart on average, in points of memory and "
+        f"cpu: usage of the same host {_points(agreement.usage)}, of the k-th fullest "
+        f"{_points(agreement.ranked)}, gap between hosts {_points(agreement.balance)}"
+    )
+
+
+def _points(of: Mapping[str, float]) -> str:
+    return f"{of['memory'] * 100:.1f} and {of['cpu'] * 100:.1f}"
+
+
+# --- JSON -------------------------------------------------------------------------------------
+
+
+def report_form(report: Report) -> dict[str, Any]:
+    """All numbers, as `--json` prints them."""
+    replayed, recording = report.replayed, report.recording
+    return {
+        "workload": report.workload.name,
+        "record": None
+        if recording is None or replayed is None
+        else {
+            "master": recording.header.master,
+            "epoch": recording.header.epoch,
+            "seconds": recording.length,
+            "events": len(recording.events),
+            "end": recording.end,
+            "decisions": replayed.decisions,
+            "different": replayed.different,
+            "differences": [str(one) for one in replayed.differences],
+        },
+        "runs": [_run_form(run) for run in report.runs],
+        "agreement": None if report.agreement is None else to_plain(report.agreement),
+    }
+
+
+def _run_form(run: Run) -> dict[str, Any]:
+    outcome = run.outcome
+    kept = ("processes", "finished", "running", "waiting", "ended_otherwise", "never_placed",
+            "makespan", "wait_mean", "wait_max", "migrations", "failed_migrations", "imbalance",
+            "over_limit", "span", "placements", "arrivals", "ends", "events")  # fmt: skip
+    return {
+        "run": run.name,
+        "hosts": run.hosts,
+        **{name: to_plain(getattr(outcome, name)) for name in kept},
+        "seconds": run.seconds,
+    }

@@ -1,0 +1,165 @@
+"""Events of the master's core, and what it decided, as the content of frames and back.
+
+Readings and usages are arrays and stay so; everything else is JSON with the fields of its
+dataclass. Numbers come back bit by bit as they were: a replay must not decide otherwise because of
+the last digit.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any, Final, get_args
+
+import numpy as np
+
+from rosrm.config.plain import from_plain, to_plain
+from rosrm.core import events as happened
+from rosrm.core.commands import Assign, Command, Order, PublishStateConfig, Withdraw
+from rosrm.core.model import RESOURCE_SLOTS
+from rosrm.recording.frames import FrameKind
+
+#: Seconds by the master's monotonic clock, and unix time.
+_TIMES: Final = struct.Struct("<dd")
+#: Readings in the frame, slots that differ from those behind them, usage and limit in the others.
+_READINGS: Final = struct.Struct("<IIdd")
+_USAGES: Final = struct.Struct("<qQI")
+_COLUMNS: Final = (
+    ("host_id", "<i8"), ("incarnation", "<u8"), ("sequence", "<u8"), ("status_sequence", "<u8"),
+    ("accepting", "?"), ("stale", "<u4"),
+)  # fmt: skip
+
+_KINDS: Final[Mapping[str, type[Any]]] = MappingProxyType(
+    {kind.__name__: kind for kind in get_args(happened.Event)}
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Happened:
+    """One event and when it was taken in.
+
+    Attributes:
+        now: seconds by the master's monotonic clock.
+        wall: unix time, as the core knew it.
+        decided: what the core decided, one line each (`decisions`); None: it is not recorded.
+    """
+
+    now: float
+    wall: float
+    event: happened.Event
+    decided: tuple[str, ...] | None = None
+
+
+# --- events -----------------------------------------------------------------------------------
+
+
+def encode(event: happened.Event, now: float, wall: float) -> tuple[FrameKind, bytes]:
+    """An event as kind and content of a frame."""
+    times = _TIMES.pack(now, wall)
+    if isinstance(event, happened.ReadingsReceived):
+        return FrameKind.READINGS, times + _encoded_readings(event)
+    if isinstance(event, happened.UsagesReceived):
+        return FrameKind.USAGES, times + _encoded_usages(event)
+    plain = {"kind": type(event).__name__, **to_plain(event)}
+    return FrameKind.EVENT, times + json.dumps(plain, separators=(",", ":")).encode()
+
+
+def decode(kind: FrameKind, content: bytes) -> Happened:
+    """The inverse of `encode`; raises `ValueError` for what makes no sense."""
+    try:
+        now, wall = _TIMES.unpack_from(content)
+        rest = content[_TIMES.size :]
+        if kind is FrameKind.READINGS:
+            return Happened(now, wall, _decoded_readings(rest))
+        if kind is FrameKind.USAGES:
+            return Happened(now, wall, _decoded_usages(rest))
+        plain = json.loads(rest)
+        event: happened.Event = from_plain(_KINDS[plain.pop("kind")], plain)
+    except (struct.error, KeyError, TypeError, AttributeError) as fault:
+        raise ValueError(f"{type(fault).__name__}: {fault}") from None
+    return Happened(now, wall, event)
+
+
+def _encoded_readings(event: happened.ReadingsReceived) -> bytes:
+    """All columns; of usage and limit only the slots up to the last one that is in use."""
+    count = len(event.host_id)
+    spare = (float(event.usage[0, -1]), float(event.limit[0, -1])) if count else (0.0, 0.0)
+    used = np.zeros(RESOURCE_SLOTS, np.bool_)
+    for values, filler in ((event.usage, spare[0]), (event.limit, spare[1])):
+        used |= (values != filler).any(axis=0)
+    slots = int(np.flatnonzero(used)[-1]) + 1 if used.any() else 0
+    columns = [getattr(event, name).astype(kind).tobytes() for name, kind in _COLUMNS]
+    columns += [v[:, :slots].astype("<f8").tobytes() for v in (event.usage, event.limit)]
+    return b"".join([_READINGS.pack(count, slots, *spare), *columns])
+
+
+def _decoded_readings(content: bytes) -> happened.ReadingsReceived:
+    count, slots, usage_filler, limit_filler = _READINGS.unpack_from(content)
+    at = _READINGS.size
+    columns: dict[str, Any] = {}
+    for name, kind in _COLUMNS:
+        values = np.frombuffer(content, kind, count, at)
+        columns[name] = values.astype(values.dtype.newbyteorder("="))
+        at += values.nbytes
+    for name, filler in (("usage", usage_filler), ("limit", limit_filler)):
+        whole = np.full((count, RESOURCE_SLOTS), filler)
+        values = np.frombuffer(content, "<f8", count * slots, at)
+        whole[:, :slots] = values.reshape(count, slots)
+        columns[name] = whole
+        at += values.nbytes
+    return happened.ReadingsReceived(**columns)
+
+
+def _encoded_usages(event: happened.UsagesReceived) -> bytes:
+    head = _USAGES.pack(event.host_id, event.incarnation, len(event.numbers))
+    columns = ((event.numbers, "<u8"), (event.cpu, "<f8"), (event.memory, "<f8"))
+    return head + b"".join(values.astype(kind).tobytes() for values, kind in columns)
+
+
+def _decoded_usages(content: bytes) -> happened.UsagesReceived:
+    host_id, incarnation, count = _USAGES.unpack_from(content)
+    at = _USAGES.size
+    columns = []
+    for kind in ("<u8", "<f8", "<f8"):
+        values = np.frombuffer(content, kind, count, at)
+        columns.append(values.astype(values.dtype.newbyteorder("=")))
+        at += values.nbytes
+    return happened.UsagesReceived(host_id, incarnation, *columns)
+
+
+# --- decisions --------------------------------------------------------------------------------
+
+
+def decisions(commands: Sequence[Command]) -> tuple[str, ...]:
+    """What of an event's commands decides where something runs, one line each, to be compared."""
+    return tuple(line for command in commands if (line := _decision(command)))
+
+
+def _decision(command: Command) -> str:
+    if isinstance(command, Assign):
+        return f"assign {command.assignment.instance} to host {command.host_id}"
+    if isinstance(command, Withdraw):
+        return f"withdraw {command.instance} from host {command.host_id}"
+    if isinstance(command, Order):
+        what = command.instance or (command.assignment.instance if command.assignment else "")
+        return f"{command.action} {what} on host {command.host_id}".replace("  ", " ")
+    if isinstance(command, PublishStateConfig):
+        way = f"from {command.source} to {command.destination}"
+        return f"{command.phase.name} {command.process} {way}"
+    return ""
+
+
+def encode_decisions(decided: Sequence[str]) -> bytes:
+    """The content of a frame of decisions: they belong to the event before them."""
+    return json.dumps(list(decided), separators=(",", ":")).encode()
+
+
+def decode_decisions(content: bytes) -> tuple[str, ...]:
+    """The inverse of `encode_decisions`; raises `ValueError`."""
+    lines = json.loads(content)
+    if not isinstance(lines, list) or not all(isinstance(line, str) for line in lines):
+        raise ValueError("a list of decisions is wanted")
+    return tuple(lines)

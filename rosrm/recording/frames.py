@@ -1,0 +1,120 @@
+r"""The file of a record: a line with its version, then frames with length and checksum.
+
+    rosrm-record 1\n
+    frame*                  length u32, CRC-32 u32 (both little-endian), then `length` bytes
+
+The first byte of a frame says what it holds (`FrameKind`). The first frame is the header, the last
+one of a record that was closed in good order says why it ends: without it the file is cut short.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Iterator
+from enum import Enum
+from typing import BinaryIO, Final
+
+from rosrm.errors import RecordError
+
+#: Of the format below; one that is read has to be the same.
+RECORD_VERSION: Final = 1
+MAGIC: Final = b"rosrm-record "
+_PREFIX: Final = struct.Struct("<II")
+#: Bytes: no frame is as large, so a larger length is damage and no reason to allocate.
+_LARGEST: Final = 2**30
+_LONGEST_LINE: Final = 64
+
+
+class FrameKind(bytes, Enum):
+    """What a frame holds."""
+
+    HEADER = b"H"
+    EVENT = b"E"
+    READINGS = b"R"
+    USAGES = b"U"
+    DECISIONS = b"D"
+    END = b"Z"
+
+
+def opening() -> bytes:
+    """The first line of a record."""
+    return MAGIC + f"{RECORD_VERSION}\n".encode()
+
+
+def is_record(beginning: bytes) -> bool:
+    """Whether a file that begins so is a record, of any version."""
+    return beginning.startswith(MAGIC)
+
+
+def frame(kind: FrameKind, content: bytes) -> bytes:
+    """One frame, as it stands in the file."""
+    body = kind.value + content
+    return _PREFIX.pack(len(body), zlib.crc32(body)) + body
+
+
+def frames(file: BinaryIO, name: str) -> Iterator[tuple[FrameKind, bytes, int]]:
+    """The frames of a record, each with its kind, its content and where it begins, in bytes.
+
+    Args:
+        file: from its beginning.
+        name: of the file, for messages.
+
+    Raises:
+        RecordError: no record, another version, damaged, or cut within a frame.
+    """
+    at = _check_opening(file, name)
+    while prefix := file.read(_PREFIX.size):
+        if len(prefix) < _PREFIX.size:
+            raise cut_short(name, at)
+        length, checksum = _PREFIX.unpack(prefix)
+        if not 0 < length <= _LARGEST:
+            raise _damaged(name, at)
+        body = file.read(length)
+        if len(body) < length:
+            raise cut_short(name, at)
+        if zlib.crc32(body) != checksum:
+            raise _damaged(name, at)
+        try:
+            kind = FrameKind(body[:1])
+        except ValueError:
+            raise _damaged(name, at) from None
+        yield kind, body[1:], at
+        at += _PREFIX.size + length
+
+
+def _check_opening(file: BinaryIO, name: str) -> int:
+    line = file.readline(_LONGEST_LINE)
+    if not line.startswith(MAGIC):
+        raise RecordError(
+            f"{name}: is no record of a master's run: it does not begin with "
+            f"{MAGIC.decode().strip()!r}. A master writes one with `record:` in its cluster.yaml"
+        )
+    if line != opening():
+        if not line.endswith(b"\n") and opening().startswith(line):
+            raise cut_short(name, 0)
+        version = line[len(MAGIC) :].strip().decode(errors="replace")
+        raise RecordError(
+            f"{name}: is a record of version {version}; this rosrm reads version {RECORD_VERSION}. "
+            f"Use the rosrm that wrote it"
+        )
+    return len(line)
+
+
+def cut_short(name: str, at: int) -> RecordError:
+    """The file ends before the record does."""
+    return CutShort(
+        f"{name}: the record is cut short at byte {at}: its master was killed, still runs, or the "
+        f"file was not copied as a whole. --cut takes what is there"
+    )
+
+
+class CutShort(RecordError):
+    """A record without its end; what is there is whole."""
+
+
+def _damaged(name: str, at: int) -> RecordError:
+    return RecordError(
+        f"{name}: the record is damaged at byte {at}: length, checksum or kind of the frame there "
+        f"do not fit. Nothing of it was used"
+    )

@@ -1,0 +1,72 @@
+"""Virtual time: what is to happen, in order; at equal times as it was planned."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from math import inf
+
+Action = Callable[[], None]
+
+
+@dataclass(order=True, slots=True)
+class Entry:
+    """One thing to happen.
+
+    Attributes:
+        action: None: it was called off.
+    """
+
+    time: float
+    number: int
+    action: Action | None = field(compare=False)
+
+
+class Agenda:
+    """What is to happen.
+
+    Attributes:
+        now: virtual seconds; never goes back.
+        pending: how many things are still to happen.
+    """
+
+    def __init__(self) -> None:
+        self.now = 0.0
+        self.pending = 0
+        self._entries: list[Entry] = []
+        self._number = 0
+
+    def at(self, time: float, action: Action) -> Entry:
+        """Plan something, not before now."""
+        self._number += 1
+        entry = Entry(max(time, self.now), self._number, action)
+        heapq.heappush(self._entries, entry)
+        self.pending += 1
+        return entry
+
+    def after(self, seconds: float, action: Action) -> Entry:
+        """Plan something so much later."""
+        return self.at(self.now + seconds, action)
+
+    def call_off(self, entry: Entry | None) -> None:
+        """It does not happen."""
+        if entry is not None and entry.action is not None:
+            entry.action = None
+            self.pending -= 1
+
+    @property
+    def next_time(self) -> float:
+        """When the next thing happens; inf: nothing will."""
+        while self._entries and self._entries[0].action is None:
+            heapq.heappop(self._entries)
+        return self._entries[0].time if self._entries else inf
+
+    def do_next(self) -> None:
+        """Let time pass until the next thing, and do it."""
+        entry = heapq.heappop(self._entries)
+        action, entry.action = entry.action, None
+        if action is not None:
+            self.pending -= 1
+            self.now = entry.time
+            action()

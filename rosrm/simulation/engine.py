@@ -1,0 +1,277 @@
+"""Runs a workload: the master's core and the slaves' cores on virtual time.
+
+The master is told the same events as in reality, with what its policies, strategies and settings
+are; what it commands reaches the hosts after the time that a message takes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from math import inf
+from typing import Any, Final
+
+import numpy as np
+
+from rosrm.core import events as happened
+from rosrm.core import slave
+from rosrm.core.commands import Assign, Command, Order, PublishStateConfig, Reply, Withdraw
+from rosrm.core.master import step
+from rosrm.core.model import InstanceId
+from rosrm.core.placement import NamedPolicy
+from rosrm.core.settings import CoreSettings
+from rosrm.core.state import MasterState
+from rosrm.ports import Intent, MigrationStrategy, Record
+from rosrm.simulation.agenda import Agenda
+from rosrm.simulation.hosting import Hosting
+from rosrm.simulation.machine import Machine
+from rosrm.simulation.meter import Meter, Outcome
+from rosrm.simulation.nodes import Nodes
+from rosrm.simulation.workload import HostPlan, Workload
+
+#: Events between two calls of `progress`.
+_TELL_EVERY: Final = 2000
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """How far a run is.
+
+    Attributes:
+        now: virtual seconds.
+        ended: processes that have ended.
+    """
+
+    now: float
+    ended: int
+    processes: int
+    events: int
+
+
+class Simulation:
+    """One run of a workload.
+
+    Args:
+        workload: that is run; its first arrival must not lie behind its end.
+        settings: of the master's core.
+        policy: that orders the hosts, with its name.
+        strategies: by name.
+    """
+
+    def __init__(
+        self,
+        workload: Workload,
+        settings: CoreSettings,
+        policy: NamedPolicy,
+        strategies: Mapping[str, MigrationStrategy],
+    ) -> None:
+        self.workload = workload
+        self.meter = Meter(workload.until)
+        self.agenda = Agenda()
+        self.state = MasterState(settings, policy[0], policy[1], strategies, epoch=1)
+        self.machines: dict[str, Machine] = {}
+        plans = {plan.name: plan for plan in workload.processes}
+        self._hosting = Hosting(self.agenda, workload.model, plans, self._tell)
+        self._nodes = Nodes(self.agenda, workload.model, self._hosting, self._tell)
+        self._by_id: dict[int, Machine] = {}
+        self._undelivered: set[InstanceId] = set()
+        self._requests = 0
+        self._taken_in: Reply | None = None
+        self._active = 0.0
+        self._usage_told = -1
+        # After this long without any event nothing falls due any more with time alone.
+        self._patience = 2.0 + max(
+            settings.settle, settings.hysteresis, settings.cooldown, settings.delivery_timeout,
+            settings.lease, settings.order_retry,
+        )  # fmt: skip
+
+    def run(self, progress: Callable[[Progress], None] | None = None) -> Outcome:
+        """Let time pass until nothing can change any more, or `until` of the workload."""
+        self._plan()
+        next_tick, told = 0.0, 0
+        until = self.workload.until
+        while True:
+            now = min(self.agenda.next_time, next_tick)
+            if now > until or (now == inf):
+                self.agenda.now = until if until < inf else self.agenda.now
+                break
+            if self.agenda.next_time <= next_tick:
+                self._active = now
+                self.agenda.do_next()
+            else:
+                self.agenda.now = now
+                self._tick()
+                next_tick = self._after_tick(now)
+            if progress is not None and self.meter.events - told >= _TELL_EVERY:
+                told = self.meter.events
+                progress(self._progress())
+        return self.meter.outcome(self.state, self.agenda.now)
+
+    def _after_tick(self, now: float) -> float:
+        """When readings come next: as long as nothing changes they are left out."""
+        if now - self._active <= self._patience:
+            return now + self.workload.model.period
+        return self.agenda.next_time if self.agenda.pending else inf
+
+    def _progress(self) -> Progress:
+        processes = len(self.workload.processes)
+        return Progress(self.agenda.now, self.meter.ended, processes, self.meter.events)
+
+    # --- what is planned -----------------------------------------------------------------
+
+    def _plan(self) -> None:
+        for host in self.workload.hosts:
+            self.agenda.at(host.joins, partial(self._join, host))
+            if host.leaves < inf:
+                self.agenda.at(host.leaves, partial(self._leave, host))
+        together: dict[float, list[str]] = {}
+        specs = {plan.name: plan.spec for plan in self.workload.processes}
+        for plan in self.workload.processes:
+            together.setdefault(plan.arrives, []).append(plan.name)
+        for time, names in together.items():
+            submitted = happened.SubmissionReceived(0, tuple(specs[name] for name in names))
+            self.agenda.at(time, partial(self._ask, submitted))
+        for time, event in self.workload.requests:
+            self.agenda.at(time, partial(self._ask, event))
+
+    def _ask(self, request: Any) -> None:
+        """Somebody asks the master for something: an event with the number of a request."""
+        self._requests += 1
+        self._tell(replace(request, request=self._requests))
+
+    def _join(self, plan: HostPlan) -> None:
+        incarnation = len(self.machines) + 1
+        machine = Machine(plan, incarnation, self.workload.model.period)
+        self.machines[plan.name] = machine
+        self._taken_in = None
+        self._ask(happened.HostRegistered(0, machine.description()))
+        reply: Reply | None = self._taken_in
+        assert reply is not None  # _tell has set it
+        machine.host_id = reply.host_id
+        self._by_id[machine.host_id] = machine
+        self._hosting.hear(machine, slave.Registered(self.state.epoch))
+        self._read([machine])
+
+    def _leave(self, plan: HostPlan) -> None:
+        machine = self.machines[plan.name]
+        if plan.lost:
+            self._hosting.lose(machine)
+            return
+        self._ask(happened.HostLeft(0, machine.host_id, machine.incarnation))
+        self._hosting.stop_all(machine)
+
+    # --- time ----------------------------------------------------------------------------
+
+    def _tick(self) -> None:
+        now = self.agenda.now
+        there = [machine for machine in self.machines.values() if machine.up and machine.host_id]
+        if any(machine.grows(now) for machine in there):
+            self._active = now
+            self.meter.changed(now)
+        if there:
+            self._read(there)
+        turn = int(now / self.workload.model.usage_period)
+        if turn != self._usage_told:
+            self._usage_told = turn
+            for machine in there:
+                self._tell_usages(machine)
+                self._hosting.hear(machine, slave.TimePassed())
+        self._tell(happened.TimePassed())
+
+    def _read(self, machines: list[Machine]) -> None:
+        """Readings of these hosts reach the master; who is under its limits asks for work."""
+        readings = [machine.reading(self.agenda.now) for machine in machines]
+        for machine in machines:
+            machine.sequence += 1
+        accepting = [
+            reading.accepts and not machine.stopping
+            for machine, reading in zip(machines, readings, strict=True)
+        ]
+        self._tell(
+            happened.ReadingsReceived(
+                host_id=np.array([one.host_id for one in machines], np.int64),
+                incarnation=np.array([one.incarnation for one in machines], np.uint64),
+                sequence=np.array([one.sequence for one in machines], np.uint64),
+                status_sequence=np.zeros(len(machines), np.uint64),
+                accepting=np.array(accepting, np.bool_), stale=np.zeros(len(machines), np.uint32),
+                usage=np.array([reading.usage for reading in readings]),
+                limit=np.array([machine.limit for machine in machines]),
+            )
+        )  # fmt: skip
+        for machine, accepts in zip(machines, accepting, strict=True):
+            if accepts and not machine.asked:
+                machine.asked = True
+                self._ask(happened.ProcessRequested(0, machine.host_id, machine.incarnation))
+
+    def _tell_usages(self, machine: Machine) -> None:
+        """What each instance uses, if it is not what was said before."""
+        usages = machine.usages(self.agenda.now)
+        if usages == machine.told_usage:
+            return
+        machine.told_usage = usages
+        numbers, cpu, memory = zip(*usages, strict=True) if usages else ((), (), ())
+        self._tell(
+            happened.UsagesReceived(
+                machine.host_id, machine.incarnation, np.array(numbers, np.uint64),
+                np.array(cpu, np.float64), np.array(memory, np.float64),
+            )
+        )  # fmt: skip
+
+    # --- the master ----------------------------------------------------------------------
+
+    def _tell(self, event: happened.Event) -> None:
+        """The master's core takes an event in, and what it commands is carried out."""
+        now = self.agenda.now
+        self.state.wall = now
+        commands = step(self.state, event, now)
+        self.meter.take(self.state, event, commands, now)
+        for command in commands:
+            if not isinstance(command, (Record, Intent)):
+                self._carry_out(command)
+
+    def _carry_out(self, command: Command) -> None:
+        if isinstance(command, Reply):
+            self._taken_in = command if command.host_id else self._taken_in
+            return
+        self._active = self.agenda.now
+        if isinstance(command, Assign):
+            self._assign(command)
+        elif isinstance(command, Order):
+            self._order(command)
+        elif isinstance(command, Withdraw):
+            self._withdraw(command)
+        elif isinstance(command, PublishStateConfig):
+            self._nodes.hear(command)
+
+    def _assign(self, command: Assign) -> None:
+        machine, assignment = self._by_id[command.host_id], command.assignment
+        self._undelivered.add(assignment.instance)
+
+        def arrive() -> None:
+            if machine.up and not machine.stopping and assignment.instance in self._undelivered:
+                self._undelivered.discard(assignment.instance)
+                self._hosting.hear(machine, slave.AssignmentsReceived((assignment,)))
+
+        self.agenda.after(self.workload.model.wire, arrive)
+
+    def _withdraw(self, command: Withdraw) -> None:
+        if command.instance in self._undelivered:
+            self._undelivered.discard(command.instance)
+            withdrawn = happened.AssignmentWithdrawn(command.instance)
+            self.agenda.after(0.0, partial(self._tell, withdrawn))
+            return
+        self._order(Order(command.order, command.host_id, "stop", command.instance))
+
+    def _order(self, order: Order) -> None:
+        machine = self._by_id[order.host_id]
+
+        def arrive() -> None:
+            if machine.up:
+                self._hosting.obey(machine, order)
+                return
+            timeout = happened.OrderAnswered(order.order, False, "timeout", "no answer in time")
+            seconds = order.timeout + self.state.settings.order_retry
+            self.agenda.after(seconds, partial(self._tell, timeout))
+
+        self.agenda.after(self.workload.model.wire, arrive)

@@ -1,0 +1,222 @@
+"""What the slaves do: their cores decide, and this carries it out on the machines."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+
+from rosrm.core import events as happened
+from rosrm.core import slave
+from rosrm.core.commands import Order
+from rosrm.core.model import (
+    Assignment,
+    InstanceId,
+    InstanceState,
+    InstanceStatus,
+    RestartPolicy,
+)
+from rosrm.simulation.agenda import Agenda, Entry
+from rosrm.simulation.machine import Machine, Program
+from rosrm.simulation.workload import Model, ProcessPlan
+
+#: The signal of an instance that was stopped: SIGINT.
+_INTERRUPTED = 2
+
+
+class Hosting:
+    """Carries out what the slaves' cores ask for.
+
+    Args:
+        agenda: time.
+        model: of the hosts.
+        plans: by process name.
+        tell: takes an event to the master.
+
+    Attributes:
+        where: number of an instance to the machine that has it.
+    """
+
+    def __init__(
+        self, agenda: Agenda, model: Model, plans: Mapping[str, ProcessPlan],
+        tell: Callable[[happened.Event], None],
+    ) -> None:  # fmt: skip
+        self._agenda = agenda
+        self._model = model
+        self._plans = plans
+        self._tell = tell
+        self.where: dict[int, Machine] = {}
+        self._ends: dict[str, Entry] = {}
+        self._settling: dict[tuple[InstanceId, RestartPolicy], Order] = {}
+
+    # --- the slave hears -----------------------------------------------------------------
+
+    def hear(self, machine: Machine, event: slave.Event) -> None:
+        """Something happens to a slave."""
+        for command in slave.step(machine.slave, event, self._agenda.now):
+            self._carry_out(machine, command)
+
+    def _carry_out(self, machine: Machine, command: slave.Command) -> None:
+        if isinstance(command, slave.Report):
+            machine.batches += 1
+            report = happened.StatusesReceived(
+                machine.host_id, machine.incarnation, machine.batches, command.complete,
+                command.statuses,
+            )  # fmt: skip
+            self._say(machine, report)
+        elif isinstance(command, slave.Launch):
+            for assignment in command.assignments:
+                self._launch(machine, assignment)
+        elif isinstance(command, slave.Stop):
+            self._stop(machine, command.instance)
+        elif isinstance(command, slave.Restart):
+            self._restart(machine, command.instance)
+        elif isinstance(command, slave.Amend):
+            machine.programs[command.instance].restart = command.restart
+            self.hear(machine, slave.RestartPolicyRecorded(command.instance, command.restart))
+        elif isinstance(command, slave.Settle):
+            self._settle(machine, command)
+
+    def _say(self, machine: Machine, event: happened.Event) -> None:
+        """An event reaches the master, if the host still is there when it leaves."""
+
+        def arrive() -> None:
+            if machine.up or machine.stopping:
+                self._tell(event)
+
+        self._agenda.after(self._model.wire, arrive)
+
+    def _supervisor_says(self, machine: Machine, status: InstanceStatus) -> None:
+        self.hear(machine, slave.SupervisorReported((status,)))
+
+    # --- what runs -----------------------------------------------------------------------
+
+    def _launch(self, machine: Machine, assignment: Assignment) -> None:
+        instance = assignment.instance
+        restart = RestartPolicy() if assignment.shadow else assignment.spec.restart
+        plan = self._plans[instance.process]
+        machine.programs[instance] = Program(plan, assignment, restart)
+        self.where[instance.number] = machine
+        self._agenda.after(self._model.start, partial(self._started, machine, instance, 0))
+
+    def _started(self, machine: Machine, instance: InstanceId, run: int) -> None:
+        program = machine.programs.get(instance)
+        if program is None or program.run != run or program.stopping or not machine.up:
+            return
+        machine.begin(instance, self._agenda.now)
+        self._plan_end(machine)
+        status = InstanceStatus(instance, InstanceState.RUNNING, pid=instance.number)
+        self._supervisor_says(machine, status)
+        if slave.awaits_graph(program.assignment.spec):
+            self._agenda.after(self._model.ready, partial(self._seen, machine, instance, run))
+
+    def _seen(self, machine: Machine, instance: InstanceId, run: int) -> None:
+        program = machine.programs.get(instance)
+        if program is not None and program.run == run and machine.up:
+            self.hear(machine, slave.SeenInGraph(instance))
+
+    def _stop(self, machine: Machine, instance: InstanceId) -> None:
+        program = machine.programs.get(instance)
+        if program is None or program.stopping:
+            return
+        program.stopping = True
+        self._plan_end(machine)
+        self._supervisor_says(machine, InstanceStatus(instance, InstanceState.STOPPING))
+        self._agenda.after(self._model.stop, partial(self._stopped, machine, instance))
+
+    def _stopped(self, machine: Machine, instance: InstanceId) -> None:
+        if instance in machine.programs:
+            self._end(machine, instance, signal=_INTERRUPTED)
+
+    def _restart(self, machine: Machine, instance: InstanceId) -> None:
+        program = machine.programs[instance]
+        machine.changed(self._agenda.now)
+        program.begun, program.work = None, 0.0
+        program.run += 1
+        machine.changed(self._agenda.now)
+        self._plan_end(machine)
+        self._supervisor_says(machine, InstanceStatus(instance, InstanceState.STOPPING))
+        seconds = self._model.stop + self._model.start
+        self._agenda.after(seconds, partial(self._started, machine, instance, program.run))
+
+    def _plan_end(self, machine: Machine) -> None:
+        """The next process of a host that will have done its work."""
+        name = machine.plan.name
+        self._agenda.call_off(self._ends.pop(name, None))
+        time = machine.next_end()
+        if time < float("inf"):
+            self._ends[name] = self._agenda.at(time, partial(self._work_done, machine))
+
+    def take_over(self, machine: Machine) -> None:
+        """An instance goes on with the work of another."""
+        machine.changed(self._agenda.now)
+        self._plan_end(machine)
+
+    def _work_done(self, machine: Machine) -> None:
+        for instance in machine.done(self._agenda.now):
+            self._end(machine, instance)
+        self._plan_end(machine)
+
+    def _end(self, machine: Machine, instance: InstanceId, *, signal: int = 0) -> None:
+        now = self._agenda.now
+        program = machine.remove(instance, now)
+        del self.where[instance.number]
+        self._plan_end(machine)
+        self._supervisor_says(machine, machine.end_status(instance, program, now, signal=signal))
+        self._close(machine)
+
+    # --- a host goes ---------------------------------------------------------------------
+
+    def stop_all(self, machine: Machine) -> None:
+        """A slave stops in good order, with all its processes."""
+        machine.stopping = True
+        for instance in list(machine.slave.held):
+            if not machine.slave.held[instance].status.state.ended:
+                self.hear(machine, slave.StopOrdered(instance))
+        self._close(machine)
+
+    def _close(self, machine: Machine) -> None:
+        if machine.stopping and not machine.programs:
+            machine.up = False
+
+    def lose(self, machine: Machine) -> None:
+        """A host is gone without a word, and everything on it."""
+        machine.up = False
+        for instance in machine.programs:
+            del self.where[instance.number]
+        machine.programs.clear()
+        self._agenda.call_off(self._ends.pop(machine.plan.name, None))
+
+    # --- orders --------------------------------------------------------------------------
+
+    def obey(self, machine: Machine, order: Order) -> None:
+        """A slave takes an order, and answers it."""
+        if order.action == "execute":
+            message = f"the simulation cannot carry out {order.executor!r}"
+            answer = happened.OrderAnswered(order.order, False, "failed", message)
+            self._say(machine, answer)
+        elif order.action == "set_restart":
+            assert order.instance is not None
+            assert order.restart is not None
+            self._settling[order.instance, order.restart] = order
+            self.hear(machine, slave.RestartPolicySet(order.instance, order.restart))
+        else:
+            self.hear(machine, _as_event(order))
+            self._say(machine, happened.OrderAnswered(order.order, accepted=True))
+
+    def _settle(self, machine: Machine, command: slave.Settle) -> None:
+        order = self._settling.pop((command.instance, command.restart), None)
+        if order is not None:
+            code = "refused" if command.refusal else ""
+            self._say(machine, happened.OrderAnswered(order.order, not code, code, command.refusal))
+
+
+def _as_event(order: Order) -> slave.Event:
+    if order.action == "report":
+        return slave.ReportRequested()
+    if order.action == "start":
+        assert order.assignment is not None
+        return slave.AssignmentsReceived((order.assignment,))
+    assert order.instance is not None
+    if order.action == "restart":
+        return slave.RestartOrdered(order.instance)
+    return slave.StopOrdered(order.instance)

@@ -1,0 +1,259 @@
+"""Measures a run, real or simulated, by what the master's core is told and decides."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from math import inf
+from typing import Final
+
+import numpy as np
+
+from rosrm.core import events as happened
+from rosrm.core.columns import FloatArray
+from rosrm.core.commands import Command
+from rosrm.core.hosts import HostCondition
+from rosrm.core.processes import ProcessPhase
+from rosrm.core.state import MasterState
+from rosrm.ports import Record
+
+#: Resources of which the balance is measured and drawn.
+MEASURED: Final = ("memory", "cpu")
+#: Most samples of the curves; then every other one is dropped.
+_SAMPLES: Final = 4000
+_ENDS: Final = frozenset({"finished", "failed", "cancelled"})
+_CHANGES: Final = _ENDS | {"submitted", "assigned", "migration_begun", "migrated", "stayed"}
+
+
+@dataclass(frozen=True, slots=True)
+class Curves:
+    """Usage over time, as the master saw it.
+
+    Attributes:
+        times: (T,) seconds from the first arrival; a value holds until the next time.
+        hosts: names of the H hosts.
+        usage: by resource, (T, H) fractions; NaN where a host was not there.
+        limit: by resource, (H,) the highest limit that a host had.
+    """
+
+    times: FloatArray
+    hosts: tuple[str, ...]
+    usage: Mapping[str, FloatArray]
+    limit: Mapping[str, FloatArray]
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """A run in numbers.
+
+    Attributes:
+        processes: submitted and taken.
+        finished, running, waiting, ended_otherwise: where they stand at the end; they add up to
+            `processes`. Waiting: in the queue, or set aside as no host may take it.
+        never_placed: process name to the reason, of those that never got a host.
+        makespan: seconds from the first arrival to the last end; None: not all of them have ended,
+            or none by itself.
+        wait_mean, wait_max: seconds from arrival to the first host, of those that got one.
+        migrations, failed_migrations: moves that were done, and that were not.
+        imbalance: by resource, fullest minus emptiest host, fraction, mean over time.
+        over_limit: seconds that a host was at or over a limit, summed over the hosts.
+        span: seconds over which the last two were measured.
+        placements: process name to its hosts, in order.
+        arrivals, ends: process name to seconds from the first arrival.
+        events: that the core took in.
+    """
+
+    processes: int
+    finished: int
+    running: int
+    waiting: int
+    ended_otherwise: int
+    never_placed: Mapping[str, str]
+    makespan: float | None
+    wait_mean: float
+    wait_max: float
+    migrations: int
+    failed_migrations: int
+    imbalance: Mapping[str, float]
+    over_limit: float
+    span: float
+    placements: Mapping[str, tuple[str, ...]]
+    arrivals: Mapping[str, float]
+    ends: Mapping[str, float]
+    curves: Curves
+    events: int
+
+
+@dataclass(slots=True)
+class _Totals:
+    """Sums over time since the first arrival."""
+
+    seconds: float = 0.0
+    gap: dict[str, float] = field(default_factory=lambda: dict.fromkeys(MEASURED, 0.0))
+    over: float = 0.0
+
+    def copy(self) -> _Totals:
+        return _Totals(self.seconds, dict(self.gap), self.over)
+
+
+class Meter:
+    """Follows a run.
+
+    Args:
+        until: the run is measured up to here; inf: up to the last time that anything changed.
+    """
+
+    def __init__(self, until: float = inf) -> None:
+        self._until = until
+        self.events = 0
+        self._first = inf
+        self._arrivals: dict[str, float] = {}
+        self._placed: dict[str, list[str]] = {}
+        self._placed_at: dict[str, float] = {}
+        self._ends: dict[str, float] = {}
+        self._migrations = self._failed = 0
+        self._at = 0.0
+        self._gap = dict.fromkeys(MEASURED, 0.0)
+        self._over = 0
+        self._totals = _Totals()
+        self._at_change = _Totals()
+        self._samples: list[tuple[float, dict[str, FloatArray]]] = []
+        self._every = 0.0
+        self._limit = {name: np.zeros(0) for name in MEASURED}
+
+    @property
+    def ended(self) -> int:
+        """How many processes have ended so far."""
+        return len(self._ends)
+
+    def take(
+        self, state: MasterState, event: happened.Event, commands: Sequence[Command], now: float
+    ) -> None:
+        """The core has taken an event in, and this came of it."""
+        self.events += 1
+        for command in commands:
+            if isinstance(command, Record) and command.kind in _CHANGES:
+                self._note(command, now)
+        if isinstance(event, happened.ReadingsReceived):
+            self._sample(state, now)
+
+    def changed(self, now: float) -> None:
+        """Something changed that the core was not told of in so many words."""
+        self._integrate(now)
+        self._at_change = self._totals.copy()
+
+    def _note(self, record: Record, now: float) -> None:
+        name = record.process
+        if record.kind == "submitted":
+            self._first = min(self._first, now)
+            self._arrivals.setdefault(name, now)
+        elif record.kind == "assigned":
+            self._placed.setdefault(name, []).append(record.host)
+            self._placed_at.setdefault(name, now)
+            self._ends.pop(name, None)
+        elif record.kind == "migrated":
+            self._migrations += 1
+            self._placed.setdefault(name, []).append(record.host)
+        elif record.kind == "stayed":
+            self._failed += 1
+        elif record.kind in _ENDS:
+            self._ends[name] = now
+        self.changed(now)
+
+    # --- usage over time -----------------------------------------------------------------
+
+    def _integrate(self, now: float) -> None:
+        """Until now everything was as it was sampled last."""
+        seconds = min(now, self._until) - max(self._at, self._first)
+        self._at = now
+        if seconds <= 0.0 or seconds == inf:
+            return
+        totals = self._totals
+        totals.seconds += seconds
+        totals.over += seconds * self._over
+        for name in MEASURED:
+            totals.gap[name] += seconds * self._gap[name]
+
+    def _sample(self, state: MasterState, now: float) -> None:
+        self._integrate(now)
+        table = state.hosts
+        up = table.condition == HostCondition.UP
+        self._over = int(((table.usage >= table.limit).any(axis=0) & up).sum())
+        usage = {}
+        for name in MEASURED:
+            if name not in table.resources:
+                usage[name] = np.full(len(table), np.nan)
+                continue
+            row = table.resources.index(name)
+            values = np.where(up, table.usage[row], np.nan)
+            usage[name] = values
+            there = values[~np.isnan(values)]
+            self._gap[name] = float(there.max() - there.min()) if len(there) else 0.0
+            highest = np.where(up, table.limit[row], 0.0)
+            before = self._limit[name]
+            highest[: len(before)] = np.maximum(highest[: len(before)], before)
+            self._limit[name] = highest
+        self._keep(now, usage)
+
+    def _keep(self, now: float, usage: dict[str, FloatArray]) -> None:
+        if self._samples and now - self._samples[-1][0] < self._every:
+            return
+        self._samples.append((now, usage))
+        if len(self._samples) > _SAMPLES:
+            span = now - self._samples[0][0]
+            self._samples = self._samples[::2]
+            self._every = max(2.0 * self._every, 2.0 * span / _SAMPLES)
+
+    # --- the end -------------------------------------------------------------------------
+
+    def outcome(self, state: MasterState, now: float) -> Outcome:
+        """All that was measured; `now` is the end of the run."""
+        self._integrate(now)
+        if self._samples and now > self._samples[-1][0]:
+            self._samples.append((now, self._samples[-1][1]))  # what was sampled last holds
+        totals = self._totals if self._until < inf else self._at_change
+        first = 0.0 if self._first == inf else self._first
+        waits = [at - self._arrivals.get(name, at) for name, at in self._placed_at.items()]
+        phases = [process.phase for process in state.processes.values()]
+        over = sum(phase.over for phase in phases)
+        finished = sum(phase is ProcessPhase.FINISHED for phase in phases)
+        waiting = (ProcessPhase.QUEUED, ProcessPhase.SET_ASIDE)
+        never = {
+            name: state.processes[name].reason or f"it waits behind {state.queue.head()}"
+            for name in state.processes
+            if name not in self._placed and not state.processes[name].phase.over
+        }
+        seconds = totals.seconds or 1.0
+        return Outcome(
+            processes=len(phases), finished=finished,
+            running=sum(phase not in waiting and not phase.over for phase in phases),
+            waiting=sum(phase in waiting for phase in phases),
+            ended_otherwise=over - finished,
+            never_placed=never,
+            makespan=self._last_end() - first if finished and over == len(phases) else None,
+            wait_mean=float(np.mean(waits)) if waits else 0.0,
+            wait_max=max(waits, default=0.0),
+            migrations=self._migrations, failed_migrations=self._failed,
+            imbalance={name: gap / seconds for name, gap in totals.gap.items()},
+            over_limit=totals.over, span=totals.seconds,
+            placements={name: tuple(hosts) for name, hosts in self._placed.items()},
+            arrivals={name: at - first for name, at in self._arrivals.items()},
+            ends={name: at - first for name, at in self._ends.items()},
+            curves=self._curves(state, first), events=self.events,
+        )  # fmt: skip
+
+    def _last_end(self) -> float:
+        return max(self._ends.values(), default=self._first)
+
+    def _curves(self, state: MasterState, first: float) -> Curves:
+        hosts = tuple(host.name for host in state.hosts.hosts)
+        times = np.array([at - first for at, _ in self._samples])
+        usage, limit = {}, {}
+        for name in MEASURED:
+            whole = np.full((len(self._samples), len(hosts)), np.nan)
+            for row, (_, values) in enumerate(self._samples):
+                whole[row, : len(values[name])] = values[name]
+            usage[name] = whole
+            limit[name] = np.ones(len(hosts))
+            limit[name][: len(self._limit[name])] = self._limit[name]
+        return Curves(times, hosts, usage, limit)

@@ -1,0 +1,69 @@
+"""What nodes that keep to the handoff protocol answer to the master, as if nothing went wrong.
+
+Of the channel between source and destination only the end is modelled: who is active, and that the
+destination then goes on with the source's work where it stood.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+from rosrm.core.commands import PublishStateConfig
+from rosrm.core.events import Event, HandoffReported
+from rosrm.core.migration import HandoffPhase, ReportPhase
+from rosrm.core.model import InstanceId
+from rosrm.simulation.agenda import Agenda
+from rosrm.simulation.hosting import Hosting
+from rosrm.simulation.workload import Model
+
+
+class Nodes:
+    """All nodes of the cluster, as far as handoffs are concerned."""
+
+    def __init__(
+        self, agenda: Agenda, model: Model, hosting: Hosting, tell: Callable[[Event], None]
+    ) -> None:
+        self._agenda = agenda
+        self._model = model
+        self._hosting = hosting
+        self._tell = tell
+
+    def hear(self, config: PublishStateConfig) -> None:
+        """The master says where a handoff stands; who is named answers."""
+        if config.phase is HandoffPhase.SHADOW:
+            seconds = self._model.ready + self._model.handoff
+            self._later(seconds, config, config.destination, ReportPhase.READY)
+        elif config.phase in (HandoffPhase.SWITCH, HandoffPhase.TAKE_OVER):
+            self._agenda.after(2 * self._model.wire, partial(self._switch, config))
+        elif config.phase is HandoffPhase.ABORT:
+            self._later(0.0, config, config.destination, ReportPhase.ABORTED)
+        elif config.phase is HandoffPhase.RESUME:
+            self._later(0.0, config, config.source, ReportPhase.RESUMED)
+
+    def _later(
+        self, seconds: float, config: PublishStateConfig, number: int, phase: ReportPhase
+    ) -> None:
+        report = partial(self._report, config, number, phase)
+        self._agenda.after(seconds + 2 * self._model.wire, report)
+
+    def _report(self, config: PublishStateConfig, number: int, phase: ReportPhase) -> None:
+        if number in self._hosting.where:
+            self._tell(HandoffReported(config.process, config.destination, number, phase))
+
+    def _switch(self, config: PublishStateConfig) -> None:
+        """The source falls silent, and the destination goes on with its work."""
+        there = self._hosting.where.get(config.destination)
+        here = self._hosting.where.get(config.source)
+        if there is None:
+            return
+        if here is not None:
+            now = self._agenda.now
+            here.changed(now)
+            there.changed(now)
+            source = here.programs[InstanceId(config.process, config.source)]
+            destination = there.programs[InstanceId(config.process, config.destination)]
+            destination.work, destination.begun = source.work, source.begun
+            self._hosting.take_over(there)
+            self._report(config, config.source, ReportPhase.RELEASED)
+        self._report(config, config.destination, ReportPhase.ACTIVE)

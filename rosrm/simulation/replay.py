@@ -1,0 +1,96 @@
+"""Tells a core again what a record holds, and compares what it decides with what was decided."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from rosrm.core.commands import Command
+from rosrm.core.master import step
+from rosrm.core.placement import NamedPolicy
+from rosrm.core.restore import restore
+from rosrm.core.settings import CoreSettings
+from rosrm.core.state import MasterState
+from rosrm.ports import MigrationStrategy
+from rosrm.recording.encoding import Happened, decisions
+from rosrm.recording.reading import Recording
+from rosrm.simulation.meter import Meter, Outcome
+
+#: Differences that are told in full.
+_TOLD: Final = 5
+
+Watcher = Callable[[MasterState, Happened, Sequence[Command]], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """One event after which something else was decided.
+
+    Attributes:
+        elapsed: seconds since the beginning of the record.
+        recorded, replayed: decisions, one line each.
+    """
+
+    elapsed: float
+    recorded: tuple[str, ...]
+    replayed: tuple[str, ...]
+
+    def __str__(self) -> str:
+        was, now = "; ".join(self.recorded) or "nothing", "; ".join(self.replayed) or "nothing"
+        return f"after {self.elapsed:.3f} s: recorded {was}, replayed {now}"
+
+
+@dataclass(frozen=True, slots=True)
+class Replay:
+    """What came of a replay.
+
+    Attributes:
+        decisions: that were recorded.
+        different: events after which something else was decided than recorded.
+        differences: the first few of them.
+        outcome: of the run, as recorded.
+    """
+
+    decisions: int
+    different: int
+    differences: tuple[Difference, ...]
+    outcome: Outcome
+
+
+def replay(
+    recording: Recording, settings: CoreSettings, policy: NamedPolicy,
+    strategies: Mapping[str, MigrationStrategy], watcher: Watcher | None = None,
+) -> Replay:  # fmt: skip
+    """Tell a core again everything that a record holds, at the same times.
+
+    With the settings and plugins of the recorded master it decides the same. The events go on as
+    recorded whatever is decided, so that other settings only show where the first difference is.
+
+    Args:
+        recording: of a master's run.
+        settings: of the master's core.
+        policy: that orders the hosts, with its name.
+        strategies: by name.
+        watcher: is shown each event with what came of it.
+    """
+    header = recording.header
+    state = MasterState(settings, policy[0], policy[1], strategies, header.epoch)
+    restore(state, lambda table: header.intents.get(table, {}), header.started)
+    meter = Meter(recording.events[-1].now if recording.events else header.started)
+    count = different = 0
+    differences: list[Difference] = []
+    for one in recording.events:
+        state.wall = one.wall
+        commands = step(state, one.event, one.now)
+        meter.take(state, one.event, commands, one.now)
+        if watcher is not None:
+            watcher(state, one, commands)
+        recorded, replayed = one.decided or (), decisions(commands)
+        count += len(recorded)
+        if recorded != replayed:
+            different += 1
+            if len(differences) < _TOLD:
+                differences.append(Difference(one.now - header.started, recorded, replayed))
+    end = recording.events[-1].now if recording.events else header.started
+    return Replay(count, different, tuple(differences), meter.outcome(state, end))

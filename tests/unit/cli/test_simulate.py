@@ -1,0 +1,199 @@
+"""`rosrm simulate`."""
+
+from __future__ import annotations
+
+import json
+import sys
+
+import pytest
+
+from rosrm.cli import simulation_picture
+from tests.unit.simulation.workloads import host, plan, recorded, simulation
+
+WORKLOAD = """
+hosts: [{name: 'h{i}', foreach: {i: 'range(0, 2)'}, memory: 1GB, cpu: 2}]
+processes:
+  - {name: 'p{i}', foreach: {i: 'range(0, 6)'}, memory: 200MB, cpu: 1, duration: 5s}
+  - {name: lonely, labels: {required: {gpu: 'yes'}}}
+until: 1min
+"""
+
+
+@pytest.fixture
+def workload(tmp_path):
+    (tmp_path / "w.yaml").write_text(WORKLOAD, encoding="utf-8")
+    return tmp_path / "w.yaml"
+
+
+@pytest.fixture(scope="module")
+def content() -> bytes:
+    plans = [plan(f"p{n}", 100.0, at=float(n), duration=4.0, cpu=0.5) for n in range(6)]
+    return recorded(simulation([host("a"), host("b")], plans, until=20.0))
+
+
+@pytest.fixture
+def record(tmp_path, content):
+    (tmp_path / "r.rosrec").write_bytes(content)
+    return tmp_path / "r.rosrec"
+
+
+def test_a_workload_is_compared_with_its_variants(rosrm, workload):
+    result = rosrm("simulate", workload, "--policy", "threshold", "--hosts", "4")
+    assert result.code == 0
+    rows = [line for line in result.out.splitlines() if "/7" in line]
+    assert [row.split("  ")[0] for row in rows] == [
+        "as given",
+        "scoring.policy threshold",
+        "hosts 4",
+    ]
+    assert "as given: 1 never placed: lonely: " in result.out
+    assert "events in" in result.out
+
+
+def test_the_json_has_every_number_and_place(rosrm, workload):
+    result = rosrm("simulate", workload, "--variant", "{name: calm, migration: {automatic: false}}",
+                   "--json")  # fmt: skip
+    report = json.loads(result.out)
+    assert (report["record"], report["agreement"]) == (None, None)
+    first, calm = report["runs"]
+    assert (first["run"], calm["run"]) == ("as given", "calm")
+    assert first["processes"] == 7 == first["finished"] + first["waiting"]
+    assert list(first["never_placed"]) == ["lonely"]
+    assert set(first["placements"]) == {f"p{n}" for n in range(6)}
+
+
+def test_variants_may_stand_in_a_file_of_their_own(rosrm, workload, tmp_path):
+    (tmp_path / "v.yaml").write_text("variants: [{hosts: 1}, {hosts: 3}]\n", encoding="utf-8")
+    result = rosrm("simulate", workload, "--variants", tmp_path / "v.yaml", "--json")
+    assert [run["hosts"] for run in json.loads(result.out)["runs"]] == [2, 1, 3]
+
+
+def test_the_runs_are_drawn(rosrm, workload, tmp_path):
+    result = rosrm("simulate", workload, "--plot", tmp_path / "p.svg")
+    assert result.code == 0
+    drawn = (tmp_path / "p.svg").read_text(encoding="utf-8")
+    assert drawn.startswith("<?xml")
+    assert len(drawn) > 5000
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [("p.gif", "has to end with .png, .svg, .pdf"), ("no/p.png", "there is no directory")],
+)
+def test_a_picture_that_cannot_be_drawn_is_refused_before_the_run(
+    rosrm, workload, tmp_path, name, said
+):
+    result = rosrm("simulate", workload, "--plot", tmp_path / name)
+    assert result.code == 2
+    assert said in result.err
+    assert not result.out
+
+
+def test_without_matplotlib_it_says_what_to_install(rosrm, workload, tmp_path, monkeypatch):
+    monkeypatch.setattr(simulation_picture, "find_spec", lambda _name: None)
+    result = rosrm("simulate", workload, "--plot", tmp_path / "p.png")
+    assert result.code == 1
+    assert result.err == (
+        "rosrm: --plot needs matplotlib, which is not installed: pip install 'rosrm[plot]'\n"
+    )
+
+
+def test_no_matplotlib_is_imported_where_nothing_is_drawn(rosrm, workload, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    assert rosrm("simulate", workload).code == 0
+
+
+def test_a_record_is_replayed_simulated_and_compared(rosrm, record):
+    result = rosrm("simulate", record, "--hosts", "3")
+    assert result.code == 0
+    assert "replayed: all 6 decisions are the same" in result.out
+    assert [line.split()[0] for line in result.out.splitlines()[4:7]] == [
+        "recorded", "simulated", "hosts",
+    ]  # fmt: skip
+    assert "first hosts equal for 100% of 6 processes" in result.out
+
+
+def test_the_json_of_a_record_says_what_was_replayed_and_how_it_agrees(rosrm, record):
+    report = json.loads(rosrm("simulate", record, "--json").out)
+    assert report["record"]["decisions"] == 6
+    assert report["record"]["different"] == 0
+    assert report["agreement"]["same_host"] == 1.0
+    assert report["agreement"]["ranked"]["memory"] < 0.02
+
+
+def test_a_replay_that_decides_otherwise_is_said(rosrm, tmp_path, content):
+    """The header says another policy than the one that decided."""
+    from io import BytesIO
+
+    from rosrm.recording.frames import FrameKind, frame, frames, opening
+
+    def other(kind, body):
+        if kind is not FrameKind.HEADER:
+            return body
+        header = json.loads(body)
+        header["config"]["scoring"]["options"] = {"weights": {}}
+        return json.dumps(header).encode()
+
+    parts = [frame(kind, other(kind, body)) for kind, body, _ in frames(BytesIO(content), "r")]
+    (tmp_path / "other.rosrec").write_bytes(opening() + b"".join(parts))
+    result = rosrm("simulate", tmp_path / "other.rosrec")
+    assert result.code == 0
+    assert "something else is decided" in result.out
+    assert "recorded assign p" in result.out
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda whole: whole[:-5], "the record is cut short at byte"),
+        (lambda whole: whole.replace(b"record 1", b"record 9", 1), "is a record of version 9"),
+        (lambda whole: whole[:500] + b"\0" + whole[501:], "the record is damaged at byte"),
+    ],
+)
+def test_a_bad_record_is_one_clear_error(rosrm, tmp_path, content, change, said):
+    (tmp_path / "r.rosrec").write_bytes(change(content))
+    result = rosrm("simulate", tmp_path / "r.rosrec")
+    assert result.code == 2
+    assert result.err.count("\n") == 1
+    assert f"r.rosrec: {said}" in result.err
+    assert not result.out
+
+
+def test_one_that_is_cut_short_can_be_used_as_far_as_it_goes(rosrm, tmp_path, content):
+    (tmp_path / "r.rosrec").write_bytes(content[:-200])
+    result = rosrm("simulate", tmp_path / "r.rosrec", "--cut")
+    assert result.code == 0
+    assert "cut short" in result.out
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (
+            ["--policy", "wieghted"],
+            "--policy:1:11: unknown scoring policy 'wieghted'; did you mean",
+        ),
+        (["--hosts", "0"], "--hosts:1:8: hosts: 0 is not within 1..10000"),
+        (["--hosts", "-2"], "--hosts:1:8: hosts: -2 is not within 1..10000"),
+        (["--until", "-5s"], "--until: '-5s' is not greater than 0"),
+        (["--variant", "[1"], "--variant:1:3: unreadable YAML"),
+        (["--cut"], "--cut is for records"),
+    ],
+)
+def test_a_wrong_option_is_refused(rosrm, workload, options, said):
+    result = rosrm("simulate", workload, *options)
+    assert result.code == 2
+    assert said in result.err
+    assert not result.out
+
+
+def test_a_seed_makes_no_sense_for_a_record(rosrm, record):
+    result = rosrm("simulate", record, "--seed", "3")
+    assert result.code == 2
+    assert "--seed is for workloads" in result.err
+
+
+def test_a_file_that_is_not_there_is_named(rosrm, tmp_path):
+    result = rosrm("simulate", tmp_path / "none.yaml")
+    assert result.code == 2
+    assert "none.yaml: cannot be read: No such file or directory" in result.err

@@ -1,0 +1,128 @@
+"""A record told again to a core: the same settings decide the same, others do not."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rosrm.core import events as happened
+from rosrm.core.settings import CoreSettings
+from rosrm.recording.encoding import Happened
+from rosrm.recording.reading import Recording
+from rosrm.simulation.agreement import compare
+from rosrm.simulation.engine import Simulation
+from rosrm.simulation.extraction import Extraction
+from rosrm.simulation.replay import replay
+from rosrm_scoring.weighted import Weighted, WeightedOptions
+
+from .workloads import EQ1, STRATEGIES, host, plan, read, recorded, simulation
+
+BY_CPU = ("weighted", Weighted(WeightedOptions({"cpu": 1.0})))
+
+
+def busy(**options) -> Simulation:
+    """Arrivals, a full host, growth, moves, a request, a host that comes and one that goes."""
+    hosts = [host("a", 400), host("b", 400), host("c", 400, joins=6.0), host("d", leaves=20.0)]
+    plans = [plan(f"p{n}", 60.0, at=0.7 * n, duration=15.0, cpu=0.5) for n in range(12)]
+    plans += [plan("grows", 40.0, at=1.0, growth=20.0, most=300.0, strategy="relaunch")]
+    plans += [plan("node", 30.0, at=2.0, ros=True, strategy="handoff")]
+    requests = [
+        (9.0, happened.MigrationRequested(0, "node")),
+        (12.0, happened.HostStateRequested(0, "a", "drain")),
+        (30.0, happened.CancelRequested(0, ("node", "grows"))),
+    ]
+    return simulation(hosts, plans, requests=requests, until=60.0, **options)
+
+
+@pytest.fixture(scope="module")
+def record() -> Recording:
+    return read(recorded(busy()))
+
+
+def test_its_own_settings_decide_the_same(record):
+    again = replay(record, CoreSettings(), EQ1, STRATEGIES)
+    assert again.decisions > 20
+    assert again.different == 0
+    assert again.differences == ()
+
+
+@settings(max_examples=15)
+@given(
+    loads=st.lists(
+        st.tuples(st.floats(0, 20), st.floats(1, 250), st.floats(0, 3), st.floats(0.1, 30)),
+        min_size=1, max_size=12,
+    ),
+    growth=st.sampled_from([0.0, 10.0]),
+    backfill=st.booleans(),
+)  # fmt: skip
+def test_any_run_is_replayed_to_the_same_decisions(loads, growth, backfill):
+    plans = [
+        plan(f"p{n}", memory, at=at, cpu=cpu, duration=d, growth=growth, strategy="relaunch")
+        for n, (at, memory, cpu, d) in enumerate(loads)
+    ]
+    made = simulation([host("a", 500), host("b", 500)], plans, until=40.0, backfill=backfill)
+    again = replay(read(recorded(made)), CoreSettings(backfill=backfill), EQ1, STRATEGIES)
+    assert again.different == 0
+
+
+def test_other_weights_decide_otherwise_and_the_first_difference_is_told(record):
+    again = replay(record, CoreSettings(), BY_CPU, STRATEGIES)
+    assert again.different > 0
+    assert "recorded assign" in str(again.differences[0])
+    assert 0.0 < again.differences[0].elapsed < 60.0
+
+
+def test_a_core_that_decides_by_chance_would_be_found(record):
+    """The recorded decisions are what is compared, not those of a second replay."""
+    events = list(record.events)
+    at = next(n for n, one in enumerate(events) if one.decided)
+    one = events[at]
+    events[at] = Happened(one.now, one.wall, one.event, ("assign p0#99 to host 2",))
+    tampered = Recording(record.name, record.header, tuple(events), record.end)
+    again = replay(tampered, CoreSettings(), EQ1, STRATEGIES)
+    assert again.different == 1
+    assert again.differences[0].recorded == ("assign p0#99 to host 2",)
+
+
+def test_the_outcome_of_a_replay_is_that_of_the_run(record):
+    run, again = busy().run(), replay(record, CoreSettings(), EQ1, STRATEGIES).outcome
+    assert again.placements == run.placements
+    assert again.ends == run.ends
+    assert again.migrations == run.migrations > 0
+    assert again.over_limit == pytest.approx(run.over_limit)
+
+
+def test_a_workload_made_of_a_record_gives_nearly_the_same_run(record):
+    """Simulated, recorded, extracted and simulated again."""
+    extraction = Extraction(record)
+    first = replay(record, CoreSettings(), EQ1, STRATEGIES, extraction.watch).outcome
+    workload = extraction.workload()
+    second = Simulation(workload, CoreSettings(), EQ1, STRATEGIES).run()
+
+    assert {one.name for one in workload.hosts} == {"a", "b", "c", "d"}
+    by_name = {one.name: one for one in workload.hosts}
+    assert by_name["c"].joins == pytest.approx(6.0, abs=0.1)
+    assert by_name["d"].leaves == pytest.approx(20.0, abs=0.1)
+    assert by_name["a"].limits["memory"] == 0.8
+    assert len(workload.processes) == 14
+    agreement = compare(first, second)
+    assert agreement.processes == 14
+    assert agreement.same_host >= 0.75
+    assert agreement.ranked["memory"] < 0.06
+    assert agreement.balance["memory"] < 0.08
+
+
+def test_a_run_agrees_with_itself_and_renamed_hosts_differ_in_name_alone():
+    plans = [plan(f"p{n}", 20.0 + 7 * n, at=n) for n in range(6)]
+    one = run_on(["a", "b"], plans)
+    same, renamed = compare(one, run_on(["a", "b"], plans)), compare(one, run_on(["b", "a"], plans))
+    assert (same.same_host, same.same_counts) == (1.0, 1.0)
+    assert set(same.usage.values()) | set(same.ranked.values()) | set(same.balance.values()) == {0}
+    assert renamed.same_host == 0.0
+    assert renamed.usage["memory"] > 0.0
+    assert renamed.ranked["memory"] == renamed.balance["memory"] == 0.0
+
+
+def run_on(names, plans):
+    return simulation([host(name) for name in names], plans, until=20.0).run()
