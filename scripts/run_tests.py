@@ -23,8 +23,8 @@ RESULTS = ROOT / "build" / "test-results"
 LAYERS = ("unit", "contract", "integration", "ros", "faults")
 
 #: Workers of the folders whose tests share nothing: neither ports nor ROS domains nor the load of
-#: the machine that a time-out was chosen for.
-WORKERS = {"unit": 2}
+#: the machine that a time-out was chosen for. The tests of one file share a cluster in `faults`.
+WORKERS = {"unit": ["-n", "2"], "faults": ["-n", "2", "--dist", "loadfile"]}
 
 # Of pytest's exit statuses:
 INTERRUPTED = 2
@@ -65,7 +65,7 @@ def run(layer: str, for_pytest: list[str]) -> Outcome:
     """Run one folder."""
     result = RESULTS / f"{layer}.xml"
     result.unlink(missing_ok=True)
-    workers = ["-n", str(WORKERS[layer])] if layer in WORKERS else []
+    workers = WORKERS.get(layer, [])
     began = time.monotonic()
     command = [sys.executable, "-m", "pytest", f"tests/{layer}", f"--junit-xml={result}", *workers]
     status = subprocess.run([*command, *for_pytest], cwd=ROOT, check=False).returncode

@@ -1,23 +1,23 @@
-"""Hears a whole handoff from outside, and strikes at one word of it."""
+"""Hears a whole handoff from outside, and strikes at the words that it is told."""
 
 from __future__ import annotations
 
 import contextlib
 import itertools
-import os
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
-from std_msgs.msg import Int64MultiArray
+from std_msgs.msg import Int64, Int64MultiArray
 
-from benchmarks.handoff_nodes import OUTPUT, QOS
+from benchmarks.handoff_nodes import INPUT, OUTPUT, QOS
 from rosrm.node.channel import CHANNEL, STATE_CONFIG
-from rosrm_msgs.msg import HandoffReport, StateConfig
+from rosrm.ros import qos
+from rosrm_msgs.msg import HandoffReport, ProcessStatus, ProcessStatusBatch, StateConfig
 from tests.ros.clusters import Cluster, pids_of, zombie
 
 #: The words of a handoff by the names that the tests use.
@@ -33,60 +33,110 @@ REPORTED = {
     )
 }  # fmt: skip
 
+#: What is done when a word is heard.
+Blow = Callable[[], None]
+
 
 class Output(NamedTuple):
-    """Which instance said which number."""
+    """Which instance said which number, in answer to which input."""
 
     instance: int
     sequence: int
+    answers: int
 
 
 class Watcher:
-    """Hears outputs, `state_config` and the channels, in a participant and a thread of its own."""
+    """Hears outputs, `state_config`, the channels and the slaves, in a thread of its own.
 
-    def __init__(self, domain: int) -> None:
+    A word is "says SHADOW" of the master, "READY" of the source or the destination, "source
+    stopping" of a slave, and "source policy" when a slave has taken another restart policy for it
+    (it then tells the status anew, though nothing of it has changed).
+
+    Attributes:
+        outputs, heard: since it was told to strike.
+        struck: the last blow has fallen.
+        destination_pid: as its slave said last; 0: none.
+
+    Args:
+        domain: ROS domain.
+        inputs: how many a second it publishes, numbered from 1; 0: none.
+    """
+
+    def __init__(self, domain: int, inputs: float = 0.0) -> None:
         self.outputs: list[Output] = []
         self.heard: list[str] = []
-        self._strike: tuple[str, Callable[[], None]] | None = None
         self.struck = threading.Event()
+        self.destination_pid = 0
+        self._source = 0
+        self._blows: list[tuple[str, Blow]] = []
+        self._states: dict[int, str] = {}
         self._channels: set[str] = set()
+        self._sent = 0
         self._context = rclpy.Context()
         rclpy.init(
             context=self._context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO
         )
-        self._node = rclpy.node.Node("watcher", context=self._context)
-        self._node.create_subscription(Int64MultiArray, OUTPUT, self._output, QOS)
-        self._node.create_subscription(StateConfig, "/rosrm/state_config", self._said, STATE_CONFIG)
+        self._node = node = rclpy.node.Node("watcher", context=self._context)
+        node.create_subscription(Int64MultiArray, OUTPUT, self._output, QOS)
+        node.create_subscription(StateConfig, "/rosrm/state_config", self._said, STATE_CONFIG)
+        node.create_subscription(
+            ProcessStatusBatch, "/rosrm/process_status", self._told, qos.STATUSES
+        )
+        if inputs:
+            self._inputs = node.create_publisher(Int64, INPUT, QOS)
+            node.create_timer(1.0 / inputs, self._drive)
         self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self._node)
+        self._executor.add_node(node)
         self._thread = threading.Thread(target=self._executor.spin, daemon=True)
         self._thread.start()
 
-    def strike_at(self, word: str, blow: Callable[[], None]) -> None:
-        """Do something the moment a word of a later handoff is heard."""
+    def strike_at(self, source: int, *blows: tuple[str, Blow]) -> None:
+        """In the next handoff away from an instance, strike at these words, one after the other."""
         self.struck.clear()
+        self.outputs.clear()
         self.heard.clear()
-        self._strike = (word, blow)
+        self.destination_pid = 0
+        self._source, self._blows = source, list(blows)
+
+    def _drive(self) -> None:
+        self._sent += 1
+        self._inputs.publish(Int64(data=self._sent))
 
     def _output(self, message: Int64MultiArray) -> None:
-        self.outputs.append(Output(*message.data[:2]))
+        self.outputs.append(Output(*message.data))
 
     def _said(self, config: StateConfig) -> None:
         if config.channel not in self._channels:
             self._channels.add(config.channel)
             self._node.create_subscription(HandoffReport, config.channel, self._reported, CHANNEL)
-        self._hear(f"says {SAID[config.phase]}")
+        if config.source == self._source:
+            self._hear(f"says {SAID[config.phase]}")
 
     def _reported(self, report: HandoffReport) -> None:
-        self._hear(REPORTED[report.phase])
+        if report.instance >= self._source:
+            self._hear(REPORTED[report.phase])
+
+    def _told(self, batch: ProcessStatusBatch) -> None:
+        for status in batch.statuses:
+            self._is(status, repeats=batch.complete)
+
+    def _is(self, status: ProcessStatus, *, repeats: bool) -> None:
+        number = status.instance.number
+        before, self._states[number] = self._states.get(number), status.state
+        if number < self._source or (repeats and before == status.state):
+            return
+        role = "source" if number == self._source else "destination"
+        if role == "destination":
+            self.destination_pid = status.pid
+        self._hear(f"{role} {'policy' if before == status.state else status.state}")
 
     def _hear(self, word: str) -> None:
         self.heard.append(word)
-        if self._strike is not None and self._strike[0] == word:
-            _, blow = self._strike
-            self._strike = None
+        if self._blows and self._blows[0][0] == word:
+            _, blow = self._blows.pop(0)
             blow()
-            self.struck.set()
+            if not self._blows:
+                self.struck.set()
 
     def close(self) -> None:
         self._executor.shutdown()
@@ -100,28 +150,21 @@ def blocks(outputs: list[Output]) -> list[list[Output]]:
     return [list(group) for _, group in itertools.groupby(outputs, lambda one: one.instance)]
 
 
-def instances(cluster: Cluster, process: str, *, shadows: bool = False) -> dict[int, int]:
-    """The pids of the instances of a process that run in a cluster, by number.
+def is_gapless(outputs: list[Output]) -> bool:
+    """Each number once and in order, and each input answered once and in order."""
+    first = outputs[0]
+    return [one[1:] for one in outputs] == [
+        (first.sequence + n, first.answers + n) for n in range(len(outputs))
+    ]
 
-    Args:
-        shadows: only those that were started as one, and not again since.
-    """
+
+def instances(cluster: Cluster, process: str) -> dict[int, int]:
+    """The pids of the instances of a process that run in a cluster, by number."""
     mark, found = f"ROSRM_INSTANCE={process}#", {}
     for pid in pids_of(cluster.directory):
         with contextlib.suppress(OSError):
             variables = Path(f"/proc/{pid}/environ").read_text().split("\0")
             number = next((v.removeprefix(mark) for v in variables if v.startswith(mark)), "")
-            if number and not zombie(pid) and not (shadows and "ROSRM_SHADOW=1" not in variables):
+            if number and not zombie(pid):
                 found[int(number)] = pid
     return found
-
-
-def kill(find: Callable[[], int], number: int) -> Callable[[], None]:
-    """A blow: end a process that is looked for when it falls."""
-
-    def blow(*_: Any) -> None:
-        pid = find()
-        assert pid > 1, "the victim is not there"
-        os.kill(pid, number)
-
-    return blow

@@ -1,0 +1,69 @@
+"""As test_handoff.py, with a node that is driven by inputs: none is lost, none is answered twice.
+
+It is struck where its inputs are in a buffer: of the destination, or of a source that is silent.
+"""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.faults.scenes import RATE, Scene, all_of
+from tests.faults.watching import blocks
+
+pytestmark = pytest.mark.timeout(180)
+
+
+@pytest.fixture(scope="module")
+def scene(make_shared):
+    """A node that answers each input once."""
+    one = Scene(make_shared, "echo", inputs=RATE)
+    yield one
+    one.close()
+
+
+@pytest.mark.parametrize("moment", ["says SWITCH", "SILENT", "ACTIVE", "source stopping"])
+def test_the_master_is_killed(scene, moment):
+    """Each input is answered once and in order."""
+    scene.move((moment, scene.kill("master")))
+    scene.end("master")
+    assert scene.is_gapless(), scene.outputs
+
+
+@pytest.mark.parametrize(
+    ("whose", "moment"), [("source", "SILENT"), ("destination", "SILENT"), ("source", "ACTIVE")]
+)
+def test_a_slave_is_killed(scene, whose, moment):
+    """Each input is answered once and in order."""
+    victim = f"{whose}'s slave"
+    scene.move((moment, scene.kill(victim)))
+    scene.end(victim)
+    assert scene.is_gapless(), scene.outputs
+
+
+@pytest.mark.parametrize("moment", ["SHADOWING", "ATTACHED"])
+def test_the_destination_is_killed_before_the_switch(scene, moment):
+    """The source goes on: each input is answered once and in order."""
+    scene.move((moment, scene.kill("destination")))
+    assert scene.end() == "stayed"
+    assert scene.is_gapless(), scene.outputs
+
+
+def test_the_destination_is_killed_in_the_switch(scene):
+    """The source, silent already, answers what it has kept: each input once and in order."""
+    blow = all_of(scene.kill("destination"), scene.let_go("source"))
+    scene.move(*scene.source_held(), ("SWITCHING", blow))
+    assert scene.end() == "stayed"
+    assert scene.is_gapless(), scene.outputs
+
+
+@pytest.mark.parametrize("moment", ["says SWITCH", "SILENT", "RELEASED", "ACTIVE"])
+def test_the_source_is_killed(scene, moment):
+    """Its successor answers what it has not: only its last output may be said again."""
+    scene.move((moment, scene.kill("source")))
+    assert scene.end() == "moved"
+    first, second = blocks(scene.outputs)
+    again = second[0].answers == first[-1].answers
+    assert again or second[0].answers == first[-1].answers + 1, (first[-9:], second[:9])
+    for block in (first, second):
+        numbers = [one.answers for one in block]
+        assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
