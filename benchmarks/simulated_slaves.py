@@ -52,6 +52,10 @@ from rosrm_msgs import msg, srv
 _LOOK = 0.05
 #: Slaves that shake hands at a time: each answer reaches all readers of this process.
 _AT_ONCE = 20
+#: Least time of listening after a round of cycles, as a part of what the round took.
+_LISTEN = 0.5
+#: Seconds between two cycles while slaves come up, which takes the machine's time.
+_GENTLY = 0.25
 _LIMIT = 0.8
 #: Standard deviation of a usage's change from one cycle to the next.
 STEP = 0.003
@@ -96,10 +100,47 @@ class Berth:
             self._shared.participant.serve(kind, name, handle)
 
 
+@dataclass
+class Tally:
+    """What the slaves of a process did.
+
+    Attributes:
+        cycles: of all slaves that are registered.
+        late: of those, more than a period after they were due; what fell due meanwhile is left out.
+        messages: readings that were sent.
+        lost: times that a slave lost its master.
+        taken: unix times at which assignments came.
+    """
+
+    cycles: int = 0
+    late: int = 0
+    messages: int = 0
+    lost: int = 0
+    taken: dict[str, float] = field(default_factory=dict)
+
+    def begin(self) -> None:
+        """Count anew."""
+        self.cycles = self.late = self.messages = self.lost = 0
+
+
+@dataclass
+class CountedPublisher:
+    """A publisher of readings, and a tally of what it sends."""
+
+    publisher: Any
+    tally: Tally
+
+    def publish(self, message: bytes) -> None:
+        """Send a reading."""
+        self.tally.messages += 1
+        self.publisher.publish(message)
+
+
 class SharedParticipant:
     """One participant for many slaves."""
 
-    def __init__(self, settings: RosSettings, name: str) -> None:
+    def __init__(self, settings: RosSettings, name: str, tally: Tally) -> None:
+        self._tally = tally
         self.participant = Participant(settings, name, pace="steady")
         self._clients: dict[Any, Any] = {}
         self._publishers: dict[Any, Any] = {}
@@ -119,8 +160,9 @@ class SharedParticipant:
         if kind in self._publishers:
             return self._publishers[kind]
         made = self.participant.node.create_publisher(kind, name, qos)
-        if kind is not msg.ResourceInfo:
-            self._publishers[kind] = made
+        if kind is msg.ResourceInfo:
+            return CountedPublisher(made, self._tally)
+        self._publishers[kind] = made
         return made
 
     def hear(self, kind: Any, name: str, take: Callable[[Any], None], qos: Any) -> None:
@@ -135,21 +177,6 @@ class SharedParticipant:
                 hearer(message)
 
         self.participant.node.create_subscription(kind, name, pass_on, qos)
-
-
-@dataclass
-class Tally:
-    """What the slaves of a process did.
-
-    Attributes:
-        cycles: readings sent.
-        late: of those, sent more than a period after they were due.
-        taken: unix times at which assignments came.
-    """
-
-    cycles: int = 0
-    late: int = 0
-    taken: dict[str, float] = field(default_factory=dict)
 
 
 class Walks:
@@ -231,6 +258,7 @@ class SimulatedSlave:
     def take(self, event: core.Event) -> None:
         """Something happened; work is begun at once, as a slave's loop does."""
         self._events.append(event)
+        self._tally.lost += isinstance(event, core.MasterLost)
         if isinstance(event, core.AssignmentsReceived):
             self.work(time.monotonic())
 
@@ -279,9 +307,10 @@ class Fleet:
         self._first = first
         self._count = count
         self._period = period
+        self._pace = max(period, _GENTLY)
         self._walks = Walks(count, step)
         self._walked = time.monotonic()
-        self._shared = SharedParticipant(settings, f"rosrm_simulated_{first}")
+        self._shared = SharedParticipant(settings, f"rosrm_simulated_{first}", self.tally)
         self._due: list[tuple[float, int]] = []
 
     def bring_up(self, timeout: float) -> None:
@@ -302,6 +331,7 @@ class Fleet:
                 if time.monotonic() >= deadline:
                     there = sum(slave.registered for slave in self.slaves)
                     raise TimeoutError(f"{there} of {self._count} registered in {timeout:g} s")
+        self._pace = self._period
 
     def _make_some(self) -> None:
         now = time.monotonic()
@@ -318,20 +348,31 @@ class Fleet:
         while (now := time.monotonic()) < end:
             while self._due and self._due[0][0] <= now:
                 self._cycle(now)
+            after = time.monotonic()
             wake = min(end, self._due[0][0]) if self._due else end
-            self._shared.participant.spin(max(0.0, wake - time.monotonic()))
+            self._listen(max(wake, after + _LISTEN * (after - now)))
+
+    def _listen(self, until: float) -> None:
+        """Take in what comes; for a while also when the next cycles are due already.
+
+        Each turn takes one event at least, and answers to other slaves are events as well: by one
+        for each round of cycles they would pile up.
+        """
+        while (left := until - time.monotonic()) > 0.0:
+            self._shared.participant.spin(left)
 
     def _cycle(self, now: float) -> None:
         due, index = self._due[0]
-        if now - due > self._period:
+        if now - due > self._pace:
             self.tally.late += 1
             due = now
-        heapq.heapreplace(self._due, (due + self._period, index))
+        heapq.heapreplace(self._due, (due + self._pace, index))
         if now - self._walked >= self._period:
             self._walked = now
             self._walks.go_on()
-        self.slaves[index].cycle(self._walks.usage[index], self._walks.limit, now)
-        self.tally.cycles += 1
+        slave = self.slaves[index]
+        slave.cycle(self._walks.usage[index], self._walks.limit, now)
+        self.tally.cycles += slave.registered
 
     def close(self) -> None:
         """Leave ROS."""
@@ -361,7 +402,7 @@ def main() -> None:
     fleet.bring_up(arguments.timeout)
     print(json.dumps({"registered": len(fleet.slaves)}), flush=True)
     while _told_to_go_on(fleet):
-        fleet.tally.cycles = fleet.tally.late = 0
+        fleet.tally.begin()
         used = resource.getrusage(resource.RUSAGE_SELF)
         began, cpu = time.monotonic(), used.ru_utime + used.ru_stime
         goes_on = _told_to_go_on(fleet)
@@ -370,7 +411,9 @@ def main() -> None:
             json.dumps(
                 {
                     "seconds": time.monotonic() - began, "cycles": fleet.tally.cycles,
-                    "late": fleet.tally.late, "cpu": used.ru_utime + used.ru_stime - cpu,
+                    "messages": fleet.tally.messages, "late": fleet.tally.late,
+                    "lost": fleet.tally.lost,
+                    "cpu": used.ru_utime + used.ru_stime - cpu,
                     "taken": fleet.tally.taken,
                 }
             ),

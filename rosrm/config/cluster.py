@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from rosrm.config.checking import validated
 from rosrm.config.documents import Node, Problems, parse, read
@@ -13,6 +13,11 @@ from rosrm.config.options import PluginCheck
 from rosrm.config.rules import check_amounts, check_name, settled
 from rosrm.config.settings import ClusterConfig
 from rosrm.registry import Registry
+
+#: Beat periods, in which a quiet slave is heard once, that a silence must outlast.
+_BEATS: Final = 3
+#: Three times 0.2 s is a little more than 0.6 s.
+_ROUNDING: Final = 1e-9
 
 
 def load_cluster(path: str | Path, registry: Registry | None = None) -> ClusterConfig:
@@ -53,11 +58,26 @@ def _check_rules(root: Node, config: ClusterConfig | None, problems: Problems) -
             f"liveness.suspect ({config.liveness.suspect:g} s) must be less than "
             f"liveness.lease ({config.liveness.lease:g} s)",
         )
+    if config is not None:
+        _check_beats(root, config, problems)
     options = root.get("checkpoint", "options")
     if options is not None and options.items and not _given(root, "checkpoint"):
         problems.add(
             options.place, "checkpoint.options: options of no policy; name one in `policy`"
         )
+
+
+def _check_beats(root: Node, config: ClusterConfig, problems: Problems) -> None:
+    suspect, period = config.liveness.suspect, config.control.beat_period
+    if suspect >= _BEATS * period - _ROUNDING:
+        return
+    keys = ("control", "beat_period")
+    given = keys if root.get(*keys) is not None else ("liveness", "suspect")
+    problems.add(
+        root.deepest(given).place,
+        f"control.beat_period ({period:g} s) must be at most a third of liveness.suspect "
+        f"({suspect:g} s): a slave with nothing new to say is heard once in a beat period",
+    )
 
 
 def _with_options(root: Node, config: ClusterConfig, plugins: PluginCheck) -> ClusterConfig:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 
+#: Seconds after which what comes without an end no longer keeps a part from its other work.
+_FLOOD: Final = 0.05
 #: The first is the one that Fast DDS 2.14 (Jazzy) reads.
 _PROFILE_VARIABLES: Final = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 
@@ -98,10 +101,14 @@ class Participant:
         return call
 
     def spin(self, timeout: float) -> None:
-        """Wait for something to do, at most `timeout` seconds, then do all that is ready."""
+        """Wait for something to do, at most `timeout` seconds, then do all that is ready.
+
+        A flood ends it as well: what is done in every cycle must not wait for the end of a flood.
+        """
         before = self._executed
         self.executor.spin_once(timeout_sec=timeout)
-        while self._executed != before:
+        flooded = time.monotonic() + _FLOOD
+        while self._executed != before and time.monotonic() < flooded:
             before = self._executed
             self.executor.spin_once(timeout_sec=0.0)
 

@@ -145,6 +145,29 @@ def test_a_lease_outlasts_the_suspicion(refusal):
     assert said == ("f.yaml:2:12: liveness.suspect (20 s) must be less than liveness.lease (10 s)")
 
 
+@pytest.mark.parametrize(
+    ("text", "place", "period", "suspect"),
+    [
+        ("liveness:\n  suspect: 500ms\n", "2:12", "0.2", "0.5"),
+        ("control:\n  beat_period: 1s\n", "2:16", "1", "1"),
+        ("liveness: {suspect: 2s}\ncontrol:\n  beat_period: 700ms\n", "3:16", "0.7", "2"),
+    ],
+)
+def test_a_quiet_slave_is_not_taken_for_a_silent_one(refusal, text, place, period, suspect):
+    """It is heard once in a beat period, and a message may be lost."""
+    assert refusal(load_cluster, text) == (
+        f"f.yaml:{place}: control.beat_period ({period} s) must be at most a third of "
+        f"liveness.suspect ({suspect} s): a slave with nothing new to say is heard once in a beat "
+        f"period"
+    )
+
+
+def test_a_suspicion_of_just_three_beat_periods_is_taken(tmp_path):
+    file = tmp_path / "f.yaml"
+    file.write_text("liveness: {suspect: 600ms}")
+    assert load_cluster(file).liveness.suspect == 0.6
+
+
 def test_options_of_no_policy_are_refused(refusal):
     assert "f.yaml:1:23: checkpoint.options: options of no policy" in refusal(
         load_cluster, "checkpoint: {options: {a: 1}}"

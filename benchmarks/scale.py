@@ -1,0 +1,269 @@
+"""A master with a thousand slaves at 10 Hz: what comes, what is missed, what it costs.
+
+The master is the real one, started as `rosrm master` starts it. The slaves are simulated
+(`benchmarks/simulated_slaves.py`), many in each of a few processes, and say what real slaves say,
+by the same code. What the master takes in it tells itself on `master_load`, by its own clock:
+
+- `received_per_s`: slave-cycles that messages account for; `missed`: those that none did, by the
+  slaves' own counting. `offered_per_s`: cycles that the simulated slaves carried out.
+- `us_per_message`: CPU of all threads of the master, by slave-cycle: reception, decoding, decision.
+- `oldest_reading_p99_s`: at each look of the master, the age of the oldest among the newest
+  readings of all hosts.
+- `request_process_*_ms`: one job at a time, from `submit` called to the assignment at the slave.
+  The master answers one request; the answer reaches the reader of each slave.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from benchmarks.machine import percentile, print_report, say
+from benchmarks.simulated_slaves import STEP
+from rosrm.core.model import Kind, ProcessSpec
+from rosrm.errors import RosrmError
+from rosrm.local_cluster import LocalCluster
+from rosrm.ros import names, qos
+from rosrm.ros.participant import Participant
+from rosrm.ros.settings import RosSettings
+from rosrm_msgs import msg
+
+_ROOT = Path(__file__).resolve().parents[1]
+#: Seconds at the full rate before anything is counted.
+_WARM_UP = 3.0
+#: Seconds for a word of the master, which comes once a second.
+_PATIENCE = 30.0
+_END = 15.0
+_JOBS = 30
+#: Seconds between two jobs.
+_PAUSE = 0.1
+
+
+class Loads:
+    """What the master says of how it keeps up.
+
+    Attributes:
+        heard: the particulars of each word, oldest first.
+    """
+
+    def __init__(self, settings: RosSettings) -> None:
+        self._participant = Participant(settings, "rosrm_scale")
+        self.heard: list[dict[str, Any]] = []
+        topic = names.Names(settings.namespace)(names.MASTER_LOAD)
+        self._participant.node.create_subscription(
+            msg.Event, topic, self._participant.counted(self._take), qos.LOAD
+        )
+
+    def _take(self, word: msg.Event) -> None:
+        self.heard.append({**json.loads(word.data), "elapsed": word.elapsed})
+
+    def wait(self, seconds: float) -> list[dict[str, Any]]:
+        """The words of so many seconds, from one that comes next on.
+
+        Raises:
+            TimeoutError: no further word came.
+        """
+        self.heard.clear()
+        deadline = time.monotonic() + seconds + _PATIENCE
+        while len(self.heard) < 2 or _span(self.heard) < seconds:
+            if time.monotonic() >= deadline:
+                raise TimeoutError(f"the master said nothing on master_load for {_PATIENCE:g} s")
+            self._participant.spin(0.2)
+        return list(self.heard)
+
+    def close(self) -> None:
+        """Leave ROS."""
+        self._participant.close()
+
+
+def _span(words: Sequence[dict[str, Any]]) -> float:
+    return float(words[-1]["elapsed"] - words[0]["elapsed"])
+
+
+@dataclass
+class Crowd:
+    """The processes of the simulated slaves; they end when they are closed.
+
+    Attributes:
+        domain: in which the master is.
+        hz, step: of a slave's cycles, and of its readings.
+        timeout: seconds for all slaves of a process to register.
+    """
+
+    domain: int
+    hz: float
+    step: float
+    timeout: float
+    _processes: list[subprocess.Popen[str]] = field(default_factory=list)
+
+    def start(self, slaves: int, processes: int) -> None:
+        """Start so many slaves, and wait until all are registered."""
+        bounds = [slaves * number // processes for number in range(processes + 1)]
+        for first, end in itertools.pairwise(bounds):
+            options = {
+                "domain": self.domain, "first": first + 1, "slaves": end - first, "hz": self.hz,
+                "step": self.step, "timeout": self.timeout,
+            }  # fmt: skip
+            words = [word for name, value in options.items() for word in (f"--{name}", str(value))]
+            self._processes.append(
+                subprocess.Popen(
+                    [sys.executable, "-m", "benchmarks.simulated_slaves", *words],
+                    stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=_ROOT,
+                )
+            )  # fmt: skip
+        self.hear()
+
+    def hear(self) -> list[dict[str, Any]]:
+        """One report of each.
+
+        Raises:
+            RosrmError: a process has ended instead.
+        """
+        return [_next_report(process) for process in self._processes]
+
+    def tell(self) -> None:
+        """Begin to count, or end it."""
+        for process in self._processes:
+            assert process.stdin is not None
+            process.stdin.write("\n")
+            process.stdin.flush()
+
+    def close(self) -> None:
+        """End all, by pid."""
+        for process in self._processes:
+            if process.stdin is not None and process.poll() is None:
+                process.stdin.close()
+        for process in self._processes:
+            try:
+                process.wait(_END)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait(_END)
+
+
+def _next_report(process: subprocess.Popen[str]) -> dict[str, Any]:
+    """The next line of JSON; Fast DDS writes to the standard output as well."""
+    assert process.stdout is not None
+    for line in process.stdout:
+        if line.startswith("{"):
+            return dict(json.loads(line))
+    raise RosrmError(f"simulated slaves ended with {process.wait(_END)}; see above")
+
+
+def readings(crowd: Crowd, loads: Loads, seconds: float) -> dict[str, float]:
+    """What comes of the readings of all slaves in so many seconds."""
+    crowd.tell()
+    words = loads.wait(seconds)
+    crowd.tell()
+    sent = crowd.hear()
+    first, last, span = words[0], words[-1], _span(words)
+    cycles = last["cycles"] - first["cycles"]
+    cpu = last["cpu_s"] - first["cpu_s"]
+    ages = [age for word in words[1:] for age in word["oldest_reading_s"]]
+    offered = sum(one["cycles"] for one in sent)
+    return {
+        "offered_per_s": sum(one["cycles"] / one["seconds"] for one in sent),
+        "received_per_s": cycles / span,
+        "missed": last["missed"] - first["missed"],
+        "master_cpu": cpu / span,
+        "us_per_message": 1e6 * cpu / cycles,
+        "oldest_reading_p99_s": percentile(ages, 0.99),
+        "hosts_heard": min(word["hosts"] for word in words),
+        "messages_per_cycle": sum(one["messages"] for one in sent) / offered,
+        "masters_lost": sum(one["lost"] for one in sent),
+        "late_cycles": sum(one["late"] for one in sent),
+        "simulated_slaves_cpu": sum(one["cpu"] / one["seconds"] for one in sent),
+        "seconds": span,
+    }
+
+
+def requests(cluster: LocalCluster, crowd: Crowd) -> dict[str, float]:
+    """How long an assignment takes to its slave, one job at a time."""
+    crowd.tell()
+    called = {}
+    for number in range(_JOBS):
+        name = f"job{number}"
+        called[name] = time.time()
+        cluster.client.submit([ProcessSpec(name, command=("true",), kind=Kind.JOB)])
+        cluster.client.spin(_PAUSE)
+    crowd.tell()
+    taken = {name: at for one in crowd.hear() for name, at in one["taken"].items()}
+    took = [1e3 * (taken[name] - called[name]) for name in called if name in taken]
+    return {
+        "request_process_p50_ms": percentile(took, 0.5),
+        "request_process_p99_ms": percentile(took, 0.99),
+        "request_process_answered": len(took),
+        "request_process_asked": _JOBS,
+    }
+
+
+def measure(arguments: argparse.Namespace, folder: Path) -> dict[str, float]:
+    """All figures of one run."""
+    with ExitStack() as opened:
+        cluster = LocalCluster(folder)
+        opened.callback(cluster.close)
+        assert cluster.domain is not None
+        cluster.start_master()
+        cluster.client.list()
+        loads = Loads(cluster.ros)
+        opened.callback(loads.close)
+        crowd = Crowd(cluster.domain, arguments.hz, arguments.step, arguments.timeout)
+        opened.callback(crowd.close)
+        begun = time.monotonic()
+        crowd.start(arguments.slaves, arguments.processes)
+        up = time.monotonic() - begun
+        say(f"{arguments.slaves} slaves are registered after {up:.1f} s")
+        loads.wait(_WARM_UP)
+        figures = readings(crowd, loads, arguments.seconds)
+        say(f"{figures['us_per_message']:.1f} us a slave-cycle, {figures['missed']} missed")
+        return {**figures, **requests(cluster, crowd), "all_registered_s": up}
+
+
+def main() -> None:
+    """Measure and print one JSON object."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--slaves", type=_positive(int), default=1000)
+    parser.add_argument("--hz", type=_positive(float), default=10.0)
+    parser.add_argument("--seconds", type=_positive(float), default=30.0)
+    parser.add_argument("--processes", type=_positive(int), default=2, help="that the slaves share")
+    parser.add_argument(
+        "--step", type=float, default=STEP,
+        help="standard deviation of a usage's change in a cycle; 0.1: all go out at once",
+    )  # fmt: skip
+    parser.add_argument(
+        "--timeout", type=_positive(float), default=240.0, help="s, for all slaves to register"
+    )
+    arguments = parser.parse_args()
+    if arguments.processes > arguments.slaves:
+        parser.error(f"{arguments.slaves} slaves cannot share {arguments.processes} processes")
+    with tempfile.TemporaryDirectory(prefix="rosrm-scale-") as folder:
+        figures = measure(arguments, Path(folder))
+    print_report(
+        "scale",
+        {"slaves": arguments.slaves, "hz": arguments.hz, "step": arguments.step, **figures},
+        runs=1,
+    )
+
+
+def _positive(kind: type) -> Any:
+    def parse(text: str) -> Any:
+        value = kind(text)
+        if not value > 0:
+            raise argparse.ArgumentTypeError(f"{text} is not above 0")
+        return value
+
+    return parse
+
+
+if __name__ == "__main__":
+    main()

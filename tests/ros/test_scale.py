@@ -1,0 +1,86 @@
+"""Tens of simulated slaves on a real master: nothing of what they say gets lost from the books."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+SLAVES = 30
+HZ = 10.0
+
+
+def scale(*words: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "benchmarks.scale", *words],
+        cwd=ROOT, capture_output=True, text=True, timeout=240.0, check=False,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def report() -> dict:
+    """What the benchmark says of one short run."""
+    ended = scale("--slaves", str(SLAVES), "--hz", str(HZ), "--seconds", "4", "--processes", "2")
+    assert ended.returncode == 0, ended.stderr
+    return json.loads(ended.stdout.splitlines()[-1])
+
+
+def test_every_slave_is_heard_all_the_time(report) -> None:
+    """Also those whose readings hardly change."""
+    assert report["slaves"] == report["hosts_heard"] == SLAVES
+
+
+def test_every_cycle_is_accounted_for_or_missed(report) -> None:
+    """What the slaves say they did and what the master counts are the same, edges aside.
+
+    The two windows differ by up to a second, and on a busy machine cycles are left out.
+    """
+    counted = report["received_per_s"] + report["missed"] / report["seconds"]
+    assert counted == pytest.approx(report["offered_per_s"], rel=0.4)
+    assert report["offered_per_s"] <= SLAVES * HZ * 1.1
+
+
+def test_quiet_cycles_cost_no_message(report) -> None:
+    """Readings that hardly move go out twice less often than they are made, never more seldom."""
+    assert 0.45 < report["messages_per_cycle"] < 0.8
+
+
+def test_each_request_is_answered(report) -> None:
+    """The assignment reaches the slave that it is meant for, among readers of all."""
+    assert report["request_process_answered"] == report["request_process_asked"]
+    assert 0.0 < report["request_process_p50_ms"] <= report["request_process_p99_ms"]
+
+
+def test_the_costs_are_of_one_piece(report) -> None:
+    """CPU by slave-cycle is that of the master's process over the cycles of the same time."""
+    assert report["us_per_message"] == pytest.approx(
+        1e6 * report["master_cpu"] / report["received_per_s"]
+    )
+
+
+def test_readings_that_move_all_go_out() -> None:
+    """A reading that has moved is not kept back (at its bounds it does not move)."""
+    ended = scale("--slaves", "10", "--seconds", "2", "--processes", "1", "--step", "0.1")
+    assert ended.returncode == 0, ended.stderr
+    assert json.loads(ended.stdout.splitlines()[-1])["messages_per_cycle"] > 0.8
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--slaves", "0"], "0 is not above 0"),
+        (["--hz", "-1"], "-1 is not above 0"),
+        (["--slaves", "2", "--processes", "3"], "2 slaves cannot share 3 processes"),
+        (["--slaves", "many"], "--slaves: invalid"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(words, said) -> None:
+    """Before anything is started, with one line."""
+    ended = scale(*words)
+    assert ended.returncode == 2
+    assert said in ended.stderr.splitlines()[-1]
+    assert "Traceback" not in ended.stderr
