@@ -164,8 +164,13 @@ def test_every_command_that_is_shown_exists(page):
 # --- names ------------------------------------------------------------------------------------
 
 TOPICS = {
-    "resource_info", "process_status", "process_usage", "master_beat", "master_load", "state_config",
-}  # fmt: skip
+    "resource_info",
+    "process_status",
+    "process_usage",
+    "master_beat",
+    "master_load",
+    "state_config",
+}
 NAMES = {value for name, value in vars(names).items() if name.isupper() and isinstance(value, str)}
 OF_A_HOST = {names.CONTROL, names.READ_LOG}
 
