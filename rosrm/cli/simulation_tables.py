@@ -8,7 +8,7 @@ from typing import Any, Final
 import typer
 from rich.text import Text
 
-from rosrm.cli import formats, tables
+from rosrm.cli import tables
 from rosrm.cli.simulation_runs import Report, Run
 from rosrm.config.plain import to_plain
 from rosrm.simulation.agreement import Agreement
@@ -44,15 +44,20 @@ def show(report: Report) -> None:
 
 def _cells(run: Run) -> list[str]:
     outcome = run.outcome
-    makespan = "-" if outcome.makespan is None else formats.duration(outcome.makespan)
+    makespan = "-" if outcome.makespan is None else _seconds(outcome.makespan)
     return [
         str(run.hosts), f"{len(outcome.placements)}/{outcome.processes}", str(outcome.finished),
-        makespan, formats.duration(outcome.wait_mean), formats.duration(outcome.wait_max),
+        makespan, _seconds(outcome.wait_mean), _seconds(outcome.wait_max),
         f"{outcome.imbalance['memory'] * 100:.1f} %", f"{outcome.imbalance['cpu'] * 100:.1f} %",
         str(outcome.migrations)
         + (f" ({outcome.failed_migrations} failed)" if outcome.failed_migrations else ""),
-        formats.duration(outcome.over_limit),
+        _seconds(outcome.over_limit),
     ]  # fmt: skip
+
+
+def _seconds(seconds: float) -> str:
+    """Rows are compared: minutes would hide what differs."""
+    return f"{seconds:.1f} s" if seconds < 999.95 else f"{seconds:.0f} s"
 
 
 def _say_of_record(report: Report, replayed: Replay) -> None:

@@ -34,6 +34,8 @@ _REQUESTS: Final = (
     happened.CancelRequested, happened.RestartRequested, happened.MigrationRequested,
     happened.HostStateRequested,
 )  # fmt: skip
+#: The scope of a resource that counts nothing but what the slave started.
+_OURS_ALONE: Final = "slice"
 _RUNS: Final = frozenset({InstanceState.RUNNING, InstanceState.READY})
 
 
@@ -75,6 +77,8 @@ class Extraction:
         self._owners: dict[int, _Process] = {}
         self._starts: list[float] = []
         self._readies: list[float] = []
+        self._stops: list[float] = []
+        self._stops_since: dict[int, float] = {}
         for name, item in recording.header.intents.get("process", {}).items():
             if not ProcessPhase(item["phase"]).over:  # the master took it up again at its start
                 self._processes[name] = _Process(spec_from_dict(item["spec"]), 0.0)
@@ -147,6 +151,8 @@ class Extraction:
             for one in host.description.resources:
                 row = state.hosts.resources.index(one.name)
                 seen.limits[one.name] = float(state.hosts.limit[row, column])
+                if one.scope == _OURS_ALONE or not all(instance.seen for instance in held):
+                    continue  # nothing of others is in it, or not yet to be told from ours
                 ours = sum(instance.seen.get(one.name, 0.0) for instance in held) / one.capacity
                 others = float(state.hosts.usage[row, column]) - ours
                 seen.others.setdefault(one.name, []).append(max(0.0, others))
@@ -172,6 +178,10 @@ class Extraction:
                 self._starts.append(at - self._assigned[number])
         elif status.state is InstanceState.READY and awaits_graph(process.spec):
             self._readies.append(at - self._runs_since[number])
+        elif status.state is InstanceState.STOPPING:
+            self._stops_since.setdefault(number, at)
+        elif status.state.ended and number in self._stops_since:
+            self._stops.append(at - self._stops_since[number])
         elif status.state.ended and not status.exit_signal and status.run_time > 0.0:
             process.duration = status.run_time
 
@@ -183,6 +193,7 @@ class Extraction:
             period=min((one.description.period for one in self._hosts.values()), default=0.1),
             start=_middle(self._starts, Model().start),
             ready=_middle(self._readies, Model().ready),
+            stop=_middle(self._stops, Model().stop),
         )
         return Workload(
             self._recording.name,
@@ -214,7 +225,7 @@ def _process_plan(seen: _Process) -> ProcessPlan:
         ages, amounts = np.maximum.accumulate(ages[kept]), amounts[kept]
         distinct = np.concatenate(([True], np.diff(ages) > 0.0))
         memory = Curve(tuple(ages[distinct]), tuple(amounts[distinct]))
-    else:
-        memory = Curve((0.0,), (seen.peak,))
+    else:  # it ran for less than the second between two usages, or never
+        memory = Curve((0.0,), (seen.peak or seen.spec.needs.get("memory", 0.0),))
     cpu = float(np.mean(seen.cpu)) if seen.cpu else 0.0
     return ProcessPlan(seen.spec, seen.arrives, memory, cpu, duration=seen.duration)

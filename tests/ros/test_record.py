@@ -1,0 +1,120 @@
+"""The record of a real run: replayed the master decides the same; simulated it is nearly that."""
+
+from __future__ import annotations
+
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from rosrm.cli.simulation_runs import Request, carry_out, load_record, replay_record
+from rosrm.config.settings import MigrationSettings, ProcessDefaults, RecordSettings
+from rosrm.core.model import MigrationPolicy
+from rosrm.errors import RecordError
+from rosrm.registry import Registry
+from tests.ros.clusters import MIB, PATIENCE, STEADY, host, job, python, service
+
+HOLD = """
+import mmap, sys, time
+held = mmap.mmap(-1, int(sys.argv[1]))
+for at in range(0, len(held), 4096): held[at] = 1
+print("held", flush=True)
+time.sleep(1000)
+"""
+SIZES = (8, 24, 40, 52, 66, 80, 12, 30, 72, 48, 20, 60)
+
+
+def holder(name: str, mib: int):
+    spec = python(name, HOLD, needs={"memory": (mib + 9.0) * MIB, "cpu": 0.0})
+    return replace(spec, arguments=(str(mib * MIB),), migration=MigrationPolicy("relaunch"))
+
+
+@pytest.fixture(scope="module")
+def records(make_shared, tmp_path_factory) -> list[Path]:
+    """Of three runs of one master: one that was stopped, one that was killed, one that goes on.
+
+    In the first, three hosts are filled with 8 to 80 MiB until their limit, as in Fig. 6 of the
+    paper, and there is a job, a move and a cancellation. Each other one begins with what runs.
+    """
+    directory = tmp_path_factory.mktemp("records")
+    cluster = make_shared(
+        *(host(f"h{n}", memory=240 * MIB) for n in range(3)),
+        record=RecordSettings(directory), defaults=ProcessDefaults(needs={"memory": MIB}),
+        migration=MigrationSettings(automatic=False), liveness=STEADY,
+    )  # fmt: skip
+    cluster.run(job("first", "true"))
+    cluster.submit(replace(service("wanders"), migration=MigrationPolicy("relaunch")))
+    source = cluster.wait("wanders", "running").host
+    _fill(cluster)
+    cluster.client.migrate("wanders", next(f"h{n}" for n in range(3) if f"h{n}" != source))
+    cluster.wait_for_event("migrated", process="wanders")
+    cluster.cancel("hold00")
+    for number in (signal.SIGINT, signal.SIGKILL):
+        cluster.master.end(number)
+        cluster.master.process.wait(PATIENCE)
+        cluster.reconnect()
+        cluster.start_master()
+        cluster.wait_for_hosts()
+        cluster.run(job(f"after_{number}", "true"))
+    return sorted(directory.glob("*.rosrec"))
+
+
+def _fill(cluster) -> None:
+    """One after the other, once the master knows what the one before uses, until there is no room.
+
+    So the run takes some seconds, of which it is known what was used in them.
+    """
+    for number, mib in enumerate(SIZES):
+        name = f"hold{number:02}"
+        cluster.submit(holder(name, mib))
+        if cluster.wait(name, "running", "queued").state == "queued":
+            return
+
+        def shows(view, name=name, least=mib * MIB) -> bool:
+            return any(row.name == name and row.memory >= least for row in view.processes)
+
+        cluster.wait_until(f"{name} holding {mib} MiB", shows)
+    raise AssertionError("the hosts were not full in the end")
+
+
+def test_it_was_recorded_in_a_file_for_each_run(records):
+    assert [path.name for path in records] == [f"rosrm-000{n}.rosrec" for n in (1, 2, 3)]
+
+
+def test_told_again_the_core_decides_the_same(records):
+    replayed, _ = replay_record(load_record(records[0]), Registry.discover())
+    assert replayed.decisions > len(SIZES) / 2
+    assert replayed.differences == ()
+    assert replayed.outcome.migrations == 1
+    assert replayed.outcome.finished >= 1
+
+
+def test_also_a_master_that_took_over_what_ran(records):
+    """Its state came from the journal, which is in the record; and it was killed."""
+    with pytest.raises(RecordError, match="cut short at byte"):
+        load_record(records[1])
+    recording = load_record(records[1], cut=True)
+    assert recording.header.epoch == 2
+    assert len(recording.header.intents["process"]) > 3
+    replayed, _ = replay_record(recording, Registry.discover())
+    assert replayed.decisions > 0
+    assert replayed.differences == ()
+
+
+def test_one_that_still_grows_is_not_taken_for_a_whole_one(records):
+    with pytest.raises(RecordError, match="cut short"):
+        load_record(records[2])
+
+
+def test_the_simulation_of_the_run_agrees_with_it(records):
+    """Bounds for a busy machine: what was seen there is several times closer."""
+    report = carry_out(Request(records[0]))
+    recorded, simulated = report.runs
+    agreement = report.agreement
+    assert agreement.processes == len(recorded.outcome.placements)
+    assert len(simulated.outcome.placements) == len(recorded.outcome.placements)
+    assert agreement.same_counts >= 0.7
+    assert agreement.ranked["memory"] < 0.10
+    assert agreement.balance["memory"] < 0.15
+    assert agreement.migrations[0] == 1
