@@ -39,8 +39,9 @@ from rosrm.ros.settings import RosSettings
 from rosrm_msgs import msg
 
 _ROOT = Path(__file__).resolve().parents[1]
-#: Seconds at the full rate before anything is counted.
-_WARM_UP = 3.0
+#: Seconds at the full rate before anything is counted: in the first half minute a slave asks for
+#: work again and again, ever more seldom.
+_SETTLE = 30.0
 #: Seconds for a word of the master, which comes once a second.
 _PATIENCE = 30.0
 _END = 15.0
@@ -223,7 +224,7 @@ def measure(arguments: argparse.Namespace, folder: Path) -> dict[str, float]:
         crowd.start(arguments.slaves, arguments.processes)
         up = time.monotonic() - begun
         say(f"{arguments.slaves} slaves are registered after {up:.1f} s")
-        loads.wait(_WARM_UP)
+        loads.wait(arguments.settle)
         figures = readings(crowd, loads, arguments.seconds)
         say(f"{figures['us_per_message']:.1f} us a slave-cycle, {figures['missed']} missed")
         return {**figures, **requests(cluster, crowd), "all_registered_s": up}
@@ -242,6 +243,9 @@ def main() -> None:
     )  # fmt: skip
     parser.add_argument(
         "--timeout", type=_positive(float), default=240.0, help="s, for all slaves to register"
+    )
+    parser.add_argument(
+        "--settle", type=_positive(float), default=_SETTLE, help="s, between that and the count"
     )
     arguments = parser.parse_args()
     if arguments.processes > arguments.slaves:

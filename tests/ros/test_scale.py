@@ -16,7 +16,7 @@ HZ = 10.0
 
 def scale(*words: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-m", "benchmarks.scale", *words],
+        [sys.executable, "-m", "benchmarks.scale", "--settle", "1", *words],
         cwd=ROOT, capture_output=True, text=True, timeout=240.0, check=False,
     )  # fmt: skip
 
