@@ -246,10 +246,13 @@ def fraction(text: str) -> float:
     """`1%` or `0.01`; raises `ConfigError`."""
     from rosrm.lab.wires import check_loss
 
+    percent = text.endswith("%")
     try:
-        value = float(text[:-1]) / 100.0 if text.endswith("%") else float(text)
+        value = float(text[:-1]) / 100.0 if percent else float(text)
     except ValueError:
         raise ConfigError(f"SHARE {text!r}: give percent (1%) or a fraction (0.01)") from None
+    if value >= 1.0 and not percent:  # who writes 1 may mean either
+        raise ConfigError(f"SHARE {text!r}: say {text}% or a fraction below 1; 100% is all")
     check_loss(value)
     return value
 

@@ -1,8 +1,8 @@
 """The control groups of a lab, version 1 or 2.
 
-Each host has one group with two in it: `limited`, where its processes run within memory and CPU
-quota, and `free`, for what shall be on the host without counting against them. (Version 2 wants
-processes in leaves only.)
+Each host has one group with three in it: `limited`, where its processes run within memory and CPU
+quota; `free`, for what shall be on the host without counting against them; and `own` for what the
+lab itself needs: the first process, and the relays. (Version 2 wants processes in leaves only.)
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from typing import Final, Literal
 from rosrm.errors import LabError
 from rosrm.lab.plan import PREFIX, HostPlan
 
-Leaf = Literal["limited", "free"]
-LEAVES: Final[tuple[Leaf, ...]] = ("limited", "free")
+Leaf = Literal["limited", "free", "own"]
+LEAVES: Final[tuple[Leaf, ...]] = ("limited", "free", "own")
 
 #: cpuacct: version 1 keeps the CPU time of a group there.
 _NEEDED: Final = ("memory", "cpu", "cpuacct")
@@ -138,6 +138,12 @@ def members(hierarchies: Iterable[Hierarchy], lab: str, host: str = "") -> set[i
     return found
 
 
+def processes(hierarchies: Iterable[Hierarchy], lab: str, host: str) -> set[int]:
+    """What was started on a host, without what the lab itself needs there."""
+    known = list(hierarchies)
+    return members(known, lab, f"{host}/limited") | members(known, lab, f"{host}/free")
+
+
 def kill(hierarchies: Sequence[Hierarchy], lab: str, host: str = "") -> None:
     """End every process in the groups of a host or lab, and wait until they have gone.
 
@@ -154,17 +160,27 @@ def kill(hierarchies: Sequence[Hierarchy], lab: str, host: str = "") -> None:
                 f"processes of lab {lab!r} do not end, {_GONE:g} s after SIGKILL: "
                 f"{', '.join(map(str, sorted(pids)))}. Look at them (`ps`), then repeat this"
             )
+        time.sleep(_LOOK)  # version 1 has no event for this
+
+
+def remove(hierarchies: Sequence[Hierarchy], lab: str) -> None:
+    """End the processes of a lab and remove its groups.
+
+    Raises:
+        LabError: a process or group would not go.
+    """
+    deadline = time.monotonic() + _GONE
+    while True:
+        kill(hierarchies, lab)
+        left = [failure for h in hierarchies if (failure := _remove_tree(h.top / lab))]
+        if not left:
+            break
+        # The kernel gives a group up a moment after its last process has gone; and a process that
+        # was about to enter may have done so.
+        if time.monotonic() > deadline:
+            raise LabError(f"control groups cannot be removed: {'; '.join(left)}")
         time.sleep(_LOOK)
-
-
-def remove(hierarchies: Iterable[Hierarchy], lab: str) -> None:
-    """Remove the groups of a lab, whose processes have ended; raises `LabError`."""
     for hierarchy in hierarchies:
-        tree = hierarchy.top / lab
-        # Deepest first. The kernel gives a group up a moment after its last process has gone.
-        inner = [Path(folder) for folder, _, _ in os.walk(tree, topdown=False)]
-        for folder in inner:
-            _remove_group(folder)
         with contextlib.suppress(OSError):  # other labs have theirs in it
             hierarchy.top.rmdir()
 
@@ -239,21 +255,16 @@ def _hand_on(group: Path, controllers: Sequence[str]) -> None:
         switch.write_text(" ".join(f"+{name}" for name in sorted(missing)))
 
 
-def _remove_group(group: Path) -> None:
-    deadline = time.monotonic() + _GONE
-    while True:
+def _remove_tree(tree: Path) -> str:
+    """Remove groups, the deepest first; returns what hinders, or ""."""
+    for folder, _, _ in os.walk(tree, topdown=False):
         try:
-            group.rmdir()
+            Path(folder).rmdir()
         except FileNotFoundError:
-            return
+            continue
         except OSError as error:
-            if time.monotonic() > deadline:
-                raise LabError(
-                    f"the control group {group} cannot be removed: {error.strerror}"
-                ) from None
-            time.sleep(_LOOK)
-        else:
-            return
+            return f"{folder}: {error.strerror}"
+    return ""
 
 
 def _cannot(hierarchy: Hierarchy, error: OSError) -> str:

@@ -17,7 +17,7 @@ from typing import Final
 
 from rosrm.bootstrapper import without_bootstrapper
 from rosrm.errors import ConfigError, LabError
-from rosrm.lab import groups, network, store
+from rosrm.lab import groups, store
 from rosrm.lab import plan as names
 from rosrm.lab.groups import Hierarchy, Leaf
 from rosrm.lab.needs import find_command
@@ -32,10 +32,10 @@ _INSIDE: Final = Path(__file__).parent / "inside"
 _BOOT: Final = 30.0
 #: Seconds for a kernel to end the processes of a host.
 _END: Final = 10.0
-#: Enters groups of control, then executes the rest: N FILE... COMMAND...
+#: Enters control groups, then executes the rest: N FILE... COMMAND...
 _ENTER: Final = (
-    'n=$1; shift; while [ "$n" -gt 0 ]; do echo 0 > "$1" || exit 125; shift; n=$((n - 1)); done; '
-    'exec "$@"'
+    'n=$1; shift; while [ "$n" -gt 0 ]; do { echo 0 > "$1"; } 2>/dev/null || '
+    '{ echo "rosrm: the host has gone" >&2; exit 125; }; shift; n=$((n - 1)); done; exec "$@"'
 )
 #: Would lead discovery to where the lab cannot reach, or make it deaf.
 _NOT_INHERITED: Final = (
@@ -76,10 +76,9 @@ def boot(hierarchies: Sequence[Hierarchy], lab: str, host: HostPlan, hosts_file:
         "shm_options": f"size={host.memory // 2}" if host.memory else "",
         "hosts_file": hosts_file,
     }
-    doors = [str(door) for door in groups.doors(hierarchies, lab, host.name, "free")]
-    namespace = network.namespace_path(names.host_namespace(lab, host.name))
+    namespace = names.namespace_path(names.host_namespace(lab, host.name))
     command = [
-        *("sh", "-c", _ENTER, "rosrm-lab", str(len(doors)), *doors),
+        *_entering(hierarchies, lab, host.name),
         *(find_command("nsenter"), f"--net={namespace}", "--"),
         *(find_command("unshare"), "--mount", "--uts", "--ipc", "--pid"),
         *("--propagation", "private", "--"),
@@ -147,6 +146,7 @@ def entrance(
         _close(descriptors)
         raise LabError(f"host {host} of lab {lab!r} has lost its control group: {error}") from None
     order = {
+        "lab": lab,
         "host": host,
         "doors": descriptors,
         "directory": directory or _working_directory(),
@@ -154,6 +154,7 @@ def entrance(
         "identity": identity,
     }
     words = [
+        *_entering(hierarchies, lab, host),
         *(find_command("nsenter"), "--target", str(birth.pid), "--no-fork"),
         *("--mount", "--uts", "--ipc", "--net", "--pid", "--"),
         *(sys.executable, "-I", "-S", str(_INSIDE / "relay.py"), json.dumps(order), *command),
@@ -198,6 +199,15 @@ def power_off(hierarchies: Sequence[Hierarchy], lab: str, host: str, birth: Birt
                 if not _readable(descriptor, _END):
                     raise LabError(f"host {host} of lab {lab!r} did not end within {_END:g} s")
     groups.kill(hierarchies, lab, host)
+
+
+def _entering(hierarchies: Sequence[Hierarchy], lab: str, host: str) -> list[str]:
+    """Words before a command, by which it is one of the lab's own processes from the first on.
+
+    Whatever happens then, who removes the lab finds it; and it cannot begin after the removal.
+    """
+    doors = [str(door) for door in groups.doors(hierarchies, lab, host, "own")]
+    return ["/bin/sh", "-c", _ENTER, "rosrm-lab", str(len(doors)), *doors]
 
 
 @contextlib.contextmanager

@@ -1,9 +1,13 @@
 """`Lab`: several virtual hosts on this machine, made, used, disturbed and removed."""
 
+# pyroute2 takes longer to import than `exec` takes in all: only what changes the network has it.
+# ruff: noqa: PLC0415
+
 from __future__ import annotations
 
 import os
 import subprocess
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from ipaddress import IPv4Network
 from pathlib import Path
@@ -11,21 +15,12 @@ from types import TracebackType
 from typing import IO, TYPE_CHECKING, Any, Final
 
 from rosrm.errors import ConfigError, LabError
-from rosrm.lab import disks, groups, needs, store
-from rosrm.lab.host import DATA, boot, entrance, power_off
-from rosrm.lab.plan import (
-    HostPlan,
-    LabPlan,
-    check_free,
-    check_name,
-    free_subnet,
-    host_namespace,
-    namespaces_of,
-    switch_namespace,
-)
+from rosrm.lab import groups, needs, store
+from rosrm.lab.host import DATA, entrance
+from rosrm.lab.plan import HostPlan, LabPlan, check_name, switch_namespace
 from rosrm.lab.status import HostStatus, host_status
 from rosrm.lab.store import Birth, Record
-from rosrm.lab.wires import Direction, Link, check_delay, check_loss
+from rosrm.lab.wires import Direction, check_delay, check_loss
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -81,28 +76,22 @@ class Lab:
             LabError: it is up already, or something is missing on this machine; nothing is left.
             ConfigError: the hosts or the subnet cannot be.
         """
-        from rosrm.lab import network  # noqa: PLC0415 - pyroute2 is looked for first
+        from rosrm.lab import making
 
         needs.check_rights(self._hosts)
         needs.check_machine(self._hosts, store.IMAGES)
         with store.lock(self.name):
-            self._refuse_if_up()
-            self._remove()
+            making.refuse_if_up(self.name)
+            making.remove(self._hierarchies, self.name)
             with store.lock(""):  # two labs at once must not choose the same addresses
-                subnet = self._choose_subnet(network.ranges_in_use())
+                subnet = making.choose_subnet(self._subnet)
                 plan = LabPlan(self.name, self._hosts, subnet)
-                links = {name: Link() for name in plan.names}
-                record = Record(plan, boot=store.boot_id(), owner=owner, links=links)
+                record = Record(plan, boot=store.boot_id(), owner=owner)
                 store.write(record)
             try:
-                network.make_switch(plan)
-                for host in plan.hosts:
-                    self._make_host(host)
-                    self._switch_on(record, host.name)
-                record.complete = True
-                store.write(record)
+                making.make(self._hierarchies, record)
             except BaseException:
-                self._remove()
+                making.remove(self._hierarchies, self.name)
                 raise
 
     def down(self) -> bool:
@@ -111,9 +100,11 @@ class Lab:
         Raises:
             LabError: something could not be removed; repeating it goes on.
         """
+        from rosrm.lab import making
+
         needs.check_rights()
         with store.lock(self.name):
-            return self._remove()
+            return making.remove(self._hierarchies, self.name)
 
     def __enter__(self) -> Self:
         """Make the lab; it ends with this process at the latest when the next one is made."""
@@ -168,9 +159,9 @@ class Lab:
         return f"/{limited.relative_to(hierarchy.mount)}"
 
     def pids(self, host: str) -> set[int]:
-        """The processes of a host, by their numbers on this machine."""
+        """What was started on a host, by its numbers on this machine."""
         self.plan.host(host)
-        return groups.members(self._hierarchies, self.name, host)
+        return groups.processes(self._hierarchies, self.name, host)
 
     # --- commands on a host -------------------------------------------------------------------
 
@@ -266,6 +257,18 @@ class Lab:
             )
         return subprocess.CompletedProcess(list(command), process.returncode, said, troubles)
 
+    def supervise(self, host: str, state: str) -> None:
+        """Start a supervisor within a host's limits, for a slave that will be beside them.
+
+        Processes are children of the supervisor, so they are within the limits too; a slave that
+        is started with this state directory finds the supervisor there.
+
+        Args:
+            state: directory of the slave, as the host has it.
+        """
+        command = [sys.executable, "-m", "rosrm.supervisor", "--state", f"{state}/supervisor"]
+        self.exec(host, command)
+
     def become(
         self, host: str, command: Sequence[str], *, user: str = "", env: Mapping[str, str]
     ) -> None:
@@ -304,22 +307,22 @@ class Lab:
 
         Its disk keeps what was written; memory, /run and /dev/shm are lost. `boot` ends it.
         """
-        from rosrm.lab import network  # noqa: PLC0415 - see `up`
+        from rosrm.lab import making
 
         with store.lock(self.name):
             record = self._record()
-            network.unplug(record.plan, record.plan.host(host).name)
-            power_off(self._hierarchies, self.name, host, record.inits.pop(host, None))
-            network.remove(_of_host(record.plan, host, network.existing()))
+            making.switch_off(self._hierarchies, record, record.plan.host(host).name)
             store.write(record)
 
     def boot(self, host: str) -> None:
         """Switch a host on again after `kill`; nothing runs there yet. Raises `LabError`."""
+        from rosrm.lab import making
+
         with store.lock(self.name):
             record = self._record()
             if self.is_up(host):
                 raise LabError(f"host {host} of lab {self.name!r} is up already")
-            self._switch_on(record, host)
+            making.switch_on(self._hierarchies, record, host)
             store.write(record)
 
     # --- inner parts --------------------------------------------------------------------------
@@ -349,75 +352,20 @@ class Lab:
             )
         return record
 
-    def _refuse_if_up(self) -> None:
-        record = store.read(self.name)
-        if record is None or not record.complete or record.boot != store.boot_id():
-            return
-        if record.owner is not None and not record.owner.alive:
-            return
-        raise LabError(
-            f"lab {self.name!r} is up already, with {', '.join(record.plan.names)}. "
-            "`rosrm lab down` removes it; another name (`--lab NAME`) makes a second one"
-        )
-
-    def _choose_subnet(self, machine: list[tuple[IPv4Network, str]]) -> IPv4Network:
-        labs = [(one, store.read(one)) for one in store.labs()]
-        taken = [
-            *machine,
-            *((known.plan.subnet, f"lab {name!r}") for name, known in labs if known is not None),
-        ]
-        if self._subnet is None:
-            return free_subnet([subnet for subnet, _ in taken])
-        check_free(self._subnet, taken)
-        return self._subnet
-
-    def _make_host(self, host: HostPlan) -> None:
-        groups.make(self._hierarchies, self.name, host)
-        disks.make(store.image(self.name, host.name), host)
-
-    def _switch_on(self, record: Record, host: str) -> None:
-        from rosrm.lab import network  # noqa: PLC0415 - see `up`
-
-        plan = record.plan
-        # What an earlier life may have left, were it killed in the midst.
-        network.unplug(plan, host)
-        power_off(self._hierarchies, self.name, host, record.inits.pop(host, None))
-        network.remove(_of_host(plan, host, network.existing()))
-        network.plug_in(plan, host, record.links[host])
-        record.inits[host] = boot(self._hierarchies, self.name, plan.host(host), plan.hosts_file())
-
-    def _remove(self) -> bool:
-        """Remove all there is of a lab of this name, whatever is known of it."""
-        from rosrm.lab import network  # noqa: PLC0415 - see `up`
-
-        namespaces = list(namespaces_of(self.name, network.existing()))
-        found = bool(namespaces) or self.name in store.labs() | groups.labs(self._hierarchies)
-        if not found:
-            return False
-        # The groups hold every process of the lab: first ones, and all that were started there.
-        groups.kill(self._hierarchies, self.name)
-        network.remove(namespaces)
-        groups.remove(self._hierarchies, self.name)
-        store.forget(self.name)
-        return True
-
     def _change_link(self, host: str, direction: Direction, **values: Any) -> None:
-        from rosrm.lab import network  # noqa: PLC0415 - see `up`
+        from rosrm.lab import making
 
         with store.lock(self.name):
             record = self._record()
             before = record.links[record.plan.host(host).name]
             after = before.changed(direction, **values)
-            if self.is_up(host):
-                network.set_delays(record.plan, host, before, after)
-            record.links[host] = after
-            network.set_rules(record.plan, record.links)
+            making.change_link(record, host, before, after)
             store.write(record)
 
 
 def all_labs() -> Iterator[Lab]:
     """Every lab of which there is something on this machine, killed attempts too."""
-    from rosrm.lab import network  # noqa: PLC0415 - pyroute2 may be missing
+    from rosrm.lab import network
 
     found = store.labs() | groups.labs(groups.find_hierarchies())
     prefix = switch_namespace("")
@@ -431,7 +379,3 @@ def all_labs() -> Iterator[Lab]:
             yield Lab(name)
         except ConfigError:  # a folder that somebody else put there
             continue
-
-
-def _of_host(plan: LabPlan, host: str, existing: list[str]) -> list[str]:
-    return [name for name in existing if name == host_namespace(plan.name, host)]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import shutil
 from collections.abc import Sequence
@@ -35,6 +34,8 @@ COMMANDS: Final = {
 }
 #: `nft` is asked for when a network is changed.
 _FROM_THE_START: Final = ("mkfs.ext4", "mount", "nsenter", "setpriv", "unshare")
+#: Makes loop devices, which disks are mounted with.
+_DEVICE: Final = Path("/dev/loop-control")
 #: Where they are although an ordinary user's PATH, or sudo's, may not say so.
 _PLACES: Final = "/usr/local/sbin:/usr/sbin:/sbin:/usr/local/bin:/usr/bin:/bin"
 
@@ -88,11 +89,9 @@ def check_machine(hosts: Sequence[HostPlan], images: Path) -> None:
     """
     for name in _FROM_THE_START:
         find_command(name)
-    if importlib.util.find_spec("pyroute2") is None:
-        raise LabError("the Python package pyroute2 is missing: pip install 'rosrm[lab]'")
-    if not Path("/dev/loop-control").exists():
+    if not _DEVICE.exists():
         raise LabError(
-            "there are no loop devices (/dev/loop-control): the hosts' disks cannot be mounted. "
+            f"there are no loop devices ({_DEVICE}): the hosts' disks cannot be mounted. "
             "`modprobe loop` brings them; a container needs `docker run --privileged -v /dev:/dev`"
         )
     _check_memory(hosts)

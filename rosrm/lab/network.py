@@ -10,10 +10,7 @@ import errno
 import subprocess
 from collections.abc import Iterator, Mapping
 from ipaddress import IPv4Network
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
-
-from pyroute2 import IPRoute, NetlinkError, netns
 
 from rosrm.errors import LabError
 from rosrm.lab import plan as names
@@ -21,20 +18,19 @@ from rosrm.lab.needs import find_command
 from rosrm.lab.plan import LabPlan
 from rosrm.lab.wires import Link, Wire, ruleset
 
+try:
+    from pyroute2 import IPRoute, NetlinkError, netns
+except ImportError:
+    raise LabError("the Python package pyroute2 is missing: pip install 'rosrm[lab]'") from None
+
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
 _BRIDGE: Final = "bridge"
 #: How a host calls its one interface.
 INTERFACE: Final = "eth0"
-_NAMESPACES: Final = Path("/run/netns")
 _MAIN_TABLE: Final = 254
 _IPV4: Final = 2
-
-
-def namespace_path(name: str) -> Path:
-    """The file that stands for a network namespace."""
-    return _NAMESPACES / name
 
 
 def existing() -> list[str]:
@@ -117,7 +113,7 @@ def set_rules(lab: LabPlan, links: Mapping[str, Link]) -> None:
         LabError: nft is missing, or the kernel refuses.
     """
     nft = find_command("nft")
-    switch = namespace_path(names.switch_namespace(lab.name))
+    switch = names.namespace_path(names.switch_namespace(lab.name))
     rules = ruleset({lab.port(host): link for host, link in links.items()})
     command = [find_command("nsenter"), f"--net={switch}", "--", nft, "-f", "-"]
     done = subprocess.run(command, input=rules, capture_output=True, text=True, check=False)

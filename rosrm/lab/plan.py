@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from ipaddress import IPv4Address, IPv4Network
+from pathlib import Path
 from typing import Any, Final
 
 from rosrm.errors import ConfigError
@@ -206,6 +207,8 @@ def _check_least(host: HostPlan, what: str, amount: float | None, least: float, 
 
 #: Namespaces and control groups of all labs begin with this.
 PREFIX: Final = "rosrm-lab"
+#: Where ip and pyroute2 keep network namespaces that have names.
+_NAMESPACES: Final = Path("/run/netns")
 
 
 def switch_namespace(lab: str) -> str:
@@ -216,6 +219,11 @@ def switch_namespace(lab: str) -> str:
 def host_namespace(lab: str, host: str) -> str:
     """The network namespace of a host."""
     return f"{PREFIX}:{lab}:{host}"
+
+
+def namespace_path(name: str) -> Path:
+    """The file that stands for a network namespace."""
+    return _NAMESPACES / name
 
 
 def namespaces_of(lab: str, existing: Iterable[str]) -> Iterator[str]:

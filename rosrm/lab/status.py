@@ -46,7 +46,6 @@ class HostStatus:
 def host_status(hierarchies: Sequence[Hierarchy], record: Record, host: HostPlan) -> HostStatus:
     """How one host is now."""
     lab, alive = record.plan.name, record.is_up(host.name)
-    pids = groups.members(hierarchies, lab, host.name)
     return HostStatus(
         lab=lab,
         name=host.name,
@@ -57,6 +56,6 @@ def host_status(hierarchies: Sequence[Hierarchy], record: Record, host: HostPlan
         cpu=host.cpu,
         disk=host.disk,
         disk_used=disks.used(record.outside(host.name, DATA)) if alive else None,
-        processes=max(0, len(pids) - alive),  # the first one is part of the lab
+        processes=len(groups.processes(hierarchies, lab, host.name)),
         network=record.links[host.name].describe(),
     )

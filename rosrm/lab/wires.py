@@ -56,6 +56,11 @@ class Link:
             outgoing = replace(outgoing, **values)
         return Link(incoming, outgoing)
 
+    @property
+    def delays(self) -> bool:
+        """Whether it delays packets in any direction."""
+        return bool(self.incoming.delay or self.outgoing.delay)
+
     def describe(self) -> str:
         """In words; "" for a link without faults."""
         if self.incoming == self.outgoing:
@@ -96,6 +101,8 @@ def ruleset(links: Mapping[str, Link]) -> str:
         f"table bridge {_TABLE} {{",
         "  chain between_hosts {",
         "    type filter hook forward priority 0; policy accept;",
+        # Who cannot be asked for its address cannot be spoken to: a cut would be two-way.
+        "    ether type arp accept",
         *(f"    {rule}" for rule in rules),
         "  }",
         "}",
@@ -106,7 +113,7 @@ def ruleset(links: Mapping[str, Link]) -> str:
 def _rules(port: str, link: Link) -> Iterator[str]:
     for match, wire in ((f'oifname "{port}"', link.incoming), (f'iifname "{port}"', link.outgoing)):
         lost = round(wire.loss * _DICE)
-        if wire.cut:
+        if wire.cut or lost == _DICE:
             yield f"{match} drop"
         elif lost:
             yield f"{match} numgen random mod {_DICE} < {lost} drop"

@@ -41,7 +41,7 @@ def main() -> None:
     os.chdir(order["directory"] if os.path.isdir(order["directory"]) else order["data"])
     check(command[0], order["host"])
     before = signal.pthread_sigmask(signal.SIG_BLOCK, PASSED | {signal.SIGCHLD})
-    child = os.fork()
+    child = fork(order["host"])
     if child == 0:
         become(order, command, before)
     for door in order["doors"]:
@@ -57,6 +57,15 @@ def check(program: str, host: str) -> None:
     why = "cannot be executed" if there else "no such command"
     print(f"rosrm: on {host}: {program}: {why}", file=sys.stderr)
     sys.exit(NOT_EXECUTABLE if there else NOT_FOUND)
+
+
+def fork(host: str) -> int:
+    """As `os.fork`; the kernel gives a host that is just ending no process more."""
+    try:
+        return os.fork()
+    except OSError as error:
+        print(f"rosrm: {host} has gone: {error.strerror}", file=sys.stderr)
+        sys.exit(NO_HOST)
 
 
 def become(order: dict[str, Any], command: list[str], mask: set[int]) -> None:

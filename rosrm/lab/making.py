@@ -1,0 +1,108 @@
+"""Makes a lab, switches its hosts on and off, changes their network, and removes all of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from ipaddress import IPv4Network
+
+from rosrm.errors import LabError
+from rosrm.lab import disks, groups, network, store
+from rosrm.lab.groups import Hierarchy
+from rosrm.lab.host import boot, power_off
+from rosrm.lab.plan import check_free, free_subnet, host_namespace, namespaces_of
+from rosrm.lab.store import Record
+from rosrm.lab.wires import Link
+
+
+def refuse_if_up(lab: str) -> None:
+    """Raise `LabError` where a lab of this name is up, and nobody has left it behind."""
+    record = store.read(lab)
+    if record is None or not record.complete or record.boot != store.boot_id():
+        return
+    if record.owner is not None and not record.owner.alive:
+        return
+    raise LabError(
+        f"lab {lab!r} is up already, with {', '.join(record.plan.names)}. "
+        "`rosrm lab down` removes it; another name (`--lab NAME`) makes a second one"
+    )
+
+
+def choose_subnet(wanted: IPv4Network | None) -> IPv4Network:
+    """The addresses of a new lab.
+
+    Args:
+        wanted: None: any that are free.
+
+    Raises:
+        ConfigError: they are in use.
+    """
+    labs = [(one, store.read(one)) for one in store.labs()]
+    taken = [
+        *network.ranges_in_use(),
+        *((known.plan.subnet, f"lab {name!r}") for name, known in labs if known is not None),
+    ]
+    if wanted is None:
+        return free_subnet([subnet for subnet, _ in taken])
+    check_free(wanted, taken)
+    return wanted
+
+
+def make(hierarchies: Sequence[Hierarchy], record: Record) -> None:
+    """Make all that a lab's record says, and mark it as complete; raises `LabError`."""
+    plan = record.plan
+    record.links = {name: Link() for name in plan.names}
+    network.make_switch(plan)
+    for host in plan.hosts:
+        groups.make(hierarchies, plan.name, host)
+        disks.make(store.image(plan.name, host.name), host)
+        switch_on(hierarchies, record, host.name)
+    record.complete = True
+    store.write(record)
+
+
+def switch_on(hierarchies: Sequence[Hierarchy], record: Record, host: str) -> None:
+    """Connect a host and start its first process; raises `LabError`."""
+    switch_off(hierarchies, record, host)  # what an earlier life left, if it was killed in part
+    plan = record.plan
+    network.plug_in(plan, host, record.links[host])
+    record.inits[host] = boot(hierarchies, plan.name, plan.host(host), plan.hosts_file())
+
+
+def switch_off(hierarchies: Sequence[Hierarchy], record: Record, host: str) -> None:
+    """Cut a host's power: first nobody hears it any more, then its processes end."""
+    plan = record.plan
+    network.unplug(plan, host)
+    power_off(hierarchies, plan.name, host, record.inits.pop(host, None))
+    mine = host_namespace(plan.name, host)
+    network.remove([name for name in network.existing() if name == mine])
+
+
+def change_link(record: Record, host: str, before: Link, after: Link) -> None:
+    """Make a host's network as bad as it is to be: all of it, or nothing; raises `LabError`."""
+    if record.is_up(host):
+        network.set_delays(record.plan, host, before, after)
+    elif after.delays and after != before:
+        raise LabError(f"host {host} is off: switch it on (`rosrm lab boot {host}`) to delay it")
+    try:
+        network.set_rules(record.plan, {**record.links, host: after})
+    except BaseException:
+        if record.is_up(host):
+            network.set_delays(record.plan, host, after, before)
+        raise
+    record.links[host] = after
+
+
+def remove(hierarchies: Sequence[Hierarchy], lab: str) -> bool:
+    """Remove all there is of a lab, whatever is known of it; False: there was nothing.
+
+    Raises:
+        LabError: something does not go; repeating it goes on.
+    """
+    namespaces = list(namespaces_of(lab, network.existing()))
+    if not namespaces and lab not in store.labs() | groups.labs(hierarchies):
+        return False
+    # The groups hold every process of the lab: first ones, and all that were started there.
+    groups.remove(hierarchies, lab)
+    network.remove(namespaces)
+    store.forget(lab)
+    return True

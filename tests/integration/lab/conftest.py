@@ -1,0 +1,94 @@
+"""Real virtual hosts, and proof that nothing of them is left on the machine."""
+
+from __future__ import annotations
+
+import subprocess
+import uuid
+from pathlib import Path
+
+import pytest
+
+from rosrm.errors import RosrmError
+from rosrm.lab import MIB, Lab, needs, store, uniform
+
+#: Seconds for whatever a busy machine needs; nothing waits so long when all goes well.
+PATIENCE = 30.0
+
+
+def why_not() -> str:
+    """What is missing here for a lab; "" when nothing is."""
+    from rosrm.lab import groups
+
+    try:
+        needs.check_rights()
+        needs.check_machine([], store.IMAGES)
+        needs.find_command("nft")
+        # What a container may lack although it has all rights: try it on one host.
+        name = f"try-{uuid.uuid4().hex[:8]}"
+        groups.find_hierarchies()
+        with Lab(name, uniform(1, memory=64 * MIB, cpu=0.5, disk=16 * MIB)):
+            pass
+    except RosrmError as error:
+        return str(error).splitlines()[0]
+    return ""
+
+
+@pytest.fixture(scope="session", autouse=True)
+def lab_is_possible():
+    reason = why_not()
+    if reason:
+        pytest.skip(f"needs root and what a lab is made of: {reason}")
+
+
+def remains(lab: str) -> dict[str, set[str]]:
+    """All of this machine that a lab could leave behind; other labs may be made meanwhile."""
+    tops = [top for top in Path("/sys/fs/cgroup").rglob("rosrm-lab") if top.is_dir()]
+    losetup = ["losetup", "-n", "-O", "BACK-FILE"]
+    loops = subprocess.run(losetup, capture_output=True, text=True, check=True).stdout.splitlines()
+    mounts = Path("/proc/self/mounts").read_text().splitlines()
+    commands = {_text(path) for path in Path("/proc").glob("[0-9]*/cmdline")}
+    return {
+        "namespaces": {path.name for path in Path("/run/netns").glob(f"rosrm-lab:{lab}*")},
+        # pyroute2, as ip does, makes /run/netns a mount point with the first namespace, for good.
+        "mounts": {
+            line for line in mounts if lab in line or not {"rosrm-lab", "/run/netns"} & _words(line)
+        },
+        "groups": {str(path) for top in tops for path in top.rglob(f"{lab}*")},
+        "processes": {line for line in commands if lab in line and "rosrm/lab/inside" in line},
+        "loops": {line for line in loops if lab in line},
+        "files": {
+            str(path) for root in (store.RUN, store.IMAGES) for path in root.rglob(f"{lab}*")
+        },
+    }
+
+
+def _words(line: str) -> set[str]:
+    """What a mount is about: its target, and whether it is some lab's."""
+    return {line.split()[1]} | ({"rosrm-lab"} if "rosrm-lab" in line else set())
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_bytes().replace(b"\0", b" ").decode(errors="replace")
+    except OSError:
+        return ""
+
+
+@pytest.fixture
+def name():
+    """Of a lab, of which nothing is left after the test."""
+    chosen = f"t-{uuid.uuid4().hex[:8]}"
+    before = remains(chosen)
+    yield chosen
+    Lab(chosen).down()
+    assert remains(chosen) == before
+
+
+@pytest.fixture
+def lab(name):
+    """Two small hosts, and one without a quota."""
+    from rosrm.lab import HostPlan
+
+    hosts = uniform(2, memory=128 * MIB, cpu=0.5, disk=32 * MIB)
+    with Lab(name, [*hosts, HostPlan("desk", disk=32 * MIB)]) as made:
+        yield made

@@ -1,0 +1,181 @@
+"""A real master and real slaves on virtual hosts: the lab's limits are what they see."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from rosrm.lab import DATA, GIB, MIB, HostPlan, Lab, uniform
+
+ROSRM = str(Path(sys.executable).parent / "rosrm")
+#: Seconds for whatever a busy machine needs; nothing waits so long when all goes well.
+PATIENCE = 60.0
+MEMORY = 512 * MIB
+#: What `rosrm` says while the master is just starting.
+NO_MASTER_YET = 3
+
+
+class Cluster:
+    """A master on `desk`, and slaves on the other hosts."""
+
+    def __init__(self, lab: Lab, logs: Path):
+        self.lab = lab
+        self.logs = logs
+        self.started: list[subprocess.Popen] = []
+
+    def start(self, host: str, *words: str, **options) -> subprocess.Popen:
+        with (self.logs / f"{host}-{words[0]}.log").open("ab") as log:
+            part = self.lab.popen(host, [ROSRM, *words], stdout=log, stderr=log, **options)
+        self.started.append(part)
+        return part
+
+    def ask(self, *words: str) -> str:
+        return self.lab.exec("desk", [ROSRM, *words]).stdout
+
+    def hosts(self) -> dict[str, dict]:
+        done = self.lab.exec("desk", [ROSRM, "hosts", "--json"], check=False)
+        if done.returncode == NO_MASTER_YET:
+            return {}
+        return {row["name"]: row for row in json.loads(done.stdout)}
+
+    def processes(self) -> dict[str, dict]:
+        return {row["name"]: row for row in json.loads(self.ask("ps", "--json"))}
+
+    def wait(self, what: str, look, condition):
+        """Look until it is so; says what there was instead."""
+        deadline = time.monotonic() + PATIENCE
+        while True:
+            seen = look()
+            if condition(seen):
+                return seen
+            assert time.monotonic() < deadline, f"{what}: {seen}\n{self.said()}"
+            time.sleep(0.2)
+
+    def wait_for_hosts(self, **states: str):
+        return self.wait(
+            f"hosts {states}",
+            self.hosts,
+            lambda rows: all(n in rows and rows[n]["state"] in s for n, s in states.items()),
+        )
+
+    def said(self) -> str:
+        return "".join(f"{p.name}:\n{p.read_text()[-1500:]}\n" for p in self.logs.glob("*.log"))
+
+    def submit(self, *processes: dict) -> None:
+        file = self.logs / "work.yaml"
+        file.write_text(json.dumps({"processes": list(processes)}))
+        self.ask("submit", str(file))
+
+
+@pytest.fixture
+def cluster(name, tmp_path):
+    """Two hosts of half a gigabyte and half a core each, and a desk without a quota."""
+    hosts = uniform(2, memory=MEMORY, cpu=0.5, disk=64 * MIB)
+    with Lab(name, [*hosts, HostPlan("desk", disk=64 * MIB)]) as lab:
+        made = Cluster(lab, tmp_path)
+        made.start("desk", "master")
+        yield made
+    for part in made.started:  # the lab has ended them
+        part.wait(PATIENCE)
+
+
+def holding(name: str, megabytes: int) -> dict:
+    hold = f"x = bytearray({megabytes} << 20); print('held', flush=True)"
+    return {
+        "name": name,
+        "command": [sys.executable, "-ISc", f"{hold}; import time; time.sleep(999)"],
+        "needs": {"memory": f"{megabytes}MiB", "cpu": 0.1},
+    }
+
+
+@pytest.mark.timeout(300)
+def test_processes_go_to_the_hosts_that_have_room(cluster):
+    """Slaves without any file show the lab host as the whole; two large processes need two hosts.
+
+    Then a host is cut off and healed, loses its power and comes back.
+    """
+    for host in ("host1", "host2"):
+        cluster.start(host, "slave")
+    rows = cluster.wait_for_hosts(host1=["up"], host2=["up"])
+    for host, row in rows.items():
+        capacity = {one["name"]: (one["capacity"], one["scope"]) for one in row["resources"]}
+        assert row["hostname"] == host
+        assert capacity["memory"] == (MEMORY, "cgroup")
+        assert capacity["cpu"] == (0.5, "cgroup")
+        assert 50 * MIB < capacity["disk"][0] <= 64 * MIB
+
+    cluster.submit(holding("a", 250), holding("b", 250))
+    running = cluster.wait(
+        "both run", cluster.processes, lambda p: {one["state"] for one in p.values()} == {"running"}
+    )
+    assert {one["host"] for one in running.values()} == {"host1", "host2"}
+    assert cluster.ask("logs", "a") == "held\n"
+    cluster.wait(
+        "memory is seen against the limit of the host",
+        lambda: {
+            one["name"]: one["usage"] for one in cluster.hosts()["host1"]["resources"]
+        }["memory"],
+        lambda usage: usage > 250 * MIB / MEMORY,
+    )  # fmt: skip
+
+    cluster.lab.cut("host2")
+    cluster.wait_for_hosts(host1=["up"], host2=["suspect", "lost"])
+    cluster.lab.heal("host2")
+    cluster.wait_for_hosts(host1=["up"], host2=["up"])
+    assert {one["state"] for one in cluster.processes().values()} == {"running"}
+
+    cluster.lab.kill("host2")
+    cluster.wait_for_hosts(host1=["up"], host2=["lost"])
+    cluster.lab.boot("host2")
+    cluster.start("host2", "slave")
+    cluster.wait_for_hosts(host1=["up"], host2=["up"])
+
+
+@pytest.mark.timeout(300)
+def test_a_slave_beside_the_quota_of_its_jobs(cluster):
+    """The jobs have the host's limits, the slave has none and measures those of the jobs."""
+    lab, state = cluster.lab, f"{DATA}/slave"
+    lab.supervise("host1", state)
+    probes = {resource: {"group": lab.group("host1")} for resource in ("cpu", "memory")}
+    settings = {"host": "host1", "state": state, "probes": {**probes, "disk": {}}}
+    lab.outside("host1", "host.yaml").write_text(json.dumps(settings))
+    words = ("slave", "--config", f"{DATA}/host.yaml")
+    slave = cluster.start("host1", *words, limited=False)
+    rows = cluster.wait_for_hosts(host1=["up"])
+    capacity = {one["name"]: one["capacity"] for one in rows["host1"]["resources"]}
+    assert (capacity["memory"], capacity["cpu"]) == (MEMORY, 0.5)
+
+    group = {"name": "group", "kind": "job", "command": ["cat", "/proc/self/cgroup"]}
+    cluster.submit(group)
+    cluster.wait(
+        "the job ends", cluster.processes, lambda p: p["group"]["state"] in ("finished", "failed")
+    )
+    limits = cluster.ask("logs", "group")
+    assert f"{lab.group('host1')}\n" in limits
+    inner = [pid for pid in lab.pids("host1") if "rosrm.slave.run" in _command(pid)]
+    assert inner
+    assert lab.group("host1") not in Path(f"/proc/{inner[0]}/cgroup").read_text()
+    assert slave.poll() is None
+
+
+def _command(pid: int) -> str:
+    return Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode()
+
+
+@pytest.mark.timeout(300)
+def test_ten_hosts_find_one_master(name, tmp_path):
+    """As the evaluation needs them: discovery by multicast, and nobody is missed."""
+    hosts = uniform(10, memory=GIB // 2, disk=32 * MIB)
+    with Lab(name, [*hosts, HostPlan("desk", disk=64 * MIB)]) as lab:
+        cluster = Cluster(lab, tmp_path)
+        cluster.start("desk", "master")
+        for host in hosts:
+            cluster.start(host.name, "slave")
+        cluster.wait_for_hosts(**{host.name: ["up"] for host in hosts})
+    for part in cluster.started:
+        part.wait(PATIENCE)

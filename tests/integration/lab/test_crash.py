@@ -1,0 +1,226 @@
+"""Whatever is killed, nothing of a lab stays behind."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from rosrm.errors import LabError
+from rosrm.lab import MIB, Lab, all_labs, store, uniform
+from tests.integration.lab.conftest import remains
+
+PATIENCE = 30.0
+ROSRM = Path(sys.executable).parent / "rosrm"
+SIZES = ["-n", "2", "--memory", "64MiB", "--cpu", "0.5", "--disk", "16MiB"]
+
+#: Makes a lab, and kills itself before or after the n-th call of a function on the way.
+KILLED_AT = """
+import importlib, os, signal, sys
+from rosrm.lab import MIB, Lab, uniform
+lab, module, function, moment, count = sys.argv[1:]
+place = importlib.import_module(module)
+real, left = getattr(place, function), [int(count)]
+def deadly(*words, **more):
+    left[0] -= 1
+    if left[0] == 0 and moment == 'before': os.kill(os.getpid(), signal.SIGKILL)
+    result = real(*words, **more)
+    if left[0] == 0: os.kill(os.getpid(), signal.SIGKILL)
+    return result
+setattr(place, function, deadly)
+Lab(lab, uniform(2, memory=64 * MIB, cpu=0.5, disk=16 * MIB)).up()
+"""
+STEPS = [
+    ("rosrm.lab.store", "write", "before", 1),
+    ("rosrm.lab.store", "write", "after", 1),
+    ("rosrm.lab.network", "make_switch", "after", 1),
+    ("rosrm.lab.groups", "_make_group", "after", 1),
+    ("rosrm.lab.groups", "make", "after", 2),
+    ("rosrm.lab.disks", "make", "after", 1),
+    ("rosrm.lab.network", "plug_in", "before", 2),
+    ("rosrm.lab.network", "plug_in", "after", 1),
+    ("rosrm.lab.host", "_until_ready", "before", 1),  # the host is just booting
+    ("rosrm.lab.host", "_until_ready", "after", 1),
+    ("rosrm.lab.host", "_last_words", "after", 2),
+    ("rosrm.lab.store", "write", "before", 2),
+    ("rosrm.lab.store", "write", "after", 2),  # complete, but nobody was told
+]
+
+
+@pytest.mark.parametrize(("module", "function", "moment", "count"), STEPS)
+def test_a_killed_up_is_removed_wholly(name, module, function, moment, count):
+    """At each of its steps; by `down` as well as by the next `up`."""
+    before = remains(name)
+    command = [sys.executable, "-c", KILLED_AT, name, module, function, moment, str(count)]
+    killed = subprocess.run(command, check=False, timeout=PATIENCE * 2)
+    assert killed.returncode == -signal.SIGKILL
+
+    Lab(name).down()
+
+    assert remains(name) == before
+
+
+def test_a_second_up_removes_what_a_killed_one_left(name):
+    """And makes its own lab."""
+    command = [sys.executable, "-c", KILLED_AT, name, "rosrm.lab.host", "_last_words", "after", "1"]
+    subprocess.run(command, check=False, timeout=PATIENCE)
+    with pytest.raises(LabError, match="was not made to the end: `rosrm lab up` begins anew"):
+        Lab(name).status()
+    assert name in {one.name for one in all_labs()}
+    lab = Lab(name, uniform(1, disk=16 * MIB))
+    lab.up()
+    assert [row.name for row in lab.status()] == ["host1"]
+    assert lab.exec("host1", ["hostname"]).stdout == "host1\n"
+
+
+def test_a_lab_whose_owner_was_killed_was_left_behind(name):
+    """The next one of its name takes its place, although it was complete."""
+    code = (
+        "import os, signal, sys\nfrom rosrm.lab import Lab, MIB, uniform\n"
+        "with Lab(sys.argv[1], uniform(1, disk=16 * MIB)) as lab:\n"
+        "    lab.popen('host1', ['setsid', 'sleep', '1000'])\n"
+        "    os.kill(os.getpid(), signal.SIGKILL)"
+    )
+    subprocess.run([sys.executable, "-c", code, name], check=False, timeout=PATIENCE)
+    assert Lab(name).is_up("host1")
+    with Lab(name, uniform(1, disk=16 * MIB)) as lab:
+        assert lab.status()[0].processes == 0
+
+
+def test_a_lab_that_fails_while_it_is_made_leaves_nothing(name, monkeypatch):
+    """Here the second disk cannot be made."""
+    from rosrm.lab import disks
+
+    real = disks.make
+
+    def fails(image, host):
+        if host.name == "host2":
+            raise LabError("no room")
+        real(image, host)
+
+    monkeypatch.setattr(disks, "make", fails)
+    before = remains(name)
+    with pytest.raises(LabError, match="no room"):
+        Lab(name, uniform(2, disk=16 * MIB)).up()
+    assert remains(name) == before
+
+
+def test_a_host_that_cannot_boot_says_why(name, monkeypatch):
+    """The words of what failed, and nothing is left."""
+    from rosrm.lab import disks
+
+    monkeypatch.setattr(disks, "make", lambda image, host: (
+        image.parent.mkdir(parents=True, exist_ok=True), image.write_bytes(bytes(MIB))
+    ))  # fmt: skip
+    before = remains(name)
+    with pytest.raises(LabError, match=r"host1 .* could not be booted: mount -o loop"):
+        Lab(name, uniform(1, disk=16 * MIB)).up()
+    assert remains(name) == before
+
+
+@pytest.mark.parametrize("damage", ["", "{", "not json"])
+def test_down_needs_no_state_file(name, damage):
+    """A damaged one does no harm."""
+    before = remains(name)
+    lab = Lab(name, uniform(1, disk=16 * MIB))
+    lab.up()
+    process = lab.popen("host1", ["sleep", "1000"])  # at whatever stage it may be by then
+    (store.RUN / name / "lab.json").write_text(damage)
+    assert lab.down()
+    assert remains(name) == before
+    assert process.wait(PATIENCE) != 0  # killed, or it found the host gone
+    assert not lab.down()
+
+
+def test_down_ends_what_ignores_signals_and_daemons(lab):
+    """And what was started beside the quota."""
+    stubborn = "trap '' TERM INT HUP; (setsid sleep 1000 &) ; sleep 1000"
+    process = lab.popen("host1", ["sh", "-c", stubborn], limited=False)
+    deadline = time.monotonic() + PATIENCE
+    while len(lab.pids("host1")) < 3:  # the shell and two sleepers
+        assert time.monotonic() < deadline, "they did not start"
+        time.sleep(0.02)
+    pids = lab.pids("host1")
+    assert lab.down()
+    assert process.wait(PATIENCE) == -signal.SIGKILL
+    assert not [pid for pid in pids if Path(f"/proc/{pid}/status").exists() and _alive(pid)]
+
+
+def _alive(pid):
+    try:
+        return "State:\tZ" not in Path(f"/proc/{pid}/status").read_text()
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
+def test_ctrl_c_during_up_leaves_nothing(name):
+    """At whatever moment it comes."""
+    before = remains(name)
+    for wait in (0.6, 0.9, 1.2):
+        process = subprocess.Popen(
+            [ROSRM, "lab", "up", "--lab", name, *SIZES], stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT, start_new_session=True,
+        )  # fmt: skip
+        time.sleep(wait)  # anywhere on the way is good
+        os.killpg(process.pid, signal.SIGINT)
+        said, _ = process.communicate(timeout=PATIENCE)
+        assert b"Traceback" not in said
+        if process.returncode == 0:  # it was through already
+            Lab(name).down()
+        assert remains(name) == before
+
+
+def test_the_command_line_from_up_to_down(name):
+    """What a user types."""
+
+    def rosrm(*words):
+        done = subprocess.run(
+            [ROSRM, "lab", *words], capture_output=True, text=True, timeout=PATIENCE * 2,
+            env={**os.environ, "ROSRM_LAB": name}, check=False,
+        )  # fmt: skip
+        return done.returncode, done.stdout, done.stderr
+
+    code, out, err = rosrm("up", *SIZES, "--host", "desk:memory=none,cpu=none")
+    assert (code, err) == (0, "")
+    assert out.startswith(f"lab '{name}' is up: host1 10.")
+    assert rosrm("exec", "host1", "sh", "-c", "echo here; exit 7")[:2] == (7, "here\n")
+    assert rosrm("exec", "--env", "X=1", "host1", "--", "printenv", "X")[:2] == (0, "1\n")
+    assert rosrm("cut", "host1", "--direction", "in")[1] == "host1: in: cut\n"
+    assert rosrm("loss", "host1", "1%")[1] == "host1: in: cut, loss 1 %; out: loss 1 %\n"
+    assert rosrm("heal", "host1")[1] == "host1: the network is as it should be\n"
+    assert rosrm("kill", "host2")[0] == 0
+    rows = json.loads(rosrm("status", "--lab", name, "--json")[1])
+    assert [(row["name"], row["state"]) for row in rows] == [
+        ("host1", "up"), ("host2", "off"), ("desk", "up"),
+    ]  # fmt: skip
+    code, _, err = rosrm("exec", "host2", "true")
+    assert code == 1
+    assert "host2 of lab" in err
+    assert "boot host2" in err
+    assert rosrm("boot", "host2")[:2] == (0, "host2 is up\n")
+    assert rosrm("exec", "host9", "true")[0] == 2
+    assert rosrm("up", *SIZES)[0] == 1
+    assert rosrm("down")[:2] == (0, f"removed: {name}\n")
+    assert rosrm("down")[:2] == (0, f"no lab '{name}': nothing to remove\n")
+    assert rosrm("exec", "host1", "true")[0] == 1
+
+
+def test_an_ordinary_user_is_told_what_is_missing(name):
+    """No traceback, nothing made; the way without root is shown."""
+    nobody = ["setpriv", "--reuid=65534", "--regid=65534", "--clear-groups", "--inh-caps=-all"]
+    done = subprocess.run(
+        [*nobody, ROSRM, "lab", "up", "--lab", name, *SIZES], capture_output=True, text=True,
+        timeout=PATIENCE, check=False,
+    )  # fmt: skip
+    if "Permission denied" in done.stderr or "No module" in done.stderr:
+        pytest.skip("the environment is not readable for another user")
+    assert done.returncode == 1, done.stderr
+    assert "CAP_SYS_ADMIN for namespaces, mounts and control groups" in done.stderr
+    assert "budget: {memory: 64MiB, cpu: 0.5, disk: 16MiB}" in done.stderr
+    assert "Traceback" not in done.stderr

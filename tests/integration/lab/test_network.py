@@ -1,0 +1,192 @@
+"""What `cut`, `loss`, `delay` and `heal` do to packets."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+
+import pytest
+
+from rosrm.errors import ConfigError, LabError
+
+PYTHON = [sys.executable, "-ISc"]
+PORT = 9100
+#: Hears for a while, then says from whom how many packets came.
+HEAR = """
+import collections, socket, sys, time
+s = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+s.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 22)
+s.bind(('', 9100)); print('ready', flush=True)
+heard, end = collections.Counter(), None
+while True:
+    s.settimeout(None if end is None else max(0.01, end - time.monotonic()))
+    try: data, (sender, _) = s.recvfrom(999)
+    except TimeoutError: break
+    if data == b'end': end = time.monotonic() + 0.3
+    else: heard[sender] += 1
+print(dict(heard))
+"""
+SPEAK = """
+import socket, sys
+s = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+for _ in range(int(sys.argv[2])): s.sendto(b'x' * 100, (sys.argv[1], 9100))
+"""
+#: To the host itself: what ends the listening is never lost.
+END = """
+import socket
+socket.socket(socket.AF_INET, socket.SOCK_DGRAM).sendto(b'end', ('127.0.0.1', 9100))
+"""
+
+
+def heard(lab, at, *speakers, number=50):
+    """How many packets of each speaker a host hears."""
+    listener = lab.popen(at, [*PYTHON, HEAR], stdout=subprocess.PIPE)
+    assert listener.stdout.readline() == b"ready\n"
+    for speaker in speakers:
+        lab.exec(speaker, [*PYTHON, SPEAK, lab.address(at), str(number)])
+    lab.exec(at, [*PYTHON, END])
+    said, _ = listener.communicate(timeout=30)
+    counts = eval(said)
+    return [counts.get(lab.address(speaker), 0) for speaker in speakers]
+
+
+def test_a_cut_in_one_direction_is_one_direction(lab):
+    """`in`: the host hears nobody and is heard. `out`: the reverse. The others notice nothing."""
+    lab.cut("host1", "in")
+    assert heard(lab, "host1", "host2", "desk") == [0, 0]
+    assert heard(lab, "host2", "host1", "desk") == [50, 50]
+    lab.heal("host1")
+    lab.cut("host1", "out")
+    assert heard(lab, "host1", "host2", "desk") == [50, 50]
+    assert heard(lab, "host2", "host1", "desk") == [0, 50]
+    lab.cut("host1")
+    assert heard(lab, "host1", "host2") == [0]
+    lab.heal("host1")
+    assert heard(lab, "host1", "host2") == [50]
+    assert heard(lab, "host2", "host1") == [50]
+
+
+def test_multicast_is_cut_too(lab):
+    """DDS finds its peers by it."""
+    listen = HEAR.replace(
+        "print('ready'",
+        "s.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, "
+        "socket.inet_aton('239.255.0.1') + socket.inet_aton(sys.argv[1])); print('ready'",
+    )
+    send_from = "s.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, "
+    speak = SPEAK.replace("for _", f"{send_from}socket.inet_aton(sys.argv[3]))\nfor _")
+    counts = []
+    for fault in (None, "out", "heal"):
+        if fault == "out":
+            lab.cut("host2", "out")
+        elif fault == "heal":
+            lab.heal("host2")
+        hears = lab.popen("host1", [*PYTHON, listen, lab.address("host1")], stdout=subprocess.PIPE)
+        assert hears.stdout.readline() == b"ready\n"
+        lab.exec("host2", [*PYTHON, speak, "239.255.0.1", "20", lab.address("host2")])
+        lab.exec("host1", [*PYTHON, END])
+        counts.append(eval(hears.communicate(timeout=30)[0]).get(lab.address("host2"), 0))
+    assert counts == [20, 0, 20]
+
+
+def test_a_share_of_the_packets_is_lost(lab):
+    """20 % of 3,000 is 600; six standard deviations are 131."""
+    lab.loss("host1", 0.2, "in")
+    (arrived,) = heard(lab, "host1", "host2", number=3000)
+    assert 2400 - 131 < arrived < 2400 + 131
+    assert heard(lab, "host2", "host1", number=300) == [300]
+    lab.loss("host1", 1.0)
+    assert heard(lab, "host2", "host1") == [0]
+    lab.loss("host1", 0.0)
+    assert heard(lab, "host1", "host2", number=300) == [300]
+
+
+def test_faults_add_up_and_are_healed_together(lab):
+    """The status has them in words."""
+    lab.loss("host1", 0.01)
+    lab.cut("host1", "out")
+    assert lab.status()[0].network == "in: loss 1 %; out: cut, loss 1 %"
+    lab.heal("host1")
+    assert lab.status()[0].network == ""
+
+
+def test_a_cut_outlives_a_power_cut(lab):
+    """It is the cable that is cut, not the host."""
+    lab.cut("host1", "in")
+    lab.kill("host1")
+    lab.boot("host1")
+    assert heard(lab, "host1", "host2") == [0]
+    assert heard(lab, "host2", "host1") == [50]
+
+
+ROUND = """
+import socket, sys, time
+s = socket.socket(socket.AF_INET, socket.SOCK_DGRAM); s.settimeout(5)
+s.sendto(b'x', (sys.argv[1], 9200)); s.recv(9)
+begin = time.monotonic()
+s.sendto(b'x', (sys.argv[1], 9200)); s.recv(9)
+print(time.monotonic() - begin)
+"""
+BACK = """
+import socket
+s = socket.socket(socket.AF_INET, socket.SOCK_DGRAM); s.bind(('', 9200)); print('ready', flush=True)
+while True: s.sendto(*s.recvfrom(9))
+"""
+
+
+def test_packets_are_late_or_the_kernel_cannot(lab):
+    """Both ways by 50 ms: 100 ms a round. Without netem: said, and nothing changed."""
+    back = lab.popen("host2", [*PYTHON, BACK], stdout=subprocess.PIPE)
+    assert back.stdout.readline() == b"ready\n"
+    try:
+        lab.delay("host1", 0.05)
+    except LabError as error:
+        said = str(error)
+    else:
+        said = ""
+    if said:
+        assert "no netem" in said
+        assert "Nothing was changed" in said
+        assert lab.status()[0].network == ""
+        assert float(lab.exec("host1", [*PYTHON, ROUND, "host2"]).stdout) < 0.05
+    else:
+        assert float(lab.exec("host1", [*PYTHON, ROUND, "host2"]).stdout) >= 0.1
+        lab.kill("host1")
+        lab.boot("host1")
+        assert float(lab.exec("host1", [*PYTHON, ROUND, "host2"]).stdout) >= 0.1
+        lab.heal("host1")
+        assert float(lab.exec("host1", [*PYTHON, ROUND, "host2"]).stdout) < 0.05
+    back.kill()
+    back.communicate()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda lab: lab.cut("host9"),
+        lambda lab: lab.cut("host1", "sideways"),
+        lambda lab: lab.loss("host1", 1.5),
+        lambda lab: lab.delay("host1", -1.0),
+        lambda lab: lab.kill("host9"),
+        lambda lab: lab.boot("host9"),
+    ],
+)
+def test_bad_input_changes_nothing(lab, change):
+    """One clear error each."""
+    before = lab.status()
+    with pytest.raises(ConfigError):
+        change(lab)
+    after = lab.status()
+    assert [(row.name, row.state, row.network) for row in after] == [
+        (row.name, row.state, row.network) for row in before
+    ]
+
+
+def test_changing_the_network_takes_a_moment_only(lab):
+    """A chaos test cuts and heals many times."""
+    begin = time.monotonic()
+    for _ in range(5):
+        lab.cut("host1", "in")
+        lab.heal("host1")
+    assert time.monotonic() - begin < 10.0

@@ -1,0 +1,167 @@
+"""A command on a host behaves as if it were typed there."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pty
+import select
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from rosrm.errors import LabError
+
+PATIENCE = 30.0
+PYTHON = [sys.executable, "-ISc"]
+#: Says each signal it gets, and ends with SIGTERM.
+TELL = """
+import os, signal, sys
+def tell(number, frame):
+    os.write(1, signal.Signals(number).name.encode() + b'\\n')
+    if number == signal.SIGTERM: sys.exit(9)
+for number in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP):
+    signal.signal(number, tell)
+print('ready', flush=True)
+while True: signal.pause()
+"""
+
+
+def test_exit_codes_and_signals_are_the_commands(lab):
+    """Ends and deaths alike."""
+    for code in (0, 1, 42, 255):
+        assert lab.exec("host1", ["sh", "-c", f"exit {code}"], check=False).returncode == code
+    for number in (signal.SIGTERM, signal.SIGKILL, signal.SIGSEGV, signal.SIGINT):
+        died = lab.exec("host1", ["sh", "-c", f"kill -{int(number)} $$"], check=False)
+        assert died.returncode == -number
+
+
+def test_a_command_that_is_not_there(lab, tmp_path):
+    """As shells say it, with the host's name."""
+    missing = lab.exec("host1", ["no-such-command"], check=False)
+    assert (missing.returncode, missing.stderr) == (
+        127,
+        "rosrm: on host1: no-such-command: no such command\n",
+    )
+    text = tmp_path / "text"
+    text.write_text("no program")
+    assert lab.exec("host1", [str(text)], check=False).returncode == 126
+    with pytest.raises(LabError, match="no-such-command on host1 ended with 127"):
+        lab.exec("host1", ["no-such-command"])
+
+
+def test_standard_input_reaches_the_command(lab):
+    """And its end too."""
+    assert lab.exec("host1", ["wc", "-c"], input="x" * 100_000).stdout.strip() == "100000"
+
+
+def test_the_directory_is_the_callers(lab, tmp_path, monkeypatch):
+    """Where the host has it; else its disk."""
+    monkeypatch.chdir(tmp_path)
+    assert lab.exec("host1", ["pwd"]).stdout.strip() == str(tmp_path)
+    there = lab.popen("host1", ["pwd"], cwd="/run/rosrm-lab", stdout=subprocess.PIPE)
+    assert there.communicate()[0] == b"/run/data\n"
+
+
+def test_signals_are_passed_on(lab):
+    """Each once, and the command decides what they mean."""
+    process = lab.popen("host1", [*PYTHON, TELL], stdout=subprocess.PIPE)
+    assert process.stdout.readline() == b"ready\n"
+    for number in (signal.SIGUSR1, signal.SIGINT, signal.SIGHUP):
+        process.send_signal(number)
+        assert process.stdout.readline().decode().strip() == number.name
+    process.terminate()
+    assert process.communicate(timeout=PATIENCE)[0] == b"SIGTERM\n"
+    assert process.returncode == 9
+
+
+def test_killing_the_relay_kills_the_command(lab):
+    """`kill()` of what `popen` returns would else leave it behind."""
+    process = lab.popen("host1", [*PYTHON, TELL], stdout=subprocess.PIPE)
+    assert process.stdout.readline() == b"ready\n"
+    (inner,) = lab.pids("host1")
+    descriptor = os.pidfd_open(inner)
+    process.kill()
+    assert select.select([descriptor], [], [], PATIENCE)[0], "the command lives on"
+    os.close(descriptor)
+    process.communicate()
+
+
+def test_a_command_that_takes_too_long_is_killed(lab):
+    """With all that it is."""
+    with pytest.raises(subprocess.TimeoutExpired):
+        lab.exec("host1", ["sleep", "1000"], timeout=1.0)
+    deadline = time.monotonic() + PATIENCE
+    while lab.pids("host1"):
+        assert time.monotonic() < deadline, "it lives on"
+        time.sleep(0.02)
+
+
+@pytest.fixture
+def terminal(lab):
+    """`rosrm lab exec` in a terminal; what it says can be awaited."""
+    opened = []
+
+    def run(*words):
+        pid, master = pty.fork()
+        if pid == 0:
+            os.execv(
+                Path(sys.executable).parent / "rosrm",
+                ["rosrm", "lab", "exec", "--lab", lab.name, "host1", *words],
+            )
+        opened.append((pid, master))
+        return pid, master
+
+    yield run
+    for pid, master in opened:
+        os.close(master)
+        with contextlib.suppress(ChildProcessError, ProcessLookupError):  # it has been waited for
+            os.kill(pid, signal.SIGKILL)
+            os.waitpid(pid, 0)
+
+
+def _read_until(master, wanted):
+    said, deadline = b"", time.monotonic() + PATIENCE
+    while wanted not in said:
+        left = deadline - time.monotonic()
+        assert left > 0, f"{wanted!r} was not said, but {said!r}"
+        if select.select([master], [], [], left)[0]:
+            try:
+                said += os.read(master, 4096)
+            except OSError:
+                pytest.fail(f"it ended before it said {wanted!r}: {said!r}")
+    return said
+
+
+def test_ctrl_c_reaches_the_command_once(terminal):
+    """The terminal sends it to relay and command: the relay must not send it again."""
+    pid, master = terminal(sys.executable, "-ISc", TELL)
+    _read_until(master, b"ready")
+    os.write(master, b"\x03")
+    said = _read_until(master, b"SIGINT")
+    os.kill(pid, signal.SIGUSR1)
+    said += _read_until(master, b"SIGUSR1")
+    assert said.count(b"SIGINT") == 1
+    os.kill(pid, signal.SIGTERM)
+    _read_until(master, b"SIGTERM")
+    assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 9
+
+
+def test_a_shell_on_a_host_has_a_terminal(terminal):
+    """With job control: Ctrl-C ends what runs in it, and not the shell."""
+    pid, master = terminal("bash", "--norc", "-i")
+    os.write(master, b"tty -s && echo on-$(hostname)-with-a-tty\n")
+    _read_until(master, b"on-host1-with-a-tty\r\n")
+    os.write(master, b"sleep 1000\n")
+    _read_until(master, b"sleep 1000\r\n")
+    time.sleep(0.5)  # the shell hands the terminal on; nothing tells when
+    os.write(master, b"\x03")
+    os.write(master, b"echo still-$((40 + 2))\n")
+    _read_until(master, b"still-42")
+    os.write(master, b"exit 3\n")
+    _, status = os.waitpid(pid, 0)
+    assert os.waitstatus_to_exitcode(status) == 3

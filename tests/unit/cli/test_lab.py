@@ -1,0 +1,120 @@
+"""The options of `rosrm lab`, and bad input."""
+
+from __future__ import annotations
+
+import pytest
+
+from rosrm.cli.lab import fraction, planned
+from rosrm.errors import ConfigError
+from rosrm.lab import GIB, MIB, HostPlan, needs
+
+LIMITS = {"memory": "1GiB", "cpu": "0.5", "disk": "2GiB"}
+
+
+@pytest.fixture
+def without_rights(monkeypatch):
+    """As an ordinary user."""
+    monkeypatch.setattr(needs, "CAPABILITIES", {"CAP_SYS_TEST": (63, "for this test")})
+
+
+def test_hosts_alike():
+    """The words of the issue's own example."""
+    assert planned(2, LIMITS, []) == [
+        HostPlan("host1", GIB, 0.5, 2 * GIB),
+        HostPlan("host2", GIB, 0.5, 2 * GIB),
+    ]
+
+
+def test_a_host_of_its_own_and_one_that_differs():
+    """What is not said is as for the others; `none` lifts a limit."""
+    hosts = planned(2, LIMITS, ["desk:memory=none,cpu=none", "host2:cpu=2"])
+    assert hosts[1] == HostPlan("host2", GIB, 2.0, 2 * GIB)
+    assert hosts[2] == HostPlan("desk", None, None, 2 * GIB)
+    assert planned(1, LIMITS, ["desk"])[1] == HostPlan("desk", GIB, 0.5, 2 * GIB)
+
+
+def test_numbers_are_base_units():
+    """Bytes and cores, as in the files."""
+    limits = {"memory": "67108864", "cpu": "0.5 cores", "disk": "33554432"}
+    assert planned(1, limits, []) == [HostPlan("host1", 64 * MIB, 0.5, 32 * MIB)]
+
+
+@pytest.mark.parametrize(
+    ("changes", "more", "said"),
+    [
+        ({"memory": "1GX"}, [], "memory of host1: unknown unit 'GX'"),
+        ({"cpu": "half"}, [], "cpu of host1: 'half' is not a number"),
+        ({"disk": "none"}, [], "host host1: a disk has a size"),
+        ({"memory": "-1GiB"}, [], "memory of host1"),
+        ({}, ["desk:ram=1GiB"], "'ram' is no limit; allowed: memory=..., cpu=..., disk=..."),
+        ({}, ["desk:memory"], "'memory' is no limit"),
+        ({}, ["de sk"], "'de sk' cannot be the name of a host"),
+        ({}, [":cpu=1"], "'' cannot be the name of a host"),
+    ],
+)
+def test_what_is_wrong_is_said_with_its_place(changes, more, said):
+    """And what is allowed."""
+    with pytest.raises(ConfigError) as raised:
+        planned(1, {**LIMITS, **changes}, more)
+    assert said in str(raised.value)
+
+
+@pytest.mark.parametrize("number", [-1, 0, 251])
+def test_a_wrong_number_is_refused(number):
+    """None at all is right only with --host."""
+    with pytest.raises(ConfigError, match="allowed are 1 to 250"):
+        planned(number, LIMITS, [])
+    assert planned(0, LIMITS, ["desk"])
+
+
+@pytest.mark.parametrize(("text", "value"), [("1%", 0.01), ("0.01", 0.01), ("100%", 1.0), ("0", 0)])
+def test_a_share_is_percent_or_a_fraction(text, value):
+    """Both are usual."""
+    assert fraction(text) == pytest.approx(value)
+
+
+@pytest.mark.parametrize("text", ["1", "5", "x", "%", "101%", "1.5", "-1%", "nan"])
+def test_what_is_no_share_is_refused(text):
+    """A bare 1 may be meant as 1 % or as all."""
+    with pytest.raises(ConfigError):
+        fraction(text)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("up",),
+        ("exec", "host1", "true"),
+        ("cut", "host1"),
+        ("heal", "host1"),
+        ("loss", "host1", "1%"),
+        ("delay", "host1", "50ms"),
+        ("kill", "host1"),
+        ("boot", "host1"),
+        ("status",),
+        ("down",),
+    ],
+)
+def test_without_root_the_right_is_named_and_slices_are_offered(rosrm, without_rights, words):
+    """One message, no traceback, exit code 1."""
+    result = rosrm("lab", *words)
+    assert result.code == 1
+    assert result.err.startswith("rosrm: a lab needs rights that are missing: CAP_SYS_TEST")
+    assert "scope: slice" in result.err
+    assert not result.out
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("up", "--subnet", "10.9.8.7/24"), "give an IPv4 range"),
+        (("up", "--lab", "a:b"), "cannot be the name of a lab"),
+        (("up", "--memory", "lots"), "memory of host1: 'lots'"),
+        (("cut", "host1", "--direction", "up"), "'up'"),
+    ],
+)
+def test_bad_input_is_refused_before_anything_is_looked_at(rosrm, words, said):
+    """Exit code 2: nothing was done."""
+    result = rosrm("lab", *words)
+    assert result.code == 2
+    assert said in result.err

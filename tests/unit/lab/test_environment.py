@@ -1,0 +1,40 @@
+"""What a process on a host inherits of the terminal."""
+
+from __future__ import annotations
+
+from rosrm.lab.host import host_environment
+
+
+def test_discovery_reaches_the_lab_whatever_the_terminal_says():
+    """A caller who stays on loopback outside would find nobody inside."""
+    caller = {
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "ROS_LOCALHOST_ONLY": "1",
+        "ROS_STATIC_PEERS": "192.168.1.5",
+        "ROS_DISCOVERY_SERVER": "192.168.1.5:11811",
+    }
+    inside = host_environment(caller, "host1")
+    assert inside["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "SUBNET"
+    assert not {"ROS_LOCALHOST_ONLY", "ROS_STATIC_PEERS", "ROS_DISCOVERY_SERVER"} & set(inside)
+
+
+def test_the_rest_is_the_terminals():
+    """PATH, the domain, and what else a user has set."""
+    caller = {"PATH": "/opt/bin:/bin", "ROS_DOMAIN_ID": "7", "MINE": "x"}
+    assert caller.items() <= host_environment(caller, "host1").items()
+
+
+def test_what_is_written_goes_to_the_disk_of_the_host():
+    """States, temporary files and logs."""
+    inside = host_environment({"ROS_LOG_DIR": "/root/logs", "TMPDIR": "/tmp/x"}, "host1")
+    assert {inside[name] for name in ("XDG_STATE_HOME", "TMPDIR", "ROS_HOME")} == {
+        "/run/data/state",
+        "/run/data/tmp",
+        "/run/data/ros",
+    }
+    assert "ROS_LOG_DIR" not in inside
+
+
+def test_a_slave_measures_the_host_without_being_told():
+    """By the variable that gives the default of `scope`."""
+    assert host_environment({}, "host1")["ROSRM_SCOPE"] == "cgroup"

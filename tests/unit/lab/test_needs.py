@@ -1,0 +1,115 @@
+"""What is missing on a machine is said before anything is made."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from rosrm.errors import LabError
+from rosrm.lab import needs
+from rosrm.lab.plan import GIB, MIB, HostPlan, uniform
+
+ALL = sum(1 << bit for bit, _ in needs.CAPABILITIES.values())
+
+
+def status(effective):
+    return f"Name:\tpython\nCapPrm:\t{effective:016x}\nCapEff:\t{effective:016x}\nSeccomp:\t0\n"
+
+
+def test_with_all_rights_nothing_is_said():
+    """More than those needed do no harm."""
+    needs.check_rights(status=status(ALL | 1))
+
+
+@pytest.mark.parametrize("name", needs.CAPABILITIES)
+def test_the_missing_right_is_named_and_no_other(name):
+    """With what it is needed for."""
+    bit, reason = needs.CAPABILITIES[name]
+    with pytest.raises(LabError, match=f"missing: {name} {reason}\\. ") as raised:
+        needs.check_rights(status=status(ALL & ~(1 << bit)))
+    assert sum(other in str(raised.value) for other in needs.CAPABILITIES) == 1
+
+
+def test_an_ordinary_user_is_told_of_sudo_and_of_slices(monkeypatch):
+    """The slices have the sizes that were asked for."""
+    monkeypatch.setattr("os.geteuid", lambda: 1000)
+    hosts = uniform(3, memory=512 * MIB, cpu=0.5, disk=GIB)
+    with pytest.raises(LabError) as raised:
+        needs.check_rights(hosts, status(0))
+    said = str(raised.value)
+    assert "sudo" in said
+    assert "{host: host1, scope: slice, budget: {memory: 512MiB, cpu: 0.5, disk: 1024MiB}}" in said
+
+
+def test_root_of_a_container_is_told_of_privileges(monkeypatch):
+    """`sudo` would not help there."""
+    monkeypatch.setattr("os.geteuid", lambda: 0)
+    with pytest.raises(LabError, match="docker run --privileged"):
+        needs.check_rights(status=status(0xA80425FB))  # what Docker gives
+
+
+def test_the_slice_that_is_offered_is_a_good_file(tmp_path):
+    """Who follows the advice gets a slave's configuration."""
+    from rosrm.config import load_host
+
+    with pytest.raises(LabError) as raised:
+        needs.check_rights(uniform(1, memory=GIB), status(0))
+    line = next(line for line in str(raised.value).splitlines() if ".yaml:  {" in line)
+    file = tmp_path / "host1.yaml"
+    file.write_text(line.partition(".yaml:")[2].strip())
+    assert load_host(file).budget == {"memory": GIB, "cpu": 1.0, "disk": GIB}
+
+
+@pytest.mark.parametrize("command", needs.COMMANDS)
+def test_a_missing_command_is_named_with_its_package(monkeypatch, command):
+    """Of Debian and Ubuntu."""
+    monkeypatch.setattr("shutil.which", lambda name, path: None)
+    package = needs.COMMANDS[command]
+    with pytest.raises(LabError, match=f"'{command}' is missing.*apt-get install {package}"):
+        needs.find_command(command)
+
+
+def test_too_little_memory_is_refused(monkeypatch):
+    """What there is, and what was asked for."""
+    monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(available=GIB))
+    hosts = uniform(3, memory=512 * MIB, disk=16 * MIB)
+    with pytest.raises(LabError, match="1536 MiB of memory together, and 1024 MiB are available"):
+        needs.check_machine(hosts, Path("/"))
+
+
+def test_hosts_without_a_limit_ask_for_no_memory(monkeypatch):
+    """They share what there is."""
+    monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(available=GIB))
+    monkeypatch.setattr(needs, "find_command", lambda name: name)
+    monkeypatch.setattr(Path, "exists", lambda path: True)
+    needs.check_machine([HostPlan("a", disk=16 * MIB)], Path("/"))
+
+
+def test_too_little_disk_is_refused(monkeypatch, tmp_path):
+    """The folder need not be there yet."""
+    monkeypatch.setattr(needs, "find_command", lambda name: name)
+    monkeypatch.setattr(needs, "_DEVICE", tmp_path)
+    monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=GIB))
+    with pytest.raises(
+        LabError, match=f"2048 MiB together, and 1024 MiB are free under {tmp_path}"
+    ):
+        needs.check_machine(uniform(2), tmp_path / "not" / "there")
+
+
+def test_a_machine_without_loop_devices_is_told_how_to_get_them(monkeypatch, tmp_path):
+    """The disks of the hosts are files that are mounted."""
+    monkeypatch.setattr(needs, "find_command", lambda name: name)
+    monkeypatch.setattr(needs, "_DEVICE", tmp_path / "none")
+    with pytest.raises(LabError, match=r"no loop devices.*modprobe loop"):
+        needs.check_machine(uniform(1), tmp_path)
+
+
+def test_more_cores_than_there_are_is_only_noted(monkeypatch):
+    """It is a fair wish, and slow."""
+    monkeypatch.setattr("psutil.cpu_count", lambda: 2)
+    assert needs.overbooked(uniform(4, cpu=0.5)) == ""
+    assert "may use 2.5 cores together and this machine has 2" in needs.overbooked(
+        uniform(5, cpu=0.5)
+    )

@@ -1,0 +1,117 @@
+"""What is wrong with a network, in words and as firewall rules."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rosrm.errors import ConfigError
+from rosrm.lab.wires import Link, check_delay, check_loss, from_plain, ruleset, to_plain
+
+
+def rules(**links):
+    return [line.strip() for line in ruleset(links).splitlines() if "port" in line]
+
+
+def test_what_a_host_hears_leaves_the_switch_through_its_port():
+    """`in` is seen from the host, the rule from the switch."""
+    assert rules(port1=Link().changed("in", cut=True)) == ['oifname "port1" drop']
+
+
+def test_what_is_heard_of_a_host_enters_the_switch_through_its_port():
+    """And nothing is said of the other direction."""
+    assert rules(port1=Link().changed("out", cut=True)) == ['iifname "port1" drop']
+
+
+def test_a_whole_port_is_sound():
+    """Without faults there are no rules, and all frames pass."""
+    assert rules(port1=Link(), port2=Link()) == []
+    assert "policy accept" in ruleset({})
+
+
+def test_loss_is_by_chance_in_each_direction():
+    """1 % is 10,000 in a million."""
+    assert rules(port2=Link().changed("both", loss=0.01)) == [
+        'oifname "port2" numgen random mod 1000000 < 10000 drop',
+        'iifname "port2" numgen random mod 1000000 < 10000 drop',
+    ]
+
+
+def test_a_loss_of_everything_is_a_cut():
+    """Nft knows no number as large as its own modulus."""
+    assert rules(port1=Link().changed("in", loss=1.0)) == ['oifname "port1" drop']
+
+
+def test_a_cut_says_all_that_loss_would():
+    """One rule for a direction."""
+    link = Link().changed("both", loss=0.5).changed("out", cut=True)
+    assert rules(port1=link) == [
+        'oifname "port1" numgen random mod 1000000 < 500000 drop',
+        'iifname "port1" drop',
+    ]
+
+
+def test_addresses_can_be_asked_for_during_a_cut():
+    """Else a cut in one direction would soon be one in both."""
+    text = ruleset({"port1": Link().changed("in", cut=True)})
+    assert text.index("ether type arp accept") < text.index("drop")
+
+
+def test_the_old_rules_go_as_the_new_ones_come():
+    """The ruleset replaces itself, also where there was none."""
+    lines = ruleset({}).splitlines()
+    assert lines[:2] == ["table bridge rosrm_lab", "delete table bridge rosrm_lab"]
+
+
+@pytest.mark.parametrize(
+    ("link", "words"),
+    [
+        (Link(), ""),
+        (Link().changed("both", cut=True), "cut"),
+        (Link().changed("in", cut=True), "in: cut"),
+        (Link().changed("both", loss=0.015, delay=0.05), "loss 1.5 %, delay 50 ms"),
+        (Link().changed("in", cut=True).changed("out", loss=0.1), "in: cut; out: loss 10 %"),
+    ],
+)
+def test_a_link_in_words(link, words):
+    """Directions are named where they differ."""
+    assert link.describe() == words
+
+
+def test_a_healed_link_is_a_new_one():
+    """Nothing stays behind."""
+    bad = Link().changed("in", cut=True, loss=0.2).changed("out", delay=1.0)
+    assert bad.changed("both", cut=False, loss=0.0, delay=0.0) == Link()
+
+
+def test_what_is_no_direction_is_refused():
+    """Nothing is changed by a word that is not understood."""
+    with pytest.raises(ConfigError, match="'sideways'; allowed: in, out, both"):
+        Link().changed("sideways", cut=True)
+
+
+@pytest.mark.parametrize("share", [-0.01, 1.01, float("nan"), float("inf")])
+def test_a_loss_that_is_no_fraction_is_refused(share):
+    """Nan compares with nothing, and is refused too."""
+    with pytest.raises(ConfigError, match=r"not within 0..1"):
+        check_loss(share)
+
+
+@pytest.mark.parametrize("seconds", [-1.0, 61.0, float("nan")])
+def test_a_delay_that_cannot_be_is_refused(seconds):
+    """The kernel's limits, and sense."""
+    with pytest.raises(ConfigError, match=r"not within 0..60 s"):
+        check_delay(seconds)
+
+
+wires = st.tuples(st.booleans(), st.floats(0, 1), st.floats(0, 60))
+
+
+@given(wires, wires)
+def test_links_survive_their_file(into, out):
+    """Nothing of them is lost on the way."""
+    names = ("cut", "loss", "delay")
+    link = Link().changed("in", **dict(zip(names, into, strict=True)))
+    links = {"a": link.changed("out", **dict(zip(names, out, strict=True))), "b": Link()}
+    assert from_plain(to_plain(links)) == links
