@@ -117,9 +117,14 @@ def _changes(request: Request) -> list[Node]:
 def _holds_record(path: Path) -> bool:
     try:
         with path.open("rb") as file:
-            return is_record(file.read(_LONGEST_OPENING))
+            beginning = file.read(_LONGEST_OPENING)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+    if is_record(beginning):
+        return True
+    if b"\0" in beginning:
+        raise ConfigError(f"{path}: is neither the record of a master's run nor a workload in YAML")
+    return False
 
 
 def _ended(workload: Workload, until: str) -> Workload:
@@ -153,6 +158,14 @@ def _of_record(request: Request, changes: Sequence[Node], registry: Registry) ->
     return Report(
         workload, tuple(runs), recording, replayed, compare(runs[0].outcome, runs[1].outcome)
     )
+
+
+def agreement_of(path: Path) -> Agreement:
+    """How closely the simulation of a recorded run agrees with it; raises as `carry_out`."""
+    agreement = carry_out(Request(path)).agreement
+    if agreement is None:
+        raise ConfigError(f"{path}: is a workload; only the record of a run can be compared")
+    return agreement
 
 
 def load_record(path: Path, *, cut: bool = False) -> Recording:

@@ -13,6 +13,7 @@ from rosrm.core import events as happened
 from rosrm.core.columns import FloatArray
 from rosrm.core.commands import Command
 from rosrm.core.hosts import HostCondition
+from rosrm.core.model import Kind
 from rosrm.core.processes import ProcessPhase
 from rosrm.core.state import MasterState
 from rosrm.ports import Record
@@ -51,8 +52,8 @@ class Outcome:
         finished, running, waiting, ended_otherwise: where they stand at the end; they add up to
             `processes`. Waiting: in the queue, or set aside as no host may take it.
         never_placed: process name to the reason, of those that never got a host.
-        makespan: seconds from the first arrival to the last end; None: not all of them have ended,
-            or none by itself.
+        makespan: seconds from the first arrival to the end of the last job; None: a job has not
+            finished, or there is none.
         wait_mean, wait_max: seconds from arrival to the first host, of those that got one.
         migrations, failed_migrations: moves that were done, and that were not.
         imbalance: by resource, fullest minus emptiest host, fraction, mean over time.
@@ -230,7 +231,7 @@ class Meter:
             waiting=sum(phase in waiting for phase in phases),
             ended_otherwise=over - finished,
             never_placed=never,
-            makespan=self._last_end() - first if finished and over == len(phases) else None,
+            makespan=self._makespan(state, first),
             wait_mean=float(np.mean(waits)) if waits else 0.0,
             wait_max=max(waits, default=0.0),
             migrations=self._migrations, failed_migrations=self._failed,
@@ -242,8 +243,11 @@ class Meter:
             curves=self._curves(state, first), events=self.events,
         )  # fmt: skip
 
-    def _last_end(self) -> float:
-        return max(self._ends.values(), default=self._first)
+    def _makespan(self, state: MasterState, first: float) -> float | None:
+        jobs = [one for one in state.processes.values() if one.spec.kind is Kind.JOB]
+        if not jobs or any(job.phase is not ProcessPhase.FINISHED for job in jobs):
+            return None
+        return max(self._ends.get(job.name, first) for job in jobs) - first
 
     def _curves(self, state: MasterState, first: float) -> Curves:
         hosts = tuple(host.name for host in state.hosts.hosts)

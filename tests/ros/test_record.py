@@ -8,7 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from rosrm.cli.simulation_runs import Request, carry_out, load_record, replay_record
+from rosrm.cli.simulation_runs import (
+    Request,
+    agreement_of,
+    carry_out,
+    load_record,
+    replay_record,
+)
 from rosrm.config.settings import MigrationSettings, ProcessDefaults, RecordSettings
 from rosrm.core.model import MigrationPolicy
 from rosrm.errors import RecordError
@@ -118,3 +124,4 @@ def test_the_simulation_of_the_run_agrees_with_it(records):
     assert agreement.ranked["memory"] < 0.10
     assert agreement.balance["memory"] < 0.15
     assert agreement.migrations[0] == 1
+    assert agreement == agreement_of(records[0])

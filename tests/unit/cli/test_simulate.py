@@ -8,6 +8,8 @@ import sys
 import pytest
 
 from rosrm.cli import simulation_picture
+from rosrm.cli.simulation_runs import agreement_of
+from rosrm.errors import ConfigError
 from tests.unit.simulation.workloads import host, plan, recorded, simulation
 
 WORKLOAD = """
@@ -191,6 +193,19 @@ def test_a_seed_makes_no_sense_for_a_record(rosrm, record):
     result = rosrm("simulate", record, "--seed", "3")
     assert result.code == 2
     assert "--seed is for workloads" in result.err
+
+
+def test_a_file_of_another_kind_is_named(rosrm, tmp_path):
+    (tmp_path / "map.npz").write_bytes(b"PK\3\4\0\0")
+    result = rosrm("simulate", tmp_path / "map.npz")
+    assert result.code == 2
+    assert "map.npz: is neither the record of a master's run nor a workload in YAML" in result.err
+
+
+def test_how_closely_a_run_was_simulated_can_be_asked_for(record, workload):
+    assert agreement_of(record).same_host == 1.0
+    with pytest.raises(ConfigError, match="only the record of a run can be compared"):
+        agreement_of(workload)
 
 
 def test_a_file_that_is_not_there_is_named(rosrm, tmp_path):

@@ -152,7 +152,7 @@ def test_the_workload_in_the_how_to_loads_and_runs(load):
     text = (ROOT / "docs" / "how-to" / "simulate.md").read_text(encoding="utf-8")
     (block,) = re.findall(r"<!-- workload -->\n```yaml\n(.*?)```", text, re.DOTALL)
     made = load(block)
-    assert [one.name for one in made.variants] == ["as given", "by CPU alone", "hosts 4"]
+    assert [one.name for one in made.variants] == ["as given", "by memory alone", "hosts 4"]
     assert len(made.workload.processes) == 21
 
 
