@@ -1,0 +1,327 @@
+"""A cluster on the hosts of a lab: master, slaves and a desk, started as users start them."""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import IO, TYPE_CHECKING, Any, Final
+
+from benchmarks.paper.settings import cluster_settings, host_settings
+from benchmarks.paper.trace import Look, Trace
+from rosrm.errors import RosrmError
+from rosrm.lab import DATA, MIB, HostPlan, Lab
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+ROOT: Final = Path(__file__).resolve().parents[2]
+DESK: Final = "desk"
+_ROSRM: Final = str(Path(sys.executable).with_name("rosrm"))
+#: Seconds between two looks at the cluster.
+LOOK_S: Final = 0.2
+#: Seconds for a part to come up, on a busy machine and within a small quota.
+_START: Final = 90.0
+_ANSWER: Final = 30.0
+#: A run that takes so many times as long as on a quiet machine is given up.
+_SLOWEST: Final = 4.0
+_END: Final = 15.0
+_WRONG: Final = frozenset({"failed", "cancelled", "set_aside", "stuck", "unreachable"})
+
+
+class Failed(Exception):
+    """A figure could not be measured; the text says why."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """A program on a host.
+
+    Attributes:
+        log: what it writes.
+    """
+
+    name: str
+    process: subprocess.Popen[bytes]
+    log: Path
+
+    def check(self) -> None:
+        """Raise `Failed` with its last words where it has ended."""
+        if self.process.poll() is None:
+            return
+        words = self.log.read_text(errors="replace").strip().splitlines()[-5:]
+        said = "\n  ".join(words) or "it said nothing"
+        raise Failed(f"{self.name} ended with exit code {self.process.returncode}:\n  {said}")
+
+
+class LabCluster:
+    """A master on a desk without a quota, and hosts on which slaves are started; removed at exit.
+
+    Args:
+        name: of the lab.
+        hosts: beside the desk.
+        folder: for settings and logs.
+        cluster: the master's `cluster.yaml`; None: with the paper's settings.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        hosts: Sequence[HostPlan],
+        folder: Path,
+        cluster: Mapping[str, Any] | None = None,
+    ) -> None:
+        self.lab: Final = Lab(name, [*hosts, HostPlan(DESK, disk=64 * MIB)])
+        self.trace = Trace()
+        self._folder = folder
+        self._settings = cluster_settings() if cluster is None else cluster
+        self._parts: list[Part] = []
+        self._works = 0
+        self._opened = ExitStack()
+        self._desk: _Desk | None = None
+
+    def __enter__(self) -> Self:
+        """Make the hosts, and start master and desk."""
+        with ExitStack() as opened:
+            opened.enter_context(self.lab)
+            settings = self._write("cluster.yaml", self._settings)
+            self._start("master", DESK, [_ROSRM, "master", "--config", settings])
+            self._desk = opened.enter_context(_Desk(self._start_desk, self._check))
+            self._opened = opened.pop_all()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._opened.close()
+
+    # --- parts --------------------------------------------------------------------------------
+
+    def start_slave(self, host: str) -> None:
+        """Start a host's slave, within its limits; `wait_for_slaves` waits for it."""
+        settings = self._write(f"{host}.yaml", host_settings(host))
+        self._start(f"the slave of {host}", host, [_ROSRM, "slave", "--config", settings])
+
+    def start_slave_beside(self, host: str) -> None:
+        """Start a host's slave beside its limits; what it starts is within."""
+        state = str(DATA / "slave")
+        supervisor = [sys.executable, "-m", "rosrm.supervisor", "--state", state]
+        self.lab.exec(host, supervisor, timeout=_START)
+        measured = {name: {"group": self.lab.group(host)} for name in ("cpu", "memory")}
+        plain = host_settings(host, state=state, probes={**measured, "disk": {}})
+        settings = self._write(f"{host}.yaml", plain)
+        command = [_ROSRM, "slave", "--config", settings]
+        self._start(f"the slave of {host}", host, command, limited=False)
+
+    def start_holder(self, host: str, mb: float) -> None:
+        """Start something on a host that rosrm knows nothing of: it holds memory."""
+        command = [sys.executable, "-m", "rosrm_examples.holder", "--mb", f"{mb:g}"]
+        self._start(f"the holder on {host}", host, command)
+
+    def wait_for_slaves(self, hosts: Sequence[str]) -> None:
+        """Wait until the slaves of some hosts are registered and ask for work."""
+
+        def asking(look: Look) -> bool:
+            return all(name in look.hosts and look.hosts[name].accepting for name in hosts)
+
+        self.wait_until(f"slaves of {', '.join(hosts)} asking for work", asking, _START)
+
+    def stop_master(self) -> None:
+        """Let the master end in good order."""
+        master = next(part for part in self._parts if part.name == "master")
+        self._parts.remove(master)
+        master.process.send_signal(signal.SIGINT)
+        try:
+            master.process.wait(_END)
+        except subprocess.TimeoutExpired:
+            raise Failed(f"the master did not end within {_END:g} s of SIGINT") from None
+
+    def _start_desk(self) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-m", "benchmarks.paper.desk"]
+        log = (self._folder / "desk.log").open("wb")
+        with log:
+            return self.lab.popen(
+                DESK, command, cwd=str(ROOT), stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+                stderr=log,
+            )  # fmt: skip
+
+    def _start(self, name: str, host: str, command: list[str], *, limited: bool = True) -> None:
+        log = self._folder / f"{name.replace(' ', '-')}.log"
+        with log.open("ab") as sink:
+            process = self.lab.popen(
+                host, command, limited=limited, cwd=str(ROOT), stdin=subprocess.DEVNULL,
+                stdout=sink, stderr=sink,
+            )  # fmt: skip
+        self._parts.append(Part(name, process, log))
+
+    def _write(self, name: str, plain: Mapping[str, Any]) -> str:
+        path = self._folder / name
+        path.write_text(json.dumps(plain))  # JSON is YAML too
+        return str(path)
+
+    def _check(self) -> None:
+        for part in self._parts:
+            part.check()
+
+    # --- using it -----------------------------------------------------------------------------
+
+    def submit(self, *processes: Mapping[str, Any]) -> None:
+        """Queue processes, as entries of a work file."""
+        self._works += 1
+        work = self._write(f"work{self._works}.yaml", {"processes": list(processes)})
+        self._ask({"do": "submit", "work": work})
+
+    def look(self) -> Look:
+        """Look at the cluster, and keep what is seen in the trace.
+
+        Raises:
+            Failed: a part has ended, or a process has not become what it should.
+        """
+        self._check()
+        look = self.trace.add(self._ask({"do": "look", "after": self.trace.last_sequence}))
+        wrong = [f"{name} is {state}" for name, state in look.states.items() if state in _WRONG]
+        if wrong:
+            raise Failed(f"on the cluster {', '.join(wrong[:5])}")
+        return look
+
+    def begin(self) -> None:
+        """The run's own time is 0 now."""
+        self.trace.looks.clear()
+        self.trace.start = self.look().elapsed
+
+    def wait_until(
+        self, what: str, condition: Callable[[Look], bool], timeout: float, every: float = LOOK_S
+    ) -> Look:
+        """Look until a condition holds; raises `Failed` with what was waited for."""
+        deadline = time.monotonic() + timeout
+        while not condition(look := self.look()):
+            if time.monotonic() >= deadline:
+                seen = {state: look.count(state) for state in set(look.states.values())}
+                raise Failed(
+                    f"{what}: not within {timeout:g} s (hosts {sorted(look.hosts)}, {seen})"
+                )
+            time.sleep(every)  # the next look is due then
+        return look
+
+    def play(self, due: Sequence[tuple[float, Callable[[], None]]], seconds: float) -> Look:
+        """Do things at their times (s from `begin`), and look on until the run is over."""
+        coming = sorted(due, key=lambda one: one[0])
+        while True:
+            look = self.look()
+            elapsed = look.elapsed - self.trace.start
+            while coming and coming[0][0] <= elapsed:
+                coming.pop(0)[1]()
+            if elapsed >= seconds:
+                return look
+            time.sleep(LOOK_S)  # the next look is due then
+
+    def feed(
+        self, entries: Sequence[Mapping[str, Any]], *, every: float, after: float,
+        also: Sequence[tuple[float, Callable[[], None]]] = (),
+    ) -> Look:  # fmt: skip
+        """Submit processes one by one, and look on until the run is over.
+
+        Each comes `every` seconds after the one before, and later where that is not yet in the
+        readings: so a busy machine stretches the run, and does not change it.
+
+        Args:
+            entries: of a work file.
+            every: seconds.
+            after: seconds from the last submission to the end.
+            also: what else is done, at its time from `begin`.
+        """
+        coming, other = list(entries), sorted(also, key=lambda one: one[0])
+        longest = _SLOWEST * (len(coming) * every + after)
+        due = 0.0
+        while True:
+            look = self.look()
+            elapsed = look.elapsed - self.trace.start
+            while other and other[0][0] <= elapsed:
+                other.pop(0)[1]()
+            if coming and elapsed >= due and _shown(look):
+                self.submit(coming.pop(0))
+                due = elapsed + (every if coming else after)
+            elif not coming and elapsed >= due:
+                return look
+            if elapsed > longest:
+                raise Failed(f"{len(coming)} processes were not submitted within {longest:.0f} s")
+            time.sleep(min(LOOK_S, every / 2))  # the next look is due then
+
+    def _ask(self, request: dict[str, Any]) -> dict[str, Any]:
+        assert self._desk is not None, "the cluster is used outside of its `with` block"
+        return self._desk.ask(request)
+
+
+def _shown(look: Look) -> bool:
+    """Whether all that was assigned is in the readings."""
+    return look.count("assigned") + look.count("starting") == 0 and all(
+        host.in_flight == 0.0 for host in look.hosts.values()
+    )
+
+
+class _Desk:
+    """The program on the desk that speaks to the master."""
+
+    def __init__(
+        self, start: Callable[[], subprocess.Popen[bytes]], check: Callable[[], None]
+    ) -> None:
+        self._check = check
+        self._process = start()
+        self._lines = b""
+
+    def __enter__(self) -> Self:
+        try:
+            self._line(_START)
+        except BaseException:
+            self.__exit__(None, None, None)
+            raise
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._process.kill()
+        self._process.communicate()
+
+    def ask(self, request: dict[str, Any]) -> dict[str, Any]:
+        """One question, one answer; raises `Failed`."""
+        to = self._process.stdin
+        assert to is not None
+        to.write(json.dumps(request).encode() + b"\n")
+        to.flush()
+        answer = self._line(_ANSWER)
+        if "error" in answer:
+            raise Failed(f"the master: {answer['error']}")
+        return answer
+
+    def _line(self, timeout: float) -> dict[str, Any]:
+        source: IO[bytes] | None = self._process.stdout
+        assert source is not None
+        deadline = time.monotonic() + timeout
+        while b"\n" not in self._lines:
+            self._check()
+            if select.select([source], [], [], 0.5)[0]:
+                read = os.read(source.fileno(), 1 << 16)
+                if not read:
+                    raise RosrmError("the client at the desk has ended; its log is desk.log")
+                self._lines += read
+            elif time.monotonic() >= deadline:
+                raise Failed(f"the client at the desk did not answer within {timeout:g} s")
+        line, _, self._lines = self._lines.partition(b"\n")
+        answer: dict[str, Any] = json.loads(line)
+        return answer

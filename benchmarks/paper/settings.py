@@ -1,0 +1,58 @@
+"""What the paper sets, and what its figures give in numbers."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+#: Section IV A: only memory decides, up to 80 % of it, at 10 Hz.
+WEIGHTS: Final = {"memory": 1.0, "cpu": 0.0, "disk": 0.0}
+MEMORY_LIMIT: Final = 0.8
+RATE_HZ: Final = 10.0
+
+#: Fig. 9: y = 0.0843 x + 0.0173, milliseconds by slaves.
+FIG9_SLOPE_MS: Final = 0.0843
+FIG9_INTERCEPT_MS: Final = 0.0173
+
+#: Table III, minutes.
+TABLE3_MIN: Final = {"one_host": 109.5, "ideal": 2.5, "rosrm": 3.6}
+
+#: MB that a holder takes beside what it is told to hold, for it is a Python process.
+HOLDER_MB: Final = 7.0
+
+
+def cluster_settings(**sections: Any) -> dict[str, Any]:
+    """A `cluster.yaml` with the paper's settings.
+
+    Args:
+        sections: more of the file.
+    """
+    scoring = {"policy": "weighted", "options": {"weights": WEIGHTS}}
+    return {"name": "paper", "scoring": scoring, **sections}
+
+
+def host_settings(name: str, **sections: Any) -> dict[str, Any]:
+    """A `host.yaml` with the paper's settings: CPU and disk have no limit.
+
+    Args:
+        name: of the host.
+        sections: more of the file.
+    """
+    limits = {"memory": MEMORY_LIMIT, "cpu": 1.0, "disk": 1.0}
+    return {"host": name, "rate": RATE_HZ, "limits": limits, **sections}
+
+
+def holder(name: str, mb: float, **entries: Any) -> dict[str, Any]:
+    """An entry of a `work.yaml`: a plain process that holds memory until it is stopped.
+
+    Args:
+        name: of the process.
+        mb: that it holds (1 MB = 10^6 bytes), beside its own footprint.
+        entries: more of it.
+    """
+    return {
+        "name": name,
+        "module": "rosrm_examples.holder",
+        "arguments": ["--mb", f"{mb:g}"],
+        "needs": {"memory": f"{mb + HOLDER_MB:g}MB", "cpu": 0},
+        **entries,
+    }

@@ -1,0 +1,114 @@
+"""The job of Table III: LiDAR drives in ten pieces, as commands and as entries of a work file."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from rosrm_examples.drives import load_drive
+from rosrm_examples.errors import DriveError
+from rosrm_examples.pieces import load_pieces
+
+#: Where they are at hand; together they have 373 scans and 536 m.
+KITTI: Final = ("kitti0001", "kitti0002", "kitti0027")
+#: A metre each; `--drive street:1000` is the kilometre, and takes hours within small quotas.
+STREET: Final = "street:200"
+PIECES: Final = 10
+_MODULE: Final = "rosrm_examples.map_piece"
+_MEMORY: Final = "110MB"
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A piece of a drive that is mapped by one process.
+
+    Attributes:
+        drive: name or path, as `load_drive` takes it.
+        number: of the piece, from 1.
+        of: pieces of its drive.
+    """
+
+    drive: str
+    number: int
+    of: int
+
+    @property
+    def name(self) -> str:
+        """Of its process."""
+        stem = "".join(one if one.isalnum() else "_" for one in Path(self.drive).stem)
+        return f"{stem}_{self.number:02d}"
+
+    def arguments(self, out: Path) -> list[str]:
+        """Of the mapping program; each drive has a folder of its own below `out`."""
+        return [
+            "--drive", self.drive, "--piece", str(self.number), "--of", str(self.of),
+            "--out", str(self.folder(out)),
+        ]  # fmt: skip
+
+    def folder(self, out: Path) -> Path:
+        """Where its result is."""
+        return out / self.name.rpartition("_")[0]
+
+    def command(self, out: Path) -> list[str]:
+        """To map it without rosrm."""
+        return [sys.executable, "-m", _MODULE, *self.arguments(out)]
+
+    def entry(self, out: Path, directory: Path) -> dict[str, Any]:
+        """Of a work file."""
+        return {
+            "name": self.name,
+            "module": _MODULE,
+            "arguments": self.arguments(out),
+            "working_directory": str(directory),
+            "ros": True,
+            "kind": "job",
+            "needs": {"memory": _MEMORY, "cpu": 0},
+        }
+
+
+def shared_out(scans: Sequence[int], pieces: int) -> list[int]:
+    """How many of `pieces` each drive is cut into: in proportion, by the largest remainder.
+
+    Args:
+        scans: of each drive.
+        pieces: together; at least one a drive.
+
+    Raises:
+        ValueError: more drives than pieces.
+    """
+    if len(scans) > pieces:
+        raise ValueError(f"{len(scans)} drives cannot be cut into {pieces} pieces together")
+    counts = [1] * len(scans)
+    while sum(counts) < pieces:  # whoever has the longest pieces is cut once more
+        longest = max(range(len(scans)), key=lambda one: (scans[one] / counts[one], -one))
+        counts[longest] += 1
+    return counts
+
+
+def pieces_of(drives: Sequence[str], pieces: int = PIECES) -> list[Piece]:
+    """The job; raises `DriveError` for a drive that is not there."""
+    counts = shared_out([len(load_drive(name)) for name in drives], pieces)
+    return [
+        Piece(name, number, of)
+        for name, of in zip(drives, counts, strict=True)
+        for number in range(1, of + 1)
+    ]
+
+
+def drives_at_hand() -> tuple[str, ...]:
+    """The KITTI drives where all are, else the simulated kilometre."""
+    try:
+        for name in KITTI:
+            load_drive(name)
+    except DriveError:
+        return (STREET,)
+    return KITTI
+
+
+def scans_mapped(pieces: Sequence[Piece], out: Path) -> int:
+    """How many scans the results of a run hold, overlaps twice; raises where one is missing."""
+    folders = {piece.folder(out) for piece in pieces}
+    return sum(len(one.poses) for folder in folders for one in load_pieces(folder))

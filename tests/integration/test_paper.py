@@ -1,0 +1,111 @@
+"""A figure of the paper on a small lab, as users measure it."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import uuid
+from pathlib import Path
+
+import pytest
+
+from rosrm.errors import RosrmError
+
+ROOT = Path(__file__).resolve().parents[2]
+#: Seconds: on a quiet machine it takes 30.
+LONGEST = 400.0
+COMMAND = [sys.executable, "-m", "benchmarks.paper"]
+
+
+def why_no_lab() -> str:
+    """What a lab lacks here; "" for nothing."""
+    from rosrm.lab import MIB, Lab, uniform
+
+    try:
+        with Lab(f"try-{uuid.uuid4().hex[:8]}", uniform(1, memory=64 * MIB, disk=16 * MIB)):
+            return ""
+    except RosrmError as error:
+        return str(error).splitlines()[0]
+
+
+@pytest.fixture
+def lab():
+    """What the names of the labs begin with; none of them may be left."""
+    from rosrm.lab import all_labs
+
+    reason = why_no_lab()
+    if reason:
+        pytest.skip(f"needs root and what a lab is made of: {reason}")
+    name = f"t-{uuid.uuid4().hex[:8]}"
+    yield name
+    assert [one.name for one in all_labs() if one.name.startswith(name)] == []
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(LONGEST + 60)
+def test_a_small_figure_is_measured_and_its_claim_holds(lab, tmp_path):
+    """Numbers, picture, the last line of output and the exit status say the same."""
+    ended = subprocess.run(
+        [*COMMAND, "fig6", "--small", "--lab", lab, "--out", str(tmp_path)],
+        check=False,
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        timeout=LONGEST,
+    )
+    assert ended.returncode == 0, ended.stderr
+    report = json.loads((tmp_path / "fig6.json").read_text())
+    assert json.loads(ended.stdout.splitlines()[-1]) == report
+    assert report["claim_holds"] is True
+    assert report["processes"] == sum(report["per_host"].values()) > 3
+    assert report["waiting_at_the_end"] > 0
+    assert report["simulation"]["replayed_differently"] == 0
+    assert (tmp_path / "fig6.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.timeout(180)
+def test_a_signal_leaves_nothing(lab, tmp_path):
+    """In the midst of a figure; the fixture looks for what is left."""
+    process = subprocess.Popen(
+        [*COMMAND, "fig7", "--small", "--lab", lab, "--out", str(tmp_path)],
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
+    )
+    said = []
+    for line in process.stderr:
+        said.append(line)
+        if "slave 1 is up" in line:
+            break
+    time.sleep(0.5)  # so that a process or two have come; it matters little how many
+    process.send_signal(signal.SIGTERM)
+    rest = process.communicate(timeout=120)[1]
+    assert process.returncode == 128 + signal.SIGTERM, "".join(said) + rest
+    assert "stopped by SIGTERM" in rest
+    assert "Traceback" not in rest
+
+
+def test_without_rights_one_message_says_what_is_missing(tmp_path):
+    """Nothing is begun, and nothing is written but the folder."""
+    drop = []
+    if os.geteuid() == 0:
+        if not shutil.which("setpriv"):
+            pytest.skip("setpriv is not here to give up root's rights")
+        drop = ["setpriv", "--bounding-set=-all", "--inh-caps=-all"]
+    ended = subprocess.run(
+        [*drop, *COMMAND, "fig6", "--out", str(tmp_path / "out")],
+        check=False,
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        timeout=60,
+    )
+    assert ended.returncode == 2
+    assert "a lab needs rights that are missing: " in ended.stderr
+    assert "CAP_SYS_ADMIN" in ended.stderr
+    assert "Traceback" not in ended.stderr
