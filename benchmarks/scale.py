@@ -197,6 +197,7 @@ def requests(cluster: LocalCluster, crowd: Crowd) -> dict[str, float]:
         called[name] = time.time()
         cluster.client.submit([ProcessSpec(name, command=("true",), kind=Kind.JOB)])
         cluster.client.spin(_PAUSE)
+    _wait_for_end(cluster, name)
     crowd.tell()
     taken = {name: at for one in crowd.hear() for name, at in one["taken"].items()}
     took = [1e3 * (taken[name] - called[name]) for name in called if name in taken]
@@ -206,6 +207,16 @@ def requests(cluster: LocalCluster, crowd: Crowd) -> dict[str, float]:
         "request_process_answered": len(took),
         "request_process_asked": _JOBS,
     }
+
+
+def _wait_for_end(cluster: LocalCluster, name: str) -> None:
+    """Until a job has finished; jobs are served in order. One that is stuck shows as unanswered."""
+    deadline = time.monotonic() + _END
+    while time.monotonic() < deadline:
+        (row,) = cluster.client.list(processes=True, process=name).processes
+        if row.state == "finished":
+            return
+        cluster.client.spin(_PAUSE)
 
 
 def measure(arguments: argparse.Namespace, folder: Path) -> dict[str, float]:

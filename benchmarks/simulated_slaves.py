@@ -61,8 +61,9 @@ _NOTHING = 50e-6
 #: Seconds between two cycles while slaves come up, which takes the machine's time.
 _GENTLY = 0.25
 _LIMIT = 0.8
-#: Standard deviation of a usage's change from one cycle to the next.
-STEP = 0.003
+#: Standard deviation of a usage's change from one cycle to the next: as many messages come of it as
+#: of a real slave that measures a busy machine.
+STEP = 0.005
 #: Bounds of the usages, below the limit.
 _BETWEEN = (0.05, 0.7)
 _RESOURCES = (("memory", "B", 2.0**34), ("cpu", "core", 16.0), ("disk", "B", 2.0**40))
