@@ -2,33 +2,27 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from enum import Enum
-from typing import Any, Final, Protocol
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 from rclpy.duration import Duration
 
 from rosrm.core import slave as core
-from rosrm.core.model import HostDescription, InstanceId, InstanceStatus, RestartPolicy
+from rosrm.core.model import HostDescription, InstanceStatus
 from rosrm.errors import Refused
 from rosrm.ros import convert, names, qos
-from rosrm.ros.control import (
-    ControlClient,
-    ControlServer,
-    Gate,
-    accepted,
-    refused,
-    version_refusal,
-)
-from rosrm.ros.participant import OpenRequest, Participant
+from rosrm.ros.control import ControlClient, Gate, version_refusal
+from rosrm.ros.participant import Participant
 from rosrm.ros.reporting import Reporter
+from rosrm.ros.slave_services import Host, LogSlice, SlaveServices, result_json
 from rosrm.version import PROTOCOL_VERSION, __version__
 from rosrm_msgs import msg, srv
+
+__all__ = ["Host", "Link", "LogSlice", "SlaveEndpoint", "result_json"]
 
 #: Seconds for one request to the master.
 _PATIENCE: Final = 3.0
@@ -58,47 +52,6 @@ class Link(Enum):
     LISTENING = "listening"  # for a beat of who greeted us: it alone tells which run that is
     REGISTERING = "registering"
     REGISTERED = "registered"
-
-
-@dataclass(frozen=True, slots=True)
-class LogSlice:
-    """A part of a log file, as `ReadLog` answers it."""
-
-    content: bytes
-    next_offset: int
-    generation: int
-    ended: bool
-
-
-class Host(Protocol):
-    """What the endpoint asks of the slave's runtime."""
-
-    def take(self, event: core.Event) -> None:
-        """Something happened."""
-
-    def statuses(self) -> Sequence[InstanceStatus]:
-        """All that this host holds."""
-
-    def read_log(self, process: str, number: int, offset: int, max_bytes: int) -> LogSlice:
-        """A part of a log; raises `Refused`."""
-
-    def set_restart(
-        self, instance: InstanceId, restart: RestartPolicy, settled: Callable[[str], None]
-    ) -> None:
-        """Give an instance another restart policy.
-
-        Args:
-            settled: called in the loop's thread; with "" when the policy survives whatever is
-                killed, else with the reason why there is no such instance.
-        """
-
-    def execute(
-        self, executor: str, arguments: dict[str, Any], done: Callable[[bool, str, str], None]
-    ) -> None:
-        """Run an executor; `done(accepted, message, result)` is called in the loop's thread."""
-
-    def say(self, message: str) -> None:
-        """Tell the user."""
 
 
 class SlaveEndpoint:
@@ -166,12 +119,8 @@ class SlaveEndpoint:
             msg.MasterBeat, path(names.MASTER_BEAT),
             self._participant.counted(self._take_beat), qos.BEAT_IN,
         )  # fmt: skip
-        host = self._description.name
-        server = ControlServer(
-            self._participant, Gate(time.monotonic_ns, max_age), lambda: self._epoch
-        )
-        server.offer(srv.ControlHost, path.of_host(host, names.CONTROL), self._take_order)
-        self._participant.serve(srv.ReadLog, path.of_host(host, names.READ_LOG), self._take_log)
+        gate = Gate(time.monotonic_ns, max_age)
+        SlaveServices(self._participant, self._host, description.name, gate, lambda: self._epoch)
 
     # --- finding the master --------------------------------------------------------------
 
@@ -330,61 +279,6 @@ class SlaveEndpoint:
             return
         self._host.take(core.AssignmentsReceived(work))
 
-    # --- orders --------------------------------------------------------------------------
-
-    def _take_order(self, request: srv.ControlHost.Request, respond: Callable[[Any], None]) -> None:
-        kind = srv.ControlHost.Request
-        try:
-            if request.action == kind.EXECUTE:
-                self._execute(request, respond)
-                return
-            if request.action == kind.SET_RESTART:
-                self._set_restart(request, respond)
-                return
-            self._host.take(_ordered(request))
-        except Refused as refusal:
-            respond(srv.ControlHost.Response(answer=refused(refusal.code, str(refusal))))
-            return
-        respond(srv.ControlHost.Response(answer=accepted()))
-
-    def _set_restart(
-        self, request: srv.ControlHost.Request, respond: Callable[[Any], None]
-    ) -> None:
-        def settled(refusal: str) -> None:
-            answer = refused("unknown", refusal) if refusal else accepted()
-            respond(srv.ControlHost.Response(answer=answer))
-
-        restart = convert.restart_from_msg(request.restart)
-        self._host.set_restart(convert.instance_from_msg(request.instance), restart, settled)
-
-    def _execute(self, request: srv.ControlHost.Request, respond: Callable[[Any], None]) -> None:
-        def done(good: bool, message: str, result: str) -> None:
-            answer = accepted(message) if good else refused("failed", message)
-            respond(srv.ControlHost.Response(answer=answer, result=result))
-
-        arguments = convert.json_object(request.arguments, "the arguments of an executor")
-        self._host.execute(request.executor, arguments, done)
-
-    def _take_log(self, request: srv.ReadLog.Request, open_request: OpenRequest) -> None:
-        fault = version_refusal(request.protocol_version, "a reader of logs")
-        if fault:
-            open_request.answer(srv.ReadLog.Response(answer=refused("version", fault)))
-            return
-        try:
-            part = self._host.read_log(
-                request.process, request.number, request.offset, request.max_bytes
-            )
-        except Refused as refusal:
-            answer = refused(refusal.code, str(refusal))
-            open_request.answer(srv.ReadLog.Response(answer=answer))
-            return
-        open_request.answer(
-            srv.ReadLog.Response(
-                answer=accepted(), content=part.content, next_offset=part.next_offset,
-                generation=part.generation, ended=part.ended,
-            )
-        )  # fmt: skip
-
     # --- what is said --------------------------------------------------------------------
 
     def publish_reading(
@@ -451,24 +345,3 @@ class SlaveEndpoint:
 def _speaker(said: msg.MasterBeat | srv.Handshake.Response) -> tuple[str, int, int]:
     """Which master said something, as far as a greeting tells."""
     return said.hostname, said.pid, said.epoch
-
-
-def _ordered(request: srv.ControlHost.Request) -> core.Event:
-    """What an order means for the core; raises `Refused`."""
-    kind = srv.ControlHost.Request
-    if request.action == kind.START:
-        return core.AssignmentsReceived((convert.assignment_from_msg(request.assignment),))
-    instance = convert.instance_from_msg(request.instance)
-    orders: dict[int, core.Event] = {
-        kind.STOP: core.StopOrdered(instance),
-        kind.RESTART: core.RestartOrdered(instance),
-        kind.REPORT: core.ReportRequested(),
-    }
-    if request.action not in orders:
-        raise Refused(f"unknown action {request.action}")
-    return orders[request.action]
-
-
-def result_json(result: Any) -> str:
-    """What an executor returned, as JSON text."""
-    return json.dumps(result, default=dict)
