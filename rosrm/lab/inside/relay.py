@@ -92,12 +92,14 @@ def relay(child: int) -> int:
             if told.si_code <= 0:  # a process sent it; the kernel's own went to the child as well
                 os.kill(child, told.si_signo)
             continue
-        pid, status = os.waitpid(child, os.WNOHANG | os.WUNTRACED)
-        if pid and os.WIFSTOPPED(status):
+        while True:  # one signal may stand for several changes
+            pid, status = os.waitpid(child, os.WNOHANG | os.WUNTRACED)
+            if not pid:
+                break
+            if not os.WIFSTOPPED(status):
+                return status
             os.kill(os.getpid(), signal.SIGSTOP)
             os.kill(child, signal.SIGCONT)
-        elif pid:
-            return status
 
 
 def end_like(status: int) -> None:
