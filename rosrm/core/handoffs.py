@@ -49,11 +49,22 @@ def close(state: MasterState, run: Run) -> None:
         publish(state, run, HandoffPhase.DONE)
 
 
-def take_over_if_alone(state: MasterState, run: Run, step: Configure, now: float) -> None:
+def say_again(state: MasterState, run: Run, step: Configure, now: float) -> None:
+    """A phase that was not answered may not have been heard; a lost source needs another one."""
+    if _needs_take_over(state, run, step):
+        _take_over(state, run, step, now)
+    elif step.awaited and now - run.order_at >= state.settings.order_retry:
+        run.order_at = now
+        publish(state, run, step.phase)
+
+
+def _needs_take_over(state: MasterState, run: Run, step: Configure) -> bool:
     """The source ended while it was to fall silent: its successor goes on from what it has."""
     alone = run.source.number not in state.instances and run.destination.number in state.instances
-    if step.phase is not HandoffPhase.SWITCH or not alone or is_active(state, run):
-        return
+    return step.phase is HandoffPhase.SWITCH and alone and not is_active(state, run)
+
+
+def _take_over(state: MasterState, run: Run, step: Configure, now: float) -> None:
     if run.taking_over and now - run.order_at < state.settings.order_retry:
         return
     if not run.taking_over:

@@ -32,7 +32,7 @@ def give_order(state: MasterState, run: Run, step: Step, now: float) -> None:
     if isinstance(step, Commit | AwaitReady):
         return
     if isinstance(step, Configure):
-        run.order = 0
+        run.order, run.order_at = 0, now
         handoffs.publish(state, run, step.phase)
         return
     host = state.hosts.by_name[step.host]
@@ -99,7 +99,7 @@ def _in_the_way(state: MasterState, run: Run, step: Start, now: float) -> bool:
 def give_order_again(state: MasterState, run: Run, step: Step, now: float) -> None:
     """A start, a stop or a restart policy may be given twice without harm; one may be lost."""
     if isinstance(step, Configure):
-        handoffs.take_over_if_alone(state, run, step, now)
+        handoffs.say_again(state, run, step, now)
     elif isinstance(step, Execute | AwaitReady | Commit):
         return
     elif now - run.order_at >= state.settings.order_retry:
