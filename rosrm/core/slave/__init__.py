@@ -3,7 +3,8 @@
 ======================  =========================================================================
 what happened           what the core does
 ======================  =========================================================================
-Registered              remembers the master's epoch; older ones are refused from now on
+Registered              remembers the master's epoch; older ones are refused from now on; reports
+                        again, if something went unheard meanwhile
 MasterLost              forgets no end until a master has taken this host in again
 AssignmentsReceived     has them launched, once, or holds them until a slot is free; one that was
                         stopped before is refused
@@ -108,7 +109,10 @@ def step(state: SlaveState, event: Event, now: float) -> Sequence[Command]:
         event: what happened.
         now: seconds by the slave's monotonic clock; never less than before.
     """
-    return HANDLERS[type(event)](state, event, now)
+    commands = HANDLERS[type(event)](state, event, now)
+    if not state.registered and any(isinstance(command, Report) for command in commands):
+        state.unheard = True
+    return commands
 
 
 def step_all(state: SlaveState, events: Iterable[Event], now: float) -> list[Command]:

@@ -51,8 +51,11 @@ def _registered(state: SlaveState, event: Registered, now: float) -> _Commands:
         state.tombstones.clear()
     for held in state.held.values():
         held.ended_at = max(held.ended_at, now)  # told with the registration, not before
-    # What has changed since the registration was sent went nowhere.
-    return [Report(state.statuses(), complete=True)] if state.held else []
+    if not state.unheard:
+        return []
+    state.unheard = False
+    # Not as complete: told late, it must not deny what has been assigned since.
+    return [Report(state.statuses())]
 
 
 def _master_lost(state: SlaveState, event: MasterLost, now: float) -> _Commands:

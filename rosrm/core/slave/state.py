@@ -52,11 +52,14 @@ class SlaveState:
     Attributes:
         max_processes: most that run at a time; 0: no bound.
         waiting: assignments that are started as soon as a slot is free, in order.
+        unheard: something was reported while no master had this host: perhaps after its
+            registration was sent.
     """
 
     max_processes: int = 0
     epoch: int = 0
     registered: bool = False
+    unheard: bool = False
     held: dict[InstanceId, Held] = field(default_factory=dict)
     waiting: dict[InstanceId, Assignment] = field(default_factory=dict)
     tombstones: dict[InstanceId, None] = field(default_factory=dict)

@@ -82,7 +82,15 @@ def test_what_changed_while_the_registration_was_on_its_way_is_told(one) -> None
     one.step(slave.MasterLost())
     one.step(told(STATE.FAILED, exit_signal=9))
     (report,) = one.step(slave.Registered(1))
-    assert (states([report]), report.complete) == ([STATE.FAILED], True)
+    assert (states([report]), report.complete) == ([STATE.FAILED], False)
+
+
+def test_a_registration_without_news_is_not_followed_by_a_report(one) -> None:
+    """All of it stood in the request."""
+    one.step(assigned())
+    one.step(told(STATE.RUNNING, pid=5))
+    one.step(slave.MasterLost())
+    assert one.step(slave.Registered(2)) == []
 
 
 def test_an_older_epoch_starts_nothing(one) -> None:
