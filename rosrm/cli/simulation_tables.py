@@ -16,18 +16,24 @@ from rosrm.simulation.replay import Replay
 
 #: Processes that were never placed, of which the reason is told.
 _TOLD: Final = 3
-_NUMBERS: Final = ("HOSTS", "PLACED", "DONE", "MAKESPAN", "WAIT", "LONGEST", "MEM GAP", "CPU GAP",
-                   "MOVES", "OVER LIMIT")  # fmt: skip
+#: Columns about the processes, and about the hosts: side by side where there is room.
+_PROCESSES: Final = ("HOSTS", "PLACED", "DONE", "MAKESPAN", "WAIT", "LONGEST")
+_HOSTS: Final = ("MEM GAP", "CPU GAP", "MOVES", "OVER LIMIT")
+_WIDE: Final = 125
 
 
 def show(report: Report) -> None:
     """Print what came of it."""
     if report.recording is not None and report.replayed is not None:
         _say_of_record(report, report.replayed)
-    made = tables.table("RUN", *_NUMBERS, right=_NUMBERS)
-    for run in report.runs:
-        made.add_row(Text(run.name), *_cells(run))
-    tables.console().print(made)
+    console = tables.console()
+    halves = (_PROCESSES + _HOSTS,) if console.width >= _WIDE else (_PROCESSES, _HOSTS)
+    for columns in halves:
+        made = tables.table("RUN", *columns, right=columns)
+        for run in report.runs:
+            cells = _cells(run)
+            made.add_row(Text(run.name), *(cells[column] for column in columns))
+        console.print(made)
     for run in report.runs:
         never = list(run.outcome.never_placed.items())
         if never:
@@ -42,17 +48,21 @@ def show(report: Report) -> None:
     typer.echo(f"{events} events in {seconds:.1f} s, {events / seconds:.0f} a second")
 
 
-def _cells(run: Run) -> list[str]:
+def _cells(run: Run) -> dict[str, str]:
     outcome = run.outcome
-    makespan = "-" if outcome.makespan is None else _seconds(outcome.makespan)
-    return [
-        str(run.hosts), f"{len(outcome.placements)}/{outcome.processes}", str(outcome.finished),
-        makespan, _seconds(outcome.wait_mean), _seconds(outcome.wait_max),
-        f"{outcome.imbalance['memory'] * 100:.1f} %", f"{outcome.imbalance['cpu'] * 100:.1f} %",
-        str(outcome.migrations)
-        + (f" ({outcome.failed_migrations} failed)" if outcome.failed_migrations else ""),
-        _seconds(outcome.over_limit),
-    ]  # fmt: skip
+    failed = f" ({outcome.failed_migrations} failed)" if outcome.failed_migrations else ""
+    return {
+        "HOSTS": str(run.hosts),
+        "PLACED": f"{len(outcome.placements)}/{outcome.processes}",
+        "DONE": str(outcome.finished),
+        "MAKESPAN": "-" if outcome.makespan is None else _seconds(outcome.makespan),
+        "WAIT": _seconds(outcome.wait_mean),
+        "LONGEST": _seconds(outcome.wait_max),
+        "MEM GAP": f"{outcome.imbalance['memory'] * 100:.1f} %",
+        "CPU GAP": f"{outcome.imbalance['cpu'] * 100:.1f} %",
+        "MOVES": f"{outcome.migrations}{failed}",
+        "OVER LIMIT": _seconds(outcome.over_limit),
+    }
 
 
 def _seconds(seconds: float) -> str:

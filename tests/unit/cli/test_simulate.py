@@ -6,8 +6,9 @@ import json
 import sys
 
 import pytest
+from rich.console import Console
 
-from rosrm.cli import simulation_picture
+from rosrm.cli import simulation_picture, tables
 from rosrm.cli.simulation_runs import agreement_of
 from rosrm.errors import ConfigError
 from tests.unit.simulation.workloads import host, plan, recorded, simulation
@@ -50,6 +51,19 @@ def test_a_workload_is_compared_with_its_variants(rosrm, workload):
     ]
     assert "as given: 1 never placed: lonely: " in result.out
     assert "events in" in result.out
+
+
+@pytest.mark.parametrize(("width", "tables_shown"), [(80, 2), (160, 1)])
+def test_the_table_reads_on_a_narrow_terminal(rosrm, workload, monkeypatch, width, tables_shown):
+    """Nothing of a number or of a name is cut: there are two tables below each other."""
+    monkeypatch.setattr(tables, "console", lambda: Console(width=width))
+    result = rosrm("simulate", workload, "--variant", "migration: {automatic: false}")
+    lines = result.out.splitlines()
+    assert sum(line.startswith("RUN ") for line in lines) == tables_shown
+    shown = lines[: next(n for n, line in enumerate(lines) if "never placed" in line)]
+    assert max(map(len, shown)) <= width
+    text = "\n".join(shown)
+    assert all(word in text for word in ("MAKESPAN", "LONGEST", "OVER LIMIT", "as given", "6/7"))
 
 
 def test_the_json_has_every_number_and_place(rosrm, workload):
