@@ -18,12 +18,12 @@ unexport AMENT_PREFIX_PATH CMAKE_PREFIX_PATH COLCON_PREFIX_PATH ROS_DISTRO RMW_I
 export ROS_AUTOMATIC_DISCOVERY_RANGE := LOCALHOST
 
 .DEFAULT_GOAL := help
-.PHONY: help setup test lint format demo demo-migration bench clean
+.PHONY: help setup test lint format demo demo-migration bench evaluation clean
 
 help: ## this list
 	@echo "make TARGET, each sets up what it needs:"
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  %-16s%s\n", $$1, $$2 }' $(MAKEFILE_LIST)
-	@echo "Variables: PYTHON=python3.12 (setup), LAYERS=\"unit ros\" ARGS=\"-k name\" (test), DRIVE=path (demo-migration)"
+	@echo "Variables: PYTHON=python3.12 (setup), LAYERS=\"unit ros\" ARGS=\"-k name\" (test), DRIVE=path (demo-migration), OUT=folder (evaluation)"
 
 setup: ## make .venv with all that the other targets need
 	@command -v $(PYTHON) >/dev/null || { \
@@ -54,6 +54,9 @@ demo-migration: setup ## a LiDAR drive is mapped while the SLAM moves to another
 
 bench: setup ## all benchmarks; each ends with one line of JSON
 	@set -e; for name in $(BENCHMARKS); do echo "== $$name"; $(BIN)/python -m benchmarks.$$name; done
+
+evaluation: setup ## the paper's figures and table, on virtual hosts: out/evaluation/ (root, 40 minutes)
+	@$(BIN)/python -m benchmarks.paper all --out "$(or $(OUT),out/evaluation)"
 
 clean: ## remove .venv, results and caches
 	rm -rf .venv build out dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

@@ -20,12 +20,12 @@ from types import FrameType
 
 from benchmarks.machine import say
 from benchmarks.paper.labs import Failed
-from benchmarks.paper.report import Options, plain_report, write_report
+from benchmarks.paper.page import update_page
+from benchmarks.paper.report import FIGURES, Options, plain_report, write_report
 from rosrm.errors import RosrmError
 from rosrm.lab import needs
 from rosrm_examples.errors import ExampleError
 
-FIGURES = ("fig6", "fig7", "fig8", "fig9", "fig10", "table3")
 #: Needs no hosts: the slaves are simulated.
 _WITHOUT_LAB = ("fig9",)
 
@@ -52,6 +52,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if set(names) - set(_WITHOUT_LAB):
             needs.check_rights()
         statuses = [_measured(name, options) for name in names]
+        if options.page is not None:
+            say(f"{options.page}: {', '.join(update_page(options.page, options.out))}")
     except Stopped as stopped:
         say(f"stopped by {stopped}")
         return 128 + stopped.number
@@ -77,6 +79,9 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         "KITTI drives 0001, 0002 and 0027 in the folder that ROSRM_KITTI names, or a simulated "
         "street",
     )  # fmt: skip
+    parser.add_argument(
+        "--page", type=Path, help="write what is in the folder into this page (docs/evaluation.md)"
+    )
     parser.add_argument("--small", action="store_true", help="only show that it works")
     parser.add_argument(
         "--lab", default="paper", help="what the names of the labs begin with (default: paper)"

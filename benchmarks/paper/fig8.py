@@ -19,7 +19,7 @@ CLAIM: Final = "The number of processes that can be allocated is proportional to
 _MB: Final = 40
 _LEAST_R2: Final = 0.999
 _SLAVES, _FEW = 10, 3
-_MEMORY, _LITTLE = 512 * MIB, 192 * MIB
+_MEMORY, _LITTLE = 528 * MIB, 192 * MIB
 #: Seconds without an assignment after which no more fits: the readings show all that was started.
 _QUIET: Final = 4.0
 _LONGEST: Final = 90.0
@@ -90,7 +90,7 @@ def _draw(slaves: list[int], held: list[int], fit: Line, path: Path) -> None:
 
 
 _SCALED: Final = {
-    "hosts": "ten of 512 MiB and half a core each on one machine; the paper: ten of 4 GB",
+    "hosts": "ten of 528 MiB and half a core each on one machine; the paper: ten of 4 GB",
     "processes": "plain processes of 40 MB, not ROS nodes: a node is 64 MiB by itself, and from "
     "about 130 participants on one machine they no longer find each other",
     "order": "the slaves join one after the other, each when the ones before are full",

@@ -30,7 +30,7 @@ CLAIM: Final = (
 _PAPER: Final = Line(FIG9_SLOPE_MS, FIG9_INTERCEPT_MS, 1.0)
 _REAL: Final = (1, 10, 25, 50, 100, 200, 400, 700, 1000)
 _CORE: Final = (1, 10, 100, 1000, 3000, 10_000)
-_FEW: Final = (1, 10, 20)
+_FEW: Final = (1, 100, 300)
 #: Processes, and so DDS participants, that the simulated slaves share.
 _SHARED_BY: Final = 2
 #: So far a usage goes in a cycle that each reading is sent at once.

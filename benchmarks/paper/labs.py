@@ -117,13 +117,21 @@ class LabCluster:
     def start_slave_beside(self, host: str) -> None:
         """Start a host's slave beside its limits; what it starts is within."""
         state = str(DATA / "slave")
-        supervisor = [sys.executable, "-m", "rosrm.supervisor", "--state", state]
+        supervisor = [sys.executable, "-m", "rosrm.supervisor", "--state", f"{state}/supervisor"]
         self.lab.exec(host, supervisor, timeout=_START)
         measured = {name: {"group": self.lab.group(host)} for name in ("cpu", "memory")}
         plain = host_settings(host, state=state, probes={**measured, "disk": {}})
         settings = self._write(f"{host}.yaml", plain)
         command = [_ROSRM, "slave", "--config", settings]
         self._start(f"the slave of {host}", host, command, limited=False)
+
+    def check_supervisors(self, hosts: Sequence[str]) -> None:
+        """Raise `Failed` where a slave has started a supervisor of its own, beside the limits."""
+        for host in hosts:
+            commands = [_command(pid) for pid in self.lab.pids(host)]
+            count = sum(b"rosrm/supervisor/" in command for command in commands)
+            if count != 1:
+                raise Failed(f"{host} has {count} supervisors: its jobs may be beside its limits")
 
     def start_holder(self, host: str, mb: float) -> None:
         """Start something on a host that rosrm knows nothing of: it holds memory."""
@@ -262,6 +270,13 @@ class LabCluster:
     def _ask(self, request: dict[str, Any]) -> dict[str, Any]:
         assert self._desk is not None, "the cluster is used outside of its `with` block"
         return self._desk.ask(request)
+
+
+def _command(pid: int) -> bytes:
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_bytes()
+    except OSError:  # it has ended
+        return b""
 
 
 def _shown(look: Look) -> bool:

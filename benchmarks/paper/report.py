@@ -6,9 +6,12 @@ import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from benchmarks.machine import machine, versions
+
+#: In the order of the paper.
+FIGURES: Final = ("fig6", "fig7", "fig8", "fig9", "fig10", "table3")
 
 
 @dataclass(frozen=True)

@@ -143,6 +143,7 @@ def measure(options: Options) -> Result:
         for host in hosts:
             cluster.start_slave_beside(host)
         cluster.wait_for_slaves(hosts)
+        cluster.check_supervisors(hosts)
         say(f"table3: {len(hosts)} slaves are up; {', '.join(drives)} in {len(pieces)} pieces")
         cluster.begin()
         cases = Cases(cluster, hosts, pieces, options.folder / "pieces")

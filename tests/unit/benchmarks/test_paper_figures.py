@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -13,6 +14,8 @@ from hypothesis import strategies as st
 
 from benchmarks.paper import fig6, fig8, fig9, pictures, table3
 from benchmarks.paper.judging import Line
+from benchmarks.paper.page import section, update_page
+from benchmarks.paper.report import FIGURES
 from benchmarks.paper.settings import HOLDER_MB, MEMORY_LIMIT, host_settings
 from benchmarks.paper.slam import Piece, pieces_of, shared_out
 from benchmarks.paper.trace import Happening, HostLook, Look, Trace
@@ -156,3 +159,54 @@ def test_bad_arguments_are_refused(words, said, tmp_path):
     assert said in ended.stderr
     assert "Traceback" not in ended.stderr
     assert not (tmp_path / "out").exists()
+
+
+# --- the page -------------------------------------------------------------------------------------
+
+
+def fig8_report(**changes):
+    return {
+        "claim": "c", "claim_holds": True, "against_it": [], "slaves": [1, 2], "processes": [8, 16],
+        "r2": 1.0, "runs": 1, "seconds": 9.0, "load_average_before": 0.1,
+        "machine": {"cores": 2, "processor": "P"}, **changes,
+    }  # fmt: skip
+
+
+def test_the_page_gets_what_was_measured_and_keeps_the_rest(tmp_path):
+    """Written twice it is the same; a figure without a result stays as it is."""
+    page = tmp_path / "page.md"
+    page.write_text(
+        "before\n<!-- fig7 -->\nold\n<!-- /fig7 -->\n<!-- fig8 -->\n<!-- /fig8 -->\nend\n"
+    )
+    (tmp_path / "results").mkdir()
+    (tmp_path / "results" / "fig8.json").write_text(json.dumps(fig8_report()))
+    assert update_page(page, tmp_path / "results") == ["fig8"]
+    once = page.read_text()
+    assert update_page(page, tmp_path / "results") == ["fig8"]
+    assert page.read_text() == once
+    assert once.startswith("before\n<!-- fig7 -->\nold\n<!-- /fig7 -->\n")
+    assert "![fig8: c](results/fig8.png)" in once
+    assert "| processes held | proportional | 8, 16 |" in once
+    assert "The claim holds." in once
+
+
+def test_a_claim_that_does_not_hold_is_said(tmp_path):
+    """With the reasons."""
+    said = section("fig8", fig8_report(claim_holds=False, against_it=["R2 is low"]), "p.png")
+    assert "**The claim does not hold:** R2 is low" in said
+
+
+def test_a_page_without_the_marks_is_refused(tmp_path):
+    """What was measured must not get lost silently."""
+    (tmp_path / "page.md").write_text("nothing")
+    (tmp_path / "fig8.json").write_text(json.dumps(fig8_report()))
+    with pytest.raises(ValueError, match="no pair of marks '<!-- fig8 -->'"):
+        update_page(tmp_path / "page.md", tmp_path)
+
+
+def test_the_documentation_has_a_place_for_each_figure():
+    """And a picture's marks for nothing else."""
+    marks = re.findall(
+        r"^<!-- (/?\w+) -->$", (ROOT / "docs/evaluation.md").read_text(), re.MULTILINE
+    )
+    assert marks == [mark for name in FIGURES for mark in (name, f"/{name}")]

@@ -1,0 +1,162 @@
+"""Writes what was measured into `docs/evaluation.md`: the text between each figure's two marks.
+
+<!-- fig6 -->
+(what this module writes)
+<!-- /fig6 -->
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from benchmarks.paper.report import FIGURES
+
+_Report = Mapping[str, Any]
+
+
+def update_page(page: Path, results: Path) -> list[str]:
+    """Write the figures that are in a folder into a page; returns their names.
+
+    Args:
+        page: with a pair of marks for each figure.
+        results: folder with FIGURE.json and FIGURE.png.
+
+    Raises:
+        ValueError: the page lacks the marks of a figure that was measured.
+    """
+    text, written = page.read_text(encoding="utf-8"), []
+    for name in FIGURES:
+        file = results / f"{name}.json"
+        if not file.exists():
+            continue
+        report = json.loads(file.read_text(encoding="utf-8"))
+        picture = os.path.relpath(results / f"{name}.png", page.parent)
+        text = _replaced(text, name, section(name, report, picture))
+        written.append(name)
+    page.write_text(text, encoding="utf-8")
+    return written
+
+
+def _replaced(text: str, name: str, content: str) -> str:
+    marked = re.compile(rf"(<!-- {name} -->\n).*?(<!-- /{name} -->)", re.DOTALL)
+    if not marked.search(text):
+        raise ValueError(f"the page has no pair of marks '<!-- {name} -->' and '<!-- /{name} -->'")
+    return marked.sub(lambda found: f"{found[1]}{content}{found[2]}", text)
+
+
+def section(name: str, report: _Report, picture: str) -> str:
+    """What is written about one figure.
+
+    Args:
+        name: of the figure.
+        report: content of its JSON file.
+        picture: path of its picture, from the page.
+    """
+    rows = "".join(f"| {what} | {paper} | {ours} |\n" for what, paper, ours in _ROWS[name](report))
+    verdict = "The claim holds." if report["claim_holds"] else "**The claim does not hold:** "
+    reasons = "; ".join(report["against_it"])
+    return (
+        f"\n![{name}: {report['claim']}]({picture})\n\n"
+        f"| | paper | here |\n|---|---|---|\n{rows}\n"
+        f"{verdict}{reasons} {_measured_on(report)}\n\n"
+    )
+
+
+def _measured_on(report: _Report) -> str:
+    machine, runs = report["machine"], report["runs"]
+    often = "one run" if runs == 1 else f"median of {runs} runs"
+    return (
+        f"({often}, {report['seconds']:.0f} s in all, load average {report['load_average_before']} "
+        f"before; {machine['cores']} cores of {machine['processor']})"
+    )
+
+
+_Rows = list[tuple[str, str, str]]
+
+
+def _fig6(report: _Report) -> _Rows:
+    simulation = report["simulation"]
+    ends = ", ".join(f"{one:.1f}" for one in report["memory_percent_at_the_end"].values())
+    return [
+        ("processes placed, and those that wait at the end", "until the limit",
+         f"{report['processes']}, {report['waiting_at_the_end']}"),
+        ("utilization at the end, %", "up to 80", ends),
+        ("slaves apart, at most; the largest process, points", "balanced",
+         f"{report['widest_gap_points']}; {report['largest_process_points']}"),
+        ("`rosrm simulate` of this run: distance of the usage of the fullest, second, third slave",
+         "", f"{100 * simulation['ranked']['memory']:.1f} points, mean over time"),
+        ("replayed record: decisions, of them different", "",
+         f"{simulation['replayed_decisions']}, {simulation['replayed_differently']}"),
+    ]  # fmt: skip
+
+
+def _fig7(report: _Report) -> _Rows:
+    first = ", ".join(f"{one:.1f}" for one in report["first_process_s"].values())
+    counts = ", ".join(str(one) for one in report["per_host"].values())
+    return [
+        ("slaves 2 and 3 are started at, s", "25, 75",
+         ", ".join(f"{one:g}" for one in report["joins_s"])),
+        ("first process on slave 1, 2, 3 at, s", "", first),
+        ("processes on each at the end", "equally full", counts),
+        ("slaves apart at the end; one process, points", "",
+         f"{report['gap_at_the_end_points']}; {report['one_process_points']}"),
+    ]  # fmt: skip
+
+
+def _fig8(report: _Report) -> _Rows:
+    return [
+        ("slaves", "1 to 10", f"1 to {report['slaves'][-1]}"),
+        ("processes held", "proportional", ", ".join(str(one) for one in report["processes"])),
+        ("R² of the line", "", f"{report['r2']:.5f}"),
+    ]
+
+
+def _fig9(report: _Report) -> _Rows:
+    most, core = report["real"][-1], report["core"][-1]
+    return [
+        ("µs a slave (slope)", f"{report['paper_slope_us']:g}", f"{report['slope_us']:g}"),
+        ("µs beside (intercept)", f"{report['paper_intercept_us']:g}",
+         f"{report['intercept_us']:g}"),
+        ("R² of the line", "", f"{report['r2']:.4f}"),
+        (f"one cycle with {most['slaves']} slaves, ms", "84.3, extrapolated",
+         f"{most['ms']:.1f}, of that the decision {most['decision_ms']:.2f}"),
+        (f"one cycle with {core['slaves']} hosts in the core alone, ms", "", f"{core['ms']:.2f}"),
+    ]  # fmt: skip
+
+
+def _fig10(report: _Report) -> _Rows:
+    moves = report["migrations"]
+    ways = "; ".join(
+        f"{one['process']} at {one['s']:.0f} s from {one['from']} to {one['to']}" for one in moves
+    )
+    took = ", ".join(f"{one['took_s']:.2f}" for one in moves)
+    return [
+        ("migrations", "process 1 at 180 s from slave 1 to slave 3, at 300 s to slave 2", ways),
+        ("each took, s", "", took),
+    ]
+
+
+def _table3(report: _Report) -> _Rows:
+    paper = report["paper_min"]
+    return [
+        ("one host", f"{paper['one_host']} min", f"{report['one_host_s']:.1f} s"),
+        ("10 hosts (ideal case)", f"{paper['ideal']} min", f"{report['ideal_s']:.1f} s"),
+        ("10 hosts (with resource manager)", f"{paper['rosrm']} min",
+         f"{report['rosrm_s']:.1f} s"),
+        ("resource manager over ideal", f"{report['paper_ratio']}", f"{report['ratio']:.3f}"),
+        ("one host over resource manager", f"{report['paper_speed_up']}",
+         f"{report['speed_up']:.1f}"),
+        ("from `submit` to the last process started, s", "",
+         ", ".join(f"{one['last_started_s']:.2f}" for one in report["rosrm_spent"])),
+        ("drives", "1 km", ", ".join(report["drives"])),
+    ]  # fmt: skip
+
+
+_ROWS: Final[Mapping[str, Callable[[_Report], _Rows]]] = {
+    "fig6": _fig6, "fig7": _fig7, "fig8": _fig8, "fig9": _fig9, "fig10": _fig10, "table3": _table3,
+}  # fmt: skip
