@@ -55,9 +55,11 @@ _AT_ONCE = 20
 #: Seconds from one round of cycles to the next: whoever is due within them is served together, as
 #: each look at what has come costs at least 60 us of waiting.
 _ROUND = 0.005
-#: Most turns of taking in between two rounds, and the seconds of a turn that finds nothing.
-_TURNS = 200
+#: Most turns of taking in between two rounds; the seconds of a turn that finds nothing; how many
+#: such turns say that there is nothing more.
+_TURNS = 1000
 _NOTHING = 50e-6
+_SLOW_TURNS = 3
 #: Seconds between two cycles while slaves come up, which takes the machine's time.
 _GENTLY = 0.25
 _LIMIT = 0.8
@@ -363,12 +365,14 @@ class Fleet:
 
         Each turn takes one event at least, and answers to other slaves are events as well: by one
         for each round of cycles they would pile up. A turn that took its time found nothing, or
-        something large.
+        was interrupted: several in a row found nothing.
         """
+        slow = 0
         for _ in range(_TURNS):
             began = time.monotonic()
             self._shared.participant.spin(0.0)
-            if time.monotonic() - began >= _NOTHING:
+            slow = slow + 1 if time.monotonic() - began >= _NOTHING else 0
+            if slow == _SLOW_TURNS:
                 break
 
     def _cycle(self, now: float) -> None:
