@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 
 from rosrm.core import events as happened
-from rosrm.core.commands import Assign, Command
+from rosrm.core.commands import Assign, Command, PublishStateConfig
 from rosrm.core.hosts import HostCondition
 from rosrm.core.model import HostDescription, InstanceState, InstanceStatus, ProcessSpec
 from rosrm.core.processes import ProcessPhase
@@ -90,6 +90,9 @@ class Extraction:
         for command in commands:
             if isinstance(command, Assign):
                 self._assigned[command.assignment.instance.number] = at
+            elif isinstance(command, PublishStateConfig):  # the destination goes on at its age
+                since = self._runs_since.get(command.source, at)
+                self._runs_since[command.destination] = since
             elif isinstance(command, Record) and command.kind in ("host_lost", "host_back"):
                 self._heard(command, at)
 
@@ -196,7 +199,7 @@ class Extraction:
             stop=_middle(self._stops, Model().stop),
         )
         return Workload(
-            self._recording.name,
+            self._recording.name.rpartition("/")[2],
             tuple(_host_plan(one) for one in self._hosts.values()),
             tuple(_process_plan(one) for one in self._processes.values()),
             model, tuple(self._requests), until=self._recording.length,

@@ -34,7 +34,7 @@ class Curves:
         times: (T,) seconds from the first arrival; a value holds until the next time.
         hosts: names of the H hosts.
         usage: by resource, (T, H) fractions; NaN where a host was not there.
-        limit: by resource, (H,) the highest limit that a host had.
+        limit: by resource, (H,) the newest limit of a host.
     """
 
     times: FloatArray
@@ -190,10 +190,9 @@ class Meter:
             usage[name] = values
             there = values[~np.isnan(values)]
             self._gap[name] = float(there.max() - there.min()) if len(there) else 0.0
-            highest = np.where(up, table.limit[row], 0.0)
-            before = self._limit[name]
-            highest[: len(before)] = np.maximum(highest[: len(before)], before)
-            self._limit[name] = highest
+            newest = np.ones(len(table))
+            newest[: len(self._limit[name])] = self._limit[name]
+            self._limit[name] = np.where(up, table.limit[row], newest)
         self._keep(now, usage)
 
     def _keep(self, now: float, usage: dict[str, FloatArray]) -> None:

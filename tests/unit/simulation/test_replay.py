@@ -16,7 +16,7 @@ from rosrm.simulation.extraction import Extraction
 from rosrm.simulation.replay import replay
 from rosrm_scoring.weighted import Weighted, WeightedOptions
 
-from .workloads import EQ1, STRATEGIES, host, plan, read, recorded, simulation
+from .workloads import EQ1, MIB, STRATEGIES, host, plan, read, recorded, simulation
 
 BY_CPU = ("weighted", Weighted(WeightedOptions({"cpu": 1.0})))
 
@@ -111,6 +111,18 @@ def test_a_workload_made_of_a_record_gives_nearly_the_same_run(record):
     assert agreement.same_host >= 0.75
     assert agreement.ranked["memory"] < 0.06
     assert agreement.balance["memory"] < 0.08
+
+
+def test_what_hands_over_keeps_its_age_in_the_workload_made_of_it():
+    """It grows for 20 s and moves after 10: its curve is that of one process, not of two."""
+    move = (10.0, happened.MigrationRequested(0, "node"))
+    grows = plan("node", 50.0, growth=10.0, most=250.0, ros=True, strategy="handoff")
+    made = simulation([host("a"), host("b")], [grows], requests=[move], until=30.0)
+    extraction = Extraction(record := read(recorded(made)))
+    assert replay(record, CoreSettings(), EQ1, STRATEGIES, extraction.watch).outcome.migrations
+    (found,) = extraction.workload().processes
+    seen = [found.memory.at(age) / MIB for age in (2.0, 8.0, 14.0, 25.0)]
+    assert seen == pytest.approx([70.0, 130.0, 190.0, 250.0], abs=12.0)
 
 
 def test_a_run_agrees_with_itself_and_renamed_hosts_differ_in_name_alone():
