@@ -44,7 +44,7 @@ def _answer(client: MasterClient, request: dict[str, Any]) -> dict[str, Any]:
         "elapsed": view.uptime,
         "hosts": {row.description.name: _host(row) for row in view.hosts},
         "states": {row.name: row.state for row in view.processes},
-        "places": {row.name: row.host for row in view.processes},
+        "reasons": {row.name: row.reason for row in view.processes if row.reason},
         "memory": {row.name: row.memory for row in view.processes},
         "events": [
             {

@@ -82,6 +82,8 @@ def judge(trace: Trace, held: list[int], fit: Line) -> tuple[list[str], dict[str
         "slaves": list(range(1, len(held) + 1)),
         "processes": held,
         "per_host": per_host(list(trace.of_kind("assigned"))),
+        "assignments": trace.assignments(),
+        **trace.curves(),
     }
 
 

@@ -198,10 +198,15 @@ class LabCluster:
             Failed: a part has ended, or a process has not become what it should.
         """
         self._check()
-        look = self.trace.add(self._ask({"do": "look", "after": self.trace.last_sequence}))
-        wrong = [f"{name} is {state}" for name, state in look.states.items() if state in _WRONG]
+        plain = self._ask({"do": "look", "after": self.trace.last_sequence})
+        look = self.trace.add(plain)
+        wrong = [
+            f"{name} is {state} ({plain['reasons'].get(name, 'no reason given')})"
+            for name, state in look.states.items()
+            if state in _WRONG
+        ]
         if wrong:
-            raise Failed(f"on the cluster {', '.join(wrong[:5])}")
+            raise Failed(f"on the cluster {'; '.join(wrong[:3])}")
         return look
 
     def begin(self) -> None:

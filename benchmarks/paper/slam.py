@@ -65,6 +65,7 @@ class Piece:
             "working_directory": str(directory),
             "ros": True,
             "kind": "job",
+            "readiness": "running",  # nobody waits for a job to be seen in the graph
             "needs": {"memory": _MEMORY, "cpu": 0},
         }
 

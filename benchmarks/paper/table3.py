@@ -29,7 +29,7 @@ CLAIM: Final = (
 )
 _MOST_RATIO: Final = 1.05
 #: Cores of each host: ten of them, with the slaves and the master beside, fit on two.
-_CPU: Final = 0.15
+_CPU: Final = 0.17
 _MEMORY: Final = 512 * MIB
 #: Seconds after which a case is given up.
 _LONGEST: Final = 1500.0
@@ -206,5 +206,5 @@ def _draw(figures: dict[str, Any], path: Path) -> None:
 _SCALED: Final = {
     "job": "drives of a few hundred metres (or what --drive says) instead of 1 km, in ten pieces; "
     "on one host one piece after the other",
-    "hosts": "ten of 0.15 cores and 512 MiB each, for ten at once must fit on two cores",
+    "hosts": "ten of 0.17 cores and 512 MiB each, for ten at once must fit on two cores",
 }
