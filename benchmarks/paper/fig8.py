@@ -72,15 +72,14 @@ def judge(trace: Trace, held: list[int], fit: Line) -> tuple[list[str], dict[str
         wrong.append("more slaves do not hold more processes")
     if not trace.looks[-1].count("queued"):
         wrong.append("the queue became empty: more could have been held")
-    wrong += [
-        f"{name} reached {100 * top:.1f} %" for name, top in over(trace, MEMORY_LIMIT).items()
-    ]
+    beyond = over(trace, MEMORY_LIMIT)
     return wrong, {
         "r2": round(fit.r2, 6),
         "slope": round(fit.slope, 4),
         "intercept": round(fit.intercept, 4),
         "slaves": list(range(1, len(held) + 1)),
         "processes": held,
+        "over_limit_percent": {name: round(100 * top, 1) for name, top in beyond.items()},
         "per_host": per_host(list(trace.of_kind("assigned"))),
         "assignments": trace.assignments(),
         **trace.curves(),

@@ -113,7 +113,12 @@ def _fig8(report: _Report) -> _Rows:
         ("slaves", "1 to 10", f"1 to {report['slaves'][-1]}"),
         ("processes held", "proportional", ", ".join(str(one) for one in report["processes"])),
         ("R² of the line", "", f"{report['r2']:.5f}"),
+        ("slaves that passed 80 %, and the highest", "", _beyond(report["over_limit_percent"])),
     ]
+
+
+def _beyond(peaks: Mapping[str, float]) -> str:
+    return f"{len(peaks)}, {max(peaks.values()):.1f} %" if peaks else "none"
 
 
 def _fig9(report: _Report) -> _Rows:

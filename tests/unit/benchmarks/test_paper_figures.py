@@ -167,7 +167,8 @@ def test_bad_arguments_are_refused(words, said, tmp_path):
 def fig8_report(**changes):
     return {
         "claim": "c", "claim_holds": True, "against_it": [], "slaves": [1, 2], "processes": [8, 16],
-        "r2": 1.0, "runs": 1, "seconds": 9.0, "load_average_before": 0.1,
+        "r2": 1.0, "over_limit_percent": {"host2": 84.0}, "runs": 1, "seconds": 9.0,
+        "load_average_before": 0.1,
         "machine": {"cores": 2, "processor": "P"}, **changes,
     }  # fmt: skip
 
@@ -187,6 +188,7 @@ def test_the_page_gets_what_was_measured_and_keeps_the_rest(tmp_path):
     assert once.startswith("before\n<!-- fig7 -->\nold\n<!-- /fig7 -->\n")
     assert "![fig8: c](results/fig8.png)" in once
     assert "| processes held | proportional | 8, 16 |" in once
+    assert "| slaves that passed 80 %, and the highest |  | 1, 84.0 % |" in once
     assert "The claim holds." in once
 
 
