@@ -26,12 +26,12 @@ import socket
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from benchmarks.shared_participant import Berth, SharedParticipant, Tally
 from rosrm.core import slave as core
 from rosrm.core.model import (
     RESOURCE_SLOTS,
@@ -43,10 +43,8 @@ from rosrm.core.model import (
     RestartPolicy,
 )
 from rosrm.errors import Refused, RosrmError
-from rosrm.ros.participant import OpenRequest, Participant
 from rosrm.ros.settings import RosSettings
 from rosrm.ros.slave_endpoint import Link, LogSlice, SlaveEndpoint
-from rosrm_msgs import msg, srv
 
 #: Most seconds between two looks at standard input.
 _LOOK = 0.05
@@ -70,120 +68,6 @@ STEP = 0.005
 _BETWEEN = (0.05, 0.7)
 _RESOURCES = (("memory", "B", 2.0**34), ("cpu", "core", 16.0), ("disk", "B", 2.0**40))
 _PRESENT = (1 << len(_RESOURCES)) - 1
-
-
-class Berth:
-    """One slave's place in the participant that it shares with others.
-
-    Stands in for a `Participant` and for its node towards one `SlaveEndpoint`.
-    """
-
-    def __init__(self, shared: SharedParticipant) -> None:
-        self._shared = shared
-        self.node = self
-        self.settings = shared.participant.settings
-
-    def create_client(self, kind: Any, name: str, *, qos_profile: Any) -> Any:
-        """A client; of its own only where answers come to many."""
-        return self._shared.client(kind, name, qos_profile)
-
-    def create_publisher(self, kind: Any, name: str, qos: Any) -> Any:
-        """A publisher; of its own for the readings."""
-        return self._shared.publisher(kind, name, qos)
-
-    def create_subscription(
-        self, kind: Any, name: str, take: Callable[[Any], None], qos: Any
-    ) -> None:
-        """A place among those that hear a topic."""
-        self._shared.hear(kind, name, take, qos)
-
-    def counted(self, callback: Callable[..., None]) -> Callable[..., None]:
-        """As the participant's."""
-        return self._shared.participant.counted(callback)
-
-    def serve(self, kind: Any, name: str, handle: Callable[[Any, OpenRequest], None]) -> None:
-        """A service of its own; none where there is nothing to ask for."""
-        if kind is not srv.ReadLog:
-            self._shared.participant.serve(kind, name, handle)
-
-
-@dataclass
-class Tally:
-    """What the slaves of a process did.
-
-    Attributes:
-        cycles: of all slaves that are registered.
-        late: of those, more than a period after they were due; what fell due meanwhile is left out.
-        messages: readings that were sent.
-        lost: times that a slave lost its master.
-        taken: unix times at which assignments came.
-    """
-
-    cycles: int = 0
-    late: int = 0
-    messages: int = 0
-    lost: int = 0
-    taken: dict[str, float] = field(default_factory=dict)
-
-    def begin(self) -> None:
-        """Count anew."""
-        self.cycles = self.late = self.messages = self.lost = 0
-
-
-@dataclass
-class CountedPublisher:
-    """A publisher of readings, and a tally of what it sends."""
-
-    publisher: Any
-    tally: Tally
-
-    def publish(self, message: bytes) -> None:
-        """Send a reading."""
-        self.tally.messages += 1
-        self.publisher.publish(message)
-
-
-class SharedParticipant:
-    """One participant for many slaves."""
-
-    def __init__(self, settings: RosSettings, name: str, tally: Tally) -> None:
-        self._tally = tally
-        self.participant = Participant(settings, name, pace="steady")
-        self._clients: dict[Any, Any] = {}
-        self._publishers: dict[Any, Any] = {}
-        self._hearers: dict[Any, list[Callable[[Any], None]]] = {}
-
-    def client(self, kind: Any, name: str, qos_profile: Any) -> Any:
-        """The shared client of a service, or a new one for `request_process`."""
-        if kind in self._clients:
-            return self._clients[kind]
-        made = self.participant.node.create_client(kind, name, qos_profile=qos_profile)
-        if kind is not srv.RequestProcess:
-            self._clients[kind] = made
-        return made
-
-    def publisher(self, kind: Any, name: str, qos: Any) -> Any:
-        """The shared publisher of a topic, or a new one for `resource_info`."""
-        if kind in self._publishers:
-            return self._publishers[kind]
-        made = self.participant.node.create_publisher(kind, name, qos)
-        if kind is msg.ResourceInfo:
-            return CountedPublisher(made, self._tally)
-        self._publishers[kind] = made
-        return made
-
-    def hear(self, kind: Any, name: str, take: Callable[[Any], None], qos: Any) -> None:
-        """Pass each message of a topic to `take`, by one subscription for all."""
-        if kind in self._hearers:
-            self._hearers[kind].append(take)
-            return
-        hearers = self._hearers[kind] = [take]
-
-        def pass_on(message: Any) -> None:
-            for hearer in hearers:
-                hearer(message)
-
-        self.participant.node.create_subscription(kind, name, pass_on, qos)
 
 
 class Walks:
