@@ -30,6 +30,8 @@ _BRIDGE: Final = "bridge"
 #: How a host calls its one interface.
 INTERFACE: Final = "eth0"
 _MAIN_TABLE: Final = 254
+#: TC_H_ROOT: pyroute2's own `root=True` asks for a handle too, which a deletion must not have.
+_ROOT: Final = 0xFFFFFFFF
 _IPV4: Final = 2
 
 
@@ -152,7 +154,7 @@ def _set_delay(name: str, interface: str, wire: Wire) -> None:
                     "replace", "netem", index=index, delay=round(wire.delay * 1e6), limit=100_000
                 )
             else:
-                namespace.tc("del", index=index, root=True)
+                namespace.tc("del", index=index, parent=_ROOT)
         except NetlinkError as error:
             if error.code in (errno.ENOENT, errno.EOPNOTSUPP):
                 raise LabError(

@@ -161,6 +161,28 @@ def test_packets_are_late_or_the_kernel_cannot(lab):
     back.communicate()
 
 
+def test_the_end_of_a_delay_takes_its_queue_away(lab):
+    """Also shown by a kernel without netem, with a queue that it has."""
+    from pyroute2 import IPRoute
+
+    from rosrm.lab import network
+    from rosrm.lab.plan import switch_namespace
+    from rosrm.lab.wires import Wire
+
+    name = switch_namespace(lab.name)
+
+    def kinds(switch, index):
+        return {queue.get("kind") for queue in switch.get_qdiscs(index=index)}
+
+    with IPRoute(netns=name) as switch:
+        (port,) = switch.link_lookup(ifname="port1")
+        before = kinds(switch, port)
+        switch.tc("replace", "tbf", index=port, rate="8mbit", burst=32000, latency="50ms")
+        assert kinds(switch, port) == {"tbf"}
+        network._set_delay(name, "port1", Wire())
+        assert kinds(switch, port) == before
+
+
 @pytest.mark.parametrize(
     "change",
     [
