@@ -112,7 +112,7 @@ def cycle_times(
     far.loglog(wide, paper.slope * wide + paper.intercept, color=_COLOURS[1], lw=1.2, ls="--",
                label="paper's line")  # fmt: skip
     far.axhline(100.0, color=_INK, lw=1.0, ls=(0, (6, 4)), label="one cycle, 100 ms")
-    far.legend(frameon=False)
+    far.legend(frameon=False, loc="lower right")
     figure.savefig(path, dpi=130)
     plt.close(figure)
 

@@ -98,6 +98,7 @@ def test_fig9_holds_below_the_papers_slope_only():
     wrong, figures = fig9.judge(points, points, Line(0.02, 0.0, 1.0))
     assert (wrong, figures["slope_us"]) == ([], 20.0)
     assert "the paper: 84.3" in fig9.judge(points, points, Line(0.09, 0.0, 1.0))[0][0]
+    assert "does not describe" in fig9.judge(points, points, Line(0.02, 0.0, 0.5))[0][0]
     slow = [{"slaves": 1000, "ms": 120.0}]
     assert "of a cycle of 100 ms" in fig9.judge(points, slow, Line(0.02, 0.0, 1.0))[0][0]
 
