@@ -20,7 +20,7 @@ from types import FrameType
 
 from benchmarks.machine import say
 from benchmarks.paper.labs import Failed
-from benchmarks.paper.page import update_page
+from benchmarks.paper.page import checked_page, update_page
 from benchmarks.paper.report import FIGURES, Options, plain_report, write_report
 from rosrm.errors import RosrmError
 from rosrm.lab import needs
@@ -48,6 +48,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     names = FIGURES if options.figure == "all" else (options.figure,)
     _raise_signals()
     try:
+        if options.page is not None:
+            checked_page(options.page)  # before an hour's work, not after it
         options.out.mkdir(parents=True, exist_ok=True)
         if set(names) - set(_WITHOUT_LAB):
             needs.check_rights()

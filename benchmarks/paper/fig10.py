@@ -83,7 +83,6 @@ def judge(trace: Trace) -> tuple[list[str], dict[str, Any]]:
     wrong += [f"{event.process} stayed: {event.message}" for event in trace.of_kind("stayed")]
     return [one for one in wrong if one], {
         "migrations": [_plain(move, trace) for move in moves],
-        "submitted": trace.assignments(),
         "limit_reached_s": [
             {"s": round(event.elapsed - trace.start, 2), "host": event.host}
             for event in trace.of_kind("over_limit")

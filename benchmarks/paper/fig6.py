@@ -79,7 +79,7 @@ def judge(trace: Trace, needs: dict[str, float]) -> tuple[list[str], dict[str, A
         trace: of the run.
         needs: bytes by process, in the order of the queue.
     """
-    assigned = list(trace.of_kind("assigned"))
+    assigned = trace.placed()
     last = trace.looks[-1]
     largest = max(needs.values()) / min(host.capacity for host in last.hosts.values())
     apart = widest_gap(trace, trace.hosts)
@@ -106,7 +106,6 @@ def judge(trace: Trace, needs: dict[str, float]) -> tuple[list[str], dict[str, A
         "largest_process_points": round(100 * largest, 2),
         "memory_percent_at_the_end": ends,
         **trace.curves(),
-        "assignments": trace.assignments(),
     }
 
 

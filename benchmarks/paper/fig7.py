@@ -60,7 +60,7 @@ def judge(trace: Trace, joins: Sequence[float]) -> tuple[list[str], dict[str, An
         trace: of the run.
         joins: seconds at which the second and third slave were started.
     """
-    assigned = list(trace.of_kind("assigned"))
+    assigned = trace.placed()
     wrong = not_to_emptiest(trace, {event.process: _NEED for event in assigned})
     first: dict[str, float] = {}
     for event in assigned:
@@ -88,7 +88,6 @@ def judge(trace: Trace, joins: Sequence[float]) -> tuple[list[str], dict[str, An
         "gap_at_the_end_points": round(100 * apart, 2),
         "one_process_points": round(100 * one, 2),
         **trace.curves(),
-        "assignments": trace.assignments(),
     }
 
 

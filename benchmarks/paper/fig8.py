@@ -80,8 +80,7 @@ def judge(trace: Trace, held: list[int], fit: Line) -> tuple[list[str], dict[str
         "slaves": list(range(1, len(held) + 1)),
         "processes": held,
         "over_limit_percent": {name: round(100 * top, 1) for name, top in beyond.items()},
-        "per_host": per_host(list(trace.of_kind("assigned"))),
-        "assignments": trace.assignments(),
+        "per_host": per_host(trace.placed()),
         **trace.curves(),
     }
 

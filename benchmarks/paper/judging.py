@@ -70,6 +70,8 @@ def not_to_emptiest(
     held: dict[str, dict[str, float]] = {}
     first = first_looks(trace)
     for event in trace.of_kind("assigned"):
+        for others in held.values():  # an assignment that was not taken up is given again
+            others.pop(event.process, None)
         loads = {
             name: (host.usage or 0.0) + sum(held.get(name, {}).values()) / host.capacity
             for name, (at, host) in first.items()
@@ -81,8 +83,6 @@ def not_to_emptiest(
                 f"{event.process} went to {event.host} at {100 * loads[event.host]:.1f} % while "
                 f"{emptiest} was at {100 * loads[emptiest]:.1f} %"
             )
-        for others in held.values():  # an assignment that was not taken up is given again
-            others.pop(event.process, None)
         held.setdefault(event.host, {})[event.process] = needs[event.process]
     return wrong
 

@@ -158,11 +158,10 @@ class LabCluster:
 
     def _start_desk(self) -> subprocess.Popen[bytes]:
         command = [sys.executable, "-m", "benchmarks.paper.desk"]
-        log = (self._folder / "desk.log").open("wb")
-        with log:
+        with (self._folder / "desk.log").open("wb") as sink:
             return self.lab.popen(
                 DESK, command, cwd=str(ROOT), stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-                stderr=log,
+                stderr=sink,
             )  # fmt: skip
 
     def _start(self, name: str, host: str, command: list[str], *, limited: bool = True) -> None:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from benchmarks.paper.report import FIGURES
+from rosrm.errors import RosrmError
 
 _Report = Mapping[str, Any]
 
@@ -27,9 +28,9 @@ def update_page(page: Path, results: Path) -> list[str]:
         results: folder with FIGURE.json and FIGURE.png.
 
     Raises:
-        ValueError: the page lacks the marks of a figure that was measured.
+        RosrmError: the page lacks the marks of a figure.
     """
-    text, written = page.read_text(encoding="utf-8"), []
+    text, written = checked_page(page), []
     for name in FIGURES:
         file = results / f"{name}.json"
         if not file.exists():
@@ -42,11 +43,24 @@ def update_page(page: Path, results: Path) -> list[str]:
     return written
 
 
+def checked_page(page: Path) -> str:
+    """The text of a page that has the marks of every figure; raises `RosrmError`."""
+    text = page.read_text(encoding="utf-8")
+    for name in FIGURES:
+        if not _marked(name).search(text):
+            raise RosrmError(
+                f"--page {page}: there are no marks '<!-- {name} -->' and '<!-- /{name} -->', each "
+                "on a line of its own; docs/evaluation.md has them"
+            )
+    return text
+
+
+def _marked(name: str) -> re.Pattern[str]:
+    return re.compile(rf"^(<!-- {name} -->\n).*?^(<!-- /{name} -->)$", re.DOTALL | re.MULTILINE)
+
+
 def _replaced(text: str, name: str, content: str) -> str:
-    marked = re.compile(rf"(<!-- {name} -->\n).*?(<!-- /{name} -->)", re.DOTALL)
-    if not marked.search(text):
-        raise ValueError(f"the page has no pair of marks '<!-- {name} -->' and '<!-- /{name} -->'")
-    return marked.sub(lambda found: f"{found[1]}{content}{found[2]}", text)
+    return _marked(name).sub(lambda found: f"{found[1]}{content}{found[2]}", text)
 
 
 def section(name: str, report: _Report, picture: str) -> str:

@@ -75,13 +75,8 @@ def shared_out(scans: Sequence[int], pieces: int) -> list[int]:
 
     Args:
         scans: of each drive.
-        pieces: together; at least one a drive.
-
-    Raises:
-        ValueError: more drives than pieces.
+        pieces: together; at least as many as drives.
     """
-    if len(scans) > pieces:
-        raise ValueError(f"{len(scans)} drives cannot be cut into {pieces} pieces together")
     counts = [1] * len(scans)
     while sum(counts) < pieces:  # whoever has the longest pieces is cut once more
         longest = max(range(len(scans)), key=lambda one: (scans[one] / counts[one], -one))
@@ -90,8 +85,13 @@ def shared_out(scans: Sequence[int], pieces: int) -> list[int]:
 
 
 def pieces_of(drives: Sequence[str], pieces: int = PIECES) -> list[Piece]:
-    """The job; raises `DriveError` for a drive that is not there."""
-    counts = shared_out([len(load_drive(name)) for name in drives], pieces)
+    """The job; raises `DriveError` for a drive that is not there or cannot be cut so."""
+    if len(drives) > pieces:
+        raise DriveError(f"{len(drives)} drives are too many for {pieces} pieces: at most {pieces}")
+    loaded = [load_drive(name) for name in drives]
+    counts = shared_out([len(drive) for drive in loaded], pieces)
+    for drive, of in zip(loaded, counts, strict=True):
+        drive.piece(1, of)  # raises where it cannot be cut so
     return [
         Piece(name, number, of)
         for name, of in zip(drives, counts, strict=True)

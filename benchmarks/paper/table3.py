@@ -8,6 +8,7 @@ turns.
 from __future__ import annotations
 
 import statistics
+import subprocess
 import time
 from collections.abc import Sequence
 from functools import partial
@@ -72,7 +73,13 @@ class Cases:
 
     def _map(self, placed: Sequence[tuple[str, Piece]], out: Path) -> None:
         started = [
-            self._cluster.lab.popen(host, piece.command(out), cwd=str(ROOT), stdin=-3, stdout=-3)
+            self._cluster.lab.popen(
+                host,
+                piece.command(out),
+                cwd=str(ROOT),
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+            )
             for host, piece in placed
         ]
         try:
@@ -117,9 +124,8 @@ def _times(trace: Trace, names: set[str], began: float) -> dict[str, dict[str, f
     return found
 
 
-def _spent(
-    trace: Trace, names: set[str], times: dict[str, dict[str, float]]
-) -> dict[str, Any]:  # fmt: skip
+def _spent(trace: Trace, names: set[str], times: dict[str, dict[str, float]]) -> dict[str, Any]:
+    """Where the time went, and how many pieces each host got."""
     assigned = [event for event in trace.of_kind("assigned") if event.process in names]
     ends, starts = times["finished"], times["starting"]
     return {

@@ -123,6 +123,10 @@ class Trace:
         """The events of some kinds."""
         return (event for event in self.events if event.kind in kinds)
 
+    def placed(self) -> list[Happening]:
+        """The last assignment of each process: one that was not taken up is given again."""
+        return list({event.process: event for event in self.of_kind("assigned")}.values())
+
     def before(self, elapsed: float) -> Look | None:
         """The last look before a moment of the master's clock."""
         found = None
@@ -163,10 +167,12 @@ class Trace:
         ]
 
     def curves(self) -> dict[str, Any]:
-        """Times and utilisations, plain."""
+        """Times, utilisations and assignments, plain."""
         return {
             "elapsed_s": self.times(),
             "memory_percent": {host: self.percent(host) for host in self.hosts},
+            "assignments": self.assignments(),
+            "given_again": sum(1 for _ in self.of_kind("assigned")) - len(self.placed()),
         }
 
     def assignments(self) -> list[dict[str, Any]]:

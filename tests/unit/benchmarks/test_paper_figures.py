@@ -21,7 +21,9 @@ from benchmarks.paper.slam import Piece, pieces_of, shared_out
 from benchmarks.paper.trace import Happening, HostLook, Look, Trace
 from rosrm.config.host import load_host
 from rosrm.config.work import load_work
+from rosrm.errors import RosrmError
 from rosrm.lab import GIB
+from rosrm_examples.errors import DriveError
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -37,10 +39,18 @@ def test_pieces_are_shared_out_so_that_the_longest_is_short(scans, pieces):
         assert count == 1 or length / (count - 1) >= longest - 1e-9
 
 
-def test_more_drives_than_pieces_are_refused():
-    """Each drive needs a piece."""
-    with pytest.raises(ValueError, match="3 drives cannot be cut into 2"):
-        shared_out([50, 50, 50], 2)
+@pytest.mark.parametrize(
+    ("drives", "said"),
+    [
+        (["street:24"] * 4, "4 drives are too many for 3 pieces"),
+        (["street:5"], "can be cut into at most 2 pieces, not 3"),
+        (["nowhere.npz"], "no such file"),
+    ],
+)
+def test_drives_that_cannot_be_cut_are_refused(drives, said):
+    """Before any host is made."""
+    with pytest.raises(DriveError, match=said):
+        pieces_of(drives, 3)
 
 
 def test_the_job_is_one_that_rosrm_takes(tmp_path):
@@ -177,16 +187,15 @@ def fig8_report(**changes):
 def test_the_page_gets_what_was_measured_and_keeps_the_rest(tmp_path):
     """Written twice it is the same; a figure without a result stays as it is."""
     page = tmp_path / "page.md"
-    page.write_text(
-        "before\n<!-- fig7 -->\nold\n<!-- /fig7 -->\n<!-- fig8 -->\n<!-- /fig8 -->\nend\n"
-    )
+    marked = "".join(f"<!-- {name} -->\nold\n<!-- /{name} -->\n" for name in FIGURES)
+    page.write_text(f"before\n{marked}end\n")
     (tmp_path / "results").mkdir()
     (tmp_path / "results" / "fig8.json").write_text(json.dumps(fig8_report()))
     assert update_page(page, tmp_path / "results") == ["fig8"]
     once = page.read_text()
     assert update_page(page, tmp_path / "results") == ["fig8"]
     assert page.read_text() == once
-    assert once.startswith("before\n<!-- fig7 -->\nold\n<!-- /fig7 -->\n")
+    assert once.startswith("before\n<!-- fig6 -->\nold\n<!-- /fig6 -->\n<!-- fig7 -->\nold\n")
     assert "![fig8: c](results/fig8.png)" in once
     assert "| processes held | proportional | 8, 16 |" in once
     assert "| slaves that passed 80 %, and the highest |  | 1, 84.0 % |" in once
@@ -203,7 +212,7 @@ def test_a_page_without_the_marks_is_refused(tmp_path):
     """What was measured must not get lost silently."""
     (tmp_path / "page.md").write_text("nothing")
     (tmp_path / "fig8.json").write_text(json.dumps(fig8_report()))
-    with pytest.raises(ValueError, match="no pair of marks '<!-- fig8 -->'"):
+    with pytest.raises(RosrmError, match="no marks '<!-- fig6 -->'"):
         update_page(tmp_path / "page.md", tmp_path)
 
 

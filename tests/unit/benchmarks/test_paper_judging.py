@@ -72,14 +72,16 @@ def test_placing_on_the_fullest_is_found_wrong(chosen):
 
 def test_an_assignment_that_is_given_again_counts_once():
     """The second word about a process moves what it holds, and does not double it."""
-    trace = filled([50_000_000, 10_000_000], emptiest)
-    first = trace.events[0]
-    again = Happening(9, 0.6, 0.0, "assigned", first.process, "host2")
-    trace.events.insert(1, again)
-    needs = needs_of([50_000_000, 10_000_000])
-    last = trace.events.pop()
-    trace.events.append(Happening(10, last.elapsed, 0.0, "assigned", last.process, first.host))
-    assert not_to_emptiest(trace, needs) == []
+    usages = {"host1": BASE, "host2": BASE}
+    trace = Trace(looks=[look_at(0.0, usages)])
+    trace.events = [
+        Happening(1, 1.0, 0.0, "assigned", "a", "host1"),
+        Happening(2, 6.0, 0.0, "assigned", "a", "host1"),
+        Happening(3, 7.0, 0.0, "assigned", "b", "host2"),
+    ]
+    assert not_to_emptiest(trace, {"a": 1e8, "b": 1e8}) == []
+    assert [(event.process, event.elapsed) for event in trace.placed()] == [("a", 6.0), ("b", 7.0)]
+    assert trace.curves()["given_again"] == 1
 
 
 def test_a_host_that_joins_is_judged_from_when_it_is_seen():
