@@ -126,7 +126,7 @@ def _times(trace: Trace, names: set[str], began: float) -> dict[str, dict[str, f
 
 def _spent(trace: Trace, names: set[str], times: dict[str, dict[str, float]]) -> dict[str, Any]:
     """Where the time went, and how many pieces each host got."""
-    assigned = [event for event in trace.of_kind("assigned") if event.process in names]
+    assigned = [event for event in trace.placed() if event.process in names]
     ends, starts = times["finished"], times["starting"]
     return {
         "last_assigned_s": round(max(times["assigned"].values()), 3),
