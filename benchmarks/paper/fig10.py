@@ -23,10 +23,10 @@ CLAIM: Final = (
 _HOSTS: Final = {
     "host1": (512 * MIB, 0.0),
     "host2": (512 * MIB, 30.0),
-    "host3": (1024 * MIB, 190.0),
+    "host3": (1536 * MIB, 350.0),
 }
 #: Seconds at which the processes are submitted, and at which the run ends.
-_COME: Final = (0.0, 33.0, 70.0)
+_COME: Final = (0.0, 33.0, 75.0)
 _END: Final = 135.0
 #: MB of each at its beginning, and more in every second.
 _MB, _GROWTH = 20.0, 5.5
@@ -108,8 +108,8 @@ def _draw(trace: Trace, moves: list[Move], path: Path) -> None:
 
 _SCALED: Final = {
     "time": "2.7 times as fast as in the paper: processes grow by 5.5 MB a second, and come at "
-    "0, 33 and 70 s",
-    "hosts": "512 MiB, 512 MiB and 1 GiB, with other programs holding 0, 30 and 190 MB, instead of "
+    "0, 33 and 75 s",
+    "hosts": "512, 512 and 1536 MiB, with other programs holding 0, 30 and 350 MB, instead of "
     "three of 16 GB alike: rosrm moves a process only where what it uses now fits under the limit, "
     "so one that fills a host by itself cannot leave it for an equal one",
 }

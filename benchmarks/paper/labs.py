@@ -35,6 +35,8 @@ _ANSWER: Final = 30.0
 #: A run that takes so many times as long as on a quiet machine is given up.
 _SLOWEST: Final = 4.0
 _END: Final = 15.0
+#: Lines of the master's record that are shown when something is wrong.
+_TOLD: Final = 15
 _WRONG: Final = frozenset({"failed", "cancelled", "set_aside", "stuck", "unreachable"})
 
 
@@ -205,7 +207,11 @@ class LabCluster:
             if state in _WRONG
         ]
         if wrong:
-            raise Failed(f"on the cluster {'; '.join(wrong[:3])}")
+            told = "\n  ".join(
+                f"{event.elapsed - self.trace.start:.1f} s: {event.message}"
+                for event in self.trace.events[-_TOLD:]
+            )
+            raise Failed(f"on the cluster {'; '.join(wrong[:3])}; last the master said\n  {told}")
         return look
 
     def begin(self) -> None:
