@@ -30,11 +30,13 @@ class Kept(NamedTuple):
         topic: of the input.
         stamp: source time stamp, ns.
         item: the message with all that is needed to serve it.
+        size: bytes.
     """
 
     topic: str
     stamp: int
     item: Any
+    size: int
 
 
 @dataclass(slots=True)
@@ -68,11 +70,13 @@ class InputBuffer:
 
     Args:
         limit: most messages of one input.
+        room: most bytes of all.
         now: monotonic seconds.
     """
 
-    def __init__(self, limit: int, now: float) -> None:
+    def __init__(self, limit: int, room: int, now: float) -> None:
         self._limit = limit
+        self._room = room
         self._since = now
         self._kept: deque[Kept] = deque()
         self._tracks: dict[str, _Track] = {}
@@ -83,7 +87,11 @@ class InputBuffer:
             track = self._tracks[topic] = _Track(self._since)
         return track
 
-    def add(self, topic: str, sent: Sent, item: Any, now: float) -> bool:
+    def mix(self, topic: str) -> None:
+        """The messages of an input come in no certain order: several threads take them."""
+        self._track(topic).mixed = True
+
+    def add(self, topic: str, sent: Sent, item: Any, now: float, size: int = 0) -> bool:
         """Keep a message, unless a state covers it already.
 
         Returns:
@@ -95,10 +103,11 @@ class InputBuffer:
         if _is_covered(track, sent.stamp):
             track.overlap = True
             return True
-        if track.held >= self._limit:
+        if track.held >= self._limit or size > self._room:
             return False
         track.held += 1
-        self._kept.append(Kept(topic, sent.stamp, item))
+        self._room -= size
+        self._kept.append(Kept(topic, sent.stamp, item, size))
         return True
 
     def cover(self, topic: str, stamps: Iterable[int], *, single: bool) -> None:
@@ -126,14 +135,15 @@ class InputBuffer:
     def _drop_covered(self, topic: str, track: _Track) -> None:
         if not track.held:
             return
-        left = [
-            one for one in self._kept if one.topic != topic or not _is_covered(track, one.stamp)
-        ]
-        dropped = len(self._kept) - len(left)
-        if dropped:
-            track.overlap = True
-            track.held -= dropped
-            self._kept = deque(left)
+        left: deque[Kept] = deque()
+        for one in self._kept:
+            if one.topic == topic and _is_covered(track, one.stamp):
+                track.overlap = True
+                track.held -= 1
+                self._room += one.size
+            else:
+                left.append(one)
+        self._kept = left
 
     def overlaps(self, topic: str) -> bool:
         """Whether a message was received that the state covers: from there on none is missing."""
@@ -162,6 +172,7 @@ class InputBuffer:
             return None
         kept = self._kept.popleft()
         self._tracks[kept.topic].held -= 1
+        self._room += kept.size
         return kept
 
     def __len__(self) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Final
 
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from rosrm.version import PROTOCOL_VERSION
@@ -25,6 +26,12 @@ STATE: Final = _latched(1)
 #: the others.
 STATE_FOLLOWED: Final = _latched(10)
 MARK: Final = _latched(100)
+
+
+#: What comes and goes with a handoff has no events: an rclpy executor of several threads raises
+#: InvalidHandle where an event handler is destroyed while it gathers what it waits for.
+NO_SUBSCRIPTION_EVENTS: Final = SubscriptionEventCallbacks(use_default_callbacks=False)
+NO_PUBLISHER_EVENTS: Final = PublisherEventCallbacks(use_default_callbacks=False)
 
 
 class Channel:
@@ -55,8 +62,12 @@ class Channel:
         self._heard = heard
         self._last: HandoffReport | None = None
         self.topic = topic
-        self._publisher = plain.create_publisher(HandoffReport, topic, CHANNEL)
-        self._subscription = plain.create_subscription(HandoffReport, topic, self._take, CHANNEL)
+        self._publisher = plain.create_publisher(
+            HandoffReport, topic, CHANNEL, event_callbacks=NO_PUBLISHER_EVENTS
+        )
+        self._subscription = plain.create_subscription(
+            HandoffReport, topic, self._take, CHANNEL, event_callbacks=NO_SUBSCRIPTION_EVENTS
+        )
 
     def _take(self, report: HandoffReport) -> None:
         theirs = report.instance == self._peer and report.destination == self._destination

@@ -120,7 +120,10 @@ class Destination:
             return
         subscribe = self._member.plain.create_subscription
         try:
-            subscription = subscribe(message_type, topic, partial(self._came, take), qos, raw=raw)
+            subscription = subscribe(
+                message_type, topic, partial(self._came, take), qos, raw=raw,
+                event_callbacks=topics.NO_SUBSCRIPTION_EVENTS,
+            )  # fmt: skip
             self._followed.append((subscription, take))
         except Exception as error:  # noqa: BLE001 - rclpy raises what the middleware says
             # An entity of the author's may have another type on that topic.
@@ -274,7 +277,7 @@ class Destination:
                     f"for the readers of {output.topic}: {readers[output.topic]} of "
                     f"{output.subscriptions} matched"
                 )
-        writers = {one.topic: one.subscription.get_publisher_count() for one in self._member.inputs}
+        writers = {one.key: one.subscription.get_publisher_count() for one in self._member.inputs}
         for covered in mark.inputs:
             if writers.get(covered.topic, covered.publishers) < covered.publishers:
                 return (
@@ -292,7 +295,7 @@ class Destination:
     def _follows(self, topic: str, now: float) -> bool:
         """Whether no message of an input can be missing both here and in the state."""
         buffer = self._member.buffer
-        if all(one.topic != topic for one in self._member.inputs) or buffer.overlaps(topic):
+        if all(one.key != topic for one in self._member.inputs) or buffer.overlaps(topic):
             return True
         return buffer.is_idle(topic, now, self._matched_at, _IDLE)
 

@@ -7,35 +7,42 @@ the author is one cycle, and cycles never overlap, so that a state always lies b
 
 from __future__ import annotations
 
+import itertools
 import threading
 import time
 from collections.abc import Callable, Iterable
 from enum import Enum
 from typing import Any, Final
 
-from rosrm.node.buffer import InputBuffer, Kept, Sent
+from rclpy.executors import MultiThreadedExecutor
+
+from rosrm.node.buffer import InputBuffer, Sent
 from rosrm.node.entities import (
-    BUFFER_LIMIT,
     Gate,
     GatedPublisher,
+    Held,
     Input,
     OpeningOf,
     ServiceOf,
     TimerOf,
     refuse_coroutine,
+    size_of,
     waiting,
     wants_all,
     wants_info,
 )
 from rosrm.node.identity import Identity
+from rosrm.node.replay import Replay
 
+#: Most messages of one input, and most bytes of all, that are kept for a successor: a silent source
+#: whose destination is stuck may have to keep half a minute of a fast sensor.
+BUFFER_LIMIT: Final = 100_000
+BUFFER_BYTES: Final = 512 << 20
 #: rclpy's own, which every node has for itself.
 _INTERNAL: Final = frozenset({"/parameter_events", "/clock", "/rosout"})
 #: Seconds after becoming active in which a message may still come that the source has processed.
 #: Not longer: the clock of a publisher may be set back.
 _LATE: Final = 10.0
-#: Seconds between two looks of a request that waits at whether its node ends.
-_LOOK: Final = 0.5
 
 
 class Mode(Enum):
@@ -65,7 +72,7 @@ class Member:
         self.node = node
         self.plain = plain
         self.identity = identity
-        self.turn = threading.Condition(threading.RLock())
+        self.turn = threading.RLock()
         self.mode = Mode.SHADOW if identity.shadow else Mode.ACTIVE
         self.sequence = 0
         self._late_until = 0.0
@@ -76,6 +83,7 @@ class Member:
         self.on_overflow: Callable[[str], None] = _ignore
         self._gate = Gate(self.mode is Mode.ACTIVE)
         self._openings: list[ServiceOf | OpeningOf] = []
+        self._replay = Replay(plain, self.turn, self._serve_next)
         self.buffer = self._new_buffer()
 
     @property
@@ -92,7 +100,7 @@ class Member:
         return f"{self.visible_node}/{resolved[len(own) :]}"
 
     def _new_buffer(self) -> InputBuffer:
-        return InputBuffer(BUFFER_LIMIT, time.monotonic())
+        return InputBuffer(BUFFER_LIMIT, BUFFER_BYTES, time.monotonic())
 
     # --- what the author creates -----------------------------------------------------------
 
@@ -126,8 +134,15 @@ class Member:
         topic = self.visible(topic, self.node.resolve_topic_name)
         one.subscription = self.plain.create_subscription(message_type, topic, take, qos, **rest)
         one.topic = one.subscription.topic_name
+        one.key = self._new_key(one.topic)
         self.inputs.append(one)
         return one.subscription
+
+    def _new_key(self, topic: str) -> str:
+        """A node may subscribe to a topic twice, and each of its inputs has every message."""
+        taken = {one.key for one in self.inputs}
+        numbered = (f"{topic}#{number}" for number in itertools.count(2))
+        return next(key for key in itertools.chain([topic], numbered) if key not in taken)
 
     def create_timer(
         self,
@@ -143,7 +158,9 @@ class Member:
         refuse_coroutine(callback, f"a timer of {period} s")
 
         def tick(*arguments: Any) -> None:
+            one.taken += 1
             with self.turn:
+                one.taken -= 1
                 if self.mode is Mode.ACTIVE:
                     one.back_in_step()
                     self._cycle(callback, *arguments)
@@ -164,14 +181,14 @@ class Member:
         name = self.visible(name, self.node.resolve_service_name)
 
         def serve(request: Any, response: Any) -> Any:
-            with service.serving(), self.turn:
-                while not self._may_serve():
-                    self.turn.wait(_LOOK)
+            with self.turn:
+                if self.mode is not Mode.ACTIVE:
+                    return Held(request, response)
                 return self._cycle(callback, request, response)
 
         service = ServiceOf(
-            lambda: self.plain.create_service(service_type, name, serve, **rest),
-            self.plain.destroy_service, name,
+            lambda answer: self.plain.create_service(service_type, name, answer, **rest),
+            self.plain.destroy_service, name, serve,
         )  # fmt: skip
         self._add_opening(service)
         return service
@@ -205,35 +222,13 @@ class Member:
 
     def _received(self, one: Input, message: Any, info: Any) -> None:
         with self.turn:
-            if self.mode is Mode.ACTIVE:
-                if not self._is_late(one, info):
-                    one.serve(message, info)
-                    self._cycle_ended()
-            elif one.buffered:
+            if one.buffered and (self.mode is not Mode.ACTIVE or self._replay.is_on):
                 self._keep(one, message, info)
-                self._catch_up(one)
-
-    def _keep(self, one: Input, message: Any, info: Any) -> None:
-        """For who goes on: this node when it becomes active, or again."""
-        sent = Sent(info["source_timestamp"], info["publication_sequence_number"] or None)
-        if not self.buffer.add(one.topic, sent, (one, message, info), time.monotonic()):
-            self.on_overflow(one.topic)
-
-    def _catch_up(self, one: Input) -> None:
-        """Keep what has come: a reader has less room than the buffer, and drops the oldest."""
-        for message, info in waiting(one.subscription):
-            self._keep(one, message, info)
-
-    def input_with_gap(self) -> str:
-        """An input that is to have every message, and misses one for good; "": there is none."""
-        topics = (one.topic for one in self.inputs if one.buffered and one.wants_all)
-        return next((topic for topic in topics if self.buffer.misses_one(topic)), "")
-
-    def catch_up(self) -> None:
-        """Keep what has come on every input that is kept at all."""
-        for one in self.inputs:
-            if one.buffered:
-                self._catch_up(one)
+                if self._may_catch_up(one):
+                    self._catch_up(one)
+            elif self.mode is Mode.ACTIVE and not self._is_late(one, info):
+                one.serve(message, info)
+                self._cycle_ended()
 
     def _is_late(self, one: Input, info: Any) -> bool:
         """It was on its way when this node became active, and the source had processed it."""
@@ -242,36 +237,91 @@ class Member:
         if time.monotonic() >= self._late_until:
             self._late_until = 0.0
             return False
-        return self.buffer.is_marked(one.topic, info["source_timestamp"])
+        return self.buffer.is_marked(one.key, info["source_timestamp"])
 
-    def _may_serve(self) -> bool:
-        """For a request that another thread took in the very moment of falling silent.
+    # --- what is kept ----------------------------------------------------------------------
 
-        It is served if the node goes on, and else when it ends: an answer would be invented.
+    def _keep(self, one: Input, message: Any, info: Any) -> None:
+        """For who goes on: this node when it becomes active, or again."""
+        sent = Sent(info["source_timestamp"], info["publication_sequence_number"] or None)
+        if not one.is_ordered():
+            self.buffer.mix(one.key)
+        item, now = (one, message, info), time.monotonic()
+        if not self.buffer.add(one.key, sent, item, now, size_of(message)):
+            self.on_overflow(one.topic)
+
+    def _may_catch_up(self, one: Input) -> bool:
+        """No other thread holds an older message; and no node of too much work is given more."""
+        busy = self.mode is Mode.ACTIVE and time.monotonic() >= self._late_until
+        return not busy and (self._is_one_thread() or one.is_ordered())
+
+    def _is_one_thread(self) -> bool:
+        return not isinstance(self.node.executor, MultiThreadedExecutor)
+
+    def _catch_up(self, one: Input) -> None:
+        """Keep what has come: a reader has less room than the buffer, and drops the oldest."""
+        for message, info in waiting(one.subscription):
+            self._keep(one, message, info)
+
+    def catch_up(self) -> None:
+        """Keep what has come on every input that is kept at all, as far as that is known."""
+        if self._is_one_thread():
+            for one in self.inputs:
+                if one.buffered:
+                    self._catch_up(one)
+
+    def input_with_gap(self) -> str:
+        """An input that is to have every message, and misses one for good; "": there is none."""
+        wanting = (one for one in self.inputs if one.buffered and one.wants_all)
+        return next((one.topic for one in wanting if self.buffer.misses_one(one.key)), "")
+
+    def serve_what_has_come(self, then: Callable[[], None]) -> None:
+        """Before falling silent: a shadow that joined later never had what waits here since.
+
+        Args:
+            then: called when it is served.
         """
-        return self.mode is Mode.ACTIVE or not self.node.context.ok()
+        if not self._replay.is_on:
+            self.catch_up()
+        if self.buffer:
+            self._replay.serve(len(self.buffer), then)
+        else:
+            then()
+
+    def _serve_next(self) -> bool:
+        if self.mode is not Mode.ACTIVE:
+            return False
+        if time.monotonic() < self._late_until:
+            self.catch_up()  # later on, a reader's depth is what it is for a busy node
+        kept = self.buffer.take()
+        if kept is not None:
+            one, message, info = kept.item
+            one.serve(message, info)
+            self._cycle_ended()
+            return True
+        return any(one.serve_held() for one in self._openings if isinstance(one, ServiceOf))
 
     # --- changes of the mode ---------------------------------------------------------------
 
     def fall_silent(self) -> list[int]:
-        """Stop all that can be heard, but for services; returns what `timers_due` was (ns)."""
+        """Stop all that can be heard; returns what `timers_due` was (ns)."""
         due = self.timers_due()
         self.mode = Mode.SILENT
         self._gate.is_open = False
-        self.buffer = self._new_buffer()
+        if not self.buffer:  # what came while the last was served is for who goes on
+            self.buffer = self._new_buffer()
         for timer in self.timers:
             timer.started = not timer.timer.is_canceled()
             timer.stop()
-        self._close_all(OpeningOf)
+        for opening in self._openings:
+            if isinstance(opening, OpeningOf):
+                self._close(opening)
         return due
 
     def close_services(self) -> None:
-        """Take the servers down, which may take some 20 ms: a silent node serves no request."""
-        self._close_all(ServiceOf)
-
-    def _close_all(self, kind: type[ServiceOf | OpeningOf]) -> None:
+        """The successor answers: what is still sent here would be lost."""
         for opening in self._openings:
-            if isinstance(opening, kind):
+            if isinstance(opening, ServiceOf):
                 self._close(opening)
 
     def _close(self, opening: ServiceOf | OpeningOf) -> None:
@@ -281,10 +331,10 @@ class Member:
             what = f"{type(error).__name__}: {error}"
             self.node.get_logger().error(f"falling silent, and closing raised {what}")
 
-    def inherit(self, topic: str, covered: Iterable[int]) -> None:
+    def inherit(self, key: str, covered: Iterable[int]) -> None:
         """What the source had processed of an input is processed here too."""
         for one in self.inputs:
-            if one.topic == topic:
+            if one.key == key:
                 one.covered.extend(covered)
 
     def timers_due(self) -> list[int]:
@@ -298,27 +348,23 @@ class Member:
             timers_due: seconds until each timer is due, negative where it is late; None: it was
                 cancelled. Timers beyond the list start now.
             announce: called at once, as serving may take long.
+
+        Timers and services go on after the first slice of what was kept.
         """
         self.mode = Mode.ACTIVE
         self._gate.is_open = True
         self._late_until = time.monotonic() + _LATE
         announce()
-        self._start_timers(timers_due)
-        try:
-            while (kept := self._next_kept()) is not None:
-                one, message, info = kept.item
-                one.serve(message, info)
-                self._cycle_ended()
-        finally:
+        begun = time.monotonic()
+
+        def go_on() -> None:
+            self._start_timers(timers_due, time.monotonic() - begun)
             for opening in self._openings:
                 opening.open()
-            self.turn.notify_all()
 
-    def _next_kept(self) -> Kept | None:
-        self.catch_up()
-        return self.buffer.take()
+        self._replay.begin(after_first=go_on)
 
-    def _start_timers(self, due: list[float | None]) -> None:
+    def _start_timers(self, due: list[float | None], passed: float) -> None:
         for index, timer in enumerate(list(self.timers)):
             if index >= len(due):
                 if timer.started:
@@ -330,7 +376,7 @@ class Member:
             elif timer.follows_ros_time():
                 timer.timer.reset()  # its seconds are not ours
             else:
-                timer.start_in(seconds)
+                timer.start_in(seconds - passed)
 
 
 def _nothing() -> None:

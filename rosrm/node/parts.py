@@ -161,10 +161,17 @@ class ParametersPart(Part):
             if not self._node.has_parameter(parameter.name):
                 self._node.declare_parameter(parameter.name, parameter.value)
         differing = [one for one in parameters if not self._has(one)]
-        for result in self._node.set_parameters(differing):
-            if not result.successful:
-                raise ValueError(f"a parameter was refused: {result.reason}")
+        # At once: they may be valid only together.
+        result = self._node.set_parameters_atomically(differing)
+        if not result.successful:
+            names = ", ".join(one.name for one in differing)
+            raise ValueError(f"{names} cannot be set: {result.reason}")
 
     def _has(self, parameter: Parameter) -> bool:
         own = self._node.get_parameter_or(parameter.name, None)
-        return own is not None and own.type_ == parameter.type_ and own.value == parameter.value
+        return own is not None and _content(own) == _content(parameter)
+
+
+def _content(parameter: Parameter) -> bytes:
+    """Its type and value; NaN is not equal to itself."""
+    return bytes(serialize_message(parameter.get_parameter_value()))

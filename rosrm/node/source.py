@@ -44,6 +44,7 @@ class Source:
         self._attached = False
         self._may_switch = False
         self._asked = False
+        self._finishing = False
         self._fault = ""
         self._timers_due: list[int] = []
         self._silent_since = 0.0
@@ -104,13 +105,13 @@ class Source:
 
     def _mark(self, *, last: bool) -> StateMark:
         member = self._member
-        due = self._timers_due if last else member.timers_due()
+        due = self._still_due() if last else member.timers_due()
         return StateMark(
             protocol_version=PROTOCOL_VERSION, run=self._run, sequence=member.sequence, last=last,
             parts=[part.described() for part in self._parts],
             inputs=[
                 CoveredInput(
-                    topic=one.topic, publishers=one.subscription.get_publisher_count(),
+                    topic=one.key, publishers=one.subscription.get_publisher_count(),
                     covered=array("q", one.covered),
                 )
                 for one in member.inputs if one.buffered
@@ -123,6 +124,11 @@ class Source:
             ],
             timers_due=array("q", due),
         )  # fmt: skip
+
+    def _still_due(self) -> list[int]:
+        """To save a large state takes its time."""
+        passed = int((time.monotonic() - self._silent_since) * 1e9)
+        return [due if due < 0 else max(0, due - passed) for due in self._timers_due]
 
     # --- a handoff -------------------------------------------------------------------------
 
@@ -157,6 +163,8 @@ class Source:
             elif report.phase == HandoffReport.SWITCHING:
                 self._asked = True
                 self._switch()
+            elif report.phase == HandoffReport.ACTIVE and self._member.mode is Mode.SILENT:
+                self._member.close_services()
 
     def _attach(self) -> None:
         if self._channel is None or self._attached or self._member.mode is not Mode.ACTIVE:
@@ -167,18 +175,24 @@ class Source:
 
     def _switch(self) -> None:
         """Fall silent, once both the master and the destination want it."""
-        member = self._member
         if self._channel is None or not (self._may_switch and self._asked) or self._fault:
             return
-        if member.mode is Mode.ACTIVE:
-            self._timers_due = member.fall_silent()
-            self._silent_since = time.monotonic()
-            if not self._show(last=True):
-                self._go_on(_nothing)
-                return
-            self._channel.say(HandoffReport.SILENT, member.sequence)
-            member.close_services()
-            self._look_again = member.plain.create_timer(_LOOK, self._release_when_heard)
+        if self._member.mode is Mode.ACTIVE and not self._finishing:
+            self._finishing = True
+            self._member.serve_what_has_come(self._fall_silent)
+
+    def _fall_silent(self) -> None:
+        member, wanted = self._member, self._finishing
+        self._finishing = False
+        if self._channel is None or not wanted or self._fault:
+            return  # called off meanwhile
+        self._timers_due = member.fall_silent()
+        self._silent_since = time.monotonic()
+        if not self._show(last=True):
+            self._go_on(_nothing)
+            return
+        self._channel.say(HandoffReport.SILENT, member.sequence)
+        self._look_again = member.plain.create_timer(_LOOK, self._release_when_heard)
 
     def _release_when_heard(self) -> None:
         """What is not acknowledged is lost when this node is stopped."""
@@ -195,7 +209,7 @@ class Source:
             self._look_again = None
 
     def _resume(self) -> None:
-        self._may_switch = self._asked = self._attached = False
+        self._may_switch = self._asked = self._attached = self._finishing = False
         self._look_no_more()
         if self._member.mode is Mode.SILENT:
             # A shadow of a later handoff must not take the last mark for its own.
@@ -223,7 +237,7 @@ class Source:
         """The handoff is over."""
         self._fault = ""
         self._look_no_more()
-        self._may_switch = self._asked = self._attached = False
+        self._may_switch = self._asked = self._attached = self._finishing = False
         if self._channel is not None:
             self._channel.close()
             self._channel = None

@@ -9,8 +9,8 @@ from types import SimpleNamespace
 
 import pytest
 import rclpy
+from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
 from rclpy.parameter import Parameter
-from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Int64, String
 from std_srvs.srv import Trigger
 
@@ -154,8 +154,33 @@ def test_parameters_set_at_run_time_move_along(stage):
     assert second.gains[-1] == 3.5
 
 
-def test_a_service_is_open_in_the_active_node_alone(stage):
-    """In DDS all servers of one name execute a request."""
+def test_parameters_that_are_valid_only_together_move_along(stage):
+    """Set at once, as they were; a read-only one that equals nothing stays as it is."""
+
+    class Bounded(Counter):
+        def __init__(self, **named):
+            super().__init__(**named)
+            fixed = ParameterDescriptor(read_only=True)
+            self.declare_parameter("unknown", float("nan"), fixed)
+            self.declare_parameter("low", 0)
+            self.declare_parameter("high", 5)
+            self.add_on_set_parameters_callback(self.check)
+
+        def check(self, parameters):
+            values = {name: self.get_parameter(name).value for name in ("low", "high")}
+            values.update({one.name: one.value for one in parameters})
+            return SetParametersResult(successful=values["low"] <= values["high"])
+
+    first = stage.instance(Bounded, 1)
+    both = [Parameter("low", value=10), Parameter("high", value=20)]
+    assert first.set_parameters_atomically(both).successful
+    second = stage.instance(Bounded, 2, alias="counter_17", shadow=True)
+    Conductor(stage, source=1, destination=2).hand_over()
+    assert [second.get_parameter(name).value for name in ("low", "high")] == [10, 20]
+
+
+def test_a_service_is_served_by_the_active_node_alone(stage):
+    """In DDS all servers of one name get a request; a shadow has none, a silent node waits."""
 
     class Server(Counter):
         def __init__(self, **named):
@@ -182,6 +207,7 @@ def test_a_service_is_open_in_the_active_node_alone(stage):
     conductor.wait(2, R.READY)
     stage.spin_until(client.service_is_ready, "the service")
     assert [call() for _ in range(3)] == ["counter"] * 3
+    assert _servers(stage, "/counter/poke") == ["counter"]
     conductor.hand_over()
     stage.spin_until(
         lambda: _servers(stage, "/counter/poke") == ["counter_17"], "the successor's service"
@@ -233,12 +259,102 @@ def test_a_successor_can_be_succeeded(stage, pair):
     assert third.count >= pair.counts[-1].data
 
 
-def test_a_shadow_waits_until_the_readers_of_its_outputs_are_matched(stage, pair):
-    """A reader that it cannot reach would lose what it says first."""
-    stage.listen(Int64, "count", QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT))
+def shadowing(stage, pair, text):
+    """It says that it waits, and for what; it is not ready."""
+    pair.conductor.say(C.SHADOW)
+    reports = pair.conductor.reports
+    stage.spin_until(lambda: any(text in one.message for one in reports), f"a wait {text}")
+    before = len(pair.counts)
+    stage.spin_until(lambda: len(pair.counts) > before + 60, "time to become ready")
+    assert R.READY not in pair.conductor.of(2)
+
+
+@pytest.mark.parametrize(
+    ("what", "method", "text"),
+    [
+        ("output", "get_subscription_count", "for the readers of /count: 0 of 1 matched"),
+        ("input", "get_publisher_count", "for the publishers of /add: 0 of 1 matched"),
+    ],
+)
+def test_a_shadow_waits_until_it_is_matched_as_its_source_is(
+    stage, pair, monkeypatch, what, method, text
+):
+    """A reader that it cannot reach would lose what it says first; so too an input."""
+    talker = stage.plain.create_publisher(Int64, "add", RELIABLE)
+    stage.spin_until(lambda: talker.get_subscription_count() == 2, "both inputs")
+    member = pair.second._rosrm.member
+    entity = member.outputs[0] if what == "output" else member.inputs[0].subscription
+    with monkeypatch.context() as patch:
+        patch.setattr(entity, method, lambda: 0)
+        shadowing(stage, pair, text)
+    pair.conductor.wait(2, R.READY)
+
+
+def test_a_shadow_waits_until_its_buffer_overlaps_the_state(stage, pair, monkeypatch):
+    """What was sent between the two would be with neither."""
+    talker = stage.plain.create_publisher(Int64, "add", RELIABLE)
+    stage.plain.create_timer(0.02, lambda: talker.publish(Int64(data=1)))
+    stage.spin_until(lambda: pair.sums, "a sum")
+    with monkeypatch.context() as patch:
+        patch.setattr(pair.second._rosrm.member.buffer, "overlaps", lambda topic: False)
+        shadowing(stage, pair, "until a message on /add has been here and in the state")
+    pair.conductor.wait(2, R.READY)
+
+
+def test_a_shadow_that_misses_an_input_does_not_become_active(stage, pair, monkeypatch):
+    """The source has it, and goes on."""
     pair.conductor.say(C.SHADOW)
     pair.conductor.wait(2, R.READY)
-    assert pair.second.output.get_subscription_count() >= 2
+    monkeypatch.setattr(pair.second._rosrm.member.buffer, "misses_one", lambda topic: True)
+    pair.conductor.say(C.SWITCH)
+    report = pair.conductor.wait(2, R.FAILED)
+    assert "a message on /add did not come here" in report.message
+    pair.conductor.say(C.RESUME)
+    pair.conductor.wait(1, R.RESUMED)
+    goes_on(stage, pair.counts)
+
+
+def test_an_input_that_comes_after_the_switch_and_was_processed_before_it_counts_once(stage, pair):
+    """Its way to the successor was longer than the state's."""
+    talker = stage.plain.create_publisher(Int64, "add", RELIABLE)
+    stage.spin_until(lambda: talker.get_subscription_count() == 2, "both inputs")
+    late, received = [], pair.second._rosrm.member._received
+    pair.second._rosrm.member._received = lambda *what: late.append(what)
+    pair.second._rosrm.member.catch_up = lambda: None
+    talker.publish(Int64(data=1))
+    stage.spin_until(lambda: pair.sums and late, "the sum, and the message at the shadow")
+    pair.second._rosrm.member.buffer.is_idle = lambda *what: True
+    pair.conductor.hand_over()
+    goes_on(stage, pair.counts)
+    received(*late.pop())
+    goes_on(stage, pair.counts)
+    assert (pair.second.total, numbers(pair.sums)) == (1, [1])
+
+
+def test_a_source_is_released_when_its_last_outputs_have_arrived(stage, pair, monkeypatch):
+    """Until then it has to stay, to send them again."""
+    with monkeypatch.context() as patch:
+        patch.setattr(pair.first.output, "wait_for_all_acked", lambda timeout: False)
+        pair.conductor.say(C.SHADOW)
+        pair.conductor.wait(2, R.READY)
+        pair.conductor.say(C.SWITCH)
+        pair.conductor.wait(2, R.ACTIVE)
+        before = len(pair.counts)
+        stage.spin_until(lambda: len(pair.counts) > before + 20, "counts of the successor")
+        assert R.RELEASED not in pair.conductor.of(1)
+    pair.conductor.wait(1, R.RELEASED)
+
+
+def test_a_successor_does_not_take_over_from_a_source_that_still_speaks(stage, pair):
+    """What of its state is on the way still counts."""
+    pair.conductor.say(C.SHADOW)
+    pair.conductor.wait(2, R.READY)
+    pair.conductor.say(C.TAKE_OVER)
+    before = len(pair.counts)
+    stage.spin_until(lambda: len(pair.counts) > before + 30, "counts of the source")
+    assert R.ACTIVE not in pair.conductor.of(2)
+    stage.remove(pair.first)
+    pair.conductor.wait(2, R.ACTIVE)
 
 
 def test_an_opening_is_made_in_the_active_node_and_destroyed_in_the_silent_one(stage):

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from rosrm.node.buffer import InputBuffer, Sent
 
 A, B = "/a", "/b"
+ROOM = 1000
 
 
 def drained(buffer):
@@ -15,7 +16,7 @@ def drained(buffer):
 
 
 def filled(*messages, limit=100):
-    buffer = InputBuffer(limit, 0.0)
+    buffer = InputBuffer(limit, ROOM, 0.0)
     for topic, stamp in messages:
         assert buffer.add(topic, Sent(stamp), None, 0.0)
     return buffer
@@ -80,7 +81,7 @@ def test_a_publisher_that_is_alone_again_is_not_measured_by_one_that_left():
 
 def test_a_message_that_did_not_come_is_missed_until_a_state_covers_it():
     """Told by the numbers of its publisher."""
-    buffer = InputBuffer(10, 0.0)
+    buffer = InputBuffer(10, ROOM, 0.0)
     for stamp, number in ((10, 1), (20, 2), (40, 4)):
         assert not buffer.misses_one(A)
         buffer.add(A, Sent(stamp, number), None, 0.0)
@@ -94,7 +95,7 @@ def test_a_message_that_did_not_come_is_missed_until_a_state_covers_it():
 
 def test_numbers_of_several_publishers_say_nothing_of_a_loss():
     """Nor do those of one that was started again."""
-    buffer = InputBuffer(10, 0.0)
+    buffer = InputBuffer(10, ROOM, 0.0)
     buffer.cover(A, [5], single=False)
     for stamp, number in ((10, 1), (20, 70), (30, 2)):
         buffer.add(A, Sent(stamp, number), None, 0.0)
@@ -129,7 +130,7 @@ def test_an_input_overlaps_once_a_message_was_here_and_in_the_state():
 
 def test_an_input_is_idle_when_nothing_waits_and_nothing_came_for_a_while():
     """From the beginning of the buffer on."""
-    buffer = InputBuffer(10, 100.0)
+    buffer = InputBuffer(10, ROOM, 100.0)
     assert not buffer.is_idle(A, 100.5, 0.0, 1.0)
     assert buffer.is_idle(A, 101.0, 0.0, 1.0)
     assert not buffer.is_idle(A, 101.0, 100.5, 1.0)
@@ -151,7 +152,7 @@ def test_source_and_successor_together_process_each_message_once(data):
     while messages or marks:
         first = data.draw(st.sampled_from([queue for queue in (messages, marks) if queue]))
         events.append(first.pop(0))
-    buffer = InputBuffer(100, 0.0)
+    buffer = InputBuffer(100, ROOM, 0.0)
     for kind, value in events:
         if kind == "message":
             assert buffer.add(A, Sent(value), None, 0.0)
