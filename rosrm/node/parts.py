@@ -172,6 +172,9 @@ class ParametersPart(Part):
         return own is not None and _content(own) == _content(parameter)
 
 
-def _content(parameter: Parameter) -> bytes:
-    """Its type and value; NaN is not equal to itself."""
-    return bytes(serialize_message(parameter.get_parameter_value()))
+def _content(parameter: Parameter) -> tuple[Any, str]:
+    """Its type and value, by which it equals itself: NaN does not, nor do serialised messages."""
+    value = parameter.value
+    if hasattr(value, "__len__") and not isinstance(value, str):
+        value = list(value)  # rclpy has lists, arrays or tuples
+    return parameter.type_, repr(value)

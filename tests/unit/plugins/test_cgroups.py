@@ -204,7 +204,7 @@ def test_another_group_is_measured_instead_of_the_own():
 
 def test_another_group_that_is_not_there_is_refused():
     """A group that cannot be seen must not silently become the one above it."""
-    with pytest.raises(ConfigError, match="no control group '/robot.slice/jobs' under"):
+    with pytest.raises(ConfigError, match=r"no control group '/robot\.slice/jobs' under"):
         CgroupMemory.find(TREES / "systemd", "/robot.slice/jobs")
 
 
