@@ -14,7 +14,7 @@ from rosrm.core import events as happened
 from rosrm.core import lifecycle
 from rosrm.core.commands import PublishStateConfig
 from rosrm.core.migration import Configure, HandoffPhase, ReportPhase
-from rosrm.core.model import ProcessSpec
+from rosrm.core.model import InstanceId, ProcessSpec
 from rosrm.core.runs import Heard, Run
 from rosrm.core.state import MasterState
 
@@ -111,6 +111,12 @@ def is_active(state: MasterState, run: Run) -> bool:
     return ReportPhase.ACTIVE in said and ReportPhase.ABORTED not in said
 
 
+def is_released(state: MasterState, run: Run, instance: InstanceId) -> bool:
+    """A silent source has nothing more to do, or has ended."""
+    ended = instance.number not in state.instances
+    return ended or ReportPhase.RELEASED in run.phases_of(instance)
+
+
 def is_switching(run: Run) -> bool:
     """The step in hand is the one in which the destination becomes active."""
     step = run.step_in_hand
@@ -135,11 +141,7 @@ def _shadowing(state: MasterState, run: Run) -> str | None:
 
 
 def _switching(state: MasterState, run: Run) -> str | None:
-    if not is_active(state, run):
-        return _fault(state, run) or None
-    released = ReportPhase.RELEASED in run.phases_of(run.source)
-    ended = run.source.number not in state.instances
-    return DONE if released or ended else None
+    return DONE if is_active(state, run) else _fault(state, run) or None
 
 
 def _fault(state: MasterState, run: Run) -> str:
@@ -195,8 +197,6 @@ def was_switched(run: Run) -> bool:
 
 def timed_out(state: MasterState, run: Run, step: Configure, now: float) -> str | None:
     """What the passing of a phase's time means: as `outcome`."""
-    if step.phase is HandoffPhase.SWITCH and is_active(state, run):
-        return DONE  # the source does not say that all of its last words have arrived
     if step.phase is HandoffPhase.RESUME and not was_switched(run):
         return DONE  # it was never asked for silence
     if step.phase is HandoffPhase.ABORT:

@@ -75,6 +75,7 @@ class Start:
     """Start an instance on a host; done when the slave says that it runs.
 
     A shadow is the destination of a handoff: it has an alias, stays silent, and is not restarted.
+    `remappings` come beside those of the process's spec.
     """
 
     instance: InstanceId
@@ -83,11 +84,25 @@ class Start:
     node_name: str = ""
     undo: Step | None = None
     shadow: bool = False
+    remappings: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
 class AwaitReady:
     """Wait until an instance is ready; done when its slave says so."""
+
+    instance: InstanceId
+    host: str
+    timeout: float
+    undo: Step | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class AwaitReleased:
+    """Wait until a silent source says that its last outputs have arrived, or for so long.
+
+    It never fails: its successor is active, and what was sent is sent.
+    """
 
     instance: InstanceId
     host: str
@@ -149,7 +164,7 @@ class Execute:
     undo: Step | None = None
 
 
-Step = Start | AwaitReady | Stop | Configure | SetRestart | Commit | Execute
+Step = Start | AwaitReady | AwaitReleased | Stop | Configure | SetRestart | Commit | Execute
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,6 +8,7 @@ from typing import Any, Final
 
 from rosrm.core.migration import (
     AwaitReady,
+    AwaitReleased,
     Commit,
     Configure,
     Execute,
@@ -23,6 +24,7 @@ from rosrm.core.model import InstanceId, RestartPolicy
 _KINDS: Final[Mapping[str, type[Any]]] = {
     "start": Start,
     "await_ready": AwaitReady,
+    "await_released": AwaitReleased,
     "stop": Stop,
     "configure": Configure,
     "set_restart": SetRestart,
@@ -63,8 +65,9 @@ def step_to_dict(step: Step) -> dict[str, Any]:
             plain[name] = asdict(plain[name])
     if "phase" in plain:
         plain["phase"] = plain["phase"].name
-    if "arguments" in plain:
-        plain["arguments"] = dict(plain["arguments"])
+    for name in ("arguments", "remappings"):
+        if name in plain:
+            plain[name] = dict(plain[name])
     plain["undo"] = None if step.undo is None else step_to_dict(step.undo)
     return {"kind": _NAMES[type(step)], **plain}
 
@@ -153,5 +156,6 @@ _READ: Final[Mapping[str, Callable[[Any], Any]]] = {
     "restart": _restart,
     "executor": _text,
     "arguments": _mapping,
+    "remappings": _mapping,
     "undo": _undo,
 }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import singledispatch
 from typing import Any, Final
 
@@ -11,6 +12,7 @@ from rosrm.core.handoffs import DONE
 from rosrm.core.hosts import Host
 from rosrm.core.migration import (
     AwaitReady,
+    AwaitReleased,
     Commit,
     Configure,
     Execute,
@@ -24,12 +26,15 @@ from rosrm.core.state import MasterState, Run
 
 __all__ = ["DONE", "give_order", "give_order_again", "outcome_of", "timed_out", "title"]
 
+_WORDS: Final = {
+    Start: "start", AwaitReady: "await ready", AwaitReleased: "await released", Stop: "stop",
+}  # fmt: skip
 _RUNS: Final = frozenset({InstanceState.RUNNING, InstanceState.READY})
 
 
 def give_order(state: MasterState, run: Run, step: Step, now: float) -> None:
     """Ask the slave for what the step needs; the nodes themselves, in a handoff."""
-    if isinstance(step, Commit | AwaitReady):
+    if isinstance(step, Commit | AwaitReady | AwaitReleased):
         return
     if isinstance(step, Configure):
         run.order, run.order_at = 0, now
@@ -76,7 +81,8 @@ def _order_start(state: MasterState, run: Run, step: Start, host: Host, now: flo
     if instance is not None and instance.node_name != step.node_name:
         instance.node_name = step.node_name
         state.save(process)
-    assignment = state.assignment(step.instance, spec, step.node_name, shadow=step.shadow)
+    remapped = replace(spec, remappings={**spec.remappings, **step.remappings})
+    assignment = state.assignment(step.instance, remapped, step.node_name, shadow=step.shadow)
     state.emit(Order(run.order, host.host_id, "start", step.instance, assignment))
 
 
@@ -100,7 +106,7 @@ def give_order_again(state: MasterState, run: Run, step: Step, now: float) -> No
     """A start, a stop or a restart policy may be given twice without harm; one may be lost."""
     if isinstance(step, Configure):
         handoffs.say_again(state, run, step, now)
-    elif isinstance(step, Execute | AwaitReady | Commit):
+    elif isinstance(step, Execute | AwaitReady | AwaitReleased | Commit):
         return
     elif now - run.order_at >= state.settings.order_retry:
         give_order(state, run, step, now)
@@ -110,6 +116,8 @@ def timed_out(state: MasterState, run: Run, step: Step, now: float) -> str | Non
     """What the passing of a step's time means: as `outcome_of`."""
     if isinstance(step, Configure):
         return handoffs.timed_out(state, run, step, now)
+    if isinstance(step, AwaitReleased):
+        return DONE
     return f"{title(step)} took longer than {step.timeout:g} s"
 
 
@@ -137,6 +145,11 @@ def _(step: AwaitReady, state: MasterState, run: Run) -> str | None:
     if instance is None:
         return f"{step.instance} ended on {step.host}: {run.how_ended(step.instance)}"
     return DONE if instance.state is InstanceState.READY else None
+
+
+@outcome_of.register
+def _(step: AwaitReleased, state: MasterState, run: Run) -> str | None:
+    return DONE if handoffs.is_released(state, run, step.instance) else None
 
 
 @outcome_of.register
@@ -184,5 +197,5 @@ def title(step: Step) -> str:
         return f"state_config {step.phase.name}"
     if isinstance(step, SetRestart):
         return f"restart policy {step.restart.when!r} of {step.instance} on {step.host}"
-    word = {Start: "start", AwaitReady: "await ready", Stop: "stop"}[type(step)]
+    word = _WORDS[type(step)]
     return f"{word} {step.instance} on {step.host}"

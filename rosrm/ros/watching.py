@@ -1,7 +1,7 @@
 """Listens to a topic until a second publisher speaks there.
 
 A message does not say who sent it (its info has no GID in Jazzy), but each writer counts what it
-writes: two that speak in turn are heard as a count that falls.
+writes: two that speak in turn are heard as a count that falls. Who they are, the graph says.
 """
 
 from __future__ import annotations
@@ -21,16 +21,21 @@ _ANY: Final = QoSProfile(
     history=HistoryPolicy.KEEP_LAST, depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT,
     durability=DurabilityPolicy.VOLATILE,
 )  # fmt: skip
+#: What the graph says of a node of which it knows only the endpoints.
+_UNKNOWN: Final = "_NODE_NAME_UNKNOWN_"
 #: Seconds between two looks.
 _EVERY: Final = 0.005
 
 
-def await_second_publisher(topic: str, type_name: str, timeout: float) -> Mapping[str, Any]:
-    """Block until two publishers of a topic have been heard.
+def await_second_publisher(
+    topic: str, type_name: str, source: str, destination: str, timeout: float
+) -> Mapping[str, Any]:
+    """Block until both source and destination have been heard on a topic, and nobody else is there.
 
     Args:
         topic: absolute name.
         type_name: as "std_msgs/msg/Int64".
+        source, destination: names of their nodes, without namespace.
         timeout: seconds.
 
     Returns:
@@ -38,6 +43,7 @@ def await_second_publisher(topic: str, type_name: str, timeout: float) -> Mappin
 
     Raises:
         TimeoutError: with what was heard instead.
+        ValueError: another node publishes there too, or there is no such type.
     """
     begun = time.monotonic()
     kind = _type_of(type_name)
@@ -49,9 +55,10 @@ def await_second_publisher(topic: str, type_name: str, timeout: float) -> Mappin
             start_parameter_services=False,
         )  # fmt: skip
         try:
-            heard = _listen(node, topic, kind, begun + timeout)
-            if heard < 0:
-                return {"heard": -heard, "seconds": time.monotonic() - begun}
+            names = frozenset((source, destination))
+            heard, both = _listen(node, topic, kind, names, begun + timeout)
+            if both:
+                return {"heard": heard, "seconds": time.monotonic() - begun}
             reason = _missing(node, topic, type_name, heard)
         finally:
             node.destroy_node()
@@ -60,10 +67,12 @@ def await_second_publisher(topic: str, type_name: str, timeout: float) -> Mappin
     raise TimeoutError(f"{reason}, in {timeout:g} s")
 
 
-def _listen(node: Node, topic: str, kind: Any, deadline: float) -> int:
-    """How many messages were heard; negative: of more than one publisher."""
+def _listen(
+    node: Node, topic: str, kind: Any, names: frozenset[str], deadline: float
+) -> tuple[int, bool]:
+    """How many messages were heard, and whether of both publishers."""
     subscription = node.create_subscription(kind, topic, _never_called, _ANY, raw=True)
-    heard, last = 0, 0
+    heard, last, two = 0, 0, False
     handle = subscription.handle
     while time.monotonic() < deadline:
         with handle:
@@ -73,10 +82,24 @@ def _listen(node: Node, topic: str, kind: Any, deadline: float) -> int:
             continue
         heard += 1
         count = int(taken[1]["publication_sequence_number"])
-        if count <= last:
-            return -heard
+        two = two or count <= last
         last = count
-    return heard
+        if two and _are_alone(node, topic, names):
+            return heard, True
+    return heard, False
+
+
+def _are_alone(node: Node, topic: str, names: frozenset[str]) -> bool:
+    """Whether these nodes publish there; a node's name is known a little later than its topics."""
+    found = {info.node_name for info in node.get_publishers_info_by_topic(topic)}
+    strangers = sorted(found - names - {_UNKNOWN})
+    if strangers:
+        raise ValueError(
+            f"{topic} is also published by {', '.join(strangers)}, so that nobody can tell whether "
+            f"the destination speaks: with `protocol: paper` only the node itself may publish its "
+            f"state"
+        )
+    return found == names
 
 
 def _missing(node: Node, topic: str, type_name: str, heard: int) -> str:

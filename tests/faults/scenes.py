@@ -92,10 +92,11 @@ class Scene:
     def settle(self) -> ProcessRow:
         """Wait until one instance owns the name, alone is heard and alone is there."""
         self.cluster.wait(NAME, "running")
+        before = len(self.watcher.outputs)  # what was heard until now may be of who is silent now
 
         def settled(view) -> bool:
             row = next(row for row in view.processes if row.name == NAME)
-            last = self.watcher.outputs[-_ALONE:]
+            last = self.watcher.outputs[before:][-_ALONE:]
             heard = len(last) == _ALONE and {one.instance for one in last} == {row.number}
             alone = instances(self.cluster, NAME).keys() == {row.number}
             return row.state == "running" and heard and alone

@@ -84,6 +84,21 @@ def moved(cluster, times: int):
     return view.processes[0]
 
 
+def test_a_state_below_the_nodes_own_name_is_found_under_an_alias(cluster):
+    """`~/state` is where the others know it."""
+    private = ProcessSpec(
+        "private", command=(sys.executable, "-c", COUNTER.replace("/counter/state", "~/state")),
+        ros=True, stop=QUICK, readiness=Readiness(timeout=PATIENCE),
+        migration=MigrationPolicy("handoff", options={**PAPER, "state": "/private/state"}),
+    )  # fmt: skip
+    cluster.submit(private)
+    cluster.wait("private", "running")
+    cluster.client.migrate("private", None)
+    cluster.wait_for_event("migrated", process="private")
+    assert "began with" in cluster.wait_for_log("private", "began with")
+    cluster.cancel("private")
+
+
 def test_a_topic_on_which_nobody_speaks_leaves_it_where_it_is(cluster):
     """With the reason, as the slave of the destination heard it."""
     cluster.submit(counter("lost", state="/wrong/state", ready_timeout=2.0))

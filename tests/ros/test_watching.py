@@ -57,7 +57,12 @@ def publishing(name: str, qos: QoSProfile = LATCHED, kind: type = Int64, period:
 
 def listen(timeout: float = 20.0):
     """As the slave does it."""
-    return watch({"state": TOPIC, "type": "std_msgs/msg/Int64", "timeout": timeout})
+    return watch(arguments("std_msgs/msg/Int64", timeout))
+
+
+def arguments(kind: str, timeout: float):
+    names = {"source": "source", "destination": "destination"}
+    return {"state": TOPIC, "type": kind, "timeout": timeout, **names}
 
 
 @pytest.mark.parametrize("qos", [LATCHED, LOSSY])
@@ -101,4 +106,13 @@ def test_another_type_is_said():
 
 def test_an_unknown_type_is_said():
     with pytest.raises(ValueError, match="no message type 'no_msgs/msg/Int64' on this host"):
-        watch({"state": TOPIC, "type": "no_msgs/msg/Int64", "timeout": 1.0})
+        watch(arguments("no_msgs/msg/Int64", 1.0))
+
+
+def test_another_publisher_is_not_taken_for_the_destination():
+    """A bag that is played, say: nobody could tell whether the destination speaks."""
+    with (
+        publishing("source"), publishing("player"),
+        pytest.raises(ValueError, match="/watched/state is also published by player"),
+    ):  # fmt: skip
+        listen()

@@ -15,6 +15,7 @@ from typing import Any, Final, Literal
 
 from rosrm.config.units import PositiveSeconds
 from rosrm.core.migration import (
+    AwaitReleased,
     Commit,
     Configure,
     Execute,
@@ -50,6 +51,8 @@ class HandoffOptions:
         abort_timeout: seconds for which a destination may think about giving up, before it is
             stopped.
         resume_timeout: seconds within which a source must say that it goes on.
+        release_timeout: seconds for which a silent source may see to it that its last outputs
+            arrive, before it is stopped. (It does so for 4 s at most.)
         protocol: "rosrm", or "paper" for a node that keeps only the paper's two constraints.
         state: the topic of its state, with "paper".
         type: of that topic: "std_msgs/msg/Int64".
@@ -60,6 +63,7 @@ class HandoffOptions:
     switch_timeout: PositiveSeconds = 10.0
     abort_timeout: PositiveSeconds = 2.0
     resume_timeout: PositiveSeconds = 5.0
+    release_timeout: PositiveSeconds = 5.0
     protocol: Literal["rosrm", "paper"] = "rosrm"
     state: str = ""
     type: str = ""
@@ -68,7 +72,7 @@ class HandoffOptions:
         """Refuse a wait that is no time, and a watch that could not begin."""
         check_seconds(
             self, "start_timeout", "ready_timeout", "switch_timeout", "abort_timeout",
-            "resume_timeout",
+            "resume_timeout", "release_timeout",
         )  # fmt: skip
         if self.protocol not in ("rosrm", "paper"):
             raise ValueError(f"protocol {self.protocol!r}; allowed: rosrm, paper")
@@ -128,14 +132,19 @@ def _handing_over(move: Move, options: HandoffOptions) -> Plan:
             Configure(HandoffPhase.SHADOW, options.ready_timeout, undo=resume),
             Configure(HandoffPhase.SWITCH, options.switch_timeout, undo=abort),
             Commit(),
-            *_after_commit(move, options),
+            _give_restart_policy(move, options),
+            AwaitReleased(move.source, move.source_host, options.release_timeout),
+            *_end(move, options),
         )
     )
 
 
 def _as_in_the_paper(move: Move, options: HandoffOptions) -> Plan:
     """From the first word of the destination to the end of the source both are active."""
-    listen = {"state": options.state, "type": options.type, "timeout": options.ready_timeout}
+    listen = {
+        "state": options.state, "type": options.type, "timeout": options.ready_timeout,
+        "source": move.source_node, "destination": alias_of(move),
+    }  # fmt: skip
     watch_timeout = options.ready_timeout + _WATCH_MARGIN
     return Plan(
         (
@@ -144,7 +153,8 @@ def _as_in_the_paper(move: Move, options: HandoffOptions) -> Plan:
             Configure(HandoffPhase.SHADOW, options.ready_timeout, awaited=False),
             Execute(WATCH, move.destination_host, listen, watch_timeout),
             Commit(),
-            *_after_commit(move, options),
+            _give_restart_policy(move, options),
+            *_end(move, options),
         ),
         overlap=watch_timeout + move.spec.stop.timeout,
     )
@@ -154,8 +164,17 @@ def _start(move: Move, options: HandoffOptions) -> Start:
     stop = Stop(move.destination, move.destination_host, move.spec.stop.timeout)
     return Start(
         move.destination, move.destination_host, options.start_timeout, alias_of(move), undo=stop,
-        shadow=True,
+        shadow=True, remappings=_own_names(move.spec, options),
     )  # fmt: skip
+
+
+def _own_names(spec: ProcessSpec, options: HandoffOptions) -> dict[str, str]:
+    """A state below the node's own name is found there under an alias too."""
+    namespace = spec.namespace.strip("/")
+    own = f"/{namespace}/{spec.name}/" if namespace else f"/{spec.name}/"
+    if not options.state.startswith(own):
+        return {}
+    return {f"~/{options.state[len(own) :]}": options.state}
 
 
 def _suspend(move: Move, options: HandoffOptions) -> SetRestart:
@@ -165,11 +184,14 @@ def _suspend(move: Move, options: HandoffOptions) -> SetRestart:
     return SetRestart(move.source, move.source_host, _NEVER, seconds, undo=give_back)
 
 
-def _after_commit(move: Move, options: HandoffOptions) -> tuple[SetRestart, Stop, Configure]:
+def _give_restart_policy(move: Move, options: HandoffOptions) -> SetRestart:
+    return SetRestart(
+        move.destination, move.destination_host, move.spec.restart, options.start_timeout
+    )
+
+
+def _end(move: Move, options: HandoffOptions) -> tuple[Stop, Configure]:
     return (
-        SetRestart(
-            move.destination, move.destination_host, move.spec.restart, options.start_timeout
-        ),
         Stop(move.source, move.source_host, move.spec.stop.timeout),
         Configure(HandoffPhase.DONE, options.start_timeout),
     )
@@ -193,5 +215,6 @@ def watch(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
     from rosrm.ros.watching import await_second_publisher  # noqa: PLC0415 - the master has no use
 
     return await_second_publisher(
-        str(arguments["state"]), str(arguments["type"]), float(arguments["timeout"])
-    )
+        str(arguments["state"]), str(arguments["type"]), str(arguments["source"]),
+        str(arguments["destination"]), float(arguments["timeout"]),
+    )  # fmt: skip

@@ -9,6 +9,7 @@ import pytest
 
 from rosrm.core.migration import (
     AwaitReady,
+    AwaitReleased,
     Commit,
     Configure,
     Execute,
@@ -24,12 +25,15 @@ from rosrm.core.plans import plan_from_dict, plan_to_dict
 ONE = InstanceId("p", 1)
 EVERYTHING = Plan(
     (
-        Start(ONE, "a", 1.5, "alias", undo=Stop(ONE, "a", 2.0), shadow=True),
+        Start(
+            ONE, "a", 1.5, "alias", undo=Stop(ONE, "a", 2.0), shadow=True, remappings={"~/a": "/b"}
+        ),
         AwaitReady(ONE, "a", 3.0, undo=Execute("x", "a", {}, 1.0, undo=Commit())),
         Configure(HandoffPhase.SHADOW, 4.0, awaited=False),
         SetRestart(ONE, "a", RestartPolicy("always", delay=0.1, attempts=7), 5.0),
         Execute("dump", "b", {"to": ["x", {"deep": 1}], "n": None}, 6.0),
         Commit(),
+        AwaitReleased(ONE, "a", 2.5),
     ),
     overlap=7.5,
     options={"why": "not"},

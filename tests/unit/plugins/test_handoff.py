@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from rosrm.core.migration import Configure, Execute, Move, Plan, Start, Stop
+from rosrm.core.migration import AwaitReleased, Configure, Execute, Move, Plan, Start, Stop
 from rosrm.core.model import InstanceId, MigrationPolicy, ProcessSpec, StopPolicy
 from rosrm_migration.handoff import Handoff, HandoffOptions, alias_of
 
@@ -65,11 +65,21 @@ def test_the_papers_protocol_listens_and_declares_its_overlap() -> None:
     assert (listen.executor, listen.host) == ("handoff_watch", "b")
     assert listen.arguments == {
         "state": "/counter/state", "type": "std_msgs/msg/Int64", "timeout": 30.0,
+        "source": "counter", "destination": "counter_1700000000",
     }  # fmt: skip
     assert listen.timeout > 30.0
     assert plan.overlap == listen.timeout + 8.0
     phases = [step.phase.name for step in plan.steps if isinstance(step, Configure)]
     assert phases == ["SHADOW", "DONE"]
+    assert not [step for step in plan.steps if isinstance(step, AwaitReleased)]
+
+
+def test_a_state_below_the_nodes_own_name_stays_there_under_the_alias() -> None:
+    """Other topics are where they are."""
+    plan = Handoff(HandoffOptions()).propose(move(**PAPER))
+    assert of_kind(plan, Start).remappings == {"~/state": "/counter/state"}
+    elsewhere = Handoff(HandoffOptions()).propose(move(**{**PAPER, "state": "/other/state"}))
+    assert of_kind(elsewhere, Start).remappings == {}
 
 
 @pytest.mark.parametrize(
