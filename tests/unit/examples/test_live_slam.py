@@ -12,7 +12,7 @@ pytest.importorskip("rclpy")
 from rclpy.serialization import deserialize_message, serialize_message
 
 from rosrm_examples.drives import Drive, load_drive
-from rosrm_examples.errors import PieceError
+from rosrm_examples.errors import DriveError, PieceError
 from rosrm_examples.live_slam import LiveSlam
 from rosrm_examples.map_part import load_parts, save_part
 from rosrm_examples.migration_results import unmigrated_poses
@@ -70,6 +70,30 @@ def test_with_the_full_state_it_goes_on_exactly(drive, unmigrated, reverse) -> N
     destination.go_on(drive, 12, SCANS)
     poses = np.concatenate([one.live.part("").poses for one in (source, destination)])
     assert np.array_equal(poses, unmigrated)
+
+
+@pytest.mark.parametrize("name", [f"street:{SCANS}", "kitti0001"])
+def test_with_the_full_state_it_goes_on_exactly_from_any_scan(name) -> None:
+    """After one scan more it knows what the original knows; so it does after all the others."""
+    try:
+        drive = load_drive(name)
+    except DriveError as error:
+        pytest.skip(str(error))
+    source = Instance("full")
+    source.go_on(drive, 0, 1)
+    for at in range(1, len(drive.times)):
+        destination = Instance("full")
+        destination.follow(source)
+        destination.go_on(drive, at, at + 1)
+        source.go_on(drive, at, at + 1)
+        for mine, theirs in zip(knowledge(destination), knowledge(source), strict=True):
+            assert mine.keys() == theirs.keys()
+            assert all(np.array_equal(mine[key], theirs[key]) for key in mine), at
+
+
+def knowledge(one: Instance):
+    """All that the next pose depends on."""
+    return one.live.slam.motion_state(newest=1), one.live.slam.map_state()
 
 
 def test_with_the_pose_alone_it_goes_on_within_a_tenth_of_a_metre(drive, unmigrated) -> None:
