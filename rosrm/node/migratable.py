@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final
@@ -11,6 +12,7 @@ import rclpy.node
 from rosrm.node.entities import ServiceOf
 from rosrm.node.handoff import Handoff
 from rosrm.node.identity import Identity, identity_from
+from rosrm.node.middleware import prompt
 
 if TYPE_CHECKING:
     _Base = Any
@@ -43,7 +45,8 @@ class Migratable(_Base):  # type: ignore[misc]  # rclpy brings no types
         if identity is not None:
             self._be_the_only_one(identity)
             self._rosrm = Handoff(self, super(), identity)
-        super().__init__(*arguments, **named)
+        with contextlib.nullcontext() if identity is None else prompt(os.environ):
+            super().__init__(*arguments, **named)
         if self._rosrm is not None:
             self._rosrm.begin()
 

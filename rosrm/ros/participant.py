@@ -164,7 +164,7 @@ def announcements(environment: Mapping[str, str], pace: str) -> dict[str, str]:
 
     Args:
         environment: that a user may have set a profile in.
-        pace: "eager" or "steady".
+        pace: "eager", "steady" or "movable".
     """
     if any(variable in environment for variable in _PROFILE_VARIABLES):
         return {}

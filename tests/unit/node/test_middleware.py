@@ -1,0 +1,32 @@
+"""The settings of Fast DDS that a node makes itself with."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+from rosrm.node.middleware import prompt
+
+
+def test_fast_dds_is_given_a_profile_while_the_node_is_made():
+    """And what the process starts later is not."""
+    environment = {"HOME": "/home/robot"}
+    with prompt(environment):
+        (profile,) = set(environment) - {"HOME"}
+        text = Path(environment[profile]).read_text()
+    assert "heartbeatPeriod" in text
+    assert ElementTree.fromstring(text.split("-->", 1)[1]).tag.endswith("profiles")
+    assert environment == {"HOME": "/home/robot"}
+
+
+@pytest.mark.parametrize(
+    "variable", ["FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE"]
+)
+def test_what_the_user_has_set_stands(variable):
+    """Also afterwards."""
+    environment = {variable: "/etc/robot.xml"}
+    with prompt(environment):
+        assert environment == {variable: "/etc/robot.xml"}
+    assert environment == {variable: "/etc/robot.xml"}
