@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from xml.etree import ElementTree
+from xml.etree import ElementTree as ET
 
 import pytest
 
@@ -17,7 +17,7 @@ def test_fast_dds_is_given_a_profile_while_the_node_is_made():
         (profile,) = set(environment) - {"HOME"}
         text = Path(environment[profile]).read_text()
     assert "heartbeatPeriod" in text
-    assert ElementTree.fromstring(text.split("-->", 1)[1]).tag.endswith("profiles")
+    assert ET.fromstring(text.split("-->", 1)[1]).tag.endswith("profiles")
     assert environment == {"HOME": "/home/robot"}
 
 
