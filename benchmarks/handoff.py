@@ -144,6 +144,7 @@ def process_of(strategy: str, program: str, rate: float) -> ProcessSpec:
 
 def move(cluster: LocalCluster) -> str:
     """Move the process to the other host; returns "migrated" or "stayed"."""
+    cluster.wait_until("the process running", lambda view: view.processes[0].state == "running")
     last = cluster.client.list(events=True, newest=1).events[-1].sequence
     here = cluster.process(_NAME).host
     there = next(name for name in cluster.slaves if name != here)
