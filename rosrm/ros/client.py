@@ -29,6 +29,8 @@ _LOOK: Final = 0.005
 _REQUEST: Final = 10.0
 #: Seconds after which a request without an answer is sent again.
 _AGAIN: Final = 2.0
+#: The same for a greeting, which costs the master nothing.
+_GREET_AGAIN: Final = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,9 +106,27 @@ def find_master(
         request = srv.Handshake.Request(
             protocol_version=PROTOCOL_VERSION, software_version=__version__, role=role, name=name
         )
-        return wait_for(participant, client.call_async(request), deadline)
+        return _ask_until_answered(participant, client, request, deadline, _GREET_AGAIN)
     finally:
         participant.node.destroy_client(client)
+
+
+def _ask_until_answered(
+    participant: Participant, client: Any, request: Any, deadline: float, again: float
+) -> Any:
+    """The first answer to a request that is repeated; None when `deadline` has passed.
+
+    A server answers nobody whose reader of answers it has not found yet, and a new client's request
+    may be there before.
+    """
+    answers = _Answers()
+    while not answers.first:
+        now = time.monotonic()
+        if now >= deadline:
+            return None
+        client.call_async(request).add_done_callback(answers.take)
+        wait_until(participant, lambda: bool(answers.first), min(deadline, now + again))
+    return answers.first[0]
 
 
 def _greet(participant: Participant, name: str, timeout: float) -> srv.Handshake.Response:
@@ -280,17 +300,12 @@ class MasterClient:
         """
         client = self._client(kind, path)
         deadline = time.monotonic() + self._timeout
-        answers = _Answers()
-        while not answers.first:
-            now = time.monotonic()
-            if now >= deadline:
-                raise NoMaster(
-                    f"{who} did not answer {path} within {self._timeout:g} s "
-                    f"({self._participant.settings.describe()})"
-                )
-            client.call_async(request).add_done_callback(answers.take)
-            wait_until(self._participant, lambda: bool(answers.first), min(deadline, now + _AGAIN))
-        (response,) = answers.first
+        response = _ask_until_answered(self._participant, client, request, deadline, _AGAIN)
+        if response is None:
+            raise NoMaster(
+                f"{who} did not answer {path} within {self._timeout:g} s "
+                f"({self._participant.settings.describe()})"
+            )
         check_answer(response.answer, who)
         return response
 
