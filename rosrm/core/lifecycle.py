@@ -93,6 +93,8 @@ def take_status(state: MasterState, host: Host, status: InstanceStatus, now: flo
         return
     before = instance.state
     instance.state, instance.pid, instance.restarts = status.state, status.pid, status.restarts
+    if instance.state is InstanceState.READY and before is not InstanceState.READY:
+        instance.ready_at = now
     if status.state.ended:
         _ended(state, instance, status, before, now)
     review_slots(state, host, now)

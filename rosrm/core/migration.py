@@ -89,12 +89,13 @@ class Start:
 
 @dataclass(frozen=True, slots=True)
 class AwaitReady:
-    """Wait until an instance is ready; done when its slave says so."""
+    """Wait until an instance is ready; done when its slave says so, and `settle` seconds later."""
 
     instance: InstanceId
     host: str
     timeout: float
     undo: Step | None = None
+    settle: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -149,6 +149,7 @@ _READ: Final[Mapping[str, Callable[[Any], Any]]] = {
     "instance": _instance,
     "host": _text,
     "timeout": _number,
+    "settle": _number,
     "node_name": _text,
     "shadow": _truth,
     "phase": _phase,

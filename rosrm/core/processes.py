@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
+from math import inf
 from typing import Any, Final
 
 from rosrm.core.columns import FloatArray
@@ -67,6 +68,7 @@ class Instance:
         order: of an unanswered stop, 0: none.
         order_at: when it was given.
         node_name: under which its node runs, where that is not the process's name.
+        ready_at: time at which this master learned that it is ready.
     """
 
     id: InstanceId
@@ -87,6 +89,7 @@ class Instance:
     order: int = 0
     order_at: float = 0.0
     node_name: str = ""
+    ready_at: float = inf
 
 
 class PlainSpec(Lazy):

@@ -19,6 +19,8 @@ from rosrm.config.process import ProcessInFile
 from rosrm.core import migration, views
 from rosrm.core.model import HostDescription
 from rosrm.loading import HOOKS
+from rosrm_migration.handoff import HandoffOptions
+from rosrm_migration.relaunch import RelaunchOptions
 
 REFERENCE = Path(__file__).resolve().parents[2] / "docs" / "reference"
 
@@ -64,6 +66,17 @@ def test_every_setting_is_documented_and_nothing_else(heading, kind):
     ros = {key for key in wanted if key.startswith("ros.")}
     assert rows(section(text, heading)) == wanted - ros | {"ros"}
     assert rows(section(text, "The section `ros`")) == ros
+
+
+@pytest.mark.parametrize("options", [RelaunchOptions, HandoffOptions])
+def test_every_option_of_a_strategy_is_documented(options):
+    """Of those that come with rosrm, in its own table."""
+    text = section(page("configuration.md"), "Options of the strategies")
+    name = options.__name__.removesuffix("Options").lower()
+    table = text[text.index(f"| `{name}` | default |") :].split("\n\n")[0]
+    named = {word for cell in re.findall(r"^\| ([^|]+) \|", table, re.MULTILINE)
+             for word in re.findall(r"`(\w+)`", cell)}  # fmt: skip
+    assert named - {name} == {field.name for field in fields(options)}
 
 
 def test_every_word_of_a_process_is_documented_and_nothing_else():

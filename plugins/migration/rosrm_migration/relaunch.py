@@ -22,13 +22,16 @@ class RelaunchOptions:
 
     Attributes:
         start_timeout: seconds within which the new instance must run.
+        settle: seconds for which a new ROS node is ready before the old one is stopped, so that the
+            others have found it.
     """
 
     start_timeout: PositiveSeconds = 10.0
+    settle: PositiveSeconds = 1.0
 
     def __post_init__(self) -> None:
         """Refuse a wait that is no time."""
-        check_seconds(self, "start_timeout")
+        check_seconds(self, "start_timeout", "settle")
 
 
 class Relaunch:
@@ -47,21 +50,22 @@ class Relaunch:
 
     def propose(self, move: Move) -> Plan:
         """Start there, be ready there, commit, stop here; or stop here first."""
-        start_timeout = options_of(move.spec, self._options).start_timeout
+        options = options_of(move.spec, self._options)
         if move.spec.migration.overlap:
-            return _start_first(move, start_timeout)
-        return _stop_first(move, start_timeout)
+            return _start_first(move, options)
+        return _stop_first(move, options.start_timeout)
 
 
-def _start_first(move: Move, start_timeout: float) -> Plan:
-    ready, stop = move.spec.readiness.timeout, move.spec.stop.timeout
+def _start_first(move: Move, options: RelaunchOptions) -> Plan:
+    settle = options.settle if move.spec.ros or move.spec.package is not None else 0.0
+    ready, stop = move.spec.readiness.timeout + settle, move.spec.stop.timeout
     return Plan(
         (
             Start(
-                move.destination, move.destination_host, start_timeout,
+                move.destination, move.destination_host, options.start_timeout,
                 undo=_stop_destination(move),
             ),
-            AwaitReady(move.destination, move.destination_host, ready),
+            AwaitReady(move.destination, move.destination_host, ready, settle=settle),
             Commit(),
             Stop(move.source, move.source_host, stop),
         ),

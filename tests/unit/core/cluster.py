@@ -22,6 +22,7 @@ from rosrm.core.commands import Assign, Command, Order, PublishStateConfig, Repl
 from rosrm.core.master import step
 from rosrm.core.migration import (
     AwaitReady,
+    AwaitReleased,
     Commit,
     Configure,
     HandoffPhase,
@@ -138,6 +139,7 @@ class HandOver:
                 Configure(HandoffPhase.SWITCH, t, undo=abort),
                 Commit(),
                 SetRestart(destination, there, policy, t),
+                AwaitReleased(source, here, t),
                 Stop(source, here, t),
                 Configure(HandoffPhase.DONE, t),
             )

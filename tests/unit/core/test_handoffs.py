@@ -150,7 +150,7 @@ def test_a_source_that_does_not_say_that_it_is_released_does_not_hold_up_the_mov
         ]
     assert cluster["p"].migrations == 1  # the destination may fail from now on
     assert not cluster.orders("stop")
-    cluster.wait(6.0)
+    cluster.wait(11.0)
     has_moved(cluster)
 
 

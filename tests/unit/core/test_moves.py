@@ -425,6 +425,31 @@ def test_an_executor_does_the_open_step_on_its_host() -> None:
     assert (cluster.phase("p"), cluster.where("p")) == ("running", ["b"])
 
 
+def test_a_new_instance_that_is_to_settle_runs_beside_the_old_one() -> None:
+    """The others have to find it."""
+
+    def settling(move: Move) -> Plan:
+        return Plan(
+            (
+                Start(move.destination, move.destination_host, 5.0),
+                AwaitReady(move.destination, move.destination_host, 5.0, settle=3.0),
+                Commit(),
+                Stop(move.source, move.source_host, 5.0),
+            ),
+            overlap=20.0,
+        )
+
+    cluster = Cluster(
+        "a", Machine("b", busy={"memory": 0.5}), strategies={"strange": Strange(settling)}
+    )
+    cluster.submit(process("p", migration=MigrationPolicy("strange", overlap=True)))
+    cluster.migrate("p")
+    cluster.wait(2.5)
+    assert sorted(cluster.where("p")) == ["a", "b"]
+    cluster.wait(1.0)
+    assert (cluster.phase("p"), cluster.where("p")) == ("running", ["b"])
+
+
 def test_an_executor_that_fails_is_undone() -> None:
     """With the undo of its own step."""
     swept: list[Any] = []
