@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from enum import Enum
@@ -83,11 +84,16 @@ def up(  # noqa: PLR0917 - typer calls it, by name
     hosts = planned(number, limits, host or [])
     made = Lab(name, hosts, subnet=parse_subnet(subnet) if subnet else None)
     made.up()
-    warning = overbooked(hosts)
-    if warning:
-        typer.echo(f"rosrm: note: {warning}", err=True)
-    told = ", ".join(f"{one.name} {made.address(one.name)}" for one in hosts)
-    typer.echo(f"lab {name!r} is up: {told}")
+    try:
+        warning = overbooked(hosts)
+        if warning:
+            typer.echo(f"rosrm: note: {warning}", err=True)
+        told = ", ".join(f"{one.name} {made.address(one.name)}" for one in hosts)
+        typer.echo(f"lab {name!r} is up: {told}")
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # too late: it is up, and that is what we say
+    except KeyboardInterrupt:
+        made.down()
+        raise
 
 
 @lab.command(
