@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Final
 
 from rosrm.config.checking import near, validated
-from rosrm.config.documents import Node, Place, Problems, read
+from rosrm.config.documents import Node, Problems, read
 from rosrm.config.foreach import rows_of, substituted
 from rosrm.config.merging import merged, written_out
+from rosrm.config.namesakes import refuse_namesakes
 from rosrm.config.options import PluginCheck
 from rosrm.config.process import ProcessInFile, complaints
 from rosrm.config.rules import check_amounts, check_name
@@ -40,7 +41,7 @@ def load_work(path: str | Path, registry: Registry | None = None) -> tuple[Proce
         for node in _expanded(merged(defaults, written_out(entry)), problems)
     ]
     specs = [_process(node, plugins, problems) for node in nodes]
-    _refuse_namesakes(nodes, problems)
+    refuse_namesakes(nodes, "process", problems)
     problems.raise_any()
     return tuple(spec for spec in specs if spec is not None)
 
@@ -105,20 +106,3 @@ def _process(node: Node, plugins: PluginCheck, problems: Problems) -> ProcessSpe
     said = given.items if given is not None else {}
     options = {name: value for name, value in checked.items() if name in said}
     return replace(process, migration=replace(process.migration, options=options)).spec()
-
-
-def _refuse_namesakes(nodes: Sequence[Node], problems: Problems) -> None:
-    first: dict[str, Place] = {}
-    for node in nodes:
-        name = node.get("name")
-        if name is None or not isinstance(name.value, str):
-            continue
-        before = first.get(name.value)
-        if before is None:
-            first[name.value] = name.place
-        elif before == name.place:
-            text = f"foreach gives every process the name {name.value!r}; put one of its names in"
-            problems.add(name.place, text)
-        else:
-            where = f"first given at line {before.line}, column {before.column}"
-            problems.add(name.place, f"duplicate process name {name.value!r}, {where}")

@@ -11,9 +11,10 @@ from typing import Annotated, Any, Final, Literal
 import numpy as np
 
 from rosrm.config.checking import near, validated
-from rosrm.config.documents import Node, Place, Problems, read
+from rosrm.config.documents import Node, Problems, read
 from rosrm.config.foreach import rows_of, substituted
 from rosrm.config.merging import merged, written_out
+from rosrm.config.namesakes import refuse_namesakes
 from rosrm.config.options import PluginCheck
 from rosrm.config.process import Labels, LabelsInFile, MigrationInFile
 from rosrm.config.rules import check_amounts, check_name
@@ -153,7 +154,7 @@ def load_workload(
     strategies = PluginCheck(registry, problems)
     plans = [_process(node, known, random, strategies, problems) for node in nodes]
     for what, listed in (("host", _listed(root, "hosts", Problems())), ("process", nodes)):
-        _refuse_namesakes(list(listed), what, problems)
+        refuse_namesakes(list(listed), what, problems)
     model = validated(ModelInFile, root.get("model") or Node({}, root.place), problems, "model")
     until = _until(root, problems)
     _refuse_endless(nodes, plans, until, problems)
@@ -303,23 +304,6 @@ def _check_fits(
                     f"{given.name}: {resource} {amount:g} {_UNITS[resource]} is more than any host "
                     f"may give: {room:g} up to the limit of the largest",
                 )
-
-
-def _refuse_namesakes(nodes: Sequence[Node], what: str, problems: Problems) -> None:
-    first: dict[str, Place] = {}
-    for node in nodes:
-        name = node.get("name")
-        if name is None or not isinstance(name.value, str):
-            continue
-        before = first.get(name.value)
-        if before is None:
-            first[name.value] = name.place
-        elif before == name.place:
-            text = f"foreach gives every {what} the name {name.value!r}; put one of its names in"
-            problems.add(name.place, text)
-        else:
-            where = f"first given at line {before.line}, column {before.column}"
-            problems.add(name.place, f"duplicate {what} name {name.value!r}, {where}")
 
 
 def _refuse_endless(
