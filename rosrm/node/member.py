@@ -313,15 +313,16 @@ class Member:
         for timer in self.timers:
             timer.started = not timer.timer.is_canceled()
             timer.stop()
-        for opening in self._openings:
-            if isinstance(opening, OpeningOf):
-                self._close(opening)
+        self._close_all(OpeningOf)
         return due
 
     def close_services(self) -> None:
         """The successor answers: what is still sent here would be lost."""
+        self._close_all(ServiceOf)
+
+    def _close_all(self, kind: type[ServiceOf | OpeningOf]) -> None:
         for opening in self._openings:
-            if isinstance(opening, ServiceOf):
+            if isinstance(opening, kind):
                 self._close(opening)
 
     def _close(self, opening: ServiceOf | OpeningOf) -> None:

@@ -12,7 +12,7 @@ import rclpy.node
 from rosrm.node.entities import ServiceOf
 from rosrm.node.handoff import Handoff
 from rosrm.node.identity import Identity, identity_from
-from rosrm.node.middleware import prompt
+from rosrm.ros.fast_dds import announcing
 
 if TYPE_CHECKING:
     _Base = Any
@@ -45,7 +45,7 @@ class Migratable(_Base):  # type: ignore[misc]  # rclpy brings no types
         if identity is not None:
             self._be_the_only_one(identity)
             self._rosrm = Handoff(self, super(), identity)
-        with contextlib.nullcontext() if identity is None else prompt(os.environ):
+        with contextlib.nullcontext() if identity is None else announcing(os.environ, "movable"):
             super().__init__(*arguments, **named)
         if self._rosrm is not None:
             self._rosrm.begin()

@@ -7,12 +7,10 @@ therefore defers every response, so that a request may stay open until there is 
 
 from __future__ import annotations
 
-import contextlib
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final
 
@@ -23,6 +21,7 @@ from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 
 from rosrm.ros import qos
+from rosrm.ros.fast_dds import Pace, announcing
 from rosrm.ros.settings import RosSettings
 
 if TYPE_CHECKING:
@@ -31,8 +30,6 @@ if TYPE_CHECKING:
 
 #: Seconds after which what comes without an end no longer keeps a part from its other work.
 _FLOOD: Final = 0.05
-#: The first is the one that Fast DDS 2.14 (Jazzy) reads.
-_PROFILE_VARIABLES: Final = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 
 
 @dataclass(slots=True)
@@ -56,11 +53,11 @@ class Participant:
         pace: how often it announces itself: "eager" or "steady" (docs/decisions/0009).
     """
 
-    def __init__(self, settings: RosSettings, name: str, *, pace: str = "eager") -> None:
+    def __init__(self, settings: RosSettings, name: str, *, pace: Pace = "eager") -> None:
         os.environ.update(settings.environment())
         self.settings = settings
         self.context = rclpy.Context()
-        with _announcing(pace):
+        with announcing(os.environ, pace):
             rclpy.init(
                 context=self.context,
                 domain_id=settings.domain,
@@ -157,30 +154,6 @@ class Participant:
         trace: TracebackType | None,
     ) -> None:
         self.close()
-
-
-def announcements(environment: Mapping[str, str], pace: str) -> dict[str, str]:
-    """Variables that make Fast DDS announce a participant more often; none where a user set one.
-
-    Args:
-        environment: that a user may have set a profile in.
-        pace: "eager", "steady" or "movable".
-    """
-    if any(variable in environment for variable in _PROFILE_VARIABLES):
-        return {}
-    return {_PROFILE_VARIABLES[0]: str(Path(__file__).parent / "profiles" / f"{pace}.xml")}
-
-
-@contextlib.contextmanager
-def _announcing(pace: str) -> Iterator[None]:
-    """Give Fast DDS a profile while a participant is made, unless the user has given one."""
-    added = announcements(os.environ, pace)
-    os.environ.update(added)
-    try:
-        yield
-    finally:
-        for variable in added:
-            del os.environ[variable]
 
 
 def _nothing() -> None:

@@ -9,7 +9,7 @@ from typing import Final
 from rosrm.bootstrapper import without_bootstrapper
 from rosrm.core.model import Assignment
 from rosrm.core.slave import qualified_name
-from rosrm.ros.participant import announcements
+from rosrm.ros.fast_dds import announcements
 
 #: Set where an instance starts as the destination of a handoff.
 SHADOW: Final = "ROSRM_SHADOW"

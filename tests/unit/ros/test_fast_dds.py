@@ -7,13 +7,13 @@ from xml.etree import ElementTree as ET
 
 import pytest
 
-from rosrm.node.middleware import prompt
+from rosrm.ros.fast_dds import announcing
 
 
 def test_fast_dds_is_given_a_profile_while_the_node_is_made():
     """And what the process starts later is not."""
     environment = {"HOME": "/home/robot"}
-    with prompt(environment):
+    with announcing(environment, "movable"):
         (profile,) = set(environment) - {"HOME"}
         text = Path(environment[profile]).read_text()
     assert "heartbeatPeriod" in text
@@ -27,6 +27,6 @@ def test_fast_dds_is_given_a_profile_while_the_node_is_made():
 def test_what_the_user_has_set_stands(variable):
     """Also afterwards."""
     environment = {variable: "/etc/robot.xml"}
-    with prompt(environment):
+    with announcing(environment, "movable"):
         assert environment == {variable: "/etc/robot.xml"}
     assert environment == {variable: "/etc/robot.xml"}
