@@ -69,11 +69,6 @@ def wait_until(participant: Participant, done: Callable[[], bool], deadline: flo
     return True
 
 
-def wait_for(participant: Participant, future: Any, deadline: float) -> Any:
-    """The result of a call; None when `deadline` (monotonic seconds) has passed."""
-    return future.result() if wait_until(participant, future.done, deadline) else None
-
-
 @dataclass(slots=True)
 class _Answers:
     """The first answer to a request that may have been sent more than once."""
@@ -325,4 +320,4 @@ class MasterClient:
         self.close()
 
 
-__all__ = ["LogPart", "MasterClient", "RosrmError", "find_master", "wait_for", "wait_for_service"]
+__all__ = ["LogPart", "MasterClient", "RosrmError", "find_master", "wait_for_service"]

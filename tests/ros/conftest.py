@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from tests.ros.clusters import STEADY, clusters
+from tests.ros.nodes import Stage
 
 
 @pytest.fixture
@@ -19,3 +20,12 @@ def make_shared(tmp_path_factory):
     """Makes clusters that the tests of a module share."""
     with clusters(lambda: tmp_path_factory.mktemp("c"), liveness=STEADY) as make:
         yield make
+
+
+@pytest.fixture
+def stage(monkeypatch):
+    """A ROS context in a domain of its own, for nodes that think they are instances."""
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    stage = Stage()
+    yield stage
+    stage.close()

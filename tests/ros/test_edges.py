@@ -16,13 +16,14 @@ from rosrm.core.model import HostDescription, ResourceDescription
 from rosrm.errors import NoMaster, Refused
 from rosrm.local_cluster import claim_domain
 from rosrm.ros import convert, names, qos
-from rosrm.ros.client import MasterClient, find_master, wait_for, wait_for_service
+from rosrm.ros.client import MasterClient, find_master, wait_for_service
 from rosrm.ros.control import ControlClient
 from rosrm.ros.participant import Participant
 from rosrm.ros.readings import LAYOUT, encode
 from rosrm.ros.settings import RosSettings
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs import msg, srv
+from tests.ros.asking import wait_for
 from tests.ros.clusters import PATIENCE, host, job, service
 
 path = names.Names("/rosrm")

@@ -19,14 +19,6 @@ R, C = HandoffReport, StateConfig
 ALIAS = "counter_1700000000"
 
 
-@pytest.fixture
-def stage(monkeypatch):
-    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    stage = Stage()
-    yield stage
-    stage.close()
-
-
 class Listener(Counter):
     """Remembers what came on `in`, in the order in which it came."""
 

@@ -22,14 +22,6 @@ R, C = HandoffReport, StateConfig
 
 
 @pytest.fixture
-def stage(monkeypatch):
-    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    stage = Stage()
-    yield stage
-    stage.close()
-
-
-@pytest.fixture
 def pair(stage):
     """A counting source, its shadow, what is heard of both, and a conductor."""
     counts, sums = stage.listen(Int64, "count"), stage.listen(Int64, "sum")

@@ -11,10 +11,11 @@ import pytest
 
 from rosrm.core.model import InstanceId, Kind, RestartPolicy
 from rosrm.ros import convert, names, qos
-from rosrm.ros.client import wait_for, wait_for_service
+from rosrm.ros.client import wait_for_service
 from rosrm.ros.control import ControlClient
 from rosrm.ros.participant import Participant
 from rosrm_msgs import srv
+from tests.ros.asking import wait_for
 from tests.ros.clusters import NODE, PATIENCE, host, node, python, service, wait_gone
 
 NEVER = RestartPolicy("never")

@@ -1,0 +1,13 @@
+"""Single calls to a part, as the tests of the protocol make them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rosrm.ros.client import wait_until
+from rosrm.ros.participant import Participant
+
+
+def wait_for(participant: Participant, future: Any, deadline: float) -> Any:
+    """The result of a call; None when `deadline` (monotonic seconds) has passed."""
+    return future.result() if wait_until(participant, future.done, deadline) else None
