@@ -37,6 +37,7 @@ from benchmarks.machine import percentile, print_report, say
 from rosrm.config.settings import ClusterConfig, MigrationSettings
 from rosrm.core.model import MigrationPolicy, ProcessSpec
 from rosrm.local_cluster import LocalCluster
+from rosrm.loopback import enter_private_network
 
 _ROOT = Path(__file__).resolve().parents[1]
 _NS = 1e9
@@ -239,6 +240,7 @@ def main() -> None:
     parser.add_argument("--strategy", choices=["handoff", "relaunch"], default="handoff")
     parser.add_argument("--driven", choices=["input", "timer"], default="input")
     chosen = parser.parse_args()
+    alone = enter_private_network()
     outcome = measure(chosen.strategy, chosen.driven, chosen.rate, chosen.runs)
     gaps = outcome.gaps
     print_report(
@@ -251,6 +253,7 @@ def main() -> None:
             "gap_p99_ms": round(percentile(gaps, 0.99) * 1e3, 3) if gaps else None,
             "gap_max_ms": round(max(gaps) * 1e3, 3) if gaps else None,
             "moved": outcome.ends.count("migrated"), "stayed": outcome.ends.count("stayed"),
+            "transports": "UDPv4, in a network namespace" if alone else "default, LOCALHOST",
         },
         runs=chosen.runs,
     )  # fmt: skip

@@ -43,6 +43,7 @@ from rosrm.core.model import (
     RestartPolicy,
 )
 from rosrm.errors import Refused, RosrmError
+from rosrm.loopback import settings_on_this_machine
 from rosrm.ros.settings import RosSettings
 from rosrm.ros.slave_endpoint import Link, LogSlice, SlaveEndpoint
 
@@ -294,7 +295,7 @@ def main() -> None:
     parser.add_argument("--step", type=float, default=STEP)
     parser.add_argument("--timeout", type=float, default=120.0)
     arguments = parser.parse_args()
-    settings = RosSettings(domain=arguments.domain, discovery_range="localhost")
+    settings = settings_on_this_machine(arguments.domain)
     period = 1.0 / arguments.hz
     fleet = Fleet(settings, arguments.first, arguments.slaves, period, arguments.step)
     fleet.bring_up(arguments.timeout)

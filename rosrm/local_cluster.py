@@ -1,7 +1,8 @@
 """A whole cluster on this machine: real master, slaves and processes, for demos, tests, benchmarks.
 
 Every part is a process of its own, started as `rosrm master` and `rosrm slave` start it, in a ROS
-domain of its own on loopback. Whatever happens, the parts that were started are ended, by pid.
+domain of its own on loopback. When its block is left, also by an exception, the parts are ended,
+by pid.
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ from rosrm.config.settings import ClusterConfig, HostConfig
 from rosrm.core.views import HostRow, ProcessRow, Snapshot
 from rosrm.errors import NoMaster, RosrmError
 from rosrm.handover import arguments, hand_over, interrupts_held
+from rosrm.loopback import settings_on_this_machine
 from rosrm.ros.client import MasterClient
-from rosrm.ros.settings import RosSettings
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -101,7 +102,7 @@ class LocalCluster:
         """Choose the domain."""
         if self.domain is None:
             self.domain, self._claim = claim_domain()
-        self.ros = RosSettings(domain=self.domain, discovery_range="localhost")
+        self.ros = settings_on_this_machine(self.domain)
 
     # --- parts ---------------------------------------------------------------------------
 

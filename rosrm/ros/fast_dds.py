@@ -1,4 +1,4 @@
-"""How prompt Fast DDS is in the parts of rosrm, and in nodes that it moves (decision 0009)."""
+"""How Fast DDS is in the parts of rosrm, and in nodes that it moves (decisions 0009, 0015)."""
 
 from __future__ import annotations
 
@@ -11,19 +11,28 @@ from typing import Final, Literal
 _VARIABLES: Final = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 _PROFILES: Final = Path(__file__).parent / "profiles"
 
+_TRANSPORTS: Final = "FASTDDS_BUILTIN_TRANSPORTS"
+
 Pace = Literal["eager", "steady", "movable"]
+#: Of rosrm's own parts. They speak UDP alone: a process that was killed leaves ports in shared
+#: memory that hold up its peers, or keep them from being heard; nodes may pay that price for large
+#: messages, who watches over them may not.
+_OF_PARTS: Final = ("eager", "steady")
 
 
 def announcements(environment: Mapping[str, str], pace: Pace) -> dict[str, str]:
-    """Variables that make Fast DDS announce a participant more often; none where a user set one.
+    """Variables that Fast DDS makes a participant by; none where a user set a profile.
 
     Args:
-        environment: that a user may have set a profile in.
+        environment: that a user may have set a profile, or transports, in.
         pace: the profile.
     """
     if any(variable in environment for variable in _VARIABLES):
         return {}
-    return {_VARIABLES[0]: str(_PROFILES / f"{pace}.xml")}
+    variables = {_VARIABLES[0]: str(_PROFILES / f"{pace}.xml")}
+    if pace in _OF_PARTS and _TRANSPORTS not in environment:
+        variables[_TRANSPORTS] = "UDPv4"
+    return variables
 
 
 @contextlib.contextmanager

@@ -4,8 +4,15 @@ from __future__ import annotations
 
 import pytest
 
+from rosrm.loopback import enter_private_network
 from tests.ros.clusters import STEADY, clusters
 from tests.ros.nodes import Stage
+
+
+@pytest.fixture(scope="session", autouse=True)
+def private_network():
+    """Where it is allowed: nobody else is heard, and who is killed leaves nothing to the next."""
+    enter_private_network()
 
 
 @pytest.fixture
@@ -23,9 +30,8 @@ def make_shared(tmp_path_factory):
 
 
 @pytest.fixture
-def stage(monkeypatch):
+def stage():
     """A ROS context in a domain of its own, for nodes that think they are instances."""
-    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     stage = Stage()
     yield stage
     stage.close()

@@ -45,7 +45,7 @@ class Terminal:
         self.directory = directory
         self.environment = {
             **os.environ, "ROS_DOMAIN_ID": str(domain), "COLUMNS": "200", "NO_COLOR": "1",
-            "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "PYTHONUNBUFFERED": "1",
+            "PYTHONUNBUFFERED": "1",
         }  # fmt: skip
 
     def start(self, *words: str, **options) -> subprocess.Popen:
@@ -418,7 +418,7 @@ def test_a_cluster_by_hand(tmp_path) -> None:
     """`rosrm master`, `rosrm slave`, `rosrm submit`, and Ctrl-C for both: clean, code 0."""
     domain, claim = claim_domain()
     terminal = Terminal(domain, tmp_path)
-    ros = f"ros: {{domain: {domain}, discovery: {{range: localhost}}}}\n"
+    ros = f"ros: {{domain: {domain}}}\n"
     cluster = terminal.file("cluster.yaml", f"name: hand\nstate: {tmp_path}/m\n{ros}")
     slave = terminal.file(
         "host.yaml",

@@ -15,6 +15,7 @@ from rosrm.config.settings import ControlSettings
 from rosrm.core.model import HostDescription, ResourceDescription
 from rosrm.errors import NoMaster, Refused
 from rosrm.local_cluster import claim_domain
+from rosrm.loopback import settings_on_this_machine
 from rosrm.ros import convert, names, qos
 from rosrm.ros.client import MasterClient, find_master, wait_for_service
 from rosrm.ros.control import ControlClient
@@ -185,7 +186,7 @@ def test_a_slave_refuses_a_master_of_another_version(make_cluster, tmp_path) -> 
     """It says which versions, ends with 1, and leaves nothing behind."""
     cluster = make_cluster()
     domain, claim = claim_domain()
-    with claim, OtherMaster(RosSettings(domain=domain, discovery_range="localhost")) as other:
+    with claim, OtherMaster(settings_on_this_machine(domain)) as other:
         cluster.ros = replace(cluster.ros, domain=domain)
         part = cluster.start_slave(host("lonely"))
         deadline = time.monotonic() + PATIENCE
@@ -439,7 +440,7 @@ def test_a_host_that_has_told_no_limits_gets_no_work(cluster, stranger) -> None:
 def test_no_master_is_said_in_time() -> None:
     """Within the time that was given, with domain, RMW and namespace."""
     domain, claim = claim_domain()
-    settings = RosSettings(domain=domain, discovery_range="localhost")
+    settings = settings_on_this_machine(domain)
     times = []
     with claim:
         # Once is enough: this machine may be busy now, and not in a moment.

@@ -377,7 +377,7 @@ def test_ctrl_c_in_a_terminal(make_cluster) -> None:
     config.write_text(
         f"host: t\nscope: slice\nbudget: {{memory: 1GiB, cpu: 4}}\nstate: {state}\n"
         "probes: {memory: {}, cpu: {}}\n"
-        f"ros: {{domain: {cluster.domain}, discovery: {{range: localhost}}}}\n"
+        f"ros: {{domain: {cluster.domain}}}\n"
     )
     log = cluster.directory / "terminal.log"
     with log.open("wb") as sink, subprocess.Popen(

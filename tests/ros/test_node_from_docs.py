@@ -154,8 +154,7 @@ def cluster(make_cluster):
 
 
 @pytest.fixture
-def robots(cluster, monkeypatch):
-    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+def robots(cluster):
     robots = Robots(cluster.domain)
     yield robots
     robots.close()

@@ -29,7 +29,6 @@ def domain(monkeypatch):
     """One that no cluster of the tests has."""
     number, claim = claim_domain()
     monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
-    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     with claim:
         yield
 

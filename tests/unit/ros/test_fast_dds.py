@@ -7,7 +7,7 @@ from xml.etree import ElementTree as ET
 
 import pytest
 
-from rosrm.ros.fast_dds import announcing
+from rosrm.ros.fast_dds import announcements, announcing
 
 
 def test_fast_dds_is_given_a_profile_while_the_node_is_made():
@@ -19,6 +19,24 @@ def test_fast_dds_is_given_a_profile_while_the_node_is_made():
     assert "heartbeatPeriod" in text
     assert ET.fromstring(text.split("-->", 1)[1]).tag.endswith("profiles")
     assert environment == {"HOME": "/home/robot"}
+
+
+@pytest.mark.parametrize("pace", ["eager", "steady"])
+def test_the_parts_speak_udp_alone(pace):
+    """What killed processes leave in shared memory must not hold them up."""
+    assert announcements({}, pace)["FASTDDS_BUILTIN_TRANSPORTS"] == "UDPv4"
+
+
+@pytest.mark.parametrize("pace", ["eager", "steady"])
+def test_the_users_choice_of_transports_stands(pace):
+    """Also where it is shared memory."""
+    chosen = {"FASTDDS_BUILTIN_TRANSPORTS": "SHM"}
+    assert "FASTDDS_BUILTIN_TRANSPORTS" not in announcements(chosen, pace)
+
+
+def test_transports_of_nodes_are_the_users():
+    """Large messages may need shared memory."""
+    assert "FASTDDS_BUILTIN_TRANSPORTS" not in announcements({}, "movable")
 
 
 @pytest.mark.parametrize(
