@@ -103,10 +103,7 @@ def _is_expected(state: MasterState, run: Run, step: Step) -> bool:
 
 def _outcome(state: MasterState, run: Run, step: Step, now: float) -> str | None:
     """Of the step in hand, now; what can be done about one that takes its time is done."""
-    outcome = outcome_of(step, state, run)
-    if outcome == DONE and isinstance(step, AwaitReady):
-        settled = state.instances[step.instance.number].ready_at + step.settle
-        outcome = DONE if now >= settled else None
+    outcome = outcome_of(step, state, run, now)
     if outcome is None:
         give_order_again(state, run, step, now)
         if now >= run.deadline:

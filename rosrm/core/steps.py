@@ -122,13 +122,13 @@ def timed_out(state: MasterState, run: Run, step: Step, now: float) -> str | Non
 
 
 @singledispatch
-def outcome_of(step: Any, state: MasterState, run: Run) -> str | None:
+def outcome_of(step: Any, state: MasterState, run: Run, now: float) -> str | None:
     """Of the step in hand: None: not yet; "": done; else why it failed."""
     raise TypeError(step)
 
 
 @outcome_of.register
-def _(step: Start, state: MasterState, run: Run) -> str | None:
+def _(step: Start, state: MasterState, run: Run, now: float) -> str | None:
     if step.instance.number in run.ended:
         return f"{step.instance} ended on {step.host}: {run.how_ended(step.instance)}"
     instance = state.instances.get(step.instance.number)
@@ -140,30 +140,31 @@ def _(step: Start, state: MasterState, run: Run) -> str | None:
 
 
 @outcome_of.register
-def _(step: AwaitReady, state: MasterState, run: Run) -> str | None:
+def _(step: AwaitReady, state: MasterState, run: Run, now: float) -> str | None:
     instance = state.instances.get(step.instance.number)
     if instance is None:
         return f"{step.instance} ended on {step.host}: {run.how_ended(step.instance)}"
-    return DONE if instance.state is InstanceState.READY else None
+    settled = instance.state is InstanceState.READY and now >= instance.ready_at + step.settle
+    return DONE if settled else None
 
 
 @outcome_of.register
-def _(step: AwaitReleased, state: MasterState, run: Run) -> str | None:
+def _(step: AwaitReleased, state: MasterState, run: Run, now: float) -> str | None:
     return DONE if handoffs.is_released(state, run, step.instance) else None
 
 
 @outcome_of.register
-def _(step: Stop, state: MasterState, run: Run) -> str | None:
+def _(step: Stop, state: MasterState, run: Run, now: float) -> str | None:
     return DONE if step.instance.number not in state.instances else None
 
 
 @outcome_of.register
-def _(step: Configure, state: MasterState, run: Run) -> str | None:
+def _(step: Configure, state: MasterState, run: Run, now: float) -> str | None:
     return handoffs.outcome(step, state, run)
 
 
 @outcome_of.register
-def _(step: SetRestart, state: MasterState, run: Run) -> str | None:
+def _(step: SetRestart, state: MasterState, run: Run, now: float) -> str | None:
     if step.instance.number not in state.instances:
         return DONE  # it has ended: there is nothing to restart
     if run.answer is None:
@@ -175,12 +176,12 @@ def _(step: SetRestart, state: MasterState, run: Run) -> str | None:
 
 
 @outcome_of.register
-def _(step: Commit, state: MasterState, run: Run) -> str | None:
+def _(step: Commit, state: MasterState, run: Run, now: float) -> str | None:
     return DONE
 
 
 @outcome_of.register
-def _(step: Execute, state: MasterState, run: Run) -> str | None:
+def _(step: Execute, state: MasterState, run: Run, now: float) -> str | None:
     if run.answer is None:
         return None
     accepted, message = run.answer
