@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple
 
 from rosrm.core.commands import Command
-from rosrm.core.events import Event
+from rosrm.core.events import Event, ReadingsReceived, StatusesReceived, UsagesReceived
 from rosrm.errors import ConfigError
 from rosrm.recording.encoding import decisions, encode, encode_decisions
 from rosrm.recording.frames import FrameKind, frame, opening
@@ -24,8 +24,11 @@ from rosrm.recording.reading import Header
 
 _log = logging.getLogger("rosrm.master")
 
-#: Events that may wait to be written; a disk that falls further behind ends the record.
-_BACKLOG: Final = 100_000
+#: Bytes of memory that may wait to be written, as `_weight` counts them; a disk that falls further
+#: behind ends the record. At a thousand hosts it is more than a minute.
+_BACKLOG: Final = 256 * 2**20
+#: Bytes that an event takes beside its readings, and each status or command that comes with it.
+_EACH: Final = 1536
 #: Seconds that the end of the master waits for what is still to be written.
 _LAST_WORDS: Final = 10.0
 _SUFFIX: Final = ".rosrec"
@@ -36,6 +39,7 @@ class _Noted(NamedTuple):
     now: float
     wall: float
     commands: Sequence[Command]
+    weight: int
 
 
 class Recorder:
@@ -55,6 +59,7 @@ class Recorder:
         self._max_size = max_size
         self._queue: queue.SimpleQueue[_Noted | None] = queue.SimpleQueue()
         self._why = ""
+        self._put = self._done = 0  # bytes; the first is the loop's, the second the thread's
         try:
             directory.mkdir(parents=True, exist_ok=True, mode=0o700)
             _make_room(directory, header.master, keep - 1)
@@ -70,14 +75,23 @@ class Recorder:
         self._thread = threading.Thread(target=self._write, name="rosrm recorder", daemon=True)
         self._thread.start()
 
+    @property
+    def waiting(self) -> int:
+        """Bytes of memory, roughly, of what waits to be written."""
+        return self._put - self._done
+
     def note(self, event: Event, now: float, wall: float, commands: Sequence[Command]) -> None:
         """Something happened, and this came of it; returns at once."""
         if self._why:
             return
-        if self._queue.qsize() >= _BACKLOG:
-            self._end(f"the disk could not keep up: {_BACKLOG} events waited")
+        weight = _weight(event, commands)
+        if self.waiting + weight > _BACKLOG:
+            self._end(
+                f"full: the disk could not keep up: {self.waiting / 2**20:.0f} MiB of events waited"
+            )
             return
-        self._queue.put(_Noted(event, now, wall, commands))
+        self._put += weight
+        self._queue.put(_Noted(event, now, wall, commands, weight))
 
     def close(self, why: str) -> None:
         """Write what waits and the end of the record; `why` the master ends."""
@@ -90,7 +104,7 @@ class Recorder:
 
     def _end(self, why: str) -> None:
         """Nothing more is recorded, and that is said."""
-        self._why = f"full: {why}"
+        self._why = why
         self._queue.put(None)
         _log.warning("the record %s ends here: %s", self.path, why)
 
@@ -99,27 +113,65 @@ class Recorder:
     def _write(self) -> None:
         try:
             with self._file:
-                while (noted := self._queue.get()) is not None:
-                    if not self._write_one(noted):
-                        break
-                    if self._queue.empty():
-                        self._file.flush()
+                self._write_events()
                 self._file.write(frame(FrameKind.END, self._why.encode()))
-        except OSError as error:
+        except Exception as fault:  # noqa: BLE001 - whatever it is, it must not go unseen
             self._why = self._why or "failed"
-            _log.warning("the record %s ends here: %s", self.path, error.strerror)
+            _log.warning("the record %s ends here: %s", self.path, _told(fault))
+        finally:
+            self._forget()
 
-    def _write_one(self, noted: _Noted) -> bool:
-        """False: the record is full."""
-        written = frame(*encode(noted.event, noted.now, noted.wall))
-        decided = decisions(noted.commands)
-        if decided:
-            written += frame(FrameKind.DECISIONS, encode_decisions(decided))
-        if self._size + len(written) > self._max_size:
-            self._end(f"it has reached `record.max_size`, {self._max_size} bytes")
-            return False
-        self._size += self._file.write(written)
-        return True
+    def _write_events(self) -> None:
+        while (noted := self._queue.get()) is not None:
+            self._done += noted.weight
+            try:
+                written = _encoded(noted)
+            except Exception as fault:  # noqa: BLE001 - a bug in here is no reason to lose the rest
+                self._end(f"failed: {_told(fault)}, at {type(noted.event).__name__}")
+                return
+            if self._size + len(written) > self._max_size:
+                self._end(f"full: it has reached `record.max_size`, {self._max_size} bytes")
+                return
+            self._size += self._file.write(written)
+            if self._queue.empty():
+                self._file.flush()
+
+    def _forget(self) -> None:
+        """Nobody writes what still waits: it need not be held until the master ends."""
+        while not self._queue.empty():
+            noted = self._queue.get()
+            self._done += 0 if noted is None else noted.weight
+
+
+def _weight(event: Event, commands: Sequence[Command]) -> int:
+    """Bytes of memory that an event and its commands hold until they are written, roughly.
+
+    What is submitted is held by the master anyway.
+    """
+    weight = _EACH * (1 + len(commands))
+    if isinstance(event, ReadingsReceived):
+        return weight + event.usage.nbytes + event.limit.nbytes + 5 * event.host_id.nbytes
+    if isinstance(event, UsagesReceived):
+        return weight + 3 * event.numbers.nbytes
+    if isinstance(event, StatusesReceived):
+        return weight + _EACH * len(event.statuses)
+    return weight
+
+
+def _encoded(noted: _Noted) -> bytes:
+    """The frames of an event and of what was decided."""
+    written = frame(*encode(noted.event, noted.now, noted.wall))
+    decided = decisions(noted.commands)
+    if decided:
+        written += frame(FrameKind.DECISIONS, encode_decisions(decided))
+    return written
+
+
+def _told(fault: Exception) -> str:
+    """What went wrong, in words."""
+    if isinstance(fault, OSError):
+        return fault.strerror or str(fault)
+    return f"{type(fault).__name__}: {fault}"
 
 
 def _new_file(directory: Path, stem: str) -> tuple[Path, BinaryIO]:

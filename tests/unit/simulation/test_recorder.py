@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import os
 import stat
+import threading
+import time
 
+import numpy as np
 import pytest
 
 from rosrm.core import events as happened
+from rosrm.core.model import RESOURCE_SLOTS
 from rosrm.errors import ConfigError
 from rosrm.master import recorder
 from rosrm.master.recorder import Recorder
@@ -62,27 +66,86 @@ def test_a_full_record_ends_there_and_says_so(start, caplog):
     assert "ends here" in caplog.text
 
 
-def test_a_disk_that_falls_behind_ends_the_record_not_the_memory(start, monkeypatch, caplog):
-    monkeypatch.setattr(recorder, "_BACKLOG", 10)
-    made = start()
+class Hung:
+    """A file whose writes wait until they are let go."""
 
-    class Behind:
-        """A queue in which much waits."""
+    def __init__(self, inner):
+        self.inner = inner
+        self.go = threading.Event()
 
-        def __init__(self, inner):
-            self.inner = inner
+    def write(self, content):
+        assert self.go.wait(20.0), "nobody let the write go"
+        return self.inner.write(content)
 
-        def qsize(self):
-            return 10
+    def __getattr__(self, name):
+        return getattr(self.inner, name)
 
-        def __getattr__(self, name):
-            return getattr(self.inner, name)
 
-    made._queue = Behind(made._queue)
-    note(made, 3)
+def batch(hosts: int) -> happened.ReadingsReceived:
+    numbers = np.arange(hosts, dtype=np.uint64)
+    usage = np.zeros((hosts, RESOURCE_SLOTS))
+    return happened.ReadingsReceived(
+        numbers.astype(np.int64), numbers, numbers, numbers, np.ones(hosts, np.bool_),
+        np.zeros(hosts, np.uint32), usage, usage.copy(),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("hosts", [1, 1000])
+def test_a_disk_that_hangs_ends_the_record_not_the_memory(start, monkeypatch, caplog, hosts):
+    """What waits is bounded in bytes, however many hosts one event is about."""
+    bound = 2**20
+    monkeypatch.setattr(recorder, "_BACKLOG", bound)
+    made = start(max_size=10**9)
+    made._file = hung = Hung(made._file)
+    event = batch(hosts)
+    content = event.usage.nbytes + event.limit.nbytes
+    for number in range(bound // content + 10):
+        made.note(event, float(number), 0.0, ())
+    waiting = made._queue.qsize()
+    assert 0 < waiting * content <= bound
+    hung.go.set()
     made.close("the master stopped: SIGINT")
-    assert read(made.path.read_bytes()).end.startswith("full: the disk could not keep up")
+    record = read(made.path.read_bytes())
+    assert record.end.startswith("full: the disk could not keep up")
+    assert len(record.events) >= waiting - 1
     assert caplog.text.count("could not keep up") == 1
+
+
+def test_a_disk_that_keeps_up_is_never_too_slow(start, monkeypatch):
+    """What is written no longer waits: a record may be many times as large as what may wait."""
+    made = start(max_size=10**9)
+    monkeypatch.setattr(recorder, "_BACKLOG", 64 * 2**10)
+    for number in range(50):
+        made.note(batch(100), float(number), 0.0, ())
+        until = time.monotonic() + 20.0
+        while made.waiting and time.monotonic() < until:
+            os.sched_yield()
+    made.close("done")
+    assert len(read(made.path.read_bytes()).events) == 50
+
+
+@pytest.mark.parametrize("fault", [KeyError("slot"), MemoryError()])
+def test_what_cannot_be_encoded_ends_the_record_with_its_reason(start, monkeypatch, caplog, fault):
+    """It is said once, nothing waits in vain after it, and what was written stays whole."""
+    encode = recorder.encode
+
+    def broken(event, now, wall):
+        if event.request == 3:
+            raise fault
+        return encode(event, now, wall)
+
+    monkeypatch.setattr(recorder, "encode", broken)
+    made = start()
+    note(made, 10)
+    made._thread.join(20.0)
+    assert not made._thread.is_alive()
+    note(made, 10, begin=10)
+    assert (made.waiting, made._queue.qsize()) == (0, 0)
+    made.close("the master stopped: SIGINT")
+    record = read(made.path.read_bytes())
+    assert [one.event.request for one in record.events] == [0, 1, 2]
+    assert record.end.startswith(f"failed: {type(fault).__name__}")
+    assert caplog.text.count("ends here") == 1
 
 
 def test_a_write_that_fails_ends_the_record_and_is_said_once(start, caplog):
