@@ -4,7 +4,9 @@ r"""The file of a record: a line with its version, then frames with length and c
     frame*                  length u32, CRC-32 u32 (both little-endian), then `length` bytes
 
 The first byte of a frame says what it holds (`FrameKind`). The first frame is the header, the last
-one of a record that was closed in good order says why it ends: without it the file is cut short.
+one of a record that was closed in good order says why it ends: without it the file is cut short. So
+it is where nothing but zeros follow, which is what a power loss leaves of bytes that were not on
+the disk yet.
 """
 
 from __future__ import annotations
@@ -24,6 +26,8 @@ _PREFIX: Final = struct.Struct("<II")
 #: Bytes: no frame is as large, so a larger length is damage and no reason to allocate.
 _LARGEST: Final = 2**30
 _LONGEST_LINE: Final = 64
+#: Bytes of a tail that are looked at in one go.
+_AT_ONCE: Final = 2**20
 
 
 class FrameKind(bytes, Enum):
@@ -69,12 +73,12 @@ def frames(file: BinaryIO, name: str) -> Iterator[tuple[FrameKind, bytes, int]]:
             raise cut_short(name, at)
         length, checksum = _PREFIX.unpack(prefix)
         if not 0 < length <= _LARGEST:
-            raise _damaged(name, at)
+            raise _broken(file, prefix, name, at)
         body = file.read(length)
         if len(body) < length:
             raise cut_short(name, at)
         if zlib.crc32(body) != checksum:
-            raise _damaged(name, at)
+            raise _broken(file, body, name, at)
         try:
             kind = FrameKind(body[:1])
         except ValueError:
@@ -84,7 +88,7 @@ def frames(file: BinaryIO, name: str) -> Iterator[tuple[FrameKind, bytes, int]]:
 
 
 def _check_opening(file: BinaryIO, name: str) -> int:
-    line = file.readline(_LONGEST_LINE)
+    line = file.readline(_LONGEST_LINE).rstrip(b"\0")
     if not line.startswith(MAGIC):
         raise RecordError(
             f"{name}: is no record of a master's run: it does not begin with "
@@ -104,13 +108,24 @@ def _check_opening(file: BinaryIO, name: str) -> int:
 def cut_short(name: str, at: int) -> RecordError:
     """The file ends before the record does."""
     return CutShort(
-        f"{name}: the record is cut short at byte {at}: its master was killed, still runs, or the "
-        f"file was not copied as a whole. --cut takes what is there"
+        f"{name}: the record is cut short at byte {at}: its master was killed, lost its power, "
+        f"still runs, or the file was not copied as a whole. --cut takes what is there"
     )
 
 
 class CutShort(RecordError):
     """A record without its end; what is there is whole."""
+
+
+def _broken(file: BinaryIO, read: bytes, name: str, at: int) -> RecordError:
+    """A frame that does not fit: cut, where its end and all that follows are zeros, or damaged."""
+    if read.endswith(b"\0"):
+        while rest := file.read(_AT_ONCE):
+            if rest.strip(b"\0"):
+                break
+        else:
+            return cut_short(name, at)
+    return _damaged(name, at)
 
 
 def _damaged(name: str, at: int) -> RecordError:

@@ -181,6 +181,33 @@ def test_a_flipped_bit_is_noticed_also_where_a_cut_would_be_borne(content, at):
         read(bytes(broken), cut=True)
 
 
+def test_zeros_behind_the_last_whole_frame_are_a_cut(content):
+    """A power loss leaves them, at any byte: within a frame, within its length, between two."""
+    whole = read(content)
+    for end in {*range(1800, 2600), len(content) - 17, len(content) - 16, len(content) - 3}:
+        torn = content[:end].rstrip(b"\0") + bytes(5000)
+        with pytest.raises(RecordError, match="cut short at byte"):
+            read(torn)
+        record = read(torn, cut=True)
+        assert record.end == "cut short"
+        assert [one.now for one in record.events] == [
+            one.now for one in whole.events[: len(record.events)]
+        ]
+        assert len(record.events) >= len(read(content[:end], cut=True).events)
+
+
+@pytest.mark.parametrize("end", [13, 14, 15, 40])
+def test_zeros_in_place_of_the_header_leave_nothing_to_use(content, end):
+    with pytest.raises(RecordError, match=r"cut short at byte (0|15)"):
+        read(content[:end] + bytes(5000), cut=True)
+
+
+def test_zeros_with_anything_behind_them_are_damage(content):
+    torn = content[:2000] + bytes(5000)
+    with pytest.raises(RecordError, match="damaged at byte"):
+        read(torn + content[7000:], cut=True)
+
+
 @pytest.mark.parametrize("foreign", [b"", b"hosts: []\n", b"\x7fELF" * 100, b"rosrm-reco"])
 def test_another_file_is_no_record(foreign):
     with pytest.raises(RecordError, match=r"r\.rosrec: is no record of a master's run"):
