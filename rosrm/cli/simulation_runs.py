@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from math import inf
 from pathlib import Path
 from typing import Final
 
@@ -95,7 +96,7 @@ def carry_out(request: Request) -> Report:
     if request.cut:
         raise ConfigError(f"--cut is for records, and {request.file} is a workload")
     comparison = load_workload(request.file, registry, changes, request.seed)
-    workload = _ended(comparison.workload, request.until)
+    workload = _ended(comparison.workload, _end(request))
     with _progress() as shown:
         runs = [run(workload, one, registry, shown) for one in comparison.variants]
     return Report(workload, tuple(runs))
@@ -127,14 +128,18 @@ def _holds_record(path: Path) -> bool:
     return False
 
 
-def _ended(workload: Workload, until: str) -> Workload:
-    if not until:
-        return workload
+def _end(request: Request) -> float:
+    """Seconds after which each run ends; inf: when it ends by itself."""
+    if not request.until:
+        return inf
     try:
-        seconds = Quantity("duration", above=True).parse(until)
+        return Quantity("duration", above=True).parse(request.until)
     except ValueError as error:
         raise ConfigError(f"--until: {error}") from None
-    return replace(workload, until=min(seconds, workload.until))
+
+
+def _ended(workload: Workload, until: float) -> Workload:
+    return replace(workload, until=min(until, workload.until))
 
 
 # --- a record ---------------------------------------------------------------------------------
@@ -143,14 +148,15 @@ def _ended(workload: Workload, until: str) -> Workload:
 def _of_record(request: Request, changes: Sequence[Node], registry: Registry) -> Report:
     if request.seed is not None:
         raise ConfigError(f"--seed is for workloads: the record {request.file} leaves no chance")
+    until = _end(request)
     recording = load_record(request.file, cut=request.cut)
     name = f"settings in {request.file}"
     base = settings_node(recording.header.config, name)
     variants = load_variants(base, changes, request.file, registry, title="simulated")
-    replayed, workload = replay_record(recording, registry)
+    replayed, workload = replay_record(recording, registry, until)
     hosts = len(replayed.outcome.curves.hosts)
     runs = [Run("recorded", hosts, replayed.outcome)]
-    workload = _ended(workload, request.until)
+    workload = _ended(workload, until)
     if not workload.hosts:
         raise RecordError(f"{request.file}: no host ever registered in it: nothing to simulate")
     with _progress() as shown:
@@ -182,8 +188,15 @@ def load_record(path: Path, *, cut: bool = False) -> Recording:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
 
 
-def replay_record(recording: Recording, registry: Registry) -> tuple[Replay, Workload]:
+def replay_record(
+    recording: Recording, registry: Registry, until: float = inf
+) -> tuple[Replay, Workload]:
     """Replay a record with its own settings, and make a workload of it.
+
+    Args:
+        recording: of a master's run; all of it is replayed, and goes into the workload.
+        registry: of the plugins.
+        until: seconds from the beginning, up to which the recorded run is measured.
 
     Raises:
         RecordError: its settings are not those of this version.
@@ -198,7 +211,7 @@ def replay_record(recording: Recording, registry: Registry) -> tuple[Replay, Wor
         ) from None
     extraction = Extraction(recording)
     policy, strategies = _plugins(config, registry)
-    replayed = replay(recording, config.core(), policy, strategies, extraction.watch)
+    replayed = replay(recording, config.core(), policy, strategies, extraction.watch, until)
     return replayed, extraction.workload()
 
 

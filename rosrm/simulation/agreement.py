@@ -20,10 +20,11 @@ class Agreement:
     """Two runs of the same workload, compared.
 
     Attributes:
-        processes: that both runs had.
-        same_host: of those, part whose first host is the same.
-        same_counts: part of the processes that would have to change their first host for each host
-            to get as many in both runs: 1 minus that.
+        processes: that got a host in either run.
+        same_host: of those, part whose first host is the same; one that got none in one of the runs
+            is not among it.
+        same_counts: part of the processes that would have to change their first host for each host,
+            and for none at all, to get as many in both runs: 1 minus that.
         usage: by resource, mean distance of the usage of the same host at the same time, fraction.
         ranked: the same of the k-th fullest host, whichever it is.
         balance: by resource, mean distance of fullest minus emptiest host at the same time.
@@ -42,22 +43,27 @@ class Agreement:
 
 
 def compare(first: Outcome, second: Outcome) -> Agreement:
-    """Compare a run with another, over the time that both cover."""
-    both = [name for name in first.placements if name in second.placements]
-    here = [first.placements[name][0] for name in both]
-    there = [second.placements[name][0] for name in both]
+    """Compare a run with another one that was measured over the same time."""
+    placed = [*first.placements, *(one for one in second.placements if one not in first.placements)]
+    here, there = ([_first_host(run, name) for name in placed] for run in (first, second))
     same = sum(one == other for one, other in zip(here, there, strict=True))
     moved = sum(abs(here.count(host) - there.count(host)) for host in {*here, *there}) / 2
     apart = {name: _distances(first.curves, second.curves, name) for name in MEASURED}
     known = first.makespan is not None and second.makespan is not None and first.makespan > 0.0
     return Agreement(
-        len(both), same / len(both) if both else 1.0, 1.0 - moved / len(both) if both else 1.0,
+        len(placed),
+        same / len(placed) if placed else 1.0, 1.0 - moved / len(placed) if placed else 1.0,
         {name: one.usage for name, one in apart.items()},
         {name: one.ranked for name, one in apart.items()},
         {name: one.balance for name, one in apart.items()},
         (second.makespan or 0.0) / (first.makespan or 1.0) if known else None,
         (first.migrations, second.migrations),
     )  # fmt: skip
+
+
+def _first_host(run: Outcome, process: str) -> str | None:
+    hosts = run.placements.get(process)
+    return None if hosts is None else hosts[0]
 
 
 class _Apart(NamedTuple):

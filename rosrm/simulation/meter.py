@@ -127,6 +127,17 @@ class Meter:
         """How many processes have ended so far."""
         return len(self._ends)
 
+    def begin(self, state: MasterState, now: float) -> None:
+        """The core starts with this: what is not over arrives now, and what runs has its host."""
+        for process in state.processes.values():
+            if process.phase.over:
+                continue
+            self._first = now
+            self._arrivals[process.name] = now
+            owner = state.instances.get(process.owner)
+            if owner is not None:
+                self._placed[process.name] = [owner.host.name]
+
     def take(
         self, state: MasterState, event: happened.Event, commands: Sequence[Command], now: float
     ) -> None:

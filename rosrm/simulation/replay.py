@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from math import inf
 from typing import Final
 
 from rosrm.core.commands import Command
@@ -49,7 +50,7 @@ class Replay:
         decisions: that were recorded.
         different: events after which something else was decided than recorded.
         differences: the first few of them.
-        outcome: of the run, as recorded.
+        outcome: of the run, as recorded, up to where it is measured.
     """
 
     decisions: int
@@ -61,6 +62,7 @@ class Replay:
 def replay(
     recording: Recording, settings: CoreSettings, policy: NamedPolicy,
     strategies: Mapping[str, MigrationStrategy], watcher: Watcher | None = None,
+    until: float = inf,
 ) -> Replay:  # fmt: skip
     """Tell a core again everything that a record holds, at the same times.
 
@@ -73,17 +75,25 @@ def replay(
         policy: that orders the hosts, with its name.
         strategies: by name.
         watcher: is shown each event with what came of it.
+        until: seconds from the beginning of the record: the run is measured up to here. All of it
+            is replayed nonetheless.
     """
     header = recording.header
     state = MasterState(settings, policy[0], policy[1], strategies, header.epoch)
     restore(state, lambda table: header.intents.get(table, {}), header.started)
-    meter = Meter(recording.events[-1].now if recording.events else header.started)
+    end = header.started + min(until, recording.length)
+    meter = Meter(end)
+    meter.begin(state, header.started)
+    outcome: Outcome | None = None
     count = different = 0
     differences: list[Difference] = []
     for one in recording.events:
+        if one.now > end and outcome is None:
+            outcome = meter.outcome(state, end)
         state.wall = one.wall
         commands = step(state, one.event, one.now)
-        meter.take(state, one.event, commands, one.now)
+        if outcome is None:
+            meter.take(state, one.event, commands, one.now)
         if watcher is not None:
             watcher(state, one, commands)
         recorded, replayed = one.decided or (), decisions(commands)
@@ -92,5 +102,4 @@ def replay(
             different += 1
             if len(differences) < _TOLD:
                 differences.append(Difference(one.now - header.started, recorded, replayed))
-    end = recording.events[-1].now if recording.events else header.started
-    return Replay(count, different, tuple(differences), meter.outcome(state, end))
+    return Replay(count, different, tuple(differences), outcome or meter.outcome(state, end))

@@ -106,6 +106,8 @@ def test_also_a_master_that_took_over_what_ran(records):
     replayed, _ = replay_record(recording, Registry.discover())
     assert replayed.decisions > 0
     assert replayed.differences == ()
+    running = [one for one in recording.header.intents["process"].values() if one["owner"]]
+    assert {one["spec"]["name"] for one in running} <= set(replayed.outcome.placements)
 
 
 def test_one_that_still_grows_is_not_taken_for_a_whole_one(records):

@@ -137,6 +137,16 @@ def test_the_json_of_a_record_says_what_was_replayed_and_how_it_agrees(rosrm, re
     assert report["agreement"]["ranked"]["memory"] < 0.02
 
 
+def test_until_ends_the_recorded_run_as_well(rosrm, record):
+    """Both rows, and how they agree, are of the same time."""
+    report = json.loads(rosrm("simulate", record, "--until", "2500ms", "--json").out)
+    assert [list(run["placements"]) for run in report["runs"]] == [["p0", "p1", "p2"]] * 2
+    assert [run["finished"] for run in report["runs"]] == [0, 0]
+    assert [run["span"] for run in report["runs"]] == pytest.approx([2.5, 2.5], abs=0.05)
+    assert report["agreement"]["processes"] == 3
+    assert report["record"]["decisions"] == 6
+
+
 def test_a_replay_that_decides_otherwise_is_said(rosrm, tmp_path, content):
     """The header says another policy than the one that decided."""
     from io import BytesIO
@@ -175,8 +185,9 @@ def test_a_bad_record_is_one_clear_error(rosrm, tmp_path, content, change, said)
     assert not result.out
 
 
-def test_one_that_is_cut_short_can_be_used_as_far_as_it_goes(rosrm, tmp_path, content):
-    (tmp_path / "r.rosrec").write_bytes(content[:-200])
+@pytest.mark.parametrize("tail", [b"", bytes(4096)])
+def test_one_that_is_cut_short_can_be_used_as_far_as_it_goes(rosrm, tmp_path, content, tail):
+    (tmp_path / "r.rosrec").write_bytes(content[:-200] + tail)
     result = rosrm("simulate", tmp_path / "r.rosrec", "--cut")
     assert result.code == 0
     assert "cut short" in result.out

@@ -8,8 +8,9 @@ from hypothesis import strategies as st
 
 from rosrm.core import events as happened
 from rosrm.core.settings import CoreSettings
+from rosrm.ports import Intent
 from rosrm.recording.encoding import Happened
-from rosrm.recording.reading import Recording
+from rosrm.recording.reading import Header, Recording
 from rosrm.simulation.agreement import compare
 from rosrm.simulation.engine import Simulation
 from rosrm.simulation.extraction import Extraction
@@ -21,7 +22,7 @@ from .workloads import EQ1, MIB, STRATEGIES, host, plan, read, recorded, simulat
 BY_CPU = ("weighted", Weighted(WeightedOptions({"cpu": 1.0})))
 
 
-def busy(**options) -> Simulation:
+def busy(until: float = 60.0, **options) -> Simulation:
     """Arrivals, a full host, growth, moves, a request, a host that comes and one that goes."""
     hosts = [host("a", 400), host("b", 400), host("c", 400, joins=6.0), host("d", leaves=20.0)]
     plans = [plan(f"p{n}", 60.0, at=0.7 * n, duration=15.0, cpu=0.5) for n in range(12)]
@@ -32,7 +33,7 @@ def busy(**options) -> Simulation:
         (12.0, happened.HostStateRequested(0, "a", "drain")),
         (30.0, happened.CancelRequested(0, ("node", "grows"))),
     ]
-    return simulation(hosts, plans, requests=requests, until=60.0, **options)
+    return simulation(hosts, plans, requests=requests, until=until, **options)
 
 
 @pytest.fixture(scope="module")
@@ -93,6 +94,42 @@ def test_the_outcome_of_a_replay_is_that_of_the_run(record):
     assert again.over_limit == pytest.approx(run.over_limit)
 
 
+def test_measured_up_to_a_time_a_replay_is_the_run_up_to_there(record):
+    """Nothing that came later is in its numbers; the decisions are compared to the end."""
+    run = busy(until=6.5).run()
+    again = replay(record, CoreSettings(), EQ1, STRATEGIES, until=6.5)
+    whole = replay(record, CoreSettings(), EQ1, STRATEGIES)
+    cut = again.outcome
+    assert (cut.placements, cut.arrivals, cut.ends) == (run.placements, run.arrivals, run.ends)
+    assert (cut.running, cut.waiting, cut.makespan) == (run.running, run.waiting, run.makespan)
+    assert cut.migrations == run.migrations == 0 < whole.outcome.migrations
+    assert cut.span == pytest.approx(run.span)
+    assert cut.curves.times[-1] <= 6.5
+    assert (again.decisions, again.different) == (whole.decisions, 0)
+
+
+def test_what_runs_when_the_record_begins_is_where_it_is():
+    """A master that took over: its processes arrived at its start, and have their hosts."""
+    plans = [plan("p0", 100.0), plan("p1", 100.0), plan("large", 5000.0)]
+    made = simulation([host("a"), host("b")], plans, until=5.0)
+    tables: dict[str, dict[str, dict]] = {}
+    take = made.meter.take
+
+    def note(state, event, commands, now):
+        for one in commands:
+            if isinstance(one, Intent):
+                tables.setdefault(one.table, {})[one.key] = one.value
+        take(state, event, commands, now)
+
+    made.meter.take = note
+    before = made.run()
+    header = Header("1", "test", {}, 2, 5.0, tables)
+    after = replay(Recording("r", header, (), "stopped"), CoreSettings(), EQ1, STRATEGIES).outcome
+    assert after.placements == before.placements != {}
+    assert list(after.never_placed) == ["large"]
+    assert after.arrivals == {"p0": 0.0, "p1": 0.0, "large": 0.0}
+
+
 def test_a_workload_made_of_a_record_gives_nearly_the_same_run(record):
     """Simulated, recorded, extracted and simulated again."""
     extraction = Extraction(record)
@@ -134,6 +171,15 @@ def test_a_run_agrees_with_itself_and_renamed_hosts_differ_in_name_alone():
     assert renamed.same_host == 0.0
     assert renamed.usage["memory"] > 0.0
     assert renamed.ranked["memory"] == renamed.balance["memory"] == 0.0
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_what_only_one_run_placed_counts_as_different(turned):
+    plans = [plan(f"p{n}", 20.0 + 7 * n, at=n) for n in range(6)]
+    runs = [run_on(["a", "b"], plans), run_on(["a", "b"], plans[:4])]
+    agreement = compare(*(reversed(runs) if turned else runs))
+    assert agreement.processes == 6
+    assert (agreement.same_host, agreement.same_counts) == pytest.approx((4 / 6, 4 / 6))
 
 
 def run_on(names, plans):
