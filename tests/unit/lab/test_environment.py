@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from rosrm.lab.host import host_environment
 
 
@@ -16,6 +18,21 @@ def test_discovery_reaches_the_lab_whatever_the_terminal_says():
     inside = host_environment(caller, "host1")
     assert inside["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "SUBNET"
     assert not {"ROS_LOCALHOST_ONLY", "ROS_STATIC_PEERS", "ROS_DISCOVERY_SERVER"} & set(inside)
+
+
+@pytest.mark.parametrize(
+    "variable",
+    [
+        "FASTDDS_BUILTIN_TRANSPORTS",
+        "FASTDDS_DEFAULT_PROFILES_FILE",
+        "FASTDDS_ENVIRONMENT_FILE",
+        "FASTRTPS_DEFAULT_PROFILES_FILE",
+        "CYCLONEDDS_URI",
+    ],
+)
+def test_the_settings_of_a_dds_are_not_handed_on(variable):
+    """They may name interfaces, peers or transports that reach nobody in a lab."""
+    assert variable not in host_environment({variable: "x"}, "host1")
 
 
 def test_the_rest_is_the_terminals():
