@@ -201,22 +201,45 @@ def memory_used(hierarchies: Iterable[Hierarchy], lab: str, host: str) -> int | 
     for hierarchy in hierarchies:
         if "memory" not in hierarchy.controllers:
             continue
-        group = hierarchy.group(lab, host, "limited")
-        name, key = (
-            ("memory.usage_in_bytes", "total_inactive_file")
-            if hierarchy.version == 1
-            else ("memory.current", "inactive_file")
-        )
         try:
-            used, details = (group / name).read_text(), (group / "memory.stat").read_text()
+            return _memory_used(hierarchy, hierarchy.group(lab, host, "limited"))
         except OSError:
             return None
-        cache = re.search(rf"^{key} (\d+)$", details, re.MULTILINE)
-        return max(0, int(used) - (int(cache[1]) if cache else 0))
+    return None
+
+
+def memory_left(hierarchies: Iterable[Hierarchy]) -> int | None:
+    """Bytes that all labs together may still use, where we are a container with a limit of its own.
+
+    None: nothing but the machine's memory limits them. The group that the labs' groups are made in
+    is the container's; what is above it cannot be seen from here.
+    """
+    for hierarchy in hierarchies:
+        if "memory" not in hierarchy.controllers:
+            continue
+        name = "memory.limit_in_bytes" if hierarchy.version == 1 else "memory.max"
+        try:
+            limit = (hierarchy.mount / name).read_text().strip()
+            if limit != "max":
+                return max(0, int(limit) - _memory_used(hierarchy, hierarchy.mount))
+        except OSError:  # the machine's own group has no limit in version 2
+            return None
     return None
 
 
 # --- inner parts ------------------------------------------------------------------------------
+
+
+def _memory_used(hierarchy: Hierarchy, group: Path) -> int:
+    """Bytes that a group uses, without cache that can be dropped at once."""
+    name, key = (
+        ("memory.usage_in_bytes", "total_inactive_file")
+        if hierarchy.version == 1
+        else ("memory.current", "inactive_file")
+    )
+    used, details = (group / name).read_text(), (group / "memory.stat").read_text()
+    cache = re.search(rf"^{key} (\d+)$", details, re.MULTILINE)
+    return max(0, int(used) - (int(cache[1]) if cache else 0))
 
 
 def _mounted(root: Path) -> Iterator[tuple[int, Path, frozenset[str]]]:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Final
 
 import psutil
 
 from rosrm.errors import LabError
+from rosrm.lab import groups
 from rosrm.lab.plan import MIB, HostPlan, total
 
 #: Bits of the capabilities (linux/capability.h), and what they are needed for.
@@ -80,12 +81,15 @@ def check_rights(hosts: Sequence[HostPlan] = (), status: str | None = None) -> N
     raise LabError(f"a lab needs rights that are missing: {reasons}. {remedy}.\n{_slices(hosts)}")
 
 
-def check_machine(hosts: Sequence[HostPlan], images: Path) -> None:
+def check_machine(
+    hosts: Sequence[HostPlan], images: Path, hierarchies: Iterable[groups.Hierarchy] = ()
+) -> None:
     """Raise `LabError` where a program, a device, memory or disk space is missing.
 
     Args:
         hosts: that are asked for.
         images: the directory that will hold their disks.
+        hierarchies: where their groups will be: a container may have a limit of its own there.
     """
     for name in _FROM_THE_START:
         find_command(name)
@@ -94,7 +98,7 @@ def check_machine(hosts: Sequence[HostPlan], images: Path) -> None:
             f"there are no loop devices ({_DEVICE}): the hosts' disks cannot be mounted. "
             "`modprobe loop` brings them; a container needs `docker run --privileged -v /dev:/dev`"
         )
-    _check_memory(hosts)
+    _check_memory(hosts, hierarchies)
     _check_space(hosts, images)
 
 
@@ -109,13 +113,16 @@ def overbooked(hosts: Sequence[HostPlan]) -> str:
     )
 
 
-def _check_memory(hosts: Sequence[HostPlan]) -> None:
-    available, wanted = psutil.virtual_memory().available, total(host.memory for host in hosts)
+def _check_memory(hosts: Sequence[HostPlan], hierarchies: Iterable[groups.Hierarchy]) -> None:
+    wanted = total(host.memory for host in hosts)
+    available, where = psutil.virtual_memory().available, "on this machine"
+    left = groups.memory_left(hierarchies)
+    if left is not None and left < available:
+        available, where = left, "within the limit of this container"
     if wanted > available:
         raise LabError(
             f"the hosts may use {wanted / MIB:.0f} MiB of memory together, and "
-            f"{available / MIB:.0f} MiB are available on this machine: ask for fewer or smaller "
-            "hosts"
+            f"{available / MIB:.0f} MiB are available {where}: ask for fewer or smaller hosts"
         )
 
 

@@ -148,3 +148,29 @@ def test_memory_in_use_is_without_cache(tmp_path):
     hierarchy = Hierarchy(2, tmp_path, ("memory",))
     assert groups.memory_used([hierarchy], "lab", "host1") == 700
     assert groups.memory_used([hierarchy], "lab", "other") is None
+
+
+@pytest.mark.parametrize(
+    ("version", "files", "left"),
+    [
+        (2, {"max": "1000", "current": "300", "stat": "inactive_file 50"}, 750),
+        (2, {"max": "1000", "current": "1300", "stat": ""}, 0),
+        (2, {"max": "max", "current": "300", "stat": ""}, None),
+        (2, {}, None),
+        (
+            1,
+            {
+                "limit_in_bytes": "1000",
+                "usage_in_bytes": "300",
+                "stat": "inactive_file 1\ntotal_inactive_file 50",
+            },
+            750,
+        ),
+    ],
+)
+def test_what_a_container_may_still_use(tmp_path, version, files, left):
+    """Its limit less what is used; the machine's own group of version 2 has no such file."""
+    for name, content in files.items():
+        (tmp_path / f"memory.{name}").write_text(f"{content}\n")
+    cpu = Hierarchy(1, tmp_path / "cpu", ("cpu",))
+    assert groups.memory_left([cpu, Hierarchy(version, tmp_path, ("memory",))]) == left

@@ -9,6 +9,7 @@ import pytest
 
 from rosrm.errors import LabError
 from rosrm.lab import needs
+from rosrm.lab.groups import Hierarchy
 from rosrm.lab.plan import GIB, MIB, HostPlan, uniform
 
 ALL = sum(1 << bit for bit, _ in needs.CAPABILITIES.values())
@@ -77,6 +78,24 @@ def test_too_little_memory_is_refused(monkeypatch):
     hosts = uniform(3, memory=512 * MIB, disk=16 * MIB)
     with pytest.raises(LabError, match="1536 MiB of memory together, and 1024 MiB are available"):
         needs.check_machine(hosts, Path("/"))
+
+
+def test_a_container_has_no_more_memory_than_its_own_limit(monkeypatch, tmp_path):
+    """However much the machine has; where the machine has less, that counts."""
+    (tmp_path / "memory.max").write_text(f"{2 * GIB}\n")
+    (tmp_path / "memory.current").write_text(f"{GIB}\n")
+    (tmp_path / "memory.stat").write_text("inactive_file 0\n")
+    container = [Hierarchy(2, tmp_path, ("memory", "cpu"))]
+    monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(available=64 * GIB))
+    hosts = uniform(3, memory=512 * MIB, disk=16 * MIB)
+    with pytest.raises(
+        LabError,
+        match="1536 MiB of memory together, and 1024 MiB are available within the limit of this c",
+    ):
+        needs.check_machine(hosts, Path("/"), container)
+    monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(available=GIB // 2))
+    with pytest.raises(LabError, match="512 MiB are available on this machine"):
+        needs.check_machine(hosts, Path("/"), container)
 
 
 def test_hosts_without_a_limit_ask_for_no_memory(monkeypatch):
