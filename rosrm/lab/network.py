@@ -35,11 +35,30 @@ _ROOT: Final = 0xFFFFFFFF
 _IPV4: Final = 2
 
 
+@contextlib.contextmanager
+def _explained(what: str) -> Iterator[None]:
+    """Turn what the kernel refuses, or a container's rules do, into a `LabError`.
+
+    Args:
+        what: cannot be done then.
+    """
+    try:
+        yield
+    except (NetlinkError, OSError, RuntimeError) as error:  # the last: pyroute2's child was killed
+        raise LabError(
+            f"{what}: {_reason(error)}. A lab needs network namespaces, bridges and veth pairs: "
+            "`modprobe -a bridge veth` brings what the kernel has as modules; a container needs "
+            "`docker run --privileged`"
+        ) from error
+
+
+@_explained("the network namespaces of this machine cannot be listed")
 def existing() -> list[str]:
     """All named network namespaces of this machine."""
     return list(netns.listnetns())
 
 
+@_explained("the address ranges of this machine cannot be read")
 def ranges_in_use() -> list[tuple[IPv4Network, str]]:
     """The address ranges that this machine reaches directly or by a route, and how."""
     found = []
@@ -53,6 +72,7 @@ def ranges_in_use() -> list[tuple[IPv4Network, str]]:
     return found
 
 
+@_explained("the bridge between the hosts cannot be made")
 def make_switch(lab: LabPlan) -> None:
     """Make the namespace with the bridge."""
     name = names.switch_namespace(lab.name)
@@ -63,6 +83,7 @@ def make_switch(lab: LabPlan) -> None:
         switch.link("set", index=_index(switch, _BRIDGE), state="up")
 
 
+@_explained("a host cannot be connected to the bridge")
 def plug_in(lab: LabPlan, host: str, link: Link) -> None:
     """Make a host's namespace, and the cable to the switch.
 
@@ -89,6 +110,7 @@ def plug_in(lab: LabPlan, host: str, link: Link) -> None:
         set_delays(lab, host, Link(), link)
 
 
+@_explained("a host cannot be taken off the bridge")
 def unplug(lab: LabPlan, host: str) -> None:
     """Take a host's cable away; nothing that its dying processes send is heard any more."""
     if names.switch_namespace(lab.name) not in existing():
@@ -98,6 +120,7 @@ def unplug(lab: LabPlan, host: str) -> None:
             switch.link("del", index=index)
 
 
+@_explained("a network namespace cannot be removed")
 def remove(namespaces: Iterable[str]) -> None:
     """Remove namespaces with all that is in them."""
     for name in namespaces:
@@ -126,6 +149,7 @@ def set_rules(lab: LabPlan, links: Mapping[str, Link]) -> None:
         )
 
 
+@_explained("the packets of a host cannot be delayed")
 def set_delays(lab: LabPlan, host: str, before: Link, after: Link) -> None:
     """Delay what goes to and from a host.
 
@@ -163,6 +187,14 @@ def _set_delay(name: str, interface: str, wire: Wire) -> None:
                     "changed"
                 ) from None
             raise
+
+
+def _reason(error: Exception) -> str:
+    """In words: both kinds of errors carry a number and a text."""
+    number = error.args[0] if error.args else None
+    if len(error.args) < 2 or not isinstance(number, int):
+        return str(error)
+    return f"{error.args[1]} ({errno.errorcode.get(number, number)})"
 
 
 @contextlib.contextmanager
