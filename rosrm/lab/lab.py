@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from ipaddress import IPv4Network
 from pathlib import Path
 from types import TracebackType
@@ -17,7 +17,7 @@ from typing import IO, TYPE_CHECKING, Any, Final
 from rosrm.errors import ConfigError, LabError
 from rosrm.lab import groups, needs, store
 from rosrm.lab.host import DATA, entrance
-from rosrm.lab.plan import HostPlan, LabPlan, check_name, switch_namespace
+from rosrm.lab.plan import HostPlan, LabPlan, check_name, check_usable, switch_namespace
 from rosrm.lab.status import HostStatus, host_status
 from rosrm.lab.store import Birth, Record
 from rosrm.lab.wires import Direction, check_delay, check_loss
@@ -59,6 +59,8 @@ class Lab:
         subnet: IPv4Network | None = None,
     ) -> None:
         check_name(name, "lab")
+        if subnet is not None:
+            check_usable(subnet)
         self.name: Final = name
         self._hosts = tuple(hosts)
         self._subnet = subnet
@@ -79,19 +81,20 @@ class Lab:
         from rosrm.lab import making
 
         needs.check_rights(self._hosts)
-        needs.check_machine(self._hosts, store.IMAGES)
-        with store.lock(self.name):
+        with making.explained(self.name), store.lock(self.name):
             making.refuse_if_up(self.name)
             making.remove(self._hierarchies, self.name)
-            with store.lock(""):  # two labs at once must not choose the same addresses
-                subnet = making.choose_subnet(self._subnet)
-                plan = LabPlan(self.name, self._hosts, subnet)
-                record = Record(plan, boot=store.boot_id(), owner=owner)
-                store.write(record)
+            # Not before: what a killed attempt left takes memory and room on the disk.
+            needs.check_machine(self._hosts, store.IMAGES, self._hierarchies)
             try:
+                with store.lock(""):  # two labs at once must not choose the same addresses
+                    subnet = making.choose_subnet(self._subnet)
+                    plan = LabPlan(self.name, self._hosts, subnet)
+                    record = Record(plan, boot=store.boot_id(), owner=owner)
+                    store.write(record)
                 making.make(self._hierarchies, record)
             except BaseException:
-                making.remove(self._hierarchies, self.name)
+                _to_the_end(lambda: making.remove(self._hierarchies, self.name))
                 raise
 
     def down(self) -> bool:
@@ -103,7 +106,7 @@ class Lab:
         from rosrm.lab import making
 
         needs.check_rights()
-        with store.lock(self.name):
+        with making.explained(self.name), store.lock(self.name):
             return making.remove(self._hierarchies, self.name)
 
     def __enter__(self) -> Self:
@@ -117,7 +120,7 @@ class Lab:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        self.down()
+        _to_the_end(self.down)
 
     # --- looking ------------------------------------------------------------------------------
 
@@ -257,7 +260,7 @@ class Lab:
             )
         return subprocess.CompletedProcess(list(command), process.returncode, said, troubles)
 
-    def supervise(self, host: str, state: str) -> None:
+    def supervise(self, host: str, state: str, timeout: float = 60.0) -> None:
         """Start a supervisor within a host's limits, for a slave that will be beside them.
 
         Processes are children of the supervisor, so they are within the limits too; a slave that
@@ -265,9 +268,10 @@ class Lab:
 
         Args:
             state: directory of the slave, as the host has it.
+            timeout: seconds for it to start, as `exec` has it.
         """
         command = [sys.executable, "-m", "rosrm.supervisor", "--state", f"{state}/supervisor"]
-        self.exec(host, command)
+        self.exec(host, command, timeout=timeout)
 
     def become(
         self, host: str, command: Sequence[str], *, user: str = "", env: Mapping[str, str]
@@ -309,7 +313,7 @@ class Lab:
         """
         from rosrm.lab import making
 
-        with store.lock(self.name):
+        with making.explained(self.name), store.lock(self.name):
             record = self._record()
             making.switch_off(self._hierarchies, record, record.plan.host(host).name)
             store.write(record)
@@ -318,7 +322,7 @@ class Lab:
         """Switch a host on again after `kill`; nothing runs there yet. Raises `LabError`."""
         from rosrm.lab import making
 
-        with store.lock(self.name):
+        with making.explained(self.name), store.lock(self.name):
             record = self._record()
             if self.is_up(host):
                 raise LabError(f"host {host} of lab {self.name!r} is up already")
@@ -355,12 +359,21 @@ class Lab:
     def _change_link(self, host: str, direction: Direction, **values: Any) -> None:
         from rosrm.lab import making
 
-        with store.lock(self.name):
+        with making.explained(self.name), store.lock(self.name):
             record = self._record()
             before = record.links[record.plan.host(host).name]
             after = before.changed(direction, **values)
             making.change_link(record, host, before, after)
             store.write(record)
+
+
+def _to_the_end(remove: Callable[[], object]) -> None:
+    """Remove a lab; a signal that raises in the midst of it is passed on when nothing is left."""
+    try:
+        remove()
+    except BaseException:
+        remove()
+        raise
 
 
 def all_labs() -> Iterator[Lab]:

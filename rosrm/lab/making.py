@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+import subprocess
+from collections.abc import Iterator, Sequence
 from ipaddress import IPv4Network
 
 from rosrm.errors import LabError
@@ -12,6 +14,22 @@ from rosrm.lab.host import boot, power_off
 from rosrm.lab.plan import check_free, free_subnet, host_namespace, namespaces_of
 from rosrm.lab.store import Record
 from rosrm.lab.wires import Link
+
+
+@contextlib.contextmanager
+def explained(lab: str) -> Iterator[None]:
+    """Turn what this machine refuses, a file, a program or a process, into a `LabError`.
+
+    Args:
+        lab: on which somebody is at work.
+    """
+    try:
+        yield
+    except (OSError, subprocess.SubprocessError) as error:
+        raise LabError(
+            f"lab {lab!r}: this machine refuses what a lab needs: {error}. A container needs "
+            "`docker run --privileged`"
+        ) from error
 
 
 def refuse_if_up(lab: str) -> None:

@@ -27,6 +27,14 @@ DEFAULT_DISK: Final = GIB
 POOL: Final = IPv4Network("10.213.0.0/16")
 _POOL_PREFIX: Final = 24
 
+#: No host can have an address of these.
+_UNUSABLE: Final = {
+    IPv4Network("0.0.0.0/8"): "this network itself",
+    IPv4Network("127.0.0.0/8"): "loopback, which never leaves a host",
+    IPv4Network("224.0.0.0/4"): "multicast",
+    IPv4Network("240.0.0.0/4"): "reserved, and broadcast",
+}
+
 #: What a host name may be; interface names, namespaces and control groups are made of them.
 _NAME: Final = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9-]{0,30}[A-Za-z0-9])?")
 
@@ -164,6 +172,16 @@ def parse_subnet(text: str) -> IPv4Network:
         raise ConfigError(
             f"--subnet {text!r}: {error}; give an IPv4 range such as 10.9.0.0/24"
         ) from None
+
+
+def check_usable(subnet: IPv4Network) -> None:
+    """Raise `ConfigError` for a subnet with addresses that no host can have."""
+    for other, what in _UNUSABLE.items():
+        if subnet.overlaps(other):
+            raise ConfigError(
+                f"the address range {subnet} cannot be a lab's: {other} is {what}. Choose one of "
+                "hosts, such as 10.9.0.0/24, or leave it out: then a free one is taken"
+            )
 
 
 def free_subnet(taken: Sequence[IPv4Network]) -> IPv4Network:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import importlib
 import json
 import os
 import signal
@@ -9,11 +11,12 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from rosrm.errors import LabError
-from rosrm.lab import MIB, Lab, all_labs, store, uniform
+from rosrm.lab import MIB, Lab, all_labs, disks, store, uniform
 from tests.integration.lab.conftest import remains
 
 PATIENCE = 30.0
@@ -95,8 +98,6 @@ def test_a_lab_whose_owner_was_killed_was_left_behind(name):
 
 def test_a_lab_that_fails_while_it_is_made_leaves_nothing(name, monkeypatch):
     """Here the second disk cannot be made."""
-    from rosrm.lab import disks
-
     real = disks.make
 
     def fails(image, host):
@@ -111,10 +112,126 @@ def test_a_lab_that_fails_while_it_is_made_leaves_nothing(name, monkeypatch):
     assert remains(name) == before
 
 
+class Stopped(Exception):
+    """Raised by a signal, as programs do that end in good order."""
+
+
+@pytest.fixture
+def stopped_at(monkeypatch):
+    """Sends this process a signal, which raises, before or after the first call of a function."""
+
+    def stop(*_):
+        raise Stopped
+
+    def arm(module, function, moment):
+        place = importlib.import_module(module)
+        real, calls = getattr(place, function), []
+
+        def deadly(*words, **more):
+            calls.append(function)
+            if len(calls) == 1 and moment == "before":
+                os.kill(os.getpid(), signal.SIGUSR1)
+            result = real(*words, **more)
+            if len(calls) == 1:
+                os.kill(os.getpid(), signal.SIGUSR1)
+            return result
+
+        monkeypatch.setattr(place, function, deadly)
+
+    kept = signal.signal(signal.SIGUSR1, stop)
+    yield arm
+    signal.signal(signal.SIGUSR1, kept)
+
+
+REMOVAL = [
+    ("rosrm.lab.groups", "kill", "before"),
+    ("rosrm.lab.groups", "kill", "after"),
+    ("rosrm.lab.network", "remove", "before"),
+    ("rosrm.lab.network", "remove", "after"),
+    ("rosrm.lab.store", "forget", "before"),
+]
+
+
+@pytest.mark.parametrize(("module", "function", "moment"), REMOVAL)
+def test_a_signal_during_the_removal_leaves_nothing(name, stopped_at, module, function, moment):
+    """It is passed on when the lab has gone."""
+    before = remains(name)
+    with pytest.raises(Stopped), Lab(name, uniform(1, disk=16 * MIB)):
+        stopped_at(module, function, moment)
+    assert remains(name) == before
+
+
+def test_a_signal_while_a_failed_attempt_is_removed_leaves_nothing(name, stopped_at, monkeypatch):
+    """The lab could not be made, and then a signal comes."""
+    before = remains(name)
+
+    def fails(image, host):
+        stopped_at("rosrm.lab.groups", "kill", "before")
+        raise LabError("no room")
+
+    monkeypatch.setattr(disks, "make", fails)
+    with pytest.raises(Stopped):
+        Lab(name, uniform(1, disk=16 * MIB)).up()
+    assert remains(name) == before
+
+
+def test_what_a_killed_lab_holds_does_not_hinder_the_next(name, monkeypatch):
+    """It is removed before memory is looked at, also where there is too little even then."""
+    before = remains(name)
+    command = [sys.executable, "-c", KILLED_AT, name, "rosrm.lab.host", "_last_words", "after", "1"]
+    subprocess.run(command, check=False, timeout=PATIENCE)
+    assert remains(name) != before
+    monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(available=MIB))
+    with pytest.raises(LabError, match="1 MiB are available on this machine"):
+        Lab(name, uniform(1, memory=64 * MIB, disk=16 * MIB)).up()
+    assert remains(name) == before
+
+
+def test_a_lab_that_is_up_is_said_to_be_up(lab, monkeypatch):
+    """Even where a second one of its size would find too little memory."""
+    monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(available=MIB))
+    with pytest.raises(LabError, match="is up already"):
+        Lab(lab.name, uniform(1, memory=64 * MIB, disk=16 * MIB)).up()
+    assert lab.is_up("host1")
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_file_that_cannot_be_written_is_one_clear_error(name, monkeypatch, count):
+    """When the lab is begun, and when it is complete; nothing is left."""
+    real, calls = store.write, []
+
+    def full(record):
+        calls.append(record)
+        if len(calls) == count:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "/run/rosrm-lab")
+        real(record)
+
+    monkeypatch.setattr(store, "write", full)
+    before = remains(name)
+    with pytest.raises(LabError, match=r"this machine refuses .*No space left on device"):
+        Lab(name, uniform(1, disk=16 * MIB)).up()
+    assert remains(name) == before
+
+
+def test_a_kernel_without_bridges_is_one_clear_error(name, monkeypatch):
+    """Here it is asked for a kind of interface that no kernel has; nothing is left."""
+    from rosrm.lab import network
+
+    class Without(network.IPRoute):
+        def link(self, command, **what):
+            if what.get("kind") == "bridge":
+                what["kind"] = "no-such-kind"
+            return self.__getattr__("link")(command, **what)
+
+    monkeypatch.setattr(network, "IPRoute", Without)
+    before = remains(name)
+    with pytest.raises(LabError, match=r"the bridge .* cannot be made: Operation not supported"):
+        Lab(name, uniform(1, disk=16 * MIB)).up()
+    assert remains(name) == before
+
+
 def test_a_host_that_cannot_boot_says_why(name, monkeypatch):
     """The words of what failed, and nothing is left."""
-    from rosrm.lab import disks
-
     monkeypatch.setattr(disks, "make", lambda image, host: (
         image.parent.mkdir(parents=True, exist_ok=True), image.write_bytes(bytes(MIB))
     ))  # fmt: skip

@@ -108,12 +108,13 @@ def test_without_root_the_right_is_named_and_slices_are_offered(rosrm, without_r
     ("words", "said"),
     [
         (("up", "--subnet", "10.9.8.7/24"), "give an IPv4 range"),
+        (("up", "--subnet", "127.0.0.0/24"), "127.0.0.0/8 is loopback"),
         (("up", "--lab", "a:b"), "cannot be the name of a lab"),
         (("up", "--memory", "lots"), "memory of host1: 'lots'"),
         (("cut", "host1", "--direction", "up"), "'up'"),
     ],
 )
-def test_bad_input_is_refused_before_anything_is_looked_at(rosrm, words, said):
+def test_bad_input_is_refused_before_anything_is_looked_at(rosrm, without_rights, words, said):
     """Exit code 2: nothing was done."""
     result = rosrm("lab", *words)
     assert result.code == 2

@@ -9,12 +9,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rosrm.errors import ConfigError
+from rosrm.lab import Lab
 from rosrm.lab.plan import (
     GIB,
     MIB,
     HostPlan,
     LabPlan,
     check_free,
+    check_usable,
     free_subnet,
     namespaces_of,
     parse_subnet,
@@ -131,6 +133,30 @@ def test_a_range_in_use_is_refused_with_its_owner():
     check_free(IPv4Network("10.8.0.0/24"), taken)
     with pytest.raises(ConfigError, match=r"10.9.8.0/24 is in use: eth0 has 10.9.0.0/16"):
         check_free(NET, taken)
+
+
+@pytest.mark.parametrize(
+    ("subnet", "what"),
+    [
+        ("127.0.0.0/24", r"127\.0\.0\.0/8 is loopback"),
+        ("224.0.0.0/24", r"224\.0\.0\.0/4 is multicast"),
+        ("255.255.255.0/24", r"240\.0\.0\.0/4 is reserved"),
+        ("0.0.0.0/24", r"0\.0\.0\.0/8 is this network"),
+        ("96.0.0.0/3", "loopback"),
+    ],
+)
+def test_a_range_with_addresses_that_no_host_can_have_is_refused(subnet, what):
+    """Also a larger one around it; said before anything is made, and with what to choose."""
+    with pytest.raises(ConfigError, match=f"{subnet} cannot be a lab's: .*{what}.*10.9.0.0/24"):
+        check_usable(IPv4Network(subnet))
+    with pytest.raises(ConfigError, match="cannot be a lab's"):
+        Lab("lab", uniform(1), subnet=IPv4Network(subnet))
+
+
+def test_the_ranges_of_hosts_are_usable():
+    """Private or not."""
+    for text in ("10.9.0.0/24", "192.168.0.0/16", "126.0.0.0/8", "128.0.0.0/8", "223.255.255.0/24"):
+        check_usable(IPv4Network(text))
 
 
 @pytest.mark.parametrize("text", ["10.9.8.7/24", "fe80::/64", "hallo", "10.9.8.0/33", ""])
