@@ -11,11 +11,15 @@ by the same code. What the master takes in it tells itself on `master_load`, by 
   readings of all hosts.
 - `request_process_*_ms`: one job at a time, from `submit` called to the assignment at the slave.
   The master answers one request; the answer reaches the reader of each slave.
+
+Where it is allowed, all of it is in a network namespace of its own and speaks UDP, as real hosts
+do; `transports` says which it was.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import itertools
 import json
 import subprocess
@@ -30,9 +34,11 @@ from typing import Any
 
 from benchmarks.machine import percentile, print_report, say
 from benchmarks.simulated_slaves import STEP
+from benchmarks.stopping import Stopped, raise_signals
 from rosrm.core.model import Kind, ProcessSpec
 from rosrm.errors import RosrmError
 from rosrm.local_cluster import LocalCluster
+from rosrm.loopback import enter_private_network
 from rosrm.ros import names, qos
 from rosrm.ros.participant import Participant
 from rosrm.ros.settings import RosSettings
@@ -120,6 +126,7 @@ class Crowd:
                 subprocess.Popen(
                     [sys.executable, "-m", "benchmarks.simulated_slaves", *words],
                     stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=_ROOT,
+                    start_new_session=True,  # a Ctrl-C is for whoever closes their input
                 )
             )  # fmt: skip
         self.hear()
@@ -133,17 +140,25 @@ class Crowd:
         return [_next_report(process) for process in self._processes]
 
     def tell(self) -> None:
-        """Begin to count, or end it."""
+        """Begin to count, or end it.
+
+        Raises:
+            RosrmError: a process has ended.
+        """
         for process in self._processes:
             assert process.stdin is not None
-            process.stdin.write("\n")
-            process.stdin.flush()
+            try:
+                process.stdin.write("\n")
+                process.stdin.flush()
+            except BrokenPipeError:
+                raise _ended(process) from None
 
     def close(self) -> None:
         """End all, by pid."""
         for process in self._processes:
-            if process.stdin is not None and process.poll() is None:
-                process.stdin.close()
+            if process.stdin is not None:
+                with contextlib.suppress(BrokenPipeError):  # it has ended before
+                    process.stdin.close()
         for process in self._processes:
             try:
                 process.wait(_END)
@@ -158,11 +173,19 @@ def _next_report(process: subprocess.Popen[str]) -> dict[str, Any]:
     for line in process.stdout:
         if line.startswith("{"):
             return dict(json.loads(line))
-    raise RosrmError(f"simulated slaves ended with {process.wait(_END)}; see above")
+    raise _ended(process)
+
+
+def _ended(process: subprocess.Popen[str]) -> RosrmError:
+    return RosrmError(f"simulated slaves ended with exit code {process.wait(_END)}; see above")
 
 
 def readings(crowd: Crowd, loads: Loads, seconds: float) -> dict[str, float]:
-    """What comes of the readings of all slaves in so many seconds."""
+    """What comes of the readings of all slaves in so many seconds.
+
+    Raises:
+        RosrmError: there was none.
+    """
     crowd.tell()
     words = loads.wait(seconds)
     crowd.tell()
@@ -172,6 +195,11 @@ def readings(crowd: Crowd, loads: Loads, seconds: float) -> dict[str, float]:
     cpu = last["cpu_s"] - first["cpu_s"]
     ages = [age for word in words[1:] for age in word["oldest_reading_s"]]
     offered = sum(one["cycles"] for one in sent)
+    if not cycles or not offered:
+        raise RosrmError(
+            f"in {span:.1f} s the slaves carried out {offered} cycles, and the master heard of "
+            f"{cycles}: nothing can be said by cycle; a longer --seconds may help"
+        )
     return {
         "offered_per_s": sum(one["cycles"] / one["seconds"] for one in sent),
         "received_per_s": cycles / span,
@@ -201,6 +229,8 @@ def requests(cluster: LocalCluster, crowd: Crowd) -> dict[str, float]:
     crowd.tell()
     taken = {name: at for one in crowd.hear() for name, at in one["taken"].items()}
     took = [1e3 * (taken[name] - called[name]) for name in called if name in taken]
+    if not took:
+        raise RosrmError(f"of {_JOBS} jobs none came to a simulated slave in {_END:g} s")
     return {
         "request_process_p50_ms": percentile(took, 0.5),
         "request_process_p99_ms": percentile(took, 0.99),
@@ -220,7 +250,12 @@ def _wait_for_end(cluster: LocalCluster, name: str) -> None:
 
 
 def measure(arguments: argparse.Namespace, folder: Path) -> dict[str, float]:
-    """All figures of one run."""
+    """All figures of one run.
+
+    Raises:
+        RosrmError: a part ended, or nothing came of the readings or of the jobs.
+        TimeoutError: the master said nothing.
+    """
     with ExitStack() as opened:
         cluster = LocalCluster(folder)
         opened.callback(cluster.close)
@@ -241,8 +276,8 @@ def measure(arguments: argparse.Namespace, folder: Path) -> dict[str, float]:
         return {**figures, **requests(cluster, crowd), "all_registered_s": up}
 
 
-def main() -> None:
-    """Measure and print one JSON object."""
+def main() -> int:
+    """Measure and print one JSON object; returns the exit status."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--slaves", type=_positive(int), default=1000)
     parser.add_argument("--hz", type=_positive(float), default=10.0)
@@ -261,13 +296,26 @@ def main() -> None:
     arguments = parser.parse_args()
     if arguments.processes > arguments.slaves:
         parser.error(f"{arguments.slaves} slaves cannot share {arguments.processes} processes")
-    with tempfile.TemporaryDirectory(prefix="rosrm-scale-") as folder:
-        figures = measure(arguments, Path(folder))
+    raise_signals()
+    alone = enter_private_network()
+    try:
+        with tempfile.TemporaryDirectory(prefix="rosrm-scale-") as folder:
+            figures = measure(arguments, Path(folder))
+    except Stopped as stopped:
+        say(f"benchmarks.scale: stopped by {stopped}")
+        return 128 + stopped.number
+    except (RosrmError, OSError) as error:
+        say(f"benchmarks.scale: {error}")
+        return 2
     print_report(
         "scale",
-        {"slaves": arguments.slaves, "hz": arguments.hz, "step": arguments.step, **figures},
+        {
+            "slaves": arguments.slaves, "hz": arguments.hz, "step": arguments.step, **figures,
+            "transports": "UDPv4, in a network namespace" if alone else "default, LOCALHOST",
+        },
         runs=1,
-    )
+    )  # fmt: skip
+    return 0
 
 
 def _positive(kind: type) -> Any:
@@ -281,4 +329,4 @@ def _positive(kind: type) -> Any:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -31,6 +31,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from benchmarks.machine import say
 from benchmarks.shared_participant import Berth, SharedParticipant, Tally
 from rosrm.core import slave as core
 from rosrm.core.model import (
@@ -201,7 +202,6 @@ class Fleet:
         self._period = period
         self._pace = max(period, _GENTLY)
         self._walks = Walks(count, step)
-        self._walked = time.monotonic()
         self._shared = SharedParticipant(settings, f"rosrm_simulated_{first}", self.tally)
         self._due: list[tuple[float, int]] = []
 
@@ -266,8 +266,7 @@ class Fleet:
             self.tally.late += 1
             due = now
         heapq.heapreplace(self._due, (due + self._pace, index))
-        if now - self._walked >= self._period:
-            self._walked = now
+        if index == 0:  # whose next cycle comes when each of the others has had one
             self._walks.go_on()
         slave = self.slaves[index]
         slave.cycle(self._walks.usage[index], self._walks.limit, now)
@@ -285,8 +284,8 @@ def _told_to_go_on(fleet: Fleet) -> bool:
     return bool(sys.stdin.readline())
 
 
-def main() -> None:
-    """Be so many slaves until standard input is closed."""
+def main() -> int:
+    """Be so many slaves until standard input is closed; returns the exit status."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--domain", type=int, required=True)
     parser.add_argument("--first", type=int, required=True)
@@ -298,7 +297,11 @@ def main() -> None:
     settings = settings_on_this_machine(arguments.domain)
     period = 1.0 / arguments.hz
     fleet = Fleet(settings, arguments.first, arguments.slaves, period, arguments.step)
-    fleet.bring_up(arguments.timeout)
+    try:
+        fleet.bring_up(arguments.timeout)
+    except (RosrmError, TimeoutError) as error:
+        say(f"simulated slaves {arguments.first} and on: {error}")
+        return 2
     print(json.dumps({"registered": len(fleet.slaves)}), flush=True)
     while _told_to_go_on(fleet):
         fleet.tally.begin()
@@ -321,7 +324,8 @@ def main() -> None:
         if not goes_on:
             break
     fleet.close()
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
 
+import psutil
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -62,11 +65,49 @@ def test_the_costs_are_of_one_piece(report) -> None:
     )
 
 
-def test_readings_that_move_all_go_out() -> None:
+def test_what_it_was_measured_through_is_told(report) -> None:
+    """As on real hosts where that is allowed: UDP alone."""
+    rights = int(Path("/proc/self/status").read_text().split("CapEff:")[1].split()[0], 16)
+    network = "UDPv4, in a network namespace" if rights >> 21 & 1 else "default, LOCALHOST"
+    assert report["transports"] == network
+
+
+def test_a_run_that_fails_says_why_in_its_last_line() -> None:
+    """Slaves that are not registered in time, for one."""
+    ended = scale("--slaves", "3", "--timeout", "0.001")
+    assert ended.returncode == 2
+    assert "of 2 registered in 0.001 s" in ended.stderr
+    assert ended.stderr.splitlines()[-1] == (
+        "benchmarks.scale: simulated slaves ended with exit code 2; see above"
+    )
+    assert "Traceback" not in ended.stderr
+
+
+def test_a_signal_ends_all_that_it_has_started(tmp_path) -> None:
+    """It says which signal, and leaves none of its processes."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "benchmarks.scale", "--slaves", "4", "--settle", "100"],
+        cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
+        env={**os.environ, "TMPDIR": str(tmp_path)},
+    )  # fmt: skip
+    assert process.stderr is not None
+    assert "4 slaves are registered" in process.stderr.readline()
+    started = {one.pid for one in psutil.Process(process.pid).children(recursive=True)}
+    assert len(started) >= 3
+    process.send_signal(signal.SIGTERM)
+    _, said = process.communicate(timeout=60.0)
+    assert process.returncode == 128 + signal.SIGTERM
+    assert said.splitlines()[-1] == "benchmarks.scale: stopped by SIGTERM"
+    assert [pid for pid in started if psutil.pid_exists(pid)] == []
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("slaves", [1, 10])
+def test_readings_that_move_all_go_out(slaves) -> None:
     """A reading that has moved is not kept back (at its bounds it does not move)."""
-    ended = scale("--slaves", "10", "--seconds", "2", "--processes", "1", "--step", "0.1")
+    ended = scale("--slaves", str(slaves), "--seconds", "4", "--processes", "1", "--step", "0.1")
     assert ended.returncode == 0, ended.stderr
-    assert json.loads(ended.stdout.splitlines()[-1])["messages_per_cycle"] > 0.8
+    assert json.loads(ended.stdout.splitlines()[-1])["messages_per_cycle"] > 0.9
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,36 @@
+"""Signals that end a benchmark in good order: what it has started ends with it."""
+
+from __future__ import annotations
+
+import os
+import signal
+from types import FrameType
+
+
+class Stopped(Exception):
+    """A signal came.
+
+    Attributes:
+        number: of the signal.
+    """
+
+    def __init__(self, number: int) -> None:
+        super().__init__(signal.Signals(number).name)
+        self.number = number
+
+
+def raise_signals() -> None:
+    """From now on SIGINT, SIGTERM and SIGHUP raise `Stopped`, the first of them only."""
+    main_process = os.getpid()
+
+    def stop(number: int, _: FrameType | None) -> None:
+        if os.getpid() != main_process:  # pyroute2 forks, and ends what it forked by SIGTERM
+            signal.signal(number, signal.SIG_DFL)
+            os.kill(os.getpid(), number)
+            return
+        for one in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            signal.signal(one, signal.SIG_IGN)  # what is under way is cleaned up, undisturbed
+        raise Stopped(number)
+
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, stop)
