@@ -33,6 +33,8 @@ _MB, _GROWTH = 20.0, 5.5
 _LEAST_MOVES: Final = 2
 #: As in `cluster.yaml` by default; told here because it is part of the judgement.
 _HEADROOM: Final = 0.05
+#: So many times as fast as the paper's run is this one.
+_THAN_PAPER: Final = 2.7
 #: A small run is so many times as fast.
 _FASTER: Final = 3.0
 
@@ -60,7 +62,7 @@ def measure(options: Options) -> Result:
     wrong, figures = judge(trace)
     lost = [name for name, state in last.states.items() if state not in ("running", "migrating")]
     wrong += [f"{name} is {last.states[name]} at the end" for name in lost]
-    return Result(wrong, figures, _SCALED, partial(_draw, trace, trace.moves()))
+    return Result(wrong, figures, scaled(faster), partial(_draw, trace, trace.moves()))
 
 
 def _growing(number: int, growth: float) -> dict[str, Any]:
@@ -106,10 +108,15 @@ def _draw(trace: Trace, moves: list[Move], path: Path) -> None:
     pictures.usage(path, trace, MEMORY_LIMIT, moves=moves, mark_assignments=False)
 
 
-_SCALED: Final = {
-    "time": "2.7 times as fast as in the paper: processes grow by 5.5 MB a second, and come at "
-    "0, 33 and 75 s",
-    "hosts": "512, 512 and 1536 MiB, with other programs holding 0, 30 and 350 MB, instead of "
-    "three of 16 GB alike: rosrm moves a process only where what it uses now fits under the limit, "
-    "so one that fills a host by itself cannot leave it for an equal one",
-}
+def scaled(faster: float = 1.0) -> dict[str, str]:
+    """What differs from the paper, for a run that is so many times as fast as usual."""
+    coming = ", ".join(f"{at / faster:g}" for at in _COME)
+    sizes = ", ".join(f"{memory // MIB}" for memory, _ in _HOSTS.values())
+    held = ", ".join(f"{mb:g}" for _, mb in _HOSTS.values())
+    return {
+        "time": f"{_THAN_PAPER * faster:.1f} times as fast as in the paper: processes grow by "
+        f"{_GROWTH * faster:g} MB a second, and come at {coming} s",
+        "hosts": f"{sizes} MiB, with other programs holding {held} MB, instead of three of 16 GB "
+        "alike: rosrm moves a process only where what it uses now fits under the limit, so one "
+        "that fills a host by itself cannot leave it for an equal one",
+    }

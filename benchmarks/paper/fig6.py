@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -12,7 +13,7 @@ from benchmarks.paper import pictures
 from benchmarks.paper.judging import NOISE, not_to_emptiest, over, room_left, widest_gap
 from benchmarks.paper.labs import LabCluster
 from benchmarks.paper.report import Options, Result
-from benchmarks.paper.settings import HOLDER_MB, MEMORY_LIMIT, cluster_settings, holder
+from benchmarks.paper.settings import HOLDER_MB, MEMORY_LIMIT, alike, cluster_settings, holder
 from benchmarks.paper.simulated import agreement
 from benchmarks.paper.trace import Trace, per_host
 from rosrm.lab import GIB, MIB, HostPlan, uniform
@@ -63,8 +64,18 @@ def measure(options: Options) -> Result:
         trace = cluster.trace
     needs = {name: (mb + HOLDER_MB) * 1e6 for name, mb in named(chosen).items()}
     wrong, figures = judge(trace, needs)
-    figures["simulation"] = agreement(records)
-    return Result(wrong, figures, _SCALED, partial(_draw, trace))
+    figures["simulation"] = simulation = agreement(records)
+    wrong += replayed_otherwise(simulation)
+    scaled = {"hosts": f"{alike(plans)}; the paper: three of 16 GB", **_SCALED}
+    return Result(wrong, figures, scaled, partial(_draw, trace))
+
+
+def replayed_otherwise(simulation: Mapping[str, Any]) -> list[str]:
+    """What the replay of the run's record says against it, in words."""
+    differently, decisions = simulation["replayed_differently"], simulation["replayed_decisions"]
+    if not differently and decisions:
+        return []
+    return [f"`rosrm simulate` decides {differently} of the record's {decisions} differently"]
 
 
 def named(chosen: list[int]) -> dict[str, int]:
@@ -114,8 +125,7 @@ def _draw(trace: Trace, path: Path) -> None:
 
 
 _SCALED: Final = {
-    "hosts": "three of 1 GiB and half a core each on one machine; the paper: three of 16 GB",
     "master": "on a host of its own; in the paper one host is both master and slave",
-    "processes": "plain processes, one submitted every 0.8 s (each when the "
-    "one before is in the readings), that say beforehand what they need",
+    "processes": f"plain processes, one submitted every {_EVERY:g} s (each when the one before is "
+    "in the readings), that say beforehand what they need",
 }

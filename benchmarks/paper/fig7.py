@@ -12,7 +12,7 @@ from benchmarks.paper import pictures
 from benchmarks.paper.judging import NOISE, not_to_emptiest, over, room_left, widest_gap
 from benchmarks.paper.labs import LabCluster
 from benchmarks.paper.report import Options, Result
-from benchmarks.paper.settings import HOLDER_MB, MEMORY_LIMIT, holder
+from benchmarks.paper.settings import HOLDER_MB, MEMORY_LIMIT, alike, holder
 from benchmarks.paper.trace import Trace, per_host
 from rosrm.lab import GIB, MIB, uniform
 
@@ -50,7 +50,12 @@ def measure(options: Options) -> Result:
         cluster.feed(entries, every=_EVERY, after=_AFTER, also=slaves)
         trace = cluster.trace
     wrong, figures = judge(trace, joins)
-    return Result(wrong, figures, _SCALED, partial(_draw, trace, joins))
+    scaled = {
+        "hosts": f"{alike(plans)}; the paper: three of 16 GB",
+        "processes": f"plain processes of {_MB} MB, one submitted every {_EVERY:g} s",
+        "joins": f"at {' and '.join(f'{at:g}' for at in joins)} s",
+    }
+    return Result(wrong, figures, scaled, partial(_draw, trace, joins))
 
 
 def judge(trace: Trace, joins: Sequence[float]) -> tuple[list[str], dict[str, Any]]:
@@ -93,9 +98,3 @@ def judge(trace: Trace, joins: Sequence[float]) -> tuple[list[str], dict[str, An
 
 def _draw(trace: Trace, joins: Sequence[float], path: Path) -> None:
     pictures.usage(path, trace, MEMORY_LIMIT, joins=joins)
-
-
-_SCALED: Final = {
-    "hosts": "three of 1 GiB and half a core each on one machine; the paper: three of 16 GB",
-    "processes": "plain processes of 32 MB, one submitted every 1.8 s",
-}

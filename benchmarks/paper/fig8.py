@@ -8,15 +8,19 @@ from typing import Any, Final
 
 from benchmarks.machine import say
 from benchmarks.paper import pictures
-from benchmarks.paper.judging import Line, line, over
+from benchmarks.paper.judging import NOISE, Line, line, over, proportion
 from benchmarks.paper.labs import LabCluster
 from benchmarks.paper.report import Options, Result
-from benchmarks.paper.settings import HOLDER_MB, MEMORY_LIMIT, holder
+from benchmarks.paper.settings import HOLDER_MB, MEMORY_LIMIT, alike, holder
 from benchmarks.paper.trace import Look, Trace, per_host
 from rosrm.lab import MIB, uniform
 
-CLAIM: Final = "The number of processes that can be allocated is proportional to that of slaves"
+CLAIM: Final = (
+    "The number of processes that are allocated is proportional to that of slaves; none ends above "
+    "its limit of 80 % by more than one process"
+)
 _MB: Final = 40
+_NEED: Final = (_MB + HOLDER_MB) * 1e6
 _LEAST_R2: Final = 0.999
 _SLAVES, _FEW = 10, 3
 _MEMORY, _LITTLE = 528 * MIB, 192 * MIB
@@ -29,7 +33,7 @@ def measure(options: Options) -> Result:
     """Add one slave after the other to a queue that never becomes empty."""
     slaves, memory = (_FEW, _LITTLE) if options.small else (_SLAVES, _MEMORY)
     plans = uniform(slaves, memory=memory, cpu=0.5, disk=64 * MIB)
-    most = int(slaves * MEMORY_LIMIT * memory / ((_MB + HOLDER_MB) * 1e6)) + slaves
+    most = int(slaves * MEMORY_LIMIT * memory / _NEED) + slaves
     held: list[int] = []
     with LabCluster(f"{options.lab}-fig8", plans, options.folder) as cluster:
         cluster.submit(*(holder(f"process_{number:03d}", _MB) for number in range(most)))
@@ -45,7 +49,8 @@ def measure(options: Options) -> Result:
     numbers = list(range(1, slaves + 1))
     fit = line(numbers, held)
     wrong, figures = judge(trace, held, fit)
-    return Result(wrong, figures, _SCALED, partial(_draw, numbers, held, fit))
+    scaled = {"hosts": f"{alike(plans)}; the paper: ten of 4 GB", **_SCALED}
+    return Result(wrong, figures, scaled, partial(_draw, numbers, held, fit))
 
 
 def _settled(trace: Trace, newest: str, look: Look) -> bool:
@@ -72,9 +77,22 @@ def judge(trace: Trace, held: list[int], fit: Line) -> tuple[list[str], dict[str
         wrong.append("more slaves do not hold more processes")
     if not trace.looks[-1].count("queued"):
         wrong.append("the queue became empty: more could have been held")
+    through_origin = proportion(range(1, len(held) + 1), held)
+    if through_origin.r2 < _LEAST_R2:
+        wrong.append(
+            f"not in proportion: R2 of the line through the origin is {through_origin.r2:.5f}, "
+            f"less than {_LEAST_R2}"
+        )
     beyond = over(trace, MEMORY_LIMIT)
+    hosts = trace.looks[-1].hosts
+    wrong += [
+        f"{name} reached {100 * top:.1f} %, more than one process ({100 * one:.1f}) above the limit"
+        for name, top in beyond.items()
+        if top > MEMORY_LIMIT + (one := _NEED / hosts[name].capacity) + NOISE
+    ]
     return wrong, {
         "r2": round(fit.r2, 6),
+        "r2_through_origin": round(through_origin.r2, 6),
         "slope": round(fit.slope, 4),
         "intercept": round(fit.intercept, 4),
         "slaves": list(range(1, len(held) + 1)),
@@ -90,8 +108,7 @@ def _draw(slaves: list[int], held: list[int], fit: Line, path: Path) -> None:
 
 
 _SCALED: Final = {
-    "hosts": "ten of 528 MiB and half a core each on one machine; the paper: ten of 4 GB",
-    "processes": "plain processes of 40 MB, not ROS nodes: a node is 64 MiB by itself, and from "
-    "about 130 participants on one machine they no longer find each other",
+    "processes": f"plain processes of {_MB} MB, not ROS nodes: a node is 64 MiB by itself, and "
+    "from about 130 participants on one machine they no longer find each other",
     "order": "the slaves join one after the other, each when the ones before are full",
 }

@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 
 from benchmarks.paper.trace import HostLook, Look, Move, Trace
+from rosrm.core.columns import FloatArray
 
 #: Fraction of a host's memory by which readings of different hosts and moments may disagree.
 NOISE: Final = 0.01
@@ -33,10 +34,21 @@ def line(x: Sequence[float], y: Sequence[float]) -> Line:
     if len(set(x)) < 2 or len(xs) != len(ys):
         raise ValueError(f"a line needs two points at least: x {list(x)}, y {list(y)}")
     slope, intercept = np.polyfit(xs, ys, 1)
+    return _explained(xs, ys, float(slope), float(intercept))
+
+
+def proportion(x: Sequence[float], y: Sequence[float]) -> Line:
+    """The line through points and the origin; raises `ValueError` where no x is beside 0."""
+    xs, ys = np.asarray(x, float), np.asarray(y, float)
+    if not xs.any() or len(xs) != len(ys):
+        raise ValueError(f"a proportion needs a point beside 0: x {list(x)}, y {list(y)}")
+    return _explained(xs, ys, float(xs @ ys / (xs @ xs)), 0.0)
+
+
+def _explained(xs: FloatArray, ys: FloatArray, slope: float, intercept: float) -> Line:
     left = float(((ys - slope * xs - intercept) ** 2).sum())
     all_of_it = float(((ys - ys.mean()) ** 2).sum())
-    r2 = 1.0 - left / all_of_it if all_of_it > 0.0 else 0.0
-    return Line(float(slope), float(intercept), r2)
+    return Line(slope, intercept, 1.0 - left / all_of_it if all_of_it > 0.0 else 0.0)
 
 
 def gap(look: Look, hosts: Sequence[str]) -> float | None:

@@ -18,7 +18,6 @@ from typing import IO, TYPE_CHECKING, Any, Final
 
 from benchmarks.paper.settings import cluster_settings, host_settings
 from benchmarks.paper.trace import Look, Trace
-from rosrm.errors import RosrmError
 from rosrm.lab import DATA, MIB, HostPlan, Lab
 
 if TYPE_CHECKING:
@@ -58,11 +57,14 @@ class Part:
 
     def check(self) -> None:
         """Raise `Failed` with its last words where it has ended."""
-        if self.process.poll() is None:
-            return
+        if self.process.poll() is not None:
+            raise self.last_words()
+
+    def last_words(self) -> Failed:
+        """What is to be said of its end."""
         words = self.log.read_text(errors="replace").strip().splitlines()[-5:]
         said = "\n  ".join(words) or "it said nothing"
-        raise Failed(f"{self.name} ended with exit code {self.process.returncode}:\n  {said}")
+        return Failed(f"{self.name} ended with exit code {self.process.returncode}:\n  {said}")
 
 
 class LabCluster:
@@ -89,7 +91,7 @@ class LabCluster:
         self._parts: list[Part] = []
         self._works = 0
         self._opened = ExitStack()
-        self._desk: _Desk | None = None
+        self._desk: Desk | None = None
 
     def __enter__(self) -> Self:
         """Make the hosts, and start master and desk."""
@@ -97,7 +99,7 @@ class LabCluster:
             opened.enter_context(self.lab)
             settings = self._write("cluster.yaml", self._settings)
             self._start("master", DESK, [_ROSRM, "master", "--config", settings])
-            self._desk = opened.enter_context(_Desk(self._start_desk, self._check))
+            self._desk = opened.enter_context(Desk(self._start_desk, self._check))
             self._opened = opened.pop_all()
         return self
 
@@ -158,13 +160,15 @@ class LabCluster:
         except subprocess.TimeoutExpired:
             raise Failed(f"the master did not end within {_END:g} s of SIGINT") from None
 
-    def _start_desk(self) -> subprocess.Popen[bytes]:
+    def _start_desk(self) -> Part:
         command = [sys.executable, "-m", "benchmarks.paper.desk"]
-        with (self._folder / "desk.log").open("wb") as sink:
-            return self.lab.popen(
+        log = self._folder / "desk.log"
+        with log.open("wb") as sink:
+            process = self.lab.popen(
                 DESK, command, cwd=str(ROOT), stdin=subprocess.PIPE, stdout=subprocess.PIPE,
                 stderr=sink,
             )  # fmt: skip
+        return Part("the client at the desk", process, log)
 
     def _start(self, name: str, host: str, command: list[str], *, limited: bool = True) -> None:
         log = self._folder / f"{name.replace(' ', '-')}.log"
@@ -296,14 +300,17 @@ def _shown(look: Look) -> bool:
     )
 
 
-class _Desk:
-    """The program on the desk that speaks to the master."""
+class Desk:
+    """The program on the desk that speaks to the master.
 
-    def __init__(
-        self, start: Callable[[], subprocess.Popen[bytes]], check: Callable[[], None]
-    ) -> None:
+    Args:
+        start: starts it, with pipes to and from it.
+        check: raises `Failed` where something else that it needs has ended.
+    """
+
+    def __init__(self, start: Callable[[], Part], check: Callable[[], None]) -> None:
         self._check = check
-        self._process = start()
+        self._part = start()
         self._lines = b""
 
     def __enter__(self) -> Self:
@@ -320,22 +327,25 @@ class _Desk:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        self._process.kill()
-        self._process.communicate()
+        self._part.process.kill()
+        self._part.process.communicate()
 
     def ask(self, request: dict[str, Any]) -> dict[str, Any]:
         """One question, one answer; raises `Failed`."""
-        to = self._process.stdin
+        to = self._part.process.stdin
         assert to is not None
-        to.write(json.dumps(request).encode() + b"\n")
-        to.flush()
+        try:
+            to.write(json.dumps(request).encode() + b"\n")
+            to.flush()
+        except BrokenPipeError:
+            raise self._ended() from None
         answer = self._line(_ANSWER)
         if "error" in answer:
             raise Failed(f"the master: {answer['error']}")
         return answer
 
     def _line(self, timeout: float) -> dict[str, Any]:
-        source: IO[bytes] | None = self._process.stdout
+        source: IO[bytes] | None = self._part.process.stdout
         assert source is not None
         deadline = time.monotonic() + timeout
         while b"\n" not in self._lines:
@@ -343,10 +353,18 @@ class _Desk:
             if select.select([source], [], [], 0.5)[0]:
                 read = os.read(source.fileno(), 1 << 16)
                 if not read:
-                    raise RosrmError("the client at the desk has ended; its log is desk.log")
+                    raise self._ended()
                 self._lines += read
             elif time.monotonic() >= deadline:
                 raise Failed(f"the client at the desk did not answer within {timeout:g} s")
         line, _, self._lines = self._lines.partition(b"\n")
         answer: dict[str, Any] = json.loads(line)
         return answer
+
+    def _ended(self) -> Failed:
+        """Its last words; it has closed its pipes."""
+        try:
+            self._part.process.wait(_END)
+        except subprocess.TimeoutExpired:
+            return Failed(f"{self._part.name} has closed its pipes, and goes on")
+        return self._part.last_words()

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -20,27 +20,23 @@ from rosrm.errors import RosrmError
 _Report = Mapping[str, Any]
 
 
-def update_page(page: Path, results: Path) -> list[str]:
-    """Write the figures that are in a folder into a page; returns their names.
+def update_page(page: Path, results: Path, names: Iterable[str]) -> None:
+    """Write figures that were measured into a page.
 
     Args:
         page: with a pair of marks for each figure.
         results: folder with FIGURE.json and FIGURE.png.
+        names: of the figures; the others stay as they are.
 
     Raises:
         RosrmError: the page lacks the marks of a figure.
     """
-    text, written = checked_page(page), []
-    for name in FIGURES:
-        file = results / f"{name}.json"
-        if not file.exists():
-            continue
-        report = json.loads(file.read_text(encoding="utf-8"))
+    text = checked_page(page)
+    for name in names:
+        report = json.loads((results / f"{name}.json").read_text(encoding="utf-8"))
         picture = os.path.relpath(results / f"{name}.png", page.parent)
         text = _replaced(text, name, section(name, report, picture))
-        written.append(name)
     page.write_text(text, encoding="utf-8")
-    return written
 
 
 def checked_page(page: Path) -> str:
@@ -126,7 +122,11 @@ def _fig8(report: _Report) -> _Rows:
     return [
         ("slaves", "1 to 10", f"1 to {report['slaves'][-1]}"),
         ("processes held", "proportional", ", ".join(str(one) for one in report["processes"])),
-        ("R² of the line", "", f"{report['r2']:.5f}"),
+        (
+            "R² of the line; of that through the origin",
+            "",
+            f"{report['r2']:.5f}; {report['r2_through_origin']:.5f}",
+        ),
         ("slaves that passed 80 %, and the highest", "", _beyond(report["over_limit_percent"])),
     ]
 
@@ -142,6 +142,8 @@ def _fig9(report: _Report) -> _Rows:
         ("µs beside (intercept)", f"{report['paper_intercept_us']:g}",
          f"{report['intercept_us']:g}"),
         ("R² of the line", "", f"{report['r2']:.4f}"),
+        (f"readings missed by the master, of {most['slaves']} slaves in one run", "",
+         f"{most['missed']} of {most['cycles']}"),
         (f"one cycle with {most['slaves']} slaves, ms", "84.3, extrapolated",
          f"{most['ms']:.1f}, of that the decision {most['decision_ms']:.2f}"),
         (f"one cycle with {core['slaves']} hosts in the core alone, ms", "", f"{core['ms']:.2f}"),

@@ -53,7 +53,7 @@ class Options:
 
 
 def plain_report(
-    name: str, claim: str, result: Result, *, seconds: float, load_before: float
+    name: str, claim: str, result: Result, *, small: bool, seconds: float, load_before: float
 ) -> dict[str, Any]:
     """All that the JSON file of a figure holds.
 
@@ -61,6 +61,7 @@ def plain_report(
         name: of the figure.
         claim: in words.
         result: what was measured.
+        small: whether only to show that it works.
         seconds: that it took.
         load_before: average of the machine's load over the minute before.
     """
@@ -69,6 +70,7 @@ def plain_report(
         "claim": claim,
         "claim_holds": not result.wrong,
         "against_it": result.wrong,
+        "small": small,
         **result.figures,
         "scaled": dict(result.scaled),
         "runs": result.runs,

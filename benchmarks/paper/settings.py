@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Final
+
+from rosrm.lab import MIB, HostPlan
 
 #: Section IV A: only memory decides, up to 80 % of it, at 10 Hz.
 WEIGHTS: Final = {"memory": 1.0, "cpu": 0.0, "disk": 0.0}
@@ -56,3 +59,9 @@ def holder(name: str, mb: float, **entries: Any) -> dict[str, Any]:
         "needs": {"memory": f"{mb + HOLDER_MB:g}MB", "cpu": 0},
         **entries,
     }
+
+
+def alike(plans: Sequence[HostPlan]) -> str:
+    """How many hosts there are, and how large each is; for hosts that are all alike."""
+    memory, cpu = (plans[0].memory or 0) / MIB, plans[0].cpu or 0.0
+    return f"{len(plans)} of {memory:g} MiB and {cpu:g} cores each on one machine"

@@ -100,7 +100,7 @@ def pieces_of(drives: Sequence[str], pieces: int = PIECES) -> list[Piece]:
 
 
 def drives_at_hand() -> tuple[str, ...]:
-    """The KITTI drives where all are, else the simulated kilometre."""
+    """The KITTI drives where all are, else a simulated street of 200 m."""
     try:
         for name in KITTI:
             load_drive(name)

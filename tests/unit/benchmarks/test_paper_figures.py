@@ -6,23 +6,26 @@ import json
 import re
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from benchmarks.paper import fig6, fig8, fig9, pictures, table3
+from benchmarks.paper import __main__ as paper
+from benchmarks.paper import fig6, fig8, fig9, fig10, pictures, table3
 from benchmarks.paper.judging import Line
+from benchmarks.paper.labs import Desk, Failed, Part
 from benchmarks.paper.page import section, update_page
-from benchmarks.paper.report import FIGURES
-from benchmarks.paper.settings import HOLDER_MB, MEMORY_LIMIT, host_settings
+from benchmarks.paper.report import FIGURES, Result
+from benchmarks.paper.settings import HOLDER_MB, MEMORY_LIMIT, alike, host_settings
 from benchmarks.paper.slam import Piece, pieces_of, shared_out
 from benchmarks.paper.trace import Happening, HostLook, Look, Trace
 from rosrm.config.host import load_host
 from rosrm.config.work import load_work
 from rosrm.errors import RosrmError
-from rosrm.lab import GIB
+from rosrm.lab import GIB, MIB, uniform
 from rosrm_examples.errors import DriveError
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -93,22 +96,75 @@ def test_fig6_does_not_hold_when_hosts_could_take_more():
     assert wrong == ["a waits, and host1, host2, host3 has room for it"]
 
 
+def test_fig6_does_not_hold_when_its_replay_decides_differently():
+    """Nor when the record holds no decision at all."""
+    alike = {"replayed_decisions": 60, "replayed_differently": 0}
+    assert fig6.replayed_otherwise(alike) == []
+    (wrong,) = fig6.replayed_otherwise({**alike, "replayed_differently": 1})
+    assert wrong == "`rosrm simulate` decides 1 of the record's 60 differently"
+    assert fig6.replayed_otherwise({**alike, "replayed_decisions": 0}) != []
+
+
 def test_fig8_holds_for_a_line_only():
     """The bound is on R2, and the queue must not have run dry."""
     trace = Trace(looks=[Look(0.0, {}, {"a": "queued"})])
     assert fig8.judge(trace, [8, 16, 24], Line(8.0, 0.0, 1.0))[0] == []
+    assert fig8.judge(trace, [8, *range(17, 90, 9)], Line(9.0, -1.0, 1.0))[0] == []
     assert "R2 is 0.99000" in fig8.judge(trace, [8, 16, 22], Line(7.0, 1.0, 0.99))[0][0]
     dry = Trace(looks=[Look(0.0, {}, {"a": "running"})])
     assert "queue became empty" in fig8.judge(dry, [8, 16], Line(8.0, 0.0, 1.0))[0][0]
 
 
+def test_fig8_holds_for_a_proportion_only():
+    """A line that misses the origin says that the first slave holds something else."""
+    trace = Trace(looks=[Look(0.0, {}, {"a": "queued"})])
+    (wrong,) = fig8.judge(trace, [28, 36, 44], Line(8.0, 20.0, 1.0))[0]
+    assert wrong.startswith("not in proportion: R2 of the line through the origin")
+
+
+@pytest.mark.parametrize(("top", "holds"), [(0.84, True), (0.9, False)])
+def test_fig8_counts_one_process_beyond_the_limit(top, holds):
+    """More than one, and the number of processes held says nothing of the limit."""
+    host = HostLook(top, 0.0, 1e9, accepting=False)
+    trace = Trace(looks=[Look(0.0, {"host1": host}, {"a": "queued"})])
+    wrong, _ = fig8.judge(trace, [8, 16], Line(8.0, 0.0, 1.0))
+    assert wrong == [] if holds else "host1 reached 90.0 %, more than one process" in wrong[0]
+
+
+KEPT_UP = {
+    "slaves": 1000, "ms": 20.0, "offered_per_s": 9900.0, "received_per_s": 9890.0, "cycles": 59_400,
+    "missed": 3, "hosts_heard": 1000, "masters_lost": 0,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({}, None),
+        ({"missed": 30_000}, "30000 of 59400 readings were missed"),
+        ({"offered_per_s": 5000.0}, "5000.0 cycles a second instead of 10000 were carried out"),
+        ({"received_per_s": 5000.0}, "5000.0 cycles a second instead of 10000 were heard"),
+        ({"hosts_heard": 999}, "of 1000 slaves 999 were heard"),
+        ({"masters_lost": 2}, "of 1000 slaves 2 took the master for lost"),
+    ],
+)
+def test_fig9_counts_only_where_the_master_kept_up(changes, said):
+    """A point is worth nothing where half of the readings were not made, or not taken in."""
+    wrong = fig9.not_kept_up({**KEPT_UP, **changes})
+    assert wrong == [] if said is None else (len(wrong) == 1 and said in wrong[0])
+
+
 def test_fig9_holds_below_the_papers_slope_only():
     """And only while all slaves are within one cycle."""
-    points = [{"slaves": 10, "ms": 0.2}, {"slaves": 1000, "ms": 20.0}]
+    points = [{**KEPT_UP, "ms": 20.0}]
     wrong, figures = fig9.judge(points, points, Line(0.02, 0.0, 1.0))
     assert (wrong, figures["slope_us"]) == ([], 20.0)
     assert "the paper: 84.3" in fig9.judge(points, points, Line(0.09, 0.0, 1.0))[0][0]
     assert "does not describe" in fig9.judge(points, points, Line(0.02, 0.0, 0.5))[0][0]
+    assert (
+        "59000 of 59400"
+        in fig9.judge([{**KEPT_UP, "missed": 59_000}], points, Line(0.02, 0.0, 1.0))[0][0]
+    )
     slow = [{"slaves": 1000, "ms": 120.0}]
     assert "of a cycle of 100 ms" in fig9.judge(points, slow, Line(0.02, 0.0, 1.0))[0][0]
 
@@ -134,6 +190,93 @@ def test_table3_does_not_hold_when_pieces_share_a_host():
     assert "shared a host" in table3.judge(seconds, spent(2, 0), 10)[0][0]
 
 
+def test_table3_does_not_hold_when_ten_hosts_are_hardly_faster_than_one():
+    """They were not at work together then."""
+    seconds = {"one_host": [30.0], "ideal": [10.0], "rosrm": [10.0]}
+    assert "10 hosts are only 3.0 times as fast" in table3.judge(seconds, spent(1, 1), 10)[0][0]
+
+
+def test_what_is_said_of_the_size_is_of_this_run():
+    """Of the hosts that were made, and of how fast it went."""
+    plans = uniform(3, memory=256 * MIB, cpu=0.5)
+    assert alike(plans) == "3 of 256 MiB and 0.5 cores each on one machine"
+    usual, small = fig10.scaled()["time"], fig10.scaled(3.0)["time"]
+    assert usual.startswith("2.7 times")
+    assert usual.endswith("5.5 MB a second, and come at 0, 33, 75 s")
+    assert small.startswith("8.1 times")
+    assert small.endswith("16.5 MB a second, and come at 0, 11, 25 s")
+
+
+# --- what goes wrong ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        subprocess.TimeoutExpired(["map"], 1500.0),
+        BrokenPipeError("Broken pipe"),
+        Failed("the client at the desk did not answer"),
+    ],
+)
+def test_a_figure_that_fails_leaves_its_logs_and_no_old_numbers(
+    error, tmp_path, monkeypatch, capsys
+):
+    """One line of what went wrong, one of where the logs are; what was measured before is gone."""
+    folders = []
+
+    def fail(options):
+        folders.append(options.folder)
+        (options.folder / "master.log").write_text("why")
+        raise error
+
+    monkeypatch.setattr(fig9, "measure", fail)
+    monkeypatch.setattr(paper, "raise_signals", lambda: None)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "fig9.json").write_text("{}")
+    assert paper.main(["fig9", "--out", str(out)]) == 2
+    said = capsys.readouterr().err.splitlines()
+    assert said[1] == f"fig9: failed: {error}"
+    assert said[2].endswith(f"are kept in {folders[0]}")
+    assert (folders[0] / "master.log").read_text() == "why"
+    assert list(out.iterdir()) == []
+
+
+def test_a_figure_that_is_measured_says_its_size_and_leaves_no_folder(tmp_path, monkeypatch):
+    """A small one is known by its numbers."""
+    result = Result([], {"slope_us": 1.0}, {"hosts": "few"}, lambda path: path.touch())
+    monkeypatch.setattr(fig9, "measure", lambda _: result)
+    monkeypatch.setattr(paper, "raise_signals", lambda: None)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    out = tmp_path / "out"
+    assert paper.main(["fig9", "--out", str(out), "--small"]) == 0
+    report = json.loads((out / "fig9.json").read_text())
+    assert (report["small"], report["claim_holds"]) == (True, True)
+    assert list(tmp_path.iterdir()) == [out]
+
+
+@pytest.mark.parametrize("ends", ["before it is asked", "when it is asked"])
+def test_a_desk_that_has_ended_is_told_with_its_last_words(ends, tmp_path):
+    """By exit code and log, before or after a question is written."""
+    log = tmp_path / "desk.log"
+    wait = "read line; " if ends == "when it is asked" else ""
+    script = f"echo '{{}}'; {wait}echo no master >&2; exit 3"
+
+    def start():
+        with log.open("wb") as sink:
+            process = subprocess.Popen(
+                ["sh", "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=sink
+            )
+        return Part("the client at the desk", process, log)
+
+    with Desk(start, lambda: None) as desk:
+        if ends == "before it is asked":
+            desk._part.process.wait(30.0)
+        with pytest.raises(Failed, match="desk ended with exit code 3:\n  no master"):
+            desk.ask({"do": "look"})
+
+
 # --- pictures and arguments -----------------------------------------------------------------------
 
 
@@ -155,7 +298,11 @@ def test_every_form_of_picture_is_drawn(tmp_path):
 
 @pytest.mark.parametrize(
     ("words", "said"),
-    [(["fig5"], "invalid choice: 'fig5'"), (["table3", "--runs", "0"], "at least 1")],
+    [
+        (["fig5"], "invalid choice: 'fig5'"),
+        (["table3", "--runs", "0"], "at least 1"),
+        (["fig6", "--small", "--page", "page.md"], "--small measures nothing worth writing there"),
+    ],
 )
 def test_bad_arguments_are_refused(words, said, tmp_path):
     """In argparse's way, with status 2."""
@@ -178,22 +325,23 @@ def test_bad_arguments_are_refused(words, said, tmp_path):
 def fig8_report(**changes):
     return {
         "claim": "c", "claim_holds": True, "against_it": [], "slaves": [1, 2], "processes": [8, 16],
-        "r2": 1.0, "over_limit_percent": {"host2": 84.0}, "runs": 1, "seconds": 9.0,
-        "load_average_before": 0.1,
+        "r2": 1.0, "r2_through_origin": 0.9995, "over_limit_percent": {"host2": 84.0},
+        "runs": 1, "seconds": 9.0, "load_average_before": 0.1,
         "machine": {"cores": 2, "processor": "P"}, **changes,
     }  # fmt: skip
 
 
 def test_the_page_gets_what_was_measured_and_keeps_the_rest(tmp_path):
-    """Written twice it is the same; a figure without a result stays as it is."""
+    """Written twice it is the same; a figure that was not measured now stays as it is."""
     page = tmp_path / "page.md"
     marked = "".join(f"<!-- {name} -->\nold\n<!-- /{name} -->\n" for name in FIGURES)
     page.write_text(f"before\n{marked}end\n")
     (tmp_path / "results").mkdir()
-    (tmp_path / "results" / "fig8.json").write_text(json.dumps(fig8_report()))
-    assert update_page(page, tmp_path / "results") == ["fig8"]
+    for name in ("fig6", "fig8"):
+        (tmp_path / "results" / f"{name}.json").write_text(json.dumps(fig8_report()))
+    update_page(page, tmp_path / "results", ["fig8"])
     once = page.read_text()
-    assert update_page(page, tmp_path / "results") == ["fig8"]
+    update_page(page, tmp_path / "results", ["fig8"])
     assert page.read_text() == once
     assert once.startswith("before\n<!-- fig6 -->\nold\n<!-- /fig6 -->\n<!-- fig7 -->\nold\n")
     assert "![fig8: c](results/fig8.png)" in once
@@ -213,7 +361,7 @@ def test_a_page_without_the_marks_is_refused(tmp_path):
     (tmp_path / "page.md").write_text("nothing")
     (tmp_path / "fig8.json").write_text(json.dumps(fig8_report()))
     with pytest.raises(RosrmError, match="no marks '<!-- fig6 -->'"):
-        update_page(tmp_path / "page.md", tmp_path)
+        update_page(tmp_path / "page.md", tmp_path, ["fig8"])
 
 
 def test_the_documentation_has_a_place_for_each_figure():

@@ -11,6 +11,7 @@ from benchmarks.paper.judging import (
     line,
     not_to_emptiest,
     over,
+    proportion,
     room_left,
     widest_gap,
     wrong_move,
@@ -113,6 +114,15 @@ def test_scattered_points_do_not_pass_for_a_line():
     """A host that holds half as many is below what Fig. 8 demands."""
     assert line(range(1, 11), [8, 16, 24, 32, 40, 48, 56, 64, 72, 76]).r2 < 0.999
     assert line(range(1, 11), [8 * n for n in range(1, 11)]).r2 == 1.0
+
+
+@given(st.floats(0.1, 1e3), st.lists(st.integers(1, 100), min_size=2, max_size=20, unique=True))
+def test_a_proportion_goes_through_the_origin(slope, x):
+    """Points in proportion are all explained, points beside it are not."""
+    fit = proportion(x, [slope * one for one in x])
+    assert (fit.slope, fit.intercept) == (pytest.approx(slope), 0.0)
+    assert fit.r2 > 0.999
+    assert proportion(x, [slope * one + 10 * slope * max(x) for one in x]).r2 < 0.999
 
 
 def test_one_point_is_no_line():
