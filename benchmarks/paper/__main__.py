@@ -73,8 +73,8 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--drive", action="append", default=[], metavar="DRIVE",
         help="for Table III: name or path of a LiDAR drive, several times for several; else the "
-        "KITTI drives 0001, 0002 and 0027 in the folder that ROSRM_KITTI names, or a simulated "
-        "street",
+        "KITTI drives 0001, 0002 and 0027 in the folder that ROSRM_KITTI names (without it: in "
+        "../shared/data/kitti beside the repository), or a simulated street",
     )  # fmt: skip
     parser.add_argument(
         "--page", type=Path, help="write what was measured into this page (docs/evaluation.md)"
