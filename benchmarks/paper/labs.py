@@ -121,8 +121,7 @@ class LabCluster:
     def start_slave_beside(self, host: str) -> None:
         """Start a host's slave beside its limits; what it starts is within."""
         state = str(DATA / "slave")
-        supervisor = [sys.executable, "-m", "rosrm.supervisor", "--state", f"{state}/supervisor"]
-        self.lab.exec(host, supervisor, timeout=_START)
+        self.lab.supervise(host, state, timeout=_START)
         measured = {name: {"group": self.lab.group(host)} for name in ("cpu", "memory")}
         plain = host_settings(host, state=state, probes={**measured, "disk": {}})
         settings = self._write(f"{host}.yaml", plain)

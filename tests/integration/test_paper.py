@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from rosrm.errors import LabError
+from tests.integration.lab.conftest import why_not
 
 ROOT = Path(__file__).resolve().parents[2]
 #: Seconds: on a quiet machine it takes 30.
@@ -22,29 +22,12 @@ LONGEST = 400.0
 COMMAND = [sys.executable, "-m", "benchmarks.paper"]
 
 
-def why_no_lab() -> str:
-    """Which rights, or what of the machine, a lab lacks here; "" for nothing.
-
-    Where nothing is lacking and a lab cannot be made all the same, that is no reason to skip.
-    """
-    from rosrm.lab import groups, needs, store
-
-    try:
-        needs.check_rights()
-        hierarchies = groups.find_hierarchies()
-        needs.check_machine([], store.IMAGES)
-    except LabError as error:
-        return str(error).splitlines()[0]
-    sealed = [str(one.mount) for one in hierarchies if not os.access(one.mount, os.W_OK)]
-    return f"read-only control groups: {', '.join(sealed)}" if sealed else ""
-
-
 @pytest.fixture
 def lab():
     """What the names of the labs begin with; none of them may be left."""
     from rosrm.lab import all_labs
 
-    reason = why_no_lab()
+    reason = why_not()
     if reason:
         pytest.skip(f"needs root and what a lab is made of: {reason}")
     name = f"t-{uuid.uuid4().hex[:8]}"
