@@ -12,6 +12,7 @@ import time
 import uuid
 from pathlib import Path
 
+import psutil
 import pytest
 
 from tests.integration.lab.conftest import why_not
@@ -77,6 +78,29 @@ def test_a_signal_leaves_nothing(lab, tmp_path):
     assert process.returncode == 128 + signal.SIGTERM, "".join(said) + rest
     assert "stopped by SIGTERM" in rest
     assert "Traceback" not in rest
+
+
+@pytest.mark.timeout(180)
+def test_a_signal_ends_the_simulated_slaves_and_their_master(tmp_path):
+    """Fig. 9 needs no lab: what it has started is in sessions of its own, and ends all the same."""
+    process = subprocess.Popen(
+        [*COMMAND, "fig9", "--small", "--out", str(tmp_path / "out")],
+        stderr=subprocess.PIPE, text=True, cwd=ROOT, env={**os.environ, "TMPDIR": str(tmp_path)},
+    )  # fmt: skip
+    try:
+        deadline = time.monotonic() + 90.0
+        while not any("registered" in log.read_text() for log in tmp_path.glob("*/scale.log")):
+            assert time.monotonic() < deadline, "no simulated slave was registered within 90 s"
+            time.sleep(0.1)  # a look at the log
+        started = {one.pid for one in psutil.Process(process.pid).children(recursive=True)}
+        assert len(started) >= 3, "the measurement, its master, its simulated slaves"
+    finally:
+        process.send_signal(signal.SIGTERM)
+        said = process.communicate(timeout=60.0)[1]
+    assert process.returncode == 128 + signal.SIGTERM, said
+    assert "Traceback" not in said
+    assert [pid for pid in started if psutil.pid_exists(pid)] == []
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
 def test_without_rights_one_message_says_what_is_missing(tmp_path):
