@@ -1,7 +1,6 @@
 """Run the tests folder by folder and close with one table: `make test`.
 
-Each folder under `tests/` is one run of pytest, so that a real ROS graph never shares the machine
-with another test's, and only what is independent runs in parallel.
+Each folder under `tests/` is one run of pytest, and only what is independent runs in parallel.
 """
 
 from __future__ import annotations
@@ -22,9 +21,10 @@ RESULTS = ROOT / "build" / "test-results"
 #: In this order: what fails fast comes first.
 LAYERS = ("unit", "contract", "integration", "ros", "faults")
 
-#: Workers of the folders whose tests share nothing: neither ports nor ROS domains nor the load of
-#: the machine that a time-out was chosen for. The tests of one file share a cluster in `faults`.
-WORKERS = {"unit": ["-n", "2"], "faults": ["-n", "2", "--dist", "loadfile"]}
+#: Workers of the folders whose tests share nothing but the load of the machine. Where there is a
+#: ROS graph, each worker has a network of its own, if it may; the tests of a file share a cluster.
+_BY_FILE = ["-n", "2", "--dist", "loadfile"]
+WORKERS = {"unit": ["-n", "2"], "ros": _BY_FILE, "faults": _BY_FILE}
 
 # Of pytest's exit statuses:
 INTERRUPTED = 2
