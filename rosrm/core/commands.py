@@ -37,6 +37,18 @@ class Withdraw:
 
 
 @dataclass(frozen=True, slots=True)
+class Redeliver:
+    """Order the start of an assignment, as the answer that it was fetched with may have been lost.
+
+    One that was not yet fetched is left where it is: it can be taken back without a word.
+    """
+
+    order: int
+    host_id: int
+    assignment: Assignment
+
+
+@dataclass(frozen=True, slots=True)
 class Order:
     """Ask one slave for something; `OrderAnswered` follows, also when no answer comes.
 
@@ -87,4 +99,4 @@ class Reply:
     host: str = ""
 
 
-Command = Assign | Withdraw | Order | PublishStateConfig | Reply | Record | Intent
+Command = Assign | Withdraw | Redeliver | Order | PublishStateConfig | Reply | Record | Intent

@@ -64,6 +64,7 @@ class Instance:
         peak: highest usage seen.
         settled: its estimates stopped counting.
         restarting: it was ordered to restart, and has not been seen to do so yet.
+        given_again: the assignment was delivered anew, since its slave did not take it up.
         recalled: a master ordered it to stop and was itself restarted: its end is not its own.
         order: of an unanswered stop, 0: none.
         order_at: when it was given.
@@ -85,6 +86,7 @@ class Instance:
     stopping: bool = False
     restarting: bool = False
     settled: bool = False
+    given_again: bool = False
     recalled: bool = False
     order: int = 0
     order_at: float = 0.0

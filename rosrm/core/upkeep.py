@@ -7,12 +7,12 @@ from typing import Final
 from rosrm.core import events as happened
 from rosrm.core.assigning import reconsider_set_aside
 from rosrm.core.charges import settle_charge
-from rosrm.core.commands import Order, Withdraw
+from rosrm.core.commands import Order, Redeliver, Withdraw
 from rosrm.core.lifecycle import stop_instance
 from rosrm.core.liveness import review_liveness
 from rosrm.core.lookahead import review_slots, waits_too_long
 from rosrm.core.relief import relieve_hosts
-from rosrm.core.state import Instance, MasterState, ProcessPhase, Wanted
+from rosrm.core.state import Instance, MasterState, Process, ProcessPhase, Wanted
 
 #: Seconds between two reviews of what need not be looked at with every event.
 _REVIEW_EVERY: Final = 0.2
@@ -36,14 +36,27 @@ def time_passed(state: MasterState, event: happened.TimePassed, now: float) -> N
 
 def _review_instance(state: MasterState, instance: Instance, now: float) -> None:
     age = now - instance.since
-    if instance.state is None and age >= state.settings.delivery_timeout:
-        _withdraw(state, instance, now)
+    if instance.state is None:
+        _review_delivery(state, instance, age, now)
     if waits_too_long(instance, now):
         _take_back(state, instance, now)
     if instance.stopping and now - instance.order_at >= state.settings.order_retry:
         stop_instance(state, instance, now)
     if not instance.settled and age >= state.settings.settle:
         settle_charge(state, instance, now)
+
+
+def _review_delivery(state: MasterState, instance: Instance, age: float, now: float) -> None:
+    """Nothing was said of an assignment: the answer that it went with may have been lost."""
+    process = state.owned_by(instance)
+    if process is None or process.phase is not ProcessPhase.ASSIGNED or instance.stopping:
+        return
+    if age >= state.settings.delivery_timeout:
+        _withdraw(state, process, instance, now)
+    elif age >= state.settings.order_retry and not instance.given_again:
+        instance.given_again = True
+        assignment = state.assignment(instance.id, process.spec)
+        state.emit(Redeliver(state.order_id(), instance.host.host_id, assignment))
 
 
 def _take_back(state: MasterState, instance: Instance, now: float) -> None:
@@ -56,11 +69,8 @@ def _take_back(state: MasterState, instance: Instance, now: float) -> None:
         stop_instance(state, instance, now)
 
 
-def _withdraw(state: MasterState, instance: Instance, now: float) -> None:
+def _withdraw(state: MasterState, process: Process, instance: Instance, now: float) -> None:
     """Take back an assignment that was not taken up: however it ends now, it is queued again."""
-    process = state.owned_by(instance)
-    if process is None or process.phase is not ProcessPhase.ASSIGNED or instance.stopping:
-        return
     if instance.order and now - instance.order_at < state.settings.delivery_timeout:
         return
     if process.wanted is Wanted.RUN:

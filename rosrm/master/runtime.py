@@ -17,7 +17,15 @@ from typing import Any, Final
 from rosrm.config.settings import ClusterConfig
 from rosrm.core import events as happened
 from rosrm.core import listing, restore
-from rosrm.core.commands import Assign, Command, Order, PublishStateConfig, Reply, Withdraw
+from rosrm.core.commands import (
+    Assign,
+    Command,
+    Order,
+    PublishStateConfig,
+    Redeliver,
+    Reply,
+    Withdraw,
+)
 from rosrm.core.master import step
 from rosrm.core.state import MasterState
 from rosrm.core.views import EventRow, PluginRow, Snapshot
@@ -254,6 +262,8 @@ class MasterRuntime:
                 endpoint.handoffs.publish(command)
             elif isinstance(command, Withdraw):
                 endpoint.withdraw(command, now)
+            elif isinstance(command, Redeliver):
+                endpoint.redeliver(command, now)
 
     def _write(
         self, records: Sequence[Record], intents: Sequence[Intent]

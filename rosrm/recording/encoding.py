@@ -18,7 +18,7 @@ import numpy as np
 
 from rosrm.config.plain import from_plain, to_plain
 from rosrm.core import events as happened
-from rosrm.core.commands import Assign, Command, Order, PublishStateConfig, Withdraw
+from rosrm.core.commands import Assign, Command, Order, PublishStateConfig, Redeliver, Withdraw
 from rosrm.core.model import RESOURCE_SLOTS
 from rosrm.recording.frames import FrameKind
 
@@ -141,6 +141,8 @@ def decisions(commands: Sequence[Command]) -> tuple[str, ...]:
 def _decision(command: Command) -> str:
     if isinstance(command, Assign):
         return f"assign {command.assignment.instance} to host {command.host_id}"
+    if isinstance(command, Redeliver):
+        return f"assign {command.assignment.instance} to host {command.host_id} again"
     if isinstance(command, Withdraw):
         return f"withdraw {command.instance} from host {command.host_id}"
     if isinstance(command, Order):

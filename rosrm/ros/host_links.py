@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from rosrm.core import events as happened
-from rosrm.core.commands import Assign, Order, Withdraw
+from rosrm.core.commands import Assign, Order, Redeliver, Withdraw
 from rosrm.core.model import Assignment, HostDescription
 from rosrm.ros import convert, names, qos
 from rosrm.ros.control import ControlClient, accepted, version_refusal
@@ -204,6 +204,14 @@ class HostLinks:
             self._tell(happened.AssignmentWithdrawn(command.instance))
             return
         self.order(Order(command.order, command.host_id, "stop", command.instance), now)
+
+    def redeliver(self, command: Redeliver, now: float) -> None:
+        """Order the start of an assignment, unless it waits to be fetched."""
+        link, assignment = self._links.get(command.host_id), command.assignment
+        if link is None or all(one.instance != assignment.instance for one in link.outbox):
+            self.order(
+                Order(command.order, command.host_id, "start", assignment.instance, assignment), now
+            )
 
     # --- orders --------------------------------------------------------------------------
 

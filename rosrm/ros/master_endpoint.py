@@ -17,7 +17,7 @@ from typing import Final
 
 from rosrm.config.settings import ControlSettings
 from rosrm.core import events as happened
-from rosrm.core.commands import Assign, Order, Reply, Withdraw
+from rosrm.core.commands import Assign, Order, Redeliver, Reply, Withdraw
 from rosrm.ros import names, qos
 from rosrm.ros.handoff_endpoint import HandoffEndpoint
 from rosrm.ros.hearing import Hearing, Refusals
@@ -126,6 +126,10 @@ class MasterEndpoint:
     def withdraw(self, command: Withdraw, now: float) -> None:
         """Take an assignment back, or order its end."""
         self._links.withdraw(command, now)
+
+    def redeliver(self, command: Redeliver, now: float) -> None:
+        """Order the start of an assignment that was fetched already."""
+        self._links.redeliver(command, now)
 
     def order(self, command: Order, now: float) -> None:
         """Ask a slave for something; the answer, or none in time, comes back as an event."""

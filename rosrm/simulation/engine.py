@@ -16,7 +16,15 @@ import numpy as np
 
 from rosrm.core import events as happened
 from rosrm.core import slave
-from rosrm.core.commands import Assign, Command, Order, PublishStateConfig, Reply, Withdraw
+from rosrm.core.commands import (
+    Assign,
+    Command,
+    Order,
+    PublishStateConfig,
+    Redeliver,
+    Reply,
+    Withdraw,
+)
 from rosrm.core.master import step
 from rosrm.core.model import InstanceId
 from rosrm.core.placement import NamedPolicy
@@ -241,6 +249,8 @@ class Simulation:
             self._order(command)
         elif isinstance(command, Withdraw):
             self._withdraw(command)
+        elif isinstance(command, Redeliver):
+            self._redeliver(command)
         elif isinstance(command, PublishStateConfig):
             self._nodes.hear(command)
 
@@ -262,6 +272,13 @@ class Simulation:
             self.agenda.after(0.0, partial(self._tell, withdrawn))
             return
         self._order(Order(command.order, command.host_id, "stop", command.instance))
+
+    def _redeliver(self, command: Redeliver) -> None:
+        assignment = command.assignment
+        if assignment.instance not in self._undelivered:
+            self._order(
+                Order(command.order, command.host_id, "start", assignment.instance, assignment)
+            )
 
     def _order(self, order: Order) -> None:
         machine = self._by_id[order.host_id]

@@ -18,7 +18,15 @@ import numpy as np
 
 from rosrm.core import events as happened
 from rosrm.core import listing, slave
-from rosrm.core.commands import Assign, Command, Order, PublishStateConfig, Reply, Withdraw
+from rosrm.core.commands import (
+    Assign,
+    Command,
+    Order,
+    PublishStateConfig,
+    Redeliver,
+    Reply,
+    Withdraw,
+)
 from rosrm.core.master import step
 from rosrm.core.migration import (
     AwaitReady,
@@ -236,6 +244,8 @@ class Cluster:
                 self.by_id(command.host_id).ordered.append(command)
             elif isinstance(command, Withdraw):
                 self._withdraw(command)
+            elif isinstance(command, Redeliver):
+                self._redeliver(command)
             elif isinstance(command, PublishStateConfig):
                 self.air.publish(command)
 
@@ -247,6 +257,13 @@ class Cluster:
             self.tell(happened.AssignmentWithdrawn(command.instance))
         else:
             machine.ordered.append(Order(command.order, command.host_id, "stop", command.instance))
+
+    def _redeliver(self, command: Redeliver) -> None:
+        machine, assignment = self.by_id(command.host_id), command.assignment
+        if all(one.instance != assignment.instance for one in machine.polled):
+            machine.ordered.append(
+                Order(command.order, command.host_id, "start", assignment.instance, assignment)
+            )
 
     def by_id(self, host_id: int) -> Machine:
         name = self.state.hosts.hosts[host_id - 1].name

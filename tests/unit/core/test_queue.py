@@ -156,3 +156,40 @@ def test_one_that_comes_back_goes_to_its_old_place() -> None:
     commands = cluster.decide(happened.AssignmentWithdrawn(InstanceId("p", 1)))
     assert [c.kind for c in commands if isinstance(c, Record)] == ["queued", "assigned"]
     assert (cluster.phase("p"), cluster.queue()) == ("assigned", ["q"])
+
+
+def test_an_assignment_that_was_lost_is_given_again_as_an_order() -> None:
+    """The process does not wait until the assignment counts as not taken up."""
+    cluster = Cluster("a", order_retry=2.0, delivery_timeout=5.0)
+    cluster.decide(happened.SubmissionReceived(1, (job("p"),)))  # the answer never arrives
+    cluster.wait(1.5)
+    assert cluster.phase("p") == "assigned"
+    cluster.wait(1.0)
+    assert (cluster.phase("p"), cluster["p"].owner) == ("running", 1)
+
+
+def test_an_assignment_that_arrives_twice_is_one() -> None:
+    """The answer was only late."""
+    machine = Machine("a")
+    cluster = Cluster(machine, order_retry=2.0, delivery_timeout=5.0)
+    commands = cluster.decide(happened.SubmissionReceived(1, (job("p"),)))
+    cluster.wait(2.5)
+    cluster.carry_out(commands)
+    cluster.settle()
+    assert list(machine.programs) == [InstanceId("p", 1)]
+
+
+def test_an_assignment_given_twice_and_withdrawn_never_starts() -> None:
+    """Neither the answer nor the order, if they come after all."""
+    machine = Machine("a")
+    cluster = Cluster(machine, order_retry=2.0, delivery_timeout=5.0)
+    given = cluster.decide(happened.SubmissionReceived(1, (job("p"),)))
+    machine.connected = False
+    cluster.now += 2.5
+    again = cluster.decide(happened.TimePassed())
+    cluster.now += 3.0
+    cluster.tell(happened.TimePassed())
+    machine.connected = True
+    cluster.carry_out([*given, *again])
+    cluster.wait(1.0)
+    assert list(machine.programs) == [InstanceId("p", 2)]

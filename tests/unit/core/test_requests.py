@@ -410,7 +410,9 @@ def test_an_assignment_that_is_not_taken_up_is_withdrawn() -> None:
 
 def test_one_that_was_fetched_and_never_heard_of_is_stopped_before_it_goes_elsewhere() -> None:
     """Its refusal then is no reason against its host."""
-    cluster = Cluster("a", Machine("b", busy={"memory": 0.5}), delivery_timeout=5.0)
+    cluster = Cluster(
+        "a", Machine("b", busy={"memory": 0.5}), delivery_timeout=5.0, order_retry=9.0
+    )
     cluster.carry_out(cluster.decide(happened.SubmissionReceived(1, (process("p"),))))
     cluster.machines["a"].polled.clear()  # fetched, and the answer got lost
     cluster.wait(4.9)
