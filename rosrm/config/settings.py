@@ -295,6 +295,7 @@ class HostConfig:
         rate: of `resource_info`, Hz.
         probes: chosen by name, each with its options; None: the default ones.
         max_processes: most processes held at a time; 0: no bound.
+        max_starting: most processes started at a time, until they are ready; 0: no bound.
         logs: of the processes.
         control: of requests.
         on_stop: a slave that is stopped stops its processes, or keeps them with the supervisor.
@@ -310,6 +311,7 @@ class HostConfig:
     rate: Annotated[float, Quantity(low=0.1, high=1000.0, hint="Hz")] = 10.0
     probes: Annotated[Mapping[str, Options] | None, OptionsByName()] = None
     max_processes: Count = 0
+    max_starting: Count = 8
     logs: LogSettings = field(default_factory=LogSettings)
     control: HostControlSettings = field(default_factory=HostControlSettings)
     on_stop: Literal["stop", "keep"] = "stop"

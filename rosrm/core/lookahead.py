@@ -58,6 +58,7 @@ def waits_too_long(instance: Instance, now: float) -> bool:
     """Whether an assignment ahead waits for a job that is not short after all."""
     return (
         instance.state is InstanceState.HELD
+        and instance.host.description.max_processes > 0  # else it waits for others to start
         and not instance.stopping
         and now - instance.since >= PROVED_LONG
     )

@@ -88,7 +88,9 @@ class SlaveRuntime:
         self._left = False
         self._shutting_down = False
         self._accepting = False
-        self._state = core.SlaveState(max_processes=config.max_processes)
+        self._state = core.SlaveState(
+            max_processes=config.max_processes, max_starting=config.max_starting
+        )
         self._events: deque[core.Event] = deque()
         self._from_threads: deque[Callable[[], None]] = deque()
         self._graph_before: dict[InstanceId, frozenset[bytes]] = {}
@@ -102,7 +104,8 @@ class SlaveRuntime:
                     config.state, "slave", code="name_taken", remedy="another `host:` and `state:`"
                 )
             )
-            self._sessions = SessionTable()
+            # A need counts as met by what shows in the readings of this scope, and by no more.
+            self._sessions = SessionTable(shared=config.scope == "slice")
             self._usage = UsageWatch(self._sessions)
             context = ProbeContext(config.scope, config.budget, config.state, self._sessions)
             probes = registry.probes(config.probes, context)

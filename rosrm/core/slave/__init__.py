@@ -6,8 +6,8 @@ what happened           what the core does
 Registered              remembers the master's epoch; older ones are refused from now on; reports
                         again, if something went unheard meanwhile
 MasterLost              forgets no end until a master has taken this host in again
-AssignmentsReceived     has them launched, once, or holds them until a slot is free; one that was
-                        stopped before is refused
+AssignmentsReceived     has them launched, once, or holds them until a slot is free and those that
+                        are being started are ready; one that was stopped before is refused
 LaunchRefused           reports that the host cannot run it, and why
 StopOrdered             has it stopped; one never heard of will never be started
 RestartOrdered          has it stopped and started again here

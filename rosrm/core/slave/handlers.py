@@ -79,8 +79,10 @@ def _assigned(state: SlaveState, event: AssignmentsReceived, now: float) -> _Com
         state.waiting[instance] = assignment
         state.held[instance] = _waiting(assignment)
     launches = _start_waiting(state)
-    held = [state.held[one.instance].status for one in event.assignments]
-    reports = refusals + [status for status in held if status.state is InstanceState.HELD]
+    held = [state.held[one.instance] for one in event.assignments if one.instance in state.waiting]
+    for one in held:
+        one.status = replace(one.status, message=state.why_wait())
+    reports = refusals + [one.status for one in held]
     return [*launches, Report(tuple(reports))] if reports else launches
 
 
@@ -90,16 +92,13 @@ def _waiting(assignment: Assignment) -> Held:
     if awaits_graph(spec):
         name = qualified_name(spec.namespace, assignment.node_name)
         awaited = Awaited(name, spec.readiness.timeout)
-    status = InstanceStatus(
-        assignment.instance, InstanceState.HELD, message="waits for a free slot there"
-    )
-    return Held(status, spec, awaited)
+    return Held(InstanceStatus(assignment.instance, InstanceState.HELD), spec, awaited)
 
 
 def _start_waiting(state: SlaveState) -> _Commands:
-    """Launch what waits, as far as there are slots."""
+    """Launch what waits, as far as it may be started now."""
     launches = []
-    while state.waiting and state.has_slot():
+    while state.waiting and not state.why_wait():
         instance = next(iter(state.waiting))
         launches.append(state.waiting.pop(instance))
         state.held[instance].status = InstanceStatus(instance, InstanceState.STARTING)
@@ -266,7 +265,9 @@ def _seen(state: SlaveState, event: SeenInGraph, now: float) -> _Commands:
     held.ready_by = None
     held.status = replace(held.status, state=InstanceState.READY)
     held.awaited = replace(held.awaited, seen=held.status.pid)
-    return [Remember(event.instance, held.awaited), Report((held.status,))]
+    return [
+        *_start_waiting(state), Remember(event.instance, held.awaited), Report((held.status,))
+    ]  # fmt: skip
 
 
 def _may_be_forgotten(state: SlaveState, held: Held, now: float) -> bool:

@@ -13,6 +13,7 @@ from rosrm.core.model import (
     RESOURCE_SLOTS,
     Assignment,
     InstanceId,
+    InstanceState,
     InstanceStatus,
     ProcessSpec,
     RestartPolicy,
@@ -51,12 +52,14 @@ class SlaveState:
 
     Attributes:
         max_processes: most that run at a time; 0: no bound.
-        waiting: assignments that are started as soon as a slot is free, in order.
+        max_starting: most that are started at a time, until they are ready; 0: no bound.
+        waiting: assignments that are started as soon as they may be, in order.
         unheard: something was reported while no master had this host: perhaps after its
             registration was sent.
     """
 
     max_processes: int = 0
+    max_starting: int = 0
     epoch: int = 0
     registered: bool = False
     unheard: bool = False
@@ -75,6 +78,21 @@ class SlaveState:
     def has_slot(self) -> bool:
         """Whether one more process may run."""
         return not self.max_processes or self.live() - len(self.waiting) < self.max_processes
+
+    def why_wait(self) -> str:
+        """Why nothing more is started now, in words; "": it is."""
+        if not self.has_slot():
+            return "waits for a free slot there"
+        if self.max_starting and self.starting() >= self.max_starting:
+            return f"waits until others there have started: {self.max_starting} at a time"
+        return ""
+
+    def starting(self) -> int:
+        """How many are being started, or run and are not ready yet."""
+        return sum(
+            held.status.state is InstanceState.STARTING or held.ready_by is not None
+            for held in self.held.values()
+        )
 
     def live(self) -> int:
         """How many instances have not ended."""

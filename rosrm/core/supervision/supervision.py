@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Final
 
-from rosrm.core.supervision.instance import MOST_KILLS, REFUSED, Instance, end
+from rosrm.core.supervision.instance import BACKOFF, MOST_KILLS, REFUSED, Instance, end
 from rosrm.core.supervision.transitions import TRANSITIONS
 from rosrm.core.supervision.words import (
     AmendOrdered,
@@ -29,6 +29,10 @@ from rosrm.core.supervision.words import (
 
 #: Process names whose dead numbers are remembered.
 MOST_TOMBSTONES: Final = 2000
+#: Restarts by policy that begin within `RESTART_SPAN` seconds: what crashed together is not started
+#: together.
+MOST_RESTARTS: Final = 8
+RESTART_SPAN: Final = 1.0
 
 _ORDERS: Final = (StartOrdered, StopOrdered, RestartOrdered, AmendOrdered, Forgotten)
 
@@ -47,6 +51,7 @@ class Supervision:
         self.dead: dict[str, int] = {}
         self.closing = False
         self._timed: dict[Key, float] = {}
+        self._restarted: list[float] = []
 
     def restore(self, instance: Instance) -> None:
         """Take over what an earlier supervisor of this host recorded."""
@@ -73,7 +78,8 @@ class Supervision:
         if isinstance(event, TimePassed):
             due = [key for key, deadline in self._timed.items() if deadline <= now]
             for key in due:
-                yield from self._apply(self.instances[key], event, now)
+                if self._has_turn(self.instances[key], now):
+                    yield from self._apply(self.instances[key], event, now)
         elif isinstance(event, ShutdownOrdered):
             self.closing = True
             for instance in list(self.instances.values()):
@@ -84,6 +90,18 @@ class Supervision:
             yield from self._known(self.instances[event.instance], event, now)
         elif isinstance(event, (StartOrdered, StopOrdered, RestartOrdered, AmendOrdered)):
             yield from self._unknown(event)
+
+    def _has_turn(self, instance: Instance, now: float) -> bool:
+        """Whether a restart that is due may begin; False: it is due later."""
+        if instance.phase != BACKOFF:
+            return True
+        self._restarted = [at for at in self._restarted if now - at < RESTART_SPAN]
+        if len(self._restarted) < MOST_RESTARTS:
+            self._restarted.append(now)
+            return True
+        instance.deadline = self._restarted[0] + RESTART_SPAN
+        self._watch_deadline(instance)
+        return False
 
     def _known(self, instance: Instance, event: Event, now: float) -> Iterator[Command]:
         if isinstance(event, Forgotten) and instance.ended:

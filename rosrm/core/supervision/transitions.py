@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import zlib
 from collections.abc import Callable
 from typing import Final
 
@@ -43,6 +44,9 @@ from rosrm.core.supervision.words import (
 )
 
 _KILL: Final = len(STEPS) - 1
+#: Part of a wait by which a restart may come sooner, so that what crashed together does not start
+#: together.
+_JITTER: Final = 0.2
 
 Transition = Callable[[Instance, "Event", float], list[Command]]
 
@@ -238,7 +242,7 @@ def _by_policy(instance: Instance, ending: str, *, succeeded: bool, now: float) 
         limit = f"{done} restarts within {rule.window:g} s are the most allowed"
         end(instance, FAILED, f"{ending}; {limit}")
         return
-    wait = backoff(rule, done)
+    wait = backoff(rule, done) * (1.0 - _JITTER * _chance(instance))
     instance.phase = BACKOFF
     instance.then = ""
     instance.deadline = now + wait
@@ -249,6 +253,12 @@ def _recent_restarts(instance: Instance, now: float) -> int:
     """How many restarts lie within the policy's window; older ones count no more."""
     instance.recent = [at for at in instance.recent if now - at < instance.restart.window]
     return len(instance.recent)
+
+
+def _chance(instance: Instance) -> float:
+    """From 0 to below 1, another one for each restart of each instance, and always the same."""
+    name, number = instance.key
+    return zlib.crc32(f"{name}#{number}/{instance.restarts}".encode()) / 2**32
 
 
 def backoff(rule: RestartRule, done: int) -> float:

@@ -379,6 +379,47 @@ def test_a_restart_policy_of_what_waits_for_a_slot() -> None:
     assert not assignment.shadow
 
 
+def nodes(count: int) -> slave.AssignmentsReceived:
+    specs = [replace(NODE, name=f"n{number}") for number in range(count)]
+    return slave.AssignmentsReceived(
+        tuple(Assignment(InstanceId(spec.name, 1), spec, 1, spec.name) for spec in specs)
+    )
+
+
+def launched(commands) -> list[str]:
+    launches = [one for one in commands if isinstance(one, slave.Launch)]
+    return [one.instance.process for launch in launches for one in launch.assignments]
+
+
+def test_so_many_are_started_at_a_time(one) -> None:
+    """The others are held, and say so; the next one starts when one is ready."""
+    one.state.max_starting = 2
+    commands = one.step(nodes(4))
+    assert launched(commands) == ["n0", "n1"]
+    assert states(commands) == [STATE.HELD, STATE.HELD]
+    assert "2 at a time" in one.of("n2").status.message
+    assert launched(one.step(told(STATE.RUNNING, "n0", pid=5))) == []
+    assert launched(one.step(slave.SeenInGraph(InstanceId("n0", 1)))) == ["n2"]
+
+
+def test_one_that_ends_before_it_is_ready_makes_room_for_the_next(one) -> None:
+    """Also one that is stopped because it is not ready in time."""
+    one.state.max_starting = 1
+    one.step(nodes(3))
+    assert launched(one.step(told(STATE.FAILED, "n0", exit_code=1))) == ["n1"]
+    one.step(told(STATE.RUNNING, "n1", pid=5))
+    assert one.step(slave.TimePassed(), after=11.0) == [slave.Stop(InstanceId("n1", 1))]
+    assert launched(one.step(told(STATE.STOPPING, "n1", pid=5))) == ["n2"]
+
+
+def test_what_is_no_node_has_started_as_soon_as_it_runs(one) -> None:
+    """So a bound on starts hardly holds up plain programs."""
+    one.state.max_starting = 1
+    one.step(assigned(number=1))
+    one.step(assigned(replace(PLAIN, name="q")))
+    assert launched(one.step(told(STATE.RUNNING, pid=5))) == ["q"]
+
+
 def test_a_restart_policy_of_what_is_forgotten_meanwhile() -> None:
     """The supervisor never says that it has it: the master is answered all the same."""
     one = running()
