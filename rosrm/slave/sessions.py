@@ -23,7 +23,7 @@ class SessionUsage:
 
     Attributes:
         cpu: cores, mean since the walk before.
-        memory: bytes, sum over the members: resident, or what each has to itself.
+        memory: bytes, resident, sum over the members (shared pages count in each).
     """
 
     cpu: float
@@ -38,21 +38,13 @@ class SessionTable:
     Args:
         proc: where the process file system is mounted.
         session_of: session id of a process; raises `OSError` where it has ended.
-        shared: count the pages that a process may share with others (files it has mapped, shared
-            memory) in each, as the probe of a slice does. Machines and control groups count them
-            once or not at all.
     """
 
     def __init__(
-        self,
-        proc: Path = Path("/proc"),
-        session_of: Callable[[int], int] = os.getsid,
-        *,
-        shared: bool = True,
+        self, proc: Path = Path("/proc"), session_of: Callable[[int], int] = os.getsid
     ) -> None:
         self._proc = str(proc)
         self._session_of = session_of
-        self._shared = shared
         self._members: dict[int, tuple[int, ...]] = {}
         self._pids: tuple[int, ...] = ()
         self._ended_cpu_time = 0.0
@@ -139,30 +131,21 @@ class SessionTable:
         self._pids = tuple(pid for pids in self._members.values() for pid in pids)
 
     def _read(self, members: tuple[int, ...]) -> tuple[float, int]:
-        """CPU time in seconds (with that of reaped children) and bytes of some pids."""
+        """CPU time in seconds (with that of reaped children) and resident bytes of some pids."""
         ticks = pages = 0
         for pid in members:
-            line = self._line_of(pid, "stat")
+            try:
+                descriptor = os.open(f"{self._proc}/{pid}/stat", os.O_RDONLY)
+            except OSError:  # it has ended meanwhile
+                continue
+            try:
+                line = os.read(descriptor, 1024)
+            except OSError:
+                continue
+            finally:
+                os.close(descriptor)
             # The name, in parentheses, may itself hold spaces and parentheses.
-            fields = line[line.rfind(b")") + 2 :].split()
-            if fields:
-                ticks += int(fields[11]) + int(fields[12]) + int(fields[13]) + int(fields[14])
-                pages += int(fields[21]) if self._shared else self._own_pages(pid)
+            fields = line[line.rindex(b")") + 2 :].split()
+            ticks += int(fields[11]) + int(fields[12]) + int(fields[13]) + int(fields[14])
+            pages += int(fields[21])
         return ticks / _TICKS, pages * _PAGE
-
-    def _own_pages(self, pid: int) -> int:
-        fields = self._line_of(pid, "statm").split()
-        return int(fields[1]) - int(fields[2]) if fields else 0
-
-    def _line_of(self, pid: int, name: str) -> bytes:
-        """A process's file of one line; empty where the process has ended meanwhile."""
-        try:
-            descriptor = os.open(f"{self._proc}/{pid}/{name}", os.O_RDONLY)
-        except OSError:
-            return b""
-        try:
-            return os.read(descriptor, 1024)
-        except OSError:
-            return b""
-        finally:
-            os.close(descriptor)

@@ -18,7 +18,7 @@ class Tree:
         self.path = path
         self.session = {}
 
-    def put(self, pid, session, *, own=0.0, children=0.0, pages=0, shared=0, name="sleep"):
+    def put(self, pid, session, *, own=0.0, children=0.0, pages=0, name="sleep"):
         """A process: its CPU seconds, those of its reaped children, its resident pages."""
         self.session[pid] = session
         fields = [
@@ -28,7 +28,6 @@ class Tree:
         folder = self.path / str(pid)
         folder.mkdir(exist_ok=True)
         (folder / "stat").write_text(f"{pid} ({name}) {' '.join(map(str, fields))}\n")
-        (folder / "statm").write_text(f"4096 {pages} {shared} 1 0 90 0\n")
 
     def end(self, pid):
         """The process has been reaped."""
@@ -76,16 +75,6 @@ def test_usage_is_a_mean_between_walks(tree, table):
     tree.put(11, 10, own=1.5, pages=70)
     table.refresh(1.0)
     assert table.usage() == {10: SessionUsage(pytest.approx(1.5), 170 * PAGE)}
-
-
-def test_pages_that_may_be_shared_can_be_left_out(tree):
-    """Where the host's own reading counts them once or not at all."""
-    tree.put(10, 10, pages=100, shared=30)
-    tree.put(11, 10, pages=50, shared=30)
-    table = SessionTable(tree.path, tree.session_of, shared=False)
-    table.add(10)
-    table.refresh(0.0)
-    assert table.usage() == {10: SessionUsage(0.0, 90 * PAGE)}
 
 
 def test_child_that_was_waited_for_stays_counted(tree, table):
