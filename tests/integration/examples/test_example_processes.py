@@ -60,7 +60,11 @@ class Listener:
         self._executor = rclpy.executors.SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
         self.heard: list[Odometry] = []
-        self._node.create_subscription(Odometry, topic, self.heard.append, 100)
+        self._subscription = self._node.create_subscription(Odometry, topic, self.heard.append, 100)
+
+    def is_matched(self) -> bool:
+        """Whether somebody who speaks is known: what is said before is not heard."""
+        return bool(self._subscription.get_publisher_count())
 
     def wait_for(self, count: int, seconds: float = 30.0) -> None:
         """Until so many messages have come; fails when they do not."""
@@ -179,6 +183,7 @@ def test_a_played_drive_is_mapped_as_one_that_is_read(
 
     parameters = ["-p", f"state:={state}", "-p", f"out:={tmp_path / 'parts'}"]
     slam = start("slam_node", "--ros-args", *parameters)
+    wait_until(listener.is_matched)
     report = tmp_path / "report.json"
     player = start("player", "--drive", "street:20", "--hz", "25", "--report", str(report))
     output, errors = player.communicate(timeout=30)

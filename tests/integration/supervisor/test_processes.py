@@ -199,7 +199,8 @@ def test_restarts_back_off_and_run_out(host, client):
     times = [float(line) for line in host.log("flaky").read_text().split()]
     assert len(times) == 4
     waits = [later - earlier for earlier, later in itertools.pairwise(times)]
-    assert all(wait >= least for wait, least in zip(waits, (0.05, 0.1, 0.2), strict=True))
+    # A wait may be shorter by a fifth, so that what crashed together does not start together.
+    assert all(wait >= 0.8 * most for wait, most in zip(waits, (0.05, 0.1, 0.2), strict=True))
 
 
 def test_a_forced_restart_is_a_new_process(host, client):
