@@ -104,8 +104,7 @@ class SlaveRuntime:
                     config.state, "slave", code="name_taken", remedy="another `host:` and `state:`"
                 )
             )
-            # A need counts as met by what shows in the readings of this scope, and by no more.
-            self._sessions = SessionTable(shared=config.scope == "slice")
+            self._sessions = SessionTable()
             self._usage = UsageWatch(self._sessions)
             context = ProbeContext(config.scope, config.budget, config.state, self._sessions)
             probes = registry.probes(config.probes, context)
