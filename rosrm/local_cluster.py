@@ -100,6 +100,8 @@ class LocalCluster:
 
     def __post_init__(self) -> None:
         """Choose the domain."""
+        # Processes run in directories of their own, and are given the names of files in it.
+        self.directory = self.directory.absolute()
         if self.domain is None:
             self.domain, self._claim = claim_domain()
         self.ros = settings_on_this_machine(self.domain)

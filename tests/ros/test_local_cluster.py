@@ -1,0 +1,21 @@
+"""A cluster on this machine, as demos and benchmarks make it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from rosrm.local_cluster import LocalCluster
+from tests.ros.clusters import PATIENCE, host, node
+
+
+def test_its_directory_may_be_relative(tmp_path, monkeypatch) -> None:
+    """A node, which runs in a directory of its own, finds its parameters all the same."""
+    monkeypatch.chdir(tmp_path)
+    with LocalCluster(Path("here"), hosts=[host("h0")]) as cluster:
+        cluster.client.submit([node("reader", parameters={"answer": 42})])
+        cluster.wait_until(
+            "the node running", lambda view: view.processes[0].state == "running", PATIENCE
+        )
+        (log,) = (tmp_path / "here").glob("hosts/h0/supervisor/logs/reader.*.log")
+        assert json.loads(log.read_text().splitlines()[0])["parameters"] == {"answer": 42}
