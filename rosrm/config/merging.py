@@ -73,5 +73,8 @@ _LONG_FORMS: Final[Mapping[str, Callable[[Node], Node]]] = {
     "restart": _word("when"),
     "migration": _word("strategy"),
     "readiness": _word("kind"),
+    "host_loss": _word("then"),
+    "isolation": _word("then"),
+    "standby": _word("wanted"),
     "remappings": _pairs,
 }

@@ -12,11 +12,15 @@ from rosrm.config.markers import NullIsEmpty, PlainWord, Words
 from rosrm.config.units import Amount, Count, PositiveSeconds, Quantity, Seconds
 from rosrm.core.model import (
     EMPTY,
+    Health,
+    HostLossPolicy,
+    IsolationPolicy,
     Kind,
     MigrationPolicy,
     ProcessSpec,
     Readiness,
     RestartPolicy,
+    StandbyPolicy,
     StopPolicy,
 )
 
@@ -67,6 +71,40 @@ class StopInFile:
 
 
 @dataclass(frozen=True, slots=True)
+class HostLossInFile:
+    """What becomes of it when its host is lost."""
+
+    then: Literal["wait", "elsewhere", "stop"] = "wait"
+    delay: Seconds = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class IsolationInFile:
+    """What its host does with it when it does not reach the master; no time: soon enough."""
+
+    then: Literal["keep", "stop"] = "keep"
+    after: Seconds = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class StandbyInFile:
+    """A second instance on another host, that follows the state."""
+
+    wanted: bool = True
+    apart_by: tuple[Text, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class HealthInFile:
+    """What it must do to count as healthy."""
+
+    topic: str = ""
+    rate: Annotated[float, Quantity(low=0.0, high=10_000.0, hint="Hz")] = 0.0
+    lifecycle: str = ""
+    timeout: PositiveSeconds = 5.0
+
+
+@dataclass(frozen=True, slots=True)
 class LabelsInFile:
     """The host labels that a process requires, prefers or avoids."""
 
@@ -99,6 +137,10 @@ class ProcessInFile:
     migration: MigrationInFile = field(default_factory=MigrationInFile)
     readiness: ReadinessInFile = field(default_factory=ReadinessInFile)
     stop: StopInFile = field(default_factory=StopInFile)
+    host_loss: HostLossInFile = field(default_factory=HostLossInFile)
+    isolation: IsolationInFile = field(default_factory=IsolationInFile)
+    standby: StandbyInFile = field(default_factory=lambda: StandbyInFile(wanted=False))
+    health: HealthInFile | None = None
 
     @property
     def is_ros(self) -> bool:
@@ -130,6 +172,10 @@ class ProcessInFile:
             migration=_same(MigrationPolicy, self.migration),
             readiness=_same(Readiness, self.readiness),
             stop=_same(StopPolicy, self.stop),
+            host_loss=_same(HostLossPolicy, self.host_loss),
+            isolation=_same(IsolationPolicy, self.isolation),
+            standby=_same(StandbyPolicy, self.standby),
+            health=Health() if self.health is None else _same(Health, self.health),
         )
 
 
@@ -150,6 +196,8 @@ def flattened(parameters: Mapping[str, Any], before: str = "") -> Iterator[tuple
 # --- rules ------------------------------------------------------------------------------------
 
 _NODE_NAME: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,199}")
+_TOPIC: Final = re.compile(r"(~?/)?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
+_LIFECYCLE: Final = ("unconfigured", "inactive", "active", "finalized")
 _NAMESPACE: Final = re.compile(r"/|(/[A-Za-z_][A-Za-z0-9_]*)+")
 _ROS_ONLY: Final = ("namespace", "parameters", "remappings")
 
@@ -173,6 +221,40 @@ def complaints(process: ProcessInFile) -> Iterator[Complaint]:
     if process.restart.max_delay < process.restart.delay:
         text = "restart.max_delay must not be less than restart.delay"
         yield Complaint(("restart", "max_delay"), text)
+    yield from _about_faults(process)
+
+
+def _about_faults(process: ProcessInFile) -> Iterator[Complaint]:
+    standby, health = process.standby, process.health
+    if standby.wanted and process.migration.strategy != "handoff":
+        text = "a standby follows the state as in a handoff: say `migration: handoff`"
+        yield Complaint(("standby",), text)
+    if standby.wanted and process.kind == "job":
+        yield Complaint(("standby",), "a job runs to completion; only a service has a standby")
+    if standby.apart_by and not standby.wanted:
+        yield Complaint(("standby", "apart_by"), "standby.apart_by goes with `wanted: true`")
+    if process.isolation.after and process.isolation.then == "keep":
+        yield Complaint(("isolation", "after"), "isolation.after goes with `then: stop`")
+    if process.host_loss.delay and process.host_loss.then == "wait":
+        text = "host_loss.delay goes with `then: elsewhere` or `stop`"
+        yield Complaint(("host_loss", "delay"), text)
+    if health is not None:
+        yield from _about_health(process, health)
+
+
+def _about_health(process: ProcessInFile, health: HealthInFile) -> Iterator[Complaint]:
+    if bool(health.topic) != bool(health.rate):
+        text = "health.topic and health.rate (Hz, above 0) go together"
+        yield Complaint(("health",), text)
+    if health.topic and not _TOPIC.fullmatch(health.topic):
+        text = f"health.topic {health.topic!r} is no ROS topic; for example /scan, scan or ~/scan"
+        yield Complaint(("health", "topic"), text)
+    if health.lifecycle and health.lifecycle not in _LIFECYCLE:
+        text = f"health.lifecycle {health.lifecycle!r}; allowed: {', '.join(_LIFECYCLE)}"
+        yield Complaint(("health", "lifecycle"), text)
+    if (health.topic or health.lifecycle) and not process.is_ros:
+        text = "health: only a ROS node has topics and a lifecycle; say `ros: true` if this is one"
+        yield Complaint(("health",), text)
 
 
 def _about_program(process: ProcessInFile) -> Iterator[Complaint]:

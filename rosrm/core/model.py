@@ -98,6 +98,62 @@ class MigrationPolicy:
 
 
 @dataclass(frozen=True, slots=True)
+class HostLossPolicy:
+    """What becomes of a process when its host is lost.
+
+    Attributes:
+        then: "wait" for the host, go "elsewhere" (as soon as a host has room; the host that comes
+            back sooner keeps it), or "stop": it has failed.
+        delay: seconds after the loss until that is done.
+    """
+
+    then: str = "wait"
+    delay: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class IsolationPolicy:
+    """What a host does with a process when it and the master do not hear each other.
+
+    Attributes:
+        then: "keep" it running, or "stop" it.
+        after: seconds; 0: so soon that it has ended when a successor starts elsewhere.
+    """
+
+    then: str = "keep"
+    after: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class StandbyPolicy:
+    """Whether a second instance on another host follows the state, to go on at once.
+
+    Attributes:
+        apart_by: host labels in which the host of the standby differs from that of the primary.
+    """
+
+    wanted: bool = False
+    apart_by: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Health:
+    """What a process that runs must do to count as healthy; otherwise it has failed.
+
+    Attributes:
+        topic: that must be published at `rate`; "": none.
+        rate: Hz, at least.
+        lifecycle: state in which its lifecycle node must be; "": not asked for.
+        timeout: seconds for which any of it may be amiss; 0: health is not watched.
+    """
+
+    topic: str = ""
+    rate: float = 0.0
+    lifecycle: str = ""
+    timeout: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
 class ProcessSpec:
     """One process to run, in the words of ROS 2 launch.
 
@@ -138,6 +194,10 @@ class ProcessSpec:
     migration: MigrationPolicy = MigrationPolicy()
     readiness: Readiness = Readiness()
     stop: StopPolicy = StopPolicy()
+    host_loss: HostLossPolicy = HostLossPolicy()
+    isolation: IsolationPolicy = IsolationPolicy()
+    standby: StandbyPolicy = StandbyPolicy()
+    health: Health = Health()
 
     @property
     def program(self) -> str:
@@ -166,6 +226,19 @@ class InstanceId:
 
 
 @dataclass(frozen=True, slots=True)
+class Fence:
+    """When a host that is cut off stops an instance, by its own clock.
+
+    Attributes:
+        after: seconds since the host last knew that the master hears it.
+        grace: seconds from there until SIGKILL at the latest.
+    """
+
+    after: float
+    grace: float
+
+
+@dataclass(frozen=True, slots=True)
 class Assignment:
     """An order to run an instance of a process.
 
@@ -174,6 +247,7 @@ class Assignment:
         node_name: under which the node runs; differs from the process's name in a handoff.
         shadow: it starts as the destination of a handoff: silent, and not restarted until its slave
             is told otherwise.
+        fence: when its host stops it, if it and the master do not hear each other; None: never.
     """
 
     instance: InstanceId
@@ -181,6 +255,7 @@ class Assignment:
     epoch: int
     node_name: str
     shadow: bool = False
+    fence: Fence | None = None
 
 
 class InstanceState(str, Enum):

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any, Final
 
 from rosrm.core.model import (
+    Health,
+    HostLossPolicy,
+    IsolationPolicy,
     Kind,
     MigrationPolicy,
     ProcessSpec,
     Readiness,
     RestartPolicy,
+    StandbyPolicy,
     StopPolicy,
 )
 
@@ -20,6 +24,10 @@ _POLICIES: Final[Mapping[str, type[Any]]] = {
     "migration": MigrationPolicy,
     "readiness": Readiness,
     "stop": StopPolicy,
+    "host_loss": HostLossPolicy,
+    "isolation": IsolationPolicy,
+    "standby": StandbyPolicy,
+    "health": Health,
 }
 _TUPLES: Final = ("command", "arguments")
 _MAPPINGS: Final = (
@@ -33,7 +41,7 @@ _MAPPINGS: Final = (
 )
 _FIELDS: Final = {
     kind.__name__: tuple(f.name for f in fields(kind))
-    for kind in (ProcessSpec, RestartPolicy, MigrationPolicy, Readiness, StopPolicy)
+    for kind in (ProcessSpec, *_POLICIES.values())
 }
 
 
@@ -48,6 +56,7 @@ def spec_to_dict(spec: ProcessSpec) -> dict[str, Any]:
     for name, kind in _POLICIES.items():
         plain[name] = {inner: getattr(plain[name], inner) for inner in _FIELDS[kind.__name__]}
     plain["migration"]["options"] = dict(plain["migration"]["options"])
+    plain["standby"]["apart_by"] = list(plain["standby"]["apart_by"])
     return plain
 
 
@@ -66,6 +75,9 @@ def spec_from_dict(plain: Mapping[str, Any]) -> ProcessSpec:
     for name, kind in _POLICIES.items():
         if name in values:
             values[name] = kind(**_known(kind, values[name]))
+    if "standby" in values:
+        standby = values["standby"]
+        values["standby"] = replace(standby, apart_by=tuple(standby.apart_by))
     return ProcessSpec(**values)
 
 

@@ -76,6 +76,19 @@ def spec_to_msg(spec: model.ProcessSpec) -> msg.ProcessSpec:
         stop=msg.StopPolicy(
             interrupt_grace=float(stop.interrupt_grace), terminate_grace=float(stop.terminate_grace)
         ),
+        host_loss=msg.HostLossPolicy(
+            then=spec.host_loss.then, delay=float(spec.host_loss.delay)
+        ),
+        isolation=msg.IsolationPolicy(
+            then=spec.isolation.then, after=float(spec.isolation.after)
+        ),
+        standby=msg.StandbyPolicy(
+            wanted=spec.standby.wanted, apart_by=list(spec.standby.apart_by)
+        ),
+        health=msg.Health(
+            topic=spec.health.topic, rate=float(spec.health.rate),
+            lifecycle=spec.health.lifecycle, timeout=float(spec.health.timeout),
+        ),
     )  # fmt: skip
 
 
@@ -107,6 +120,13 @@ def spec_from_msg(message: msg.ProcessSpec) -> model.ProcessSpec:
         ),
         readiness=model.Readiness(message.readiness.kind, message.readiness.timeout),
         stop=model.StopPolicy(message.stop.interrupt_grace, message.stop.terminate_grace),
+        host_loss=model.HostLossPolicy(message.host_loss.then, message.host_loss.delay),
+        isolation=model.IsolationPolicy(message.isolation.then, message.isolation.after),
+        standby=model.StandbyPolicy(message.standby.wanted, tuple(message.standby.apart_by)),
+        health=model.Health(
+            message.health.topic, message.health.rate, message.health.lifecycle,
+            message.health.timeout,
+        ),
     )  # fmt: skip
 
 
@@ -119,14 +139,26 @@ def _spec_fault(message: msg.ProcessSpec) -> str:
         return "give exactly one of package + executable, module, command"
     if bool(message.package) != bool(message.executable):
         return "package and executable go together"
-    if message.kind not in {kind.value for kind in model.Kind}:
-        return f"kind {message.kind!r}; allowed: service, job"
-    if message.readiness.kind not in ("auto", "graph", "running"):
-        return f"readiness {message.readiness.kind!r}; allowed: auto, graph, running"
+    fault = _word_fault(message)
+    if fault:
+        return fault
     for need in message.needs:
         if not 0.0 <= need.amount < _INFINITE:
             return f"it needs {need.amount} of {need.resource}; allowed: 0 and more"
     return _times_fault(message)
+
+
+def _word_fault(message: msg.ProcessSpec) -> str:
+    words = (
+        ("kind", message.kind, tuple(kind.value for kind in model.Kind)),
+        ("readiness", message.readiness.kind, ("auto", "graph", "running")),
+        ("host_loss", message.host_loss.then, ("wait", "elsewhere", "stop")),
+        ("isolation", message.isolation.then, ("keep", "stop")),
+    )
+    for name, given, allowed in words:
+        if given not in allowed:
+            return f"{name} {given!r}; allowed: {', '.join(allowed)}"
+    return ""
 
 
 def _times_fault(message: msg.ProcessSpec) -> str:
@@ -138,10 +170,14 @@ def _times_fault(message: msg.ProcessSpec) -> str:
         "readiness.timeout": message.readiness.timeout,
         "stop.interrupt_grace": message.stop.interrupt_grace,
         "stop.terminate_grace": message.stop.terminate_grace,
+        "host_loss.delay": message.host_loss.delay,
+        "isolation.after": message.isolation.after,
+        "health.rate": message.health.rate,
+        "health.timeout": message.health.timeout,
     }
     for name, seconds in times.items():
         if not 0.0 <= seconds < _INFINITE:
-            return f"{name} is {seconds} s; allowed: 0 and more"
+            return f"{name} is {seconds}; allowed: 0 and more"
     return ""
 
 
@@ -188,18 +224,24 @@ def _json_value(text: str, what: str) -> Any:
 
 def assignment_to_msg(assignment: model.Assignment) -> msg.Assignment:
     """An order to run an instance."""
+    fence = assignment.fence or model.Fence(0.0, 0.0)
     return msg.Assignment(
         instance=instance_to_msg(assignment.instance), epoch=assignment.epoch,
         node_name=assignment.node_name, shadow=assignment.shadow,
+        fence_after=float(fence.after), fence_grace=float(fence.grace),
         spec=spec_to_msg(assignment.spec),
     )  # fmt: skip
 
 
 def assignment_from_msg(message: msg.Assignment) -> model.Assignment:
     """The inverse of `assignment_to_msg`; raises `Refused`."""
+    for name in ("fence_after", "fence_grace"):
+        if not 0.0 <= getattr(message, name) < _INFINITE:
+            raise Refused(f"{message.instance.process}: {name} is {getattr(message, name)}")
+    fence = model.Fence(message.fence_after, message.fence_grace) if message.fence_after else None
     return model.Assignment(
         instance_from_msg(message.instance), spec_from_msg(message.spec), message.epoch,
-        message.node_name, message.shadow,
+        message.node_name, message.shadow, fence,
     )  # fmt: skip
 
 
