@@ -23,6 +23,7 @@ from rosrm.core.model import (
 )
 from rosrm.core.supervision import (
     AmendOrdered,
+    FailOrdered,
     Forgotten,
     RestartOrdered,
     RestartRule,
@@ -183,6 +184,16 @@ class SupervisorClient:
     def restart(self, instance: InstanceId) -> None:
         """Stop it, then start it again; the restart policy does not count this."""
         self._order(RestartOrdered(_key(instance)))
+
+    def fail(self, instance: InstanceId, pid: int, reason: str, *, kill: bool) -> None:
+        """A run of it counts as failed: stop it, then do as its restart policy says.
+
+        Args:
+            pid: of the run; where it has ended meanwhile nothing is done.
+            reason: for people.
+            kill: SIGKILL at once; otherwise it is asked first.
+        """
+        self._order(FailOrdered(_key(instance), pid, reason, kill))
 
     def amend(
         self, instance: InstanceId, restart: RestartPolicy, changes: Mapping[str, str | None]

@@ -15,6 +15,8 @@ The client orders, by the key `do`:
     stop         instance                       SIGINT, SIGTERM, SIGKILL; never heard of: a start
                                                 that comes late will be refused
     restart      instance                       stop, then start again
+    fail         instance, pid, reason, kill    this run of it counts as failed: stop it, at once by
+                                                SIGKILL where kill is true; then its restart policy
     amend        instance, restart, changes     from now on it has this restart policy, and these
                                                 changes on top of its own when it starts again
     remember     instance, memo                 another text to keep
@@ -44,6 +46,7 @@ from typing import Any, Final, NamedTuple
 
 from rosrm.core.supervision import (
     AmendOrdered,
+    FailOrdered,
     Forgotten,
     Instance,
     Key,
@@ -55,7 +58,7 @@ from rosrm.core.supervision import (
 )
 from rosrm.supervisor.logs import LogLimits
 
-PROTOCOL: Final = 2
+PROTOCOL: Final = 3
 #: Longest line that is read.
 LONGEST_LINE: Final = 8 << 20
 
@@ -125,6 +128,7 @@ Order = (
     | Launch
     | StopOrdered
     | RestartOrdered
+    | FailOrdered
     | Amend
     | Remember
     | Forget
@@ -171,6 +175,13 @@ def encode_order(order: Order) -> bytes:
     return line(_order_fields(order))
 
 
+_WORDS: Final[Mapping[type, str]] = {
+    StopOrdered: "stop",
+    RestartOrdered: "restart",
+    FailOrdered: "fail",
+}
+
+
 def _order_fields(order: Order) -> dict[str, Any]:
     if isinstance(order, Hello):
         return {"do": "hello", "protocol": order.protocol, "pid": order.pid, "log": order.log}
@@ -178,9 +189,8 @@ def _order_fields(order: Order) -> dict[str, Any]:
         return {"do": "environment", "id": order.id, "variables": dict(order.variables)}
     if isinstance(order, Launch):
         return {"do": "start", **launch_fields(order)}
-    if isinstance(order, (StopOrdered, RestartOrdered)):
-        kind = "stop" if isinstance(order, StopOrdered) else "restart"
-        return {"do": kind, "instance": order.instance}
+    if isinstance(order, (StopOrdered, RestartOrdered, FailOrdered)):
+        return {"do": _WORDS[type(order)], **order._asdict()}
     if isinstance(order, Amend):
         instance, restart = order.order
         changes = dict(order.changes)
@@ -243,6 +253,11 @@ def read_launch(fields: Mapping[str, Any]) -> Launch:
     )
 
 
+def _read_fail(fields: Mapping[str, Any]) -> FailOrdered:
+    key, pid = read_key(fields["instance"]), int(fields["pid"])
+    return FailOrdered(key, pid, _text(fields["reason"]), bool(fields["kill"]))
+
+
 def _read_amend(fields: Mapping[str, Any]) -> Amend:
     order = AmendOrdered(read_key(fields["instance"]), read_restart(fields["restart"]))
     return Amend(order, _changes(fields["changes"]))
@@ -256,6 +271,7 @@ _READERS: Final[Mapping[str, Callable[[Mapping[str, Any]], Order]]] = {
     "start": read_launch,
     "stop": lambda fields: StopOrdered(read_key(fields["instance"])),
     "restart": lambda fields: RestartOrdered(read_key(fields["instance"])),
+    "fail": _read_fail,
     "amend": _read_amend,
     "remember": lambda fields: Remember(read_key(fields["instance"]), _text(fields["memo"])),
     "forget": lambda fields: Forget(tuple(Forgotten(read_key(key)) for key in fields["instances"])),

@@ -113,7 +113,8 @@ def _take_state(recorded: Recorded, fields: Mapping[str, Any]) -> None:
         protocol.read_stop(fields["stop"]),
     )
     for name in _PLAIN_FIELDS:
-        setattr(instance, name, fields[name])
+        if name in fields or name not in _NEW_FIELDS:
+            setattr(instance, name, fields[name])
     recorded.instances[instance.key] = instance
     recorded.births[instance.key] = fields["birth"]
     recorded.spawning.discard(instance.key)
@@ -124,6 +125,8 @@ def _take_state(recorded: Recorded, fields: Mapping[str, Any]) -> None:
 _PLAIN_FIELDS: Final = tuple(
     name for name in Instance.__slots__ if name not in ("key", "restart", "stop")
 )
+#: Records of before protocol 3 have none of these.
+_NEW_FIELDS: Final = frozenset({"fault"})
 
 
 class Record:

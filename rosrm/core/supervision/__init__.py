@@ -4,31 +4,45 @@
     -         StartOrdered     Spawn                                         starting
                                its number is dead, or all is stopped: -      refused
     -         StopOrdered      - (a start that comes late is refused)        refused
+              FenceOrdered     -                                             refused
               RestartOrdered   -                                             refused
               AmendOrdered     -                                             refused
     starting  Spawned          -                                             running
                                a stop came in between: SIGINT                stopping
               SpawnFailed      final, or by policy where it may pass         failed, backoff
               StopOrdered      Unspawn (one in hand is stopped later)        starting
+              FencePassed      Unspawn (one in hand is stopped later)        starting
+              FenceOrdered     Unspawn (one in hand is killed later)         starting
               Resumed          Spawn (the supervisor was restarted)          starting
               AmendOrdered     - (its policy is another from now on)         starting
     running   Exited           by policy                                     exited, failed, backoff
                                others of its session live: SIGINT            stopping
               StopOrdered      SIGINT                                        stopping
+              FencePassed      SIGINT; dead within the grace of its fence    stopping
+              FenceOrdered     SIGKILL                                       stopping
               RestartOrdered   SIGINT, to start again afterwards             stopping
+              FailOrdered      SIGINT, or SIGKILL at once; then by policy    stopping
               AmendOrdered     -                                             running
     stopping  TimePassed       SIGTERM, then SIGKILL, then SIGKILL again     stopping
               Exited           as was meant (end, restart, policy)           exited, starting, ...
                                others of its session live: -                 stopping
               Cleared          as was meant (end, restart, policy)           exited, starting, ...
               StopOrdered      now it is meant to end                        stopping
+              FencePassed      now it is meant to end, in the grace          stopping
+              FenceOrdered     the same; SIGKILL                             stopping
               RestartOrdered   unless it is meant to end: to start again     stopping
               AmendOrdered     -                                             stopping
     backoff   TimePassed       Spawn                                         starting
               RestartOrdered   Spawn, the count of restarts afresh           starting
               StopOrdered      -                                             exited
+              FencePassed      -                                             failed
+              FenceOrdered     -                                             failed
               AmendOrdered     - (if the policy now allows no restart)       failed, backoff
     ended     Forgotten        Drop; its number is dead                      -
+
+An instance may have a fence: `FencePassed` comes by itself when nobody has said for too long that
+the master hears this host (`Heard`; its start counts as such). What was fenced has failed, with a
+message that begins with "fenced: ", and is not restarted here, nor by the client's later orders.
 
 Whatever is not in the table changes nothing; an order that changes nothing has its status told
 again, as DDS may repeat it. Every change of an instance is told (`Tell`). A signal goes to every
@@ -45,6 +59,7 @@ from rosrm.core.supervision.instance import (
     ENDED,
     EXITED,
     FAILED,
+    FENCED,
     KILL_AGAIN,
     MOST_KILLS,
     REFUSED,
@@ -76,7 +91,12 @@ from rosrm.core.supervision.words import (
     Drop,
     Event,
     Exited,
+    FailOrdered,
+    FenceOrdered,
+    FencePassed,
+    FenceRule,
     Forgotten,
+    Heard,
     Key,
     Leave,
     RestartOrdered,
@@ -100,6 +120,7 @@ __all__ = [
     "ENDED",
     "EXITED",
     "FAILED",
+    "FENCED",
     "KILL_AGAIN",
     "MOST_KILLS",
     "MOST_TOMBSTONES",
@@ -120,7 +141,12 @@ __all__ = [
     "Drop",
     "Event",
     "Exited",
+    "FailOrdered",
+    "FenceOrdered",
+    "FencePassed",
+    "FenceRule",
     "Forgotten",
+    "Heard",
     "Instance",
     "Key",
     "Leave",

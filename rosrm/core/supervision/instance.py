@@ -44,6 +44,7 @@ class Instance:
         step: the last step of the stop, an index of STEPS; -1: none.
         stop_began: when its stop began.
         trail: the steps of the stop, for people.
+        fault: why its last run counts as failed, however it ended; "": by its exit alone.
     """
 
     __slots__ = (
@@ -51,6 +52,7 @@ class Instance:
         "deadline",
         "exit_code",
         "exit_signal",
+        "fault",
         "key",
         "kills",
         "message",
@@ -86,6 +88,7 @@ class Instance:
         self.kills = 0
         self.stop_began = 0.0
         self.trail = ""
+        self.fault = ""
         self.peak_memory = 0.0
         self.cpu_time = 0.0
         self.run_time = 0.0
@@ -110,14 +113,20 @@ def stopping(instance: Instance) -> str:
     """Why and how far it is being stopped, for people."""
     why = {
         THEN_RESTART: "to restart it: ",
-        THEN_POLICY: f"{ending(instance)}; stopping what it left: ",
+        THEN_POLICY: f"{ending(instance)}; {_left_to_stop(instance)}: ",
     }.get(instance.then, "")
     still = f"; still there after {instance.kills} times" if instance.kills > 1 else ""
     return f"{why}{instance.trail}{still}"
 
 
+def _left_to_stop(instance: Instance) -> str:
+    return "stopping it" if instance.fault else "stopping what it left"
+
+
 def ending(instance: Instance) -> str:
     """How its last run ended, for people."""
+    if instance.fault:
+        return instance.fault
     if instance.exit_signal:
         return f"killed by {signal_name(instance.exit_signal)}"
     if instance.exit_code == UNKNOWN_EXIT:

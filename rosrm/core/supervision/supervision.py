@@ -13,6 +13,7 @@ from rosrm.core.supervision.words import (
     Command,
     Drop,
     Event,
+    FailOrdered,
     Forgotten,
     Key,
     Leave,
@@ -34,7 +35,7 @@ MOST_TOMBSTONES: Final = 2000
 MOST_RESTARTS: Final = 8
 RESTART_SPAN: Final = 1.0
 
-_ORDERS: Final = (StartOrdered, StopOrdered, RestartOrdered, AmendOrdered, Forgotten)
+_ORDERS: Final = (StartOrdered, StopOrdered, RestartOrdered, AmendOrdered, FailOrdered, Forgotten)
 
 
 class Supervision:

@@ -11,6 +11,7 @@ from rosrm.core.supervision.instance import (
     BACKOFF,
     EXITED,
     FAILED,
+    FENCED,
     KILL_AGAIN,
     RUNNING,
     STARTING,
@@ -30,6 +31,9 @@ from rosrm.core.supervision.words import (
     Command,
     Event,
     Exited,
+    FailOrdered,
+    FenceOrdered,
+    FencePassed,
     RestartOrdered,
     RestartRule,
     Resumed,
@@ -56,7 +60,7 @@ def _spawned(instance: Instance, event: Event, now: float) -> list[Command]:
     instance.phase = RUNNING
     instance.pid = event.pid
     instance.started = now
-    instance.message = ""
+    instance.message = instance.fault = ""
     if instance.then == THEN_END:
         return _stop(instance, event, now)
     return [Tell(instance.key)]
@@ -66,7 +70,7 @@ def _spawn_failed(instance: Instance, event: Event, now: float) -> list[Command]
     assert isinstance(event, SpawnFailed)
     instance.run_time = instance.cpu_time = instance.peak_memory = 0.0
     if instance.then == THEN_END:
-        end(instance, EXITED, "stopped before it was started")
+        _end_as_meant(instance, "stopped before it was started")
     elif event.transient:
         _by_policy(instance, event.message, succeeded=False, now=now)
     else:
@@ -113,6 +117,14 @@ def _restart(instance: Instance, event: Event, now: float) -> list[Command]:
     return _begin_stop(instance, THEN_RESTART, now)
 
 
+def _fail(instance: Instance, event: Event, now: float) -> list[Command]:
+    assert isinstance(event, FailOrdered)
+    if event.pid != instance.pid:
+        return []  # that run has ended meanwhile
+    instance.fault = event.reason
+    return _begin_stop(instance, THEN_POLICY, now, _KILL if event.kill else 0)
+
+
 def _mean_to_end(instance: Instance, event: Event, now: float) -> list[Command]:
     if instance.then == THEN_END:
         return []
@@ -131,16 +143,15 @@ def _mean_to_restart(instance: Instance, event: Event, now: float) -> list[Comma
 
 def _escalate(instance: Instance, event: Event, now: float) -> list[Command]:
     """The next step of a stop; after SIGKILL only that again."""
-    instance.step = min(instance.step + 1, _KILL)
+    instance.step = _KILL if _must_be_gone(instance, now) else min(instance.step + 1, _KILL)
     number = STEPS[instance.step]
-    after = f" after {now - instance.stop_began:.1f} s" if instance.step else ""
+    after = f" after {now - instance.stop_began:.1f} s" if instance.trail else ""
     if instance.step == _KILL:
         instance.kills += 1
     if instance.kills <= 1:
         instance.trail += f"{', ' if instance.trail else ''}{number.name}{after}"
     instance.message = stopping(instance)
-    graces = (instance.stop.interrupt_grace, instance.stop.terminate_grace, KILL_AGAIN)
-    instance.deadline = now + graces[instance.step]
+    instance.deadline = now + _grace(instance, now)
     return [Tell(instance.key), Signal(instance.key, number)]
 
 
@@ -157,6 +168,34 @@ def _restart_now(instance: Instance, event: Event, now: float) -> list[Command]:
 
 def _stop_in_backoff(instance: Instance, event: Event, now: float) -> list[Command]:
     end(instance, EXITED, f"stopped while it waited for its restart ({ending(instance)})")
+    return [Tell(instance.key)]
+
+
+def _fence_before_spawn(instance: Instance, event: Event, now: float) -> list[Command]:
+    _take_fence(instance, event, now)
+    return _stop_before_spawn(instance, event, now)
+
+
+def _fence(instance: Instance, event: Event, now: float) -> list[Command]:
+    _take_fence(instance, event, now)
+    return _begin_stop(instance, THEN_END, now)
+
+
+def _fence_while_it_stops(instance: Instance, event: Event, now: float) -> list[Command]:
+    _take_fence(instance, event, now)
+    if instance.then == THEN_RESTART:
+        instance.then = THEN_END
+    if instance.step < _KILL and _must_be_gone(instance, now):
+        return _escalate(instance, event, now)
+    assert instance.deadline is not None
+    instance.deadline = min(instance.deadline, now + _grace(instance, now))
+    instance.message = stopping(instance)
+    return [Tell(instance.key)]
+
+
+def _fence_in_backoff(instance: Instance, event: Event, now: float) -> list[Command]:
+    _take_fence(instance, event, now)
+    _end_as_meant(instance, f"it waited for its restart ({ending(instance)})")
     return [Tell(instance.key)]
 
 
@@ -180,21 +219,30 @@ TRANSITIONS: Final[dict[tuple[str, type], Transition]] = {
     (STARTING, Spawned): _spawned,
     (STARTING, SpawnFailed): _spawn_failed,
     (STARTING, StopOrdered): _stop_before_spawn,
+    (STARTING, FencePassed): _fence_before_spawn,
+    (STARTING, FenceOrdered): _fence_before_spawn,
     (STARTING, Resumed): _spawn,
     (STARTING, AmendOrdered): _amend,
     (RUNNING, Exited): _exited,
     (RUNNING, StopOrdered): _stop,
+    (RUNNING, FencePassed): _fence,
+    (RUNNING, FenceOrdered): _fence,
     (RUNNING, RestartOrdered): _restart,
     (RUNNING, AmendOrdered): _amend,
+    (RUNNING, FailOrdered): _fail,
     (STOPPING, TimePassed): _escalate,
     (STOPPING, Exited): _exited,
     (STOPPING, Cleared): _cleared,
     (STOPPING, StopOrdered): _mean_to_end,
+    (STOPPING, FencePassed): _fence_while_it_stops,
+    (STOPPING, FenceOrdered): _fence_while_it_stops,
     (STOPPING, RestartOrdered): _mean_to_restart,
     (STOPPING, AmendOrdered): _amend,
     (BACKOFF, TimePassed): _restart_due,
     (BACKOFF, RestartOrdered): _restart_now,
     (BACKOFF, StopOrdered): _stop_in_backoff,
+    (BACKOFF, FencePassed): _fence_in_backoff,
+    (BACKOFF, FenceOrdered): _fence_in_backoff,
     (BACKOFF, AmendOrdered): _amend_in_backoff,
 }
 
@@ -210,14 +258,52 @@ def _start_again(instance: Instance) -> list[Command]:
     return [Tell(instance.key), Spawn(instance.key)]
 
 
-def _begin_stop(instance: Instance, then: str, now: float) -> list[Command]:
+def _begin_stop(instance: Instance, then: str, now: float, first: int = 0) -> list[Command]:
+    """Begin with the step `first`."""
     instance.phase = STOPPING
     instance.then = then
-    instance.step = -1
+    instance.step = first - 1
     instance.kills = 0
     instance.stop_began = now
     instance.trail = ""
     return _escalate(instance, TimePassed(), now)
+
+
+def _take_fence(instance: Instance, event: Event, now: float) -> None:
+    """From here on it is on its way out, and dead in time; what was to end anyway ends as meant."""
+    if isinstance(event, FenceOrdered) or instance.fence is None:
+        why, by = "it has a successor", now
+    else:
+        after, grace = instance.fence
+        why = f"for {after:g} s it was not known here whether the master hears this host"
+        by = instance.heard + after + grace
+    instance.kill_by = by if instance.kill_by is None else min(by, instance.kill_by)
+    if instance.then != THEN_END:
+        instance.fenced = f"{FENCED}{why}"
+
+
+def _must_be_gone(instance: Instance, now: float) -> bool:
+    return instance.kill_by is not None and now >= instance.kill_by
+
+
+def _grace(instance: Instance, now: float) -> float:
+    """Seconds until the next step; SIGINT and SIGTERM share what a fence leaves."""
+    if instance.step == _KILL:
+        return KILL_AGAIN
+    graces = (instance.stop.interrupt_grace, instance.stop.terminate_grace)
+    grace = graces[instance.step]
+    if instance.kill_by is None:
+        return grace
+    wanted = sum(graces[instance.step :])
+    left = max(0.0, instance.kill_by - now)
+    return grace if wanted <= left else left * grace / wanted
+
+
+def _end_as_meant(instance: Instance, how: str) -> None:
+    if instance.fenced:
+        end(instance, FAILED, f"{instance.fenced}; {how}")
+    else:
+        end(instance, EXITED, how)
 
 
 def _when_nothing_is_left(instance: Instance, now: float) -> list[Command]:
@@ -225,9 +311,10 @@ def _when_nothing_is_left(instance: Instance, now: float) -> list[Command]:
         instance.recent.clear()
         return _start_again(instance)
     if instance.then == THEN_END:
-        end(instance, EXITED, f"stopped by {instance.trail}")
+        _end_as_meant(instance, f"stopped by {instance.trail}")
     else:
-        succeeded = instance.exit_code == 0 and instance.exit_signal == 0
+        exited_well = instance.exit_code == 0 and instance.exit_signal == 0
+        succeeded = exited_well and not instance.fault
         _by_policy(instance, ending(instance), succeeded=succeeded, now=now)
     return [Tell(instance.key)]
 
@@ -236,6 +323,9 @@ def _by_policy(instance: Instance, ending: str, *, succeeded: bool, now: float) 
     rule = instance.restart
     if rule.when == "never" or (rule.when == "on-failure" and succeeded):
         end(instance, EXITED if succeeded else FAILED, "" if succeeded else ending)
+        return
+    if instance.fenced:
+        end(instance, FAILED, f"{instance.fenced}; {ending}")
         return
     done = _recent_restarts(instance, now)
     if done >= rule.attempts:

@@ -56,6 +56,21 @@ class AmendOrdered(NamedTuple):
     restart: RestartRule
 
 
+class FailOrdered(NamedTuple):
+    """The client has found that a run of it is not what it should be: it counts as failed.
+
+    Attributes:
+        pid: of the run that is meant; another one is left alone.
+        reason: for people.
+        kill: it is stopped (SIGSTOP) and cannot end in good order: SIGKILL at once.
+    """
+
+    instance: Key
+    pid: int
+    reason: str
+    kill: bool = False
+
+
 class Forgotten(NamedTuple):
     """The client has kept its final status: this side need not."""
 
@@ -123,6 +138,7 @@ Event = (
     | StopOrdered
     | RestartOrdered
     | AmendOrdered
+    | FailOrdered
     | Forgotten
     | Resumed
     | Spawned

@@ -8,6 +8,7 @@ from hypothesis import given
 
 from rosrm.core.supervision import (
     AmendOrdered,
+    FailOrdered,
     Forgotten,
     RestartOrdered,
     RestartRule,
@@ -48,6 +49,7 @@ ORDERS = st.one_of(
     ),
     st.builds(StopOrdered, KEYS),
     st.builds(RestartOrdered, KEYS),
+    st.builds(FailOrdered, KEYS, st.integers(1, 2**31), st.text(), st.booleans()),
     st.builds(protocol.Amend, st.builds(AmendOrdered, KEYS, RULES), CHANGES),
     st.builds(protocol.Remember, KEYS, st.text()),
     st.builds(protocol.Forget, st.lists(st.builds(Forgotten, KEYS)).map(tuple)),

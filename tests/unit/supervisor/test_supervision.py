@@ -247,6 +247,62 @@ NEVER = sv.RestartRule("never")
 ON_FAILURE = sv.RestartRule("on-failure")
 
 
+@pytest.mark.parametrize(
+    ("when", "phase"), [("never", sv.FAILED), ("on-failure", sv.BACKOFF), ("always", sv.BACKOFF)]
+)
+def test_an_unhealthy_run_has_failed_however_it_ends(when, phase):
+    """It is asked to end and exits with 0: its policy goes by the reason, and says it."""
+    core, instance = started(restart=sv.RestartRule(when))
+    commands = core.handle(sv.FailOrdered(TALKER, 100, "unhealthy: silent"), 1.0)
+    assert commands[-1] == sv.Signal(TALKER, signal.SIGINT)
+    assert instance.message == "unhealthy: silent; stopping it: SIGINT"
+    core.handle(sv.Exited(TALKER, 0), 2.0)
+    assert instance.phase == phase
+    assert instance.message.startswith("unhealthy: silent")
+
+
+def test_an_unhealthy_run_that_does_not_end_is_killed():
+    """The steps of the stop rule, as for every other stop."""
+    core, _ = started()
+    core.handle(sv.FailOrdered(TALKER, 100, "unhealthy: silent"), 1.0)
+    sent = []
+    for _ in range(2):
+        sent += core.handle(sv.TimePassed(), core.deadline())[1:]
+    assert [command.number for command in sent] == [signal.SIGTERM, signal.SIGKILL]
+
+
+def test_what_is_stopped_is_killed_at_once():
+    """It would hear no SIGINT; behind the SIGKILL nothing milder follows."""
+    core, instance = started()
+    commands = core.handle(sv.FailOrdered(TALKER, 100, "unhealthy: stopped", kill=True), 1.0)
+    assert commands[-1] == sv.Signal(TALKER, signal.SIGKILL)
+    assert instance.message == "unhealthy: stopped; stopping it: SIGKILL"
+    again = core.handle(sv.TimePassed(), core.deadline())
+    assert again[-1] == sv.Signal(TALKER, signal.SIGKILL)
+
+
+def test_a_run_is_not_failed_for_the_one_before():
+    """The order names a pid; what runs now is another run. Its own end is by its own exit."""
+    core, instance = started(restart=ON_FAILURE)
+    assert kinds(core.handle(sv.FailOrdered(TALKER, 99, "late"), 1.0)) == ["Tell"]
+    assert instance.phase == sv.RUNNING
+    core.handle(sv.FailOrdered(TALKER, 100, "unhealthy: silent"), 1.0)
+    core.handle(sv.Exited(TALKER, 0), 1.1)
+    core.handle(sv.TimePassed(), core.deadline())
+    core.handle(sv.Spawned(TALKER, 101), 3.0)
+    core.handle(sv.Exited(TALKER, 0), 4.0)
+    assert (instance.phase, instance.message) == (sv.EXITED, "")
+
+
+def test_a_stop_of_what_is_failing_wins():
+    """The user's stop is stronger than its restart policy."""
+    core, instance = started(restart=sv.RestartRule("always"))
+    core.handle(sv.FailOrdered(TALKER, 100, "unhealthy: silent"), 1.0)
+    core.handle(sv.StopOrdered(TALKER), 1.5)
+    core.handle(sv.Exited(TALKER, 0), 2.0)
+    assert instance.phase == sv.EXITED
+
+
 def test_another_policy_counts_at_the_next_end():
     """A source whose policy is suspended ends for good; a shadow that is none any more does not."""
     core, instance = started(restart=ON_FAILURE)
@@ -465,7 +521,9 @@ class Host(RuleBasedStateMachine):
         self.happens(sv.StartOrdered(("a", self.newest), restart, stop))
 
     @precondition(lambda self: self.core.instances)
-    @rule(data=st.data(), kind=st.sampled_from(["stop", "stop", "restart", "start", "forget"]))
+    @rule(
+        data=st.data(), kind=st.sampled_from(["stop", "stop", "restart", "start", "fail", "forget"])
+    )
     def order(self, data, kind):
         """About one that is known, or now and then one that is not (any more)."""
         known = [number for _, number in self.core.instances]
@@ -476,6 +534,8 @@ class Host(RuleBasedStateMachine):
         elif kind == "restart":
             self.policy_restarts.pop(key, None)
             self.happens(sv.RestartOrdered(key))
+        elif kind == "fail":
+            self.happens(sv.FailOrdered(key, 100, "unhealthy", data.draw(st.booleans())))
         elif kind == "forget":
             self.happens(sv.Forgotten(key))
         else:
