@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 from typing import Final
 
-from rosrm.core.supervision.words import Key, RestartRule, StopRule
+from rosrm.core.supervision.words import FenceRule, Key, RestartRule, StopRule
 
 STARTING: Final = "starting"
 RUNNING: Final = "running"
@@ -23,6 +23,8 @@ THEN_POLICY: Final = "policy"
 
 STEPS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
 _KILL: Final = len(STEPS) - 1
+#: How the final message of an instance begins that was fenced, and by that has ended.
+FENCED: Final = "fenced: "
 #: Seconds between one SIGKILL and the next, for members that were forked in between.
 KILL_AGAIN: Final = 1.0
 #: SIGKILLs after which a shutdown no longer waits (a process stuck in the kernel).
@@ -45,6 +47,10 @@ class Instance:
         stop_began: when its stop began.
         trail: the steps of the stop, for people.
         fault: why its last run counts as failed, however it ended; "": by its exit alone.
+        fence: None: none; what it is at its start, it stays.
+        heard: when the master last heard this host, as far as is known, or when it was started.
+        fenced: why it was fenced, for people; "": it was not, or was meant to end already.
+        kill_by: when SIGKILL comes at the latest, once it is fenced; None: it is not.
     """
 
     __slots__ = (
@@ -53,7 +59,11 @@ class Instance:
         "exit_code",
         "exit_signal",
         "fault",
+        "fence",
+        "fenced",
+        "heard",
         "key",
+        "kill_by",
         "kills",
         "message",
         "peak_memory",
@@ -75,6 +85,10 @@ class Instance:
         self.key = key
         self.restart = restart
         self.stop = stop
+        self.fence: FenceRule | None = None
+        self.heard = 0.0
+        self.fenced = ""
+        self.kill_by: float | None = None
         self.phase = STARTING
         self.then = ""
         self.pid = 0
@@ -99,6 +113,13 @@ class Instance:
         """Nothing of it runs, and nothing will."""
         return self.phase in ENDED
 
+    @property
+    def fence_at(self) -> float | None:
+        """When it is fenced unless the master is known to hear this host; None: never (again)."""
+        if self.fence is None or self.kill_by is not None or self.ended:
+            return None
+        return self.heard + self.fence.after
+
 
 def end(instance: Instance, phase: str, message: str) -> None:
     """Nothing of it runs any more, and nothing will."""
@@ -116,7 +137,8 @@ def stopping(instance: Instance) -> str:
         THEN_POLICY: f"{ending(instance)}; {_left_to_stop(instance)}: ",
     }.get(instance.then, "")
     still = f"; still there after {instance.kills} times" if instance.kills > 1 else ""
-    return f"{why}{instance.trail}{still}"
+    fenced = f"{instance.fenced}; " if instance.fenced else ""
+    return f"{fenced}{why}{instance.trail}{still}"
 
 
 def _left_to_stop(instance: Instance) -> str:

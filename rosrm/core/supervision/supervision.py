@@ -14,7 +14,10 @@ from rosrm.core.supervision.words import (
     Drop,
     Event,
     FailOrdered,
+    FenceOrdered,
+    FencePassed,
     Forgotten,
+    Heard,
     Key,
     Leave,
     RestartOrdered,
@@ -35,7 +38,10 @@ MOST_TOMBSTONES: Final = 2000
 MOST_RESTARTS: Final = 8
 RESTART_SPAN: Final = 1.0
 
-_ORDERS: Final = (StartOrdered, StopOrdered, RestartOrdered, AmendOrdered, FailOrdered, Forgotten)
+_ORDERS: Final = (
+    StartOrdered, StopOrdered, FenceOrdered, RestartOrdered, AmendOrdered, FailOrdered, Forgotten
+)  # fmt: skip
+_OrderOfStranger = StartOrdered | StopOrdered | FenceOrdered | RestartOrdered | AmendOrdered
 
 
 class Supervision:
@@ -79,8 +85,11 @@ class Supervision:
         if isinstance(event, TimePassed):
             due = [key for key, deadline in self._timed.items() if deadline <= now]
             for key in due:
+                yield from self._fence_in_time(self.instances[key], now)
                 if self._has_turn(self.instances[key], now):
                     yield from self._apply(self.instances[key], event, now)
+        elif isinstance(event, Heard):
+            self._renew(min(event.at, now))
         elif isinstance(event, ShutdownOrdered):
             self.closing = True
             for instance in list(self.instances.values()):
@@ -89,11 +98,26 @@ class Supervision:
             return
         elif event.instance in self.instances:
             yield from self._known(self.instances[event.instance], event, now)
-        elif isinstance(event, (StartOrdered, StopOrdered, RestartOrdered, AmendOrdered)):
-            yield from self._unknown(event)
+        elif isinstance(event, _OrderOfStranger):
+            yield from self._unknown(event, now)
+
+    def _renew(self, at: float) -> None:
+        """The clocks of the fences start afresh; what is fenced already stays so."""
+        for instance in self.instances.values():
+            if instance.fence_at is not None and instance.heard < at:
+                instance.heard = at
+                self._watch_deadline(instance)
+
+    def _fence_in_time(self, instance: Instance, now: float) -> list[Command]:
+        at = instance.fence_at
+        if at is None or now < at:
+            return []
+        return self._apply(instance, FencePassed(instance.key), now)
 
     def _has_turn(self, instance: Instance, now: float) -> bool:
-        """Whether a restart that is due may begin; False: it is due later."""
+        """Whether its step is due, and a restart may begin; False: it is due later."""
+        if instance.deadline is None or now < instance.deadline:
+            return False
         if instance.phase != BACKOFF:
             return True
         self._restarted = [at for at in self._restarted if now - at < RESTART_SPAN]
@@ -113,21 +137,22 @@ class Supervision:
         if not commands and isinstance(event, _ORDERS):
             yield Tell(instance.key)
 
-    def _unknown(
-        self, event: StartOrdered | StopOrdered | RestartOrdered | AmendOrdered
-    ) -> Iterator[Command]:
+    def _unknown(self, event: _OrderOfStranger, now: float) -> Iterator[Command]:
         name, number = event.instance
-        starts = isinstance(event, StartOrdered)
-        restart = event.restart if isinstance(event, StartOrdered) else RestartRule()
-        stop = event.stop if isinstance(event, StartOrdered) else StopRule()
-        instance = Instance(event.instance, restart, stop)
+        if isinstance(event, StartOrdered):
+            instance = Instance(event.instance, event.restart, event.stop)
+            instance.fence = event.fence
+            instance.heard = now if event.heard is None else min(event.heard, now)
+        else:
+            instance = Instance(event.instance, RestartRule(), StopRule())
         self.instances[instance.key] = instance
         if number <= self.dead.get(name, -1):
             end(instance, REFUSED, f"{name}#{number} or a later one has ended and was forgotten")
-        elif not starts:
+        elif not isinstance(event, StartOrdered):
             end(instance, REFUSED, "it was never started here")
         elif self.closing:
             end(instance, REFUSED, "the supervisor of this host is shutting down")
+        self._watch_deadline(instance)
         yield Tell(instance.key)
         if not instance.ended:
             yield Spawn(instance.key)
@@ -141,10 +166,11 @@ class Supervision:
         return commands
 
     def _watch_deadline(self, instance: Instance) -> None:
-        if instance.deadline is None:
-            self._timed.pop(instance.key, None)
+        due = [at for at in (instance.deadline, instance.fence_at) if at is not None]
+        if due:
+            self._timed[instance.key] = min(due)
         else:
-            self._timed[instance.key] = instance.deadline
+            self._timed.pop(instance.key, None)
 
     def _bury(self, instance: Instance) -> Drop:
         name, number = instance.key

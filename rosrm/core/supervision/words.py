@@ -26,21 +26,47 @@ class StopRule(NamedTuple):
     terminate_grace: float = 5.0
 
 
+class FenceRule(NamedTuple):
+    """`rosrm.core.model.Fence`, without its weight."""
+
+    after: float
+    grace: float
+
+
 # --- events: what happened --------------------------------------------------------------------
 
 
 class StartOrdered(NamedTuple):
-    """The client wants it to run."""
+    """The client wants it to run.
+
+    Attributes:
+        fence: None: it is not stopped by the clock, whatever the client hears.
+        heard: when the master last heard this host, as far as the client knows; None: just now.
+    """
 
     instance: Key
     restart: RestartRule
     stop: StopRule
+    fence: FenceRule | None = None
+    heard: float | None = None
 
 
 class StopOrdered(NamedTuple):
     """The client wants it to end, and not to be restarted."""
 
     instance: Key
+
+
+class FenceOrdered(NamedTuple):
+    """The client wants all of it to be gone at once: it has a successor."""
+
+    instance: Key
+
+
+class Heard(NamedTuple):
+    """The client knows that the master heard this host `at` that time, by the monotonic clock."""
+
+    at: float
 
 
 class RestartOrdered(NamedTuple):
@@ -121,6 +147,12 @@ class Cleared(NamedTuple):
     instance: Key
 
 
+class FencePassed(NamedTuple):
+    """For too long it was not known that the master hears this host."""
+
+    instance: Key
+
+
 class TimePassed(NamedTuple):
     """A deadline may have been reached."""
 
@@ -130,12 +162,14 @@ class ShutdownOrdered(NamedTuple):
 
 
 class ClientLost(NamedTuple):
-    """Nobody listens. The instances keep running: fencing by a timer would have its place here."""
+    """Nobody listens. The instances keep running, each as long as its fence allows."""
 
 
 Event = (
     StartOrdered
     | StopOrdered
+    | FenceOrdered
+    | Heard
     | RestartOrdered
     | AmendOrdered
     | FailOrdered
@@ -145,6 +179,7 @@ Event = (
     | SpawnFailed
     | Exited
     | Cleared
+    | FencePassed
     | TimePassed
     | ShutdownOrdered
     | ClientLost
