@@ -112,7 +112,7 @@ def _assign(
         instance, host, now, demand.amounts, demand.estimated, ranking.need[:, column]
     )
     ranking.took()
-    process.owner = instance.number
+    process.owner, process.left_behind = instance.number, None
     state.set_phase(process, ProcessPhase.ASSIGNED, now)
     state.note_decision(process, decision, "assigned", now)
     state.record(

@@ -53,7 +53,7 @@ class Order:
     """Ask one slave for something; `OrderAnswered` follows, also when no answer comes.
 
     Attributes:
-        action: "stop", "restart", "start", "execute", "report" or "set_restart".
+        action: "stop", "fence", "restart", "start", "execute", "report" or "set_restart".
         assignment: for "start".
         restart: for "set_restart".
         executor, arguments, timeout: for "execute".

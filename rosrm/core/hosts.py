@@ -51,6 +51,7 @@ class Host:
         instances: numbers of the instances that it holds or was promised.
         over_since: resource name to the time since when it is over its limit.
         told: kind of a record that is not repeated at once, to when it was made.
+        lost_since: time at which it was lost, while it is.
     """
 
     column: int
@@ -60,6 +61,7 @@ class Host:
     instances: set[int] = field(default_factory=set)
     over_since: dict[str, float] = field(default_factory=dict)
     told: dict[str, float] = field(default_factory=dict)
+    lost_since: float = 0.0
 
     @property
     def host_id(self) -> int:
@@ -255,6 +257,11 @@ class HostTable(HostColumns):
         if not self.asking[column]:
             return "it has not asked for work yet"
         return ""
+
+    def unheard(self) -> list[int]:
+        """Numbers of the hosts that have reported, and have been silent for a moment or longer."""
+        silent = (self.condition == HostCondition.SUSPECT) | (self.condition == HostCondition.LOST)
+        return [int(column) + 1 for column in np.flatnonzero(silent)]
 
     def away(self) -> BoolArray:
         """(H,) True: gets no work until somebody brings it back: lost, left, cordoned, drained."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rosrm.core import events as happened
-from rosrm.core import lifecycle
+from rosrm.core import host_loss, lifecycle
 from rosrm.core.assigning import reconsider_set_aside
 from rosrm.core.charges import settle_charge
 from rosrm.core.commands import Order, Reply
@@ -46,7 +46,7 @@ def host_registered(state: MasterState, event: happened.HostRegistered, now: flo
             "absent": dict(description.absent),
         },
     )  # fmt: skip
-    lifecycle.regained_sight(state, host, now)
+    host_loss.regain_sight(state, host, now)
     lifecycle.reconcile(state, host, event.instances, now, registering=True)
     _forgive(state, host)
     reconsider_set_aside(state, now)

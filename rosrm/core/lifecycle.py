@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from typing import Final
 
+from rosrm.core import coming_back
 from rosrm.core import events as happened
 from rosrm.core.charges import learn_from
 from rosrm.core.commands import Order
@@ -148,18 +149,25 @@ def _take_stranger(state: MasterState, host: Host, status: InstanceStatus, now: 
     It is kept on the books until it has ended, so that it is told to stop until it does, and no
     successor is started beside it.
     """
+    if coming_back.take_back(state, host, status, now):
+        take_status(state, host, status, now)
+        return
     if status.state.ended:
         return
     if status.instance.number in state.instances:  # it is intended, but elsewhere
         if status.state is not InstanceState.STOPPING:
             state.emit(Order(state.order_id(), host.host_id, "stop", status.instance))
         return
+    followed = coming_back.has_successor(state, status)
+    how = "its successor owns the name: fenced" if followed else "stopped"
     state.record(
-        now, "stranger_stopped", f"{status.instance} is not meant to run on {host.name}: stopped",
+        now, "fenced" if followed else "stranger_stopped",
+        f"{status.instance} is not meant to run on {host.name}: {how}",
         process=status.instance.process, host=host.name,
     )  # fmt: skip
     stranger = adopt_to_stop(state, status.instance, host, now)
     stranger.state, stranger.pid = status.state, status.pid
+    stranger.at_once = followed
     stop_instance(state, stranger, now)
 
 
@@ -175,7 +183,8 @@ def stop_instance(state: MasterState, instance: Instance, now: float) -> None:
     """Order an instance to stop, for good; asked again until it has ended."""
     instance.stopping = True
     instance.order, instance.order_at = state.order_id(), now
-    state.emit(Order(instance.order, instance.host.host_id, "stop", instance.id))
+    action = "fence" if instance.at_once else "stop"
+    state.emit(Order(instance.order, instance.host.host_id, action, instance.id))
 
 
 # --- ends -------------------------------------------------------------------------------------
@@ -306,14 +315,16 @@ def requeue_if_clear(state: MasterState, process: Process, now: float) -> bool:
     return True
 
 
-def gone(state: MasterState, instance: Instance, now: float, reason: str) -> None:
-    """The host is heard, and says nothing of an instance that should be there."""
+def gone(
+    state: MasterState, instance: Instance, now: float, reason: str, *, comes_again: bool = True
+) -> None:
+    """An instance that should be there is not, or counts as lost; nothing is known of its end."""
     process = state.processes.get(instance.id.process)
     state.drop_instance(instance)
     if process is None:
         return
     status = InstanceStatus(instance.id, InstanceState.FAILED, exit_code=1, message=reason)
-    end = End(status, gone=True)
+    end = End(status, gone=comes_again)
     run = state.runs.get(process.name)
     if run is not None:
         run.ended[instance.id.number] = end
@@ -331,26 +342,6 @@ def assignment_withdrawn(
     instance = state.instances.get(event.instance.number)
     if instance is not None:
         gone(state, instance, now, f"{instance.host.name} did not take it up in time")
-
-
-# --- hosts that are lost and come back --------------------------------------------------------
-
-
-def lost_sight(state: MasterState, host: Host, now: float) -> None:
-    """A host is lost: its processes are out of reach, not gone."""
-    for number in host.instances:
-        process = state.owned_by(state.instances[number])
-        if process is not None and process.name not in state.runs:
-            state.set_phase(process, ProcessPhase.UNREACHABLE, now, f"{host.name} is lost")
-
-
-def regained_sight(state: MasterState, host: Host, now: float) -> None:
-    """A lost host is heard again: its processes are again what their instances were last."""
-    for number in host.instances:
-        instance = state.instances[number]
-        process = state.owned_by(instance)
-        if process is not None and process.phase is ProcessPhase.UNREACHABLE:
-            state.set_phase(process, phase_of(process, instance), now)
 
 
 def phase_in_sight(state: MasterState, process: Process, owner: Instance) -> ProcessPhase:

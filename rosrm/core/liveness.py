@@ -6,11 +6,12 @@ reports seldom, by its own word, is given as much more time as it needs for a fe
 
 from __future__ import annotations
 
+from math import inf
 from typing import Final
 
 import numpy as np
 
-from rosrm.core import lifecycle
+from rosrm.core import host_loss
 from rosrm.core.assigning import reconsider_set_aside
 from rosrm.core.commands import Order
 from rosrm.core.hosts import Host, HostCondition
@@ -39,10 +40,16 @@ def review_liveness(state: MasterState, now: float) -> None:
     past_lease = (up | suspect | left | (condition == HostCondition.EXPECTED)) & gone
     for column in np.flatnonzero(up & ~fresh & ~past_lease):
         _suspect(state, table.hosts[column], float(age[column]), now)
+    _note_company(state, bool((up & ~past_lease).any()), now)
     for column in np.flatnonzero(past_lease):
         _lose(state, table.hosts[column], float(age[column]), float(lease[column]), now)
     for column in np.flatnonzero((suspect | lost) & fresh):
         welcome_back(state, table.hosts[column], now)
+
+
+def _note_company(state: MasterState, heard: bool, now: float) -> None:
+    """Whether any host is heard at all: a master that hears none may itself be cut off."""
+    state.in_company_since = min(state.in_company_since, now) if heard else inf
 
 
 def _suspect(state: MasterState, host: Host, age: float, now: float) -> None:
@@ -60,7 +67,7 @@ def _lose(state: MasterState, host: Host, age: float, lease: float, now: float) 
         f"{host.name} is lost: silent for {age:.1f} s, its lease is {lease:g} s",
         host=host.name,
     )  # fmt: skip
-    lifecycle.lost_sight(state, host, now)
+    host_loss.lose_sight(state, host, now)
 
 
 def welcome_back(state: MasterState, host: Host, now: float) -> None:
@@ -69,6 +76,6 @@ def welcome_back(state: MasterState, host: Host, now: float) -> None:
     state.hosts.set_condition(host, HostCondition.UP)
     state.record(now, "host_back", f"{host.name} is heard again", host=host.name)
     if was_lost:
-        lifecycle.regained_sight(state, host, now)
+        host_loss.regain_sight(state, host, now)
         state.emit(Order(state.order_id(), host.host_id, "report"))
     reconsider_set_aside(state, now)

@@ -66,6 +66,7 @@ class Instance:
         restarting: it was ordered to restart, and has not been seen to do so yet.
         given_again: the assignment was delivered anew, since its slave did not take it up.
         recalled: a master ordered it to stop and was itself restarted: its end is not its own.
+        at_once: it is to end without delay, as another instance owns the name.
         order: of an unanswered stop, 0: none.
         order_at: when it was given.
         node_name: under which its node runs, where that is not the process's name.
@@ -88,10 +89,26 @@ class Instance:
     settled: bool = False
     given_again: bool = False
     recalled: bool = False
+    at_once: bool = False
     order: int = 0
     order_at: float = 0.0
     node_name: str = ""
     ready_at: float = inf
+
+
+@dataclass(frozen=True, slots=True)
+class LeftBehind:
+    """The owner that a process had on a host which was lost, as long as nothing has followed it.
+
+    Attributes:
+        number: of the instance.
+        host: name of the host.
+        node_name: under which its node runs, where that is not the process's name.
+    """
+
+    number: int
+    host: str
+    node_name: str = ""
 
 
 class PlainSpec(Lazy):
@@ -118,6 +135,8 @@ class Process:
         instances: numbers of all its instances that may still run.
         excluded: host name to the reason why it cannot run there.
         decision: the newest one about it, with its kind.
+        left_behind: the instance that may still run on a lost host, while this process waits in the
+            queue for another one.
         demand: what decides where it may go, and the version of what was learned that is in it.
     """
 
@@ -136,6 +155,7 @@ class Process:
     restarts: int = 0
     decision: Mapping[str, Any] | None = None
     decided_at: float = 0.0
+    left_behind: LeftBehind | None = None
     history: list[tuple[float, str, str]] = field(default_factory=list)
     demand: tuple[int, Demand] | None = None
     plain: PlainSpec = field(init=False)

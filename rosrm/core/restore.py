@@ -8,6 +8,7 @@ from typing import Any
 from rosrm.core.lifecycle import adopt_to_stop
 from rosrm.core.model import InstanceId
 from rosrm.core.plans import plan_from_dict
+from rosrm.core.processes import LeftBehind
 from rosrm.core.runs import end_from_dict, way_back
 from rosrm.core.specs import spec_from_dict
 from rosrm.core.state import MasterState, Process, ProcessPhase, Run, Wanted
@@ -51,6 +52,7 @@ def _restore_process(state: MasterState, item: Mapping[str, Any], now: float) ->
         wanted=Wanted(item["wanted"]), reason=item["reason"], excluded=dict(item["excluded"]),
         migrations=int(item["migrations"]), exit_code=int(item["exit_code"]),
         restarts=int(item["restarts"]),
+        left_behind=LeftBehind(*left) if (left := item.get("left_behind")) else None,
     )  # fmt: skip
     state.add_process(process)
     return process

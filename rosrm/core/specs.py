@@ -39,10 +39,8 @@ _MAPPINGS: Final = (
     "preferred_labels",
     "avoided_labels",
 )
-_FIELDS: Final = {
-    kind.__name__: tuple(f.name for f in fields(kind))
-    for kind in (ProcessSpec, *_POLICIES.values())
-}
+_KINDS: Final[tuple[type[Any], ...]] = (ProcessSpec, *_POLICIES.values())
+_FIELDS: Final = {kind.__name__: tuple(f.name for f in fields(kind)) for kind in _KINDS}
 
 
 def spec_to_dict(spec: ProcessSpec) -> dict[str, Any]:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from math import inf
 from typing import Any, Final
 
 import numpy as np
 
 from rosrm.core.columns import FloatArray
 from rosrm.core.commands import Command
+from rosrm.core.fencing import fence_of
 from rosrm.core.hosts import Host, HostTable
 from rosrm.core.model import EMPTY, Assignment, InstanceId, ProcessSpec
 from rosrm.core.needs import LearnedNeeds
@@ -35,6 +37,7 @@ class MasterState:
 
     Attributes:
         over: names of the processes that are over, in the order in which they ended.
+        in_company_since: time since when at least one host has been heard; inf: none is.
     """
 
     def __init__(
@@ -72,6 +75,7 @@ class MasterState:
         self.reserved_instances = 1
         self.next_order_id = 1
         self.wall = 0.0
+        self.in_company_since = inf
         self.missing_since: dict[int, float] = {}
         self.reviewed = float("-inf")
         self.policy_told = float("-inf")
@@ -114,7 +118,7 @@ class MasterState:
         self._unsaved[process.name] = process
 
     def _intent_of(self, process: Process) -> Intent:
-        owner = self.instances.get(process.owner)
+        owner, left = self.instances.get(process.owner), process.left_behind
         held = {str(number): self.instances[number].host.name for number in process.instances}
         aliases = {
             str(number): alias
@@ -130,6 +134,7 @@ class MasterState:
                 "reason": process.reason, "excluded": dict(process.excluded),
                 "migrations": process.migrations, "exit_code": process.exit_code,
                 "restarts": process.restarts, "node_names": aliases,
+                "left_behind": left and [left.number, left.host, left.node_name],
             },
         )  # fmt: skip
 
@@ -269,7 +274,8 @@ class MasterState:
         shadow: bool = False,
     ) -> Assignment:  # fmt: skip
         """The order for a slave to run an instance."""
-        return Assignment(instance, spec, self.epoch, node_name or spec.name, shadow)
+        fence = fence_of(spec, self.settings)
+        return Assignment(instance, spec, self.epoch, node_name or spec.name, shadow, fence)
 
     def note_decision(self, process: Process, decision: Decision, kind: str, now: float) -> None:
         """Remember the newest decision about a process, for `explain`."""

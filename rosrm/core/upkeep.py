@@ -8,6 +8,7 @@ from rosrm.core import events as happened
 from rosrm.core.assigning import reconsider_set_aside
 from rosrm.core.charges import settle_charge
 from rosrm.core.commands import Order, Redeliver, Withdraw
+from rosrm.core.host_loss import review_lost_hosts
 from rosrm.core.lifecycle import stop_instance
 from rosrm.core.liveness import review_liveness
 from rosrm.core.lookahead import review_slots, waits_too_long
@@ -28,6 +29,7 @@ def time_passed(state: MasterState, event: happened.TimePassed, now: float) -> N
     state.reviewed = now
     for instance in list(state.instances.values()):
         _review_instance(state, instance, now)
+    review_lost_hosts(state, now)
     _ask_for_missing_statuses(state, now)
     relieve_hosts(state, now)
     reconsider_set_aside(state, now)

@@ -187,7 +187,7 @@ class MasterRuntime:
                     self._tick(now)
                 if now >= next_beat:
                     next_beat = now + self._config.control.beat_period
-                    self._endpoint.beat(now - self._started)
+                    self._endpoint.beat(now - self._started, self._state.hosts.unheard())
                 self._take_in(now)
             self._write([Record("master_stopped", message=f"master stopped: {self._stopping}")], [])
         return 1 if self._stopping.startswith("refused") else 0

@@ -23,6 +23,7 @@ from rosrm_msgs import srv
 
 _ACTIONS: Final = {
     "stop": srv.ControlHost.Request.STOP,
+    "fence": srv.ControlHost.Request.FENCE,
     "restart": srv.ControlHost.Request.RESTART,
     "start": srv.ControlHost.Request.START,
     "execute": srv.ControlHost.Request.EXECUTE,

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final
 
 from rosrm.config.settings import ControlSettings
@@ -139,14 +139,19 @@ class MasterEndpoint:
         """End what was not answered in time."""
         self._links.expire(now)
 
-    def beat(self, uptime: float) -> None:
-        """Say that the master lives, and now and then how it keeps up."""
+    def beat(self, uptime: float, unheard: Sequence[int]) -> None:
+        """Say that the master lives, and now and then how it keeps up.
+
+        Args:
+            uptime: seconds.
+            unheard: numbers of the hosts that it does not hear.
+        """
         identity = self._identity
         self._beats.publish(
             msg.MasterBeat(
                 protocol_version=PROTOCOL_VERSION, name=identity.name, hostname=identity.hostname,
                 pid=identity.pid, epoch=identity.epoch, incarnation=identity.incarnation,
-                beat=self._beat(), uptime=uptime,
+                beat=self._beat(), uptime=uptime, unheard=list(unheard),
             )
         )  # fmt: skip
         if uptime - self._load_at >= _LOAD_EVERY:

@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
 from pathlib import Path
+from types import UnionType
 from typing import Annotated, get_args, get_origin, get_type_hints
 
 import pytest
@@ -45,7 +46,9 @@ def keys(kind: type, before: str = "") -> Iterator[str]:
         hint = hints[f.name]
         marks = get_args(hint)[1:] if get_origin(hint) is Annotated else ()
         in_file = [mark.in_file() for mark in marks if hasattr(mark, "in_file")]
-        inner = in_file[0] if in_file else hint
+        members = get_args(hint) if get_origin(hint) is UnionType else ()
+        optional = [one for one in members if is_dataclass(one)]
+        inner = (in_file or optional or [hint])[0]
         if is_dataclass(inner):
             yield from keys(inner, f"{before}{f.name}.")
         else:
@@ -82,6 +85,7 @@ def test_every_option_of_a_strategy_is_documented(options):
 def test_every_word_of_a_process_is_documented_and_nothing_else():
     wanted = set(keys(ProcessInFile)) | {"foreach", "processes", "defaults"}
     wanted |= {"restart", "migration", "readiness", "stop"}
+    wanted |= {"host_loss", "isolation", "standby", "health"}
     assert rows(section(page("configuration.md"), "`work.yaml`")) == wanted
 
 

@@ -270,7 +270,12 @@ class Machine:
             event = slave.AssignmentsReceived((order.assignment,))
         else:
             assert order.instance is not None
-            kinds = {"stop": slave.StopOrdered, "restart": slave.RestartOrdered}
+            if order.action == "fence":
+                self.stubborn.discard(order.instance.process)
+            kinds = {
+                "stop": slave.StopOrdered, "fence": slave.StopOrdered,
+                "restart": slave.RestartOrdered,
+            }  # fmt: skip
             event = kinds[order.action](order.instance)
         self.tell(event, now)
         return happened.OrderAnswered(order.order, accepted=True)

@@ -18,6 +18,7 @@ from rosrm.core import slave
 from rosrm.core.assigning import demand_of
 from rosrm.core.commands import Assign, Command
 from rosrm.core.model import (
+    HostLossPolicy,
     InstanceState,
     Kind,
     MigrationPolicy,
@@ -38,14 +39,16 @@ LABELLED = "c"
 names = st.sampled_from([*NAMES[:1] * 4, *NAMES[:2] * 2, *NAMES])
 hosts = st.sampled_from(HOSTS)
 ways = st.sampled_from(["overlap", "stop first", "handoff", "handoff, restarted"])
+losses = st.sampled_from(["wait", "wait", "elsewhere", "elsewhere", "stop"])
 chance = st.booleans()
 #: Which of the things that are there at the moment; `Play.pick` takes it modulo their number.
 which_one = st.integers(0, 11)
 
 
 def spec(
-    name: str, kind: str, memory: int, moves: str, special: bool, priority: int
-) -> ProcessSpec:
+    name: str, kind: str, memory: int, moves: str, special: bool, priority: int,
+    loss: str = "wait",
+) -> ProcessSpec:  # fmt: skip
     """One of a few sorts of process."""
     strategy = "handoff" if moves.startswith("handoff") else "relaunch"
     migration = MigrationPolicy(strategy, overlap=moves == "overlap") if moves else None
@@ -56,6 +59,7 @@ def spec(
         needs={"memory": memory * MIB} if memory else {},
         required_labels={"arm": "yes"} if special else {},
         migration=migration or MigrationPolicy(), restart=restart, readiness=Readiness(timeout=4.0),
+        host_loss=HostLossPolicy(loss, 1.0 if loss == "elsewhere" and memory else 0.0),
     )  # fmt: skip
 
 
@@ -63,9 +67,12 @@ class Play(RuleBasedStateMachine):
     """The rules of the play; the promises are its invariants."""
 
     @initialize(
-        backfill=chance, most=st.integers(1, 2), slots=st.integers(0, 2), first=ways, second=ways
-    )
-    def begin(self, backfill: bool, most: int, slots: int, first: str, second: str) -> None:
+        backfill=chance, most=st.integers(1, 2), slots=st.integers(0, 2), first=ways, second=ways,
+        loss=losses,
+    )  # fmt: skip
+    def begin(
+        self, backfill: bool, most: int, slots: int, first: str, second: str, loss: str
+    ) -> None:
         self.cluster = Cluster(
             backfill=backfill, max_migrations=most, settle=3.0, suspect=1.0, lease=5.0,
             delivery_timeout=2.0, cooldown=2.0, hysteresis=0.4, order_retry=1.0,
@@ -87,10 +94,12 @@ class Play(RuleBasedStateMachine):
         #: Process and host where it could not be started at some time.
         self.missing: set[tuple[str, str]] = set()
         self.late: list[happened.Event] = []
+        self.left: set[int] = set()
+        self.records_seen = 0
         self.prompt = True
         # Something to play with from the beginning.
         for name, moves in (("p0", first), ("p1", second)):
-            self.cluster.submit(spec(name, "node", 100, moves, special=False, priority=0))
+            self.cluster.submit(spec(name, "node", 100, moves, False, 0, loss))
             for machine, running in self.programs():
                 machine.seen_in_graph(running, self.cluster.now)
         self.cluster.settle()
@@ -188,13 +197,14 @@ class Play(RuleBasedStateMachine):
         name=names, kind=st.sampled_from(["service", "job", "node", "node"]),
         memory=st.sampled_from([0, 100, 100, 300]),
         moves=ways | st.just(""),
-        special=chance, urgent=chance, twin=names,
+        special=chance, urgent=chance, twin=names, loss=losses,
     )  # fmt: skip
     def submit(
-        self, name: str, kind: str, memory: int, moves: str, special: bool, urgent: bool, twin: str
-    ) -> None:
+        self, name: str, kind: str, memory: int, moves: str, special: bool, urgent: bool,
+        twin: str, loss: str = "wait",
+    ) -> None:  # fmt: skip
         special = special and memory == 300
-        specs = [spec(one, kind, memory, moves, special, int(urgent)) for one in (name, twin)]
+        specs = [spec(one, kind, memory, moves, special, int(urgent), loss) for one in (name, twin)]
         before = set(self.cluster.state.processes)
         if self.ask(happened.SubmissionReceived, tuple(specs)):
             for one in (name, twin):
@@ -604,17 +614,29 @@ class Play(RuleBasedStateMachine):
             assert np.allclose(state.hosts.load[:, host.column], total, atol=1e-6)
             assert (state.hosts.load[:, host.column] >= 0.0).all()
 
+    def given_up(self) -> set[int]:
+        """Instances that may run on lost hosts, beside a successor that nobody there hears of."""
+        for record in self.cluster.records[self.records_seen :]:
+            if record.kind == "given_up":
+                self.left.add(record.facts["number"])
+            elif record.kind == "taken_back":
+                self.left.discard(record.facts["number"])
+        self.records_seen = len(self.cluster.records)
+        return self.left
+
     @invariant()
     def never_two_active(self) -> None:
         """In truth: one instance of a process, two only where its spec declares an overlap."""
         if not hasattr(self, "cluster"):
             return
+        left = self.given_up()
         for name in (*NAMES, *TWINS):
             running = [
                 program.assignment
                 for machine in self.cluster.machines.values()
                 for program in machine.programs.values()
                 if program.assignment.instance.process == name
+                and program.assignment.instance.number not in left
             ]
             overlap = all(one.spec.migration.overlap and one.spec.migration.strategy
                           for one in running)  # fmt: skip
@@ -622,7 +644,10 @@ class Play(RuleBasedStateMachine):
             most = 2 if overlap or shadows else 1
             assert len(running) <= most, [str(one.instance) for one in running]
         for name in {node.instance.process for _, node in self.nodes()}:
-            active = [node for _, node in self.nodes() if node.instance.process == name]
+            active = [
+                node for _, node in self.nodes()
+                if node.instance.process == name and node.instance.number not in left
+            ]  # fmt: skip
             assert sum(node.active for node in active) <= 1, [str(one.instance) for one in active]
 
     @invariant()
@@ -637,7 +662,8 @@ class Play(RuleBasedStateMachine):
                 assert (process.name, host) in self.missing
             if process.phase is ProcessPhase.FAILED and not process.spec.ros:
                 missing = {name for name, _ in self.missing}
-                assert process.name in self.failed | missing
+                host_lost = process.spec.host_loss.then == "stop"
+                assert host_lost or process.name in self.failed | missing
 
     def teardown(self) -> None:
         """Once everything works again, everything that was asked for comes to its end."""

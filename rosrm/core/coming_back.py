@@ -1,0 +1,64 @@
+"""What a host brings back that was given up when it was lost.
+
+Where nothing has followed the instance yet, it is the owner again, and its process leaves the
+queue; a job that has completed meanwhile has completed. Where something has, it is fenced.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from rosrm.core.hosts import Host
+from rosrm.core.model import InstanceId, InstanceState, InstanceStatus
+from rosrm.core.processes import LeftBehind
+from rosrm.core.state import MasterState, Process, ProcessPhase
+
+_WAITING: Final = (ProcessPhase.QUEUED, ProcessPhase.SET_ASIDE)
+
+
+def take_back_all(state: MasterState, host: Host, now: float) -> None:
+    """A host is heard again: what nothing has followed is its own, until it says otherwise."""
+    for name in [*state.queue, *sorted(state.set_aside)]:
+        process = state.processes[name]
+        if process.left_behind is not None and process.left_behind.host == host.name:
+            _take_back(state, process, process.left_behind, host, now)
+
+
+def take_back(state: MasterState, host: Host, status: InstanceStatus, now: float) -> bool:
+    """The first that is heard of a host is of an instance that was given up; as `take_back_all`.
+
+    Returns:
+        False: it is not that.
+    """
+    process = state.processes.get(status.instance.process)
+    left = None if process is None else process.left_behind
+    if process is None or left is None or process.phase not in _WAITING:
+        return False
+    if (left.number, left.host) != (status.instance.number, host.name):
+        return False
+    _take_back(state, process, left, host, now)
+    return True
+
+
+def _take_back(
+    state: MasterState, process: Process, left: LeftBehind, host: Host, now: float
+) -> None:
+    if process.name in state.queue:
+        state.queue.remove(process.name)
+    state.set_aside.discard(process.name)
+    instance = state.add_instance(InstanceId(process.name, left.number), process.spec, host, now)
+    # Not as one that was assigned a moment ago: if the host does not hold it, it is gone.
+    instance.node_name, instance.state = left.node_name, InstanceState.RUNNING
+    process.owner, process.left_behind = left.number, None
+    state.set_phase(process, ProcessPhase.STARTING, now)
+    state.record(
+        now, "taken_back", f"{instance.id} goes on: {host.name} is heard again",
+        process=process.name, host=host.name, facts={"number": left.number},
+    )  # fmt: skip
+    state.save(process)
+
+
+def has_successor(state: MasterState, status: InstanceStatus) -> bool:
+    """Another instance owns the name that this one ran under."""
+    process = state.processes.get(status.instance.process)
+    return process is not None and process.owner not in (0, status.instance.number)

@@ -1,0 +1,37 @@
+"""When a host that is cut off from the master stops an instance by itself.
+
+A lease in the sense of Gray and Cheriton (1989), with one difference: the master need not answer
+each host. It names in its beats those that it does not hear, so that a beat which does not name a
+host tells it that it was heard at most `suspect` seconds before. From there the host counts by its
+own monotonic clock; clocks may differ, if only they run equally fast.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from rosrm.core.model import Fence, ProcessSpec
+from rosrm.core.settings import CoreSettings
+
+#: Seconds for a beat on its way, and for the master and the host to look at their clocks.
+_MARGIN: Final = 0.1
+#: Part of the time until a successor may start that a process is given to end by itself.
+_TO_END: Final = 0.25
+
+
+def fence_of(spec: ProcessSpec, settings: CoreSettings) -> Fence | None:
+    """When its host stops an instance of a process; None: never.
+
+    Where the process goes elsewhere when its host is lost, it has ended before a successor starts,
+    unless its own `isolation.after` is longer than that.
+    """
+    if spec.isolation.then != "stop":
+        return None
+    graces = spec.stop.interrupt_grace + spec.stop.terminate_grace
+    if spec.host_loss.then != "elsewhere":
+        return Fence(spec.isolation.after or settings.lease, graces)
+    until_successor = settings.lease + spec.host_loss.delay - settings.suspect - _MARGIN
+    until_successor = max(until_successor, _MARGIN)
+    grace = min(graces, _TO_END * until_successor)
+    after = spec.isolation.after or until_successor - grace
+    return Fence(after, min(graces, max(0.0, until_successor - after)))

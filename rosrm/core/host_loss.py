@@ -1,0 +1,101 @@
+"""What becomes of the processes of a host that is lost, and of those that it brings back.
+
+=========================  ======================================================================
+on a lost host             what follows
+=========================  ======================================================================
+the owner of the name      by `host_loss`: `wait`; after `delay` go `elsewhere`, or `stop`
+one that may be the owner  as the owner: the destination of a move that may be active, or the last
+                           that is left of a process
+one that is cancelled      given up at once: nothing follows it
+any other                  given up at once: a former source, a shadow
+=========================  ======================================================================
+
+What is given up may still run where nobody hears it; `coming_back` says what becomes of it then.
+
+Nothing is given up while the master hears no host at all, nor for one lease after: then it is
+the master that was cut off, and its hosts come back one by one.
+"""
+
+from __future__ import annotations
+
+from rosrm.core import coming_back, handoffs, lifecycle
+from rosrm.core.hosts import Host, HostCondition
+from rosrm.core.processes import LeftBehind
+from rosrm.core.state import Instance, MasterState, Process, ProcessPhase, Wanted
+
+
+def lose_sight(state: MasterState, host: Host, now: float) -> None:
+    """A host is lost: its processes are out of reach, not gone."""
+    host.lost_since = now
+    for number in host.instances:
+        process = state.owned_by(state.instances[number])
+        if process is not None and process.name not in state.runs:
+            reason = f"{host.name} is lost{_what_follows(process)}"
+            state.set_phase(process, ProcessPhase.UNREACHABLE, now, reason)
+    _review(state, host, now)
+
+
+def _what_follows(process: Process) -> str:
+    policy = process.spec.host_loss
+    if policy.then == "wait":
+        return ""
+    when = f" in {policy.delay:g} s" if policy.delay else ""
+    return f"; it goes elsewhere{when}" if policy.then == "elsewhere" else f"; it fails{when}"
+
+
+def regain_sight(state: MasterState, host: Host, now: float) -> None:
+    """A lost host is heard again: its processes are again what their instances were last."""
+    for number in host.instances:
+        instance = state.instances[number]
+        process = state.owned_by(instance)
+        if process is not None and process.phase is ProcessPhase.UNREACHABLE:
+            state.set_phase(process, lifecycle.phase_of(process, instance), now)
+    coming_back.take_back_all(state, host, now)
+
+
+def review_lost_hosts(state: MasterState, now: float) -> None:
+    """Give up what is due on every lost host."""
+    for host in state.hosts.hosts:
+        if host.instances and state.hosts.condition_of(host) is HostCondition.LOST:
+            _review(state, host, now)
+
+
+def _review(state: MasterState, host: Host, now: float) -> None:
+    for number in sorted(host.instances):
+        instance = state.instances[number]
+        if _is_given_up(state, instance, now):
+            _give_up(state, instance, now)
+
+
+def _is_given_up(state: MasterState, instance: Instance, now: float) -> bool:
+    process = state.processes.get(instance.id.process)
+    if process is None or process.wanted is Wanted.CANCEL:
+        return True
+    if now < state.in_company_since + state.settings.lease:
+        return False
+    if process.owner not in (0, instance.id.number) and not _may_be_active(state, instance):
+        return True
+    policy = process.spec.host_loss
+    return policy.then != "wait" and now - instance.host.lost_since >= policy.delay
+
+
+def _may_be_active(state: MasterState, instance: Instance) -> bool:
+    """The destination of a move may be the only one that is active, without our knowing."""
+    run = state.runs.get(instance.id.process)
+    if run is None or run.committed or run.destination != instance.id:
+        return False
+    number = instance.id.number
+    alone = run.plan.overlap == 0.0 and number in run.launched and number not in run.suspended
+    return alone or handoffs.was_switched(run)
+
+
+def _give_up(state: MasterState, instance: Instance, now: float) -> None:
+    host, process = instance.host, state.processes.get(instance.id.process)
+    state.record(
+        now, "given_up", f"{instance.id} is given up: {host.name} is lost",
+        process=instance.id.process, host=host.name, facts={"number": instance.id.number},
+    )  # fmt: skip
+    follows = process is None or process.spec.host_loss.then != "stop"
+    if follows and process is not None and process.owner == instance.id.number:
+        process.left_behind = LeftBehind(instance.id.number, host.name, instance.node_name)
+    lifecycle.gone(state, instance, now, f"{host.name} is lost", comes_again=follows)

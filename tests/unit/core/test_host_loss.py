@@ -1,0 +1,272 @@
+"""Hosts that are lost, and that come back: what becomes of their processes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from rosrm.core.model import HostLossPolicy, IsolationPolicy, ProcessSpec, StopPolicy
+from rosrm.core.settings import CoreSettings
+from tests.unit.core.cluster import Cluster, job, movable, process
+
+ELSEWHERE = HostLossPolicy("elsewhere")
+
+
+def lose(cluster: Cluster, *names: str, seconds: float = 12.0) -> None:
+    """Cut hosts off for longer than their lease."""
+    for name in names:
+        cluster.machines[name].connected = False
+    cluster.wait(seconds)
+
+
+def back(cluster: Cluster, *names: str, seconds: float = 1.0) -> None:
+    for name in names:
+        cluster.machines[name].connected = True
+    cluster.wait(seconds)
+
+
+def on_a(spec: ProcessSpec, *others: str, **settings: Any) -> Cluster:
+    """A cluster in which a process runs on host a."""
+    cluster = Cluster("a", **settings)
+    cluster.submit(spec)
+    for name in others:
+        cluster.add(name)
+    cluster.wait(11.0)  # somebody has been heard for a whole lease
+    assert cluster.where(spec.name) == ["a"]
+    return cluster
+
+
+# --- by policy --------------------------------------------------------------------------------
+
+
+def test_by_default_a_process_waits_for_its_host() -> None:
+    """However long: it may well run on."""
+    cluster = on_a(process("p"), "b")
+    lose(cluster, "a", seconds=600.0)
+    assert (cluster.phase("p"), cluster["p"].reason) == ("unreachable", "a is lost")
+    back(cluster, "a")
+    assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
+
+
+def test_elsewhere_starts_it_on_another_host_as_soon_as_its_host_is_lost() -> None:
+    """Not before its lease is over."""
+    cluster = on_a(process("p", host_loss=ELSEWHERE), "b")
+    lose(cluster, "a", seconds=9.5)
+    assert cluster.where("p") == ["a"]
+    cluster.wait(1.0)
+    assert cluster.where("p") == ["a", "b"]
+    assert (cluster.phase("p"), cluster["p"].owner) == ("running", 2)
+    assert cluster.told("given_up") == ["p#1 is given up: a is lost"]
+
+
+def test_elsewhere_waits_for_its_delay() -> None:
+    """And says so meanwhile."""
+    cluster = on_a(process("p", host_loss=HostLossPolicy("elsewhere", 20.0)), "b")
+    lose(cluster, "a", seconds=25.0)
+    assert cluster["p"].reason == "a is lost; it goes elsewhere in 20 s"
+    assert cluster.where("p") == ["a"]
+    cluster.wait(6.0)
+    assert cluster.where("p") == ["a", "b"]
+
+
+def test_stop_lets_it_fail() -> None:
+    """Nothing follows it, and when the host is back it is stopped there."""
+    cluster = on_a(process("p", host_loss=HostLossPolicy("stop")), "b")
+    lose(cluster, "a")
+    assert (cluster.phase("p"), cluster["p"].reason) == ("failed", "a is lost")
+    assert cluster.where("p") == ["a"]
+    back(cluster, "a")
+    assert cluster.where("p") == []
+
+
+# --- what comes back --------------------------------------------------------------------------
+
+
+def test_the_old_instance_is_fenced_when_its_host_is_heard() -> None:
+    """At once, also where it would take its time to stop: the new one owns the name."""
+    cluster = on_a(process("p", host_loss=ELSEWHERE), "b")
+    cluster.machines["a"].stubborn.add("p")
+    lose(cluster, "a")
+    back(cluster, "a", seconds=0.2)
+    assert cluster.where("p") == ["b"]
+    assert [order.instance.number for order in cluster.orders("fence") if order.instance] == [1]
+    assert cluster.told("fenced")[0].startswith("p#1 is not meant to run on a")
+
+
+def test_the_old_instance_is_fenced_by_a_master_that_was_restarted() -> None:
+    """What is not intended anywhere is not meant to run."""
+    cluster = on_a(process("p", host_loss=ELSEWHERE), "b")
+    lose(cluster, "a")
+    cluster.restart_master()
+    assert cluster.phase("p") == "running"
+    cluster.machines["a"].connected = True
+    cluster.register(cluster.machines["a"])
+    cluster.wait(1.0)
+    assert cluster.where("p") == ["b"]
+
+
+@pytest.mark.parametrize("restarted", [False, True], ids=["same master", "restarted master"])
+def test_what_nothing_has_followed_goes_on(restarted: bool) -> None:
+    """No host had room for it meanwhile: it leaves the queue, and no process was touched."""
+    cluster = on_a(process("p", host_loss=ELSEWHERE, required_labels={}), "b")
+    cluster.set_host("b", "cordon")
+    lose(cluster, "a")
+    assert (cluster.phase("p"), cluster.queue()) == ("queued", ["p"])
+    if restarted:
+        cluster.restart_master()
+        cluster.machines["a"].connected = True
+        cluster.register(cluster.machines["a"])
+    back(cluster, "a")
+    assert (cluster.phase("p"), cluster["p"].owner, cluster.queue()) == ("running", 1, [])
+    assert cluster.where("p") == ["a"]
+    assert not cluster.orders("fence")
+    cluster.set_host("b", "uncordon")
+    cluster.cancel("p")
+    assert (cluster.phase("p"), cluster.where("p")) == ("cancelled", [])
+
+
+def test_a_job_that_completed_out_of_sight_is_not_done_again() -> None:
+    """Nothing had followed it yet."""
+    cluster = on_a(job("p", host_loss=ELSEWHERE), "b")
+    cluster.set_host("b", "cordon")
+    lose(cluster, "a")
+    cluster.machines["a"].finish("p", cluster.now)
+    back(cluster, "a")
+    assert (cluster.phase("p"), cluster.queue()) == ("finished", [])
+
+
+def test_what_failed_out_of_sight_has_failed() -> None:
+    """By its own restart policy, which its host has followed."""
+    cluster = on_a(process("p", host_loss=ELSEWHERE), "b")
+    cluster.set_host("b", "cordon")
+    lose(cluster, "a")
+    cluster.machines["a"].finish("p", cluster.now, code=3)
+    back(cluster, "a")
+    assert (cluster.phase("p"), cluster["p"].exit_code) == ("failed", 3)
+
+
+def test_what_is_not_there_any_more_goes_elsewhere() -> None:
+    """The host was switched off and on: it comes back with nothing."""
+    cluster = on_a(process("p", host_loss=ELSEWHERE), "b")
+    cluster.set_host("b", "cordon")
+    lose(cluster, "a")
+    cluster.machines["a"].programs.clear()
+    cluster.machines["a"].restart_slave(cluster.now)
+    cluster.machines["a"].connected = True
+    cluster.register(cluster.machines["a"])
+    cluster.wait(1.0)
+    assert (cluster.phase("p"), cluster["p"].owner, cluster.where("p")) == ("running", 2, ["a"])
+
+
+# --- is it the host, or are we cut off? -------------------------------------------------------
+
+
+def test_a_master_that_hears_nobody_gives_nothing_up() -> None:
+    """It is cut off itself; what comes back within a lease of the first keeps its processes."""
+    cluster = on_a(process("p", host_loss=ELSEWHERE), "b")
+    lose(cluster, "a", "b", seconds=60.0)
+    assert (cluster.phase("p"), cluster.told("given_up")) == ("unreachable", [])
+    back(cluster, "b", seconds=8.0)
+    back(cluster, "a")
+    assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
+    assert not cluster.told("given_up")
+
+
+def test_a_host_that_stays_away_when_the_others_are_back_is_given_up() -> None:
+    """One lease after the first of them was heard."""
+    cluster = on_a(process("p", host_loss=ELSEWHERE), "b")
+    lose(cluster, "a", "b", seconds=60.0)
+    back(cluster, "b", seconds=12.0)
+    assert cluster.where("p") == ["a", "b"]
+
+
+def test_a_restarted_master_gives_the_hosts_their_lease_first() -> None:
+    """It has heard nobody yet, which says nothing."""
+    cluster = on_a(process("p", host_loss=ELSEWHERE), "b")
+    cluster.machines["a"].connected = False
+    cluster.restart_master()
+    cluster.wait(9.0)
+    assert cluster.where("p") == ["a"]
+    cluster.wait(3.0)
+    assert cluster.where("p") == ["a", "b"]
+
+
+# --- others than owners -----------------------------------------------------------------------
+
+
+def test_cancel_of_one_whose_host_is_lost_is_over_at_once() -> None:
+    """What may still run there is stopped when the host is back."""
+    cluster = on_a(process("p"))
+    lose(cluster, "a")
+    cluster.cancel("p")
+    cluster.wait(0.5)
+    assert cluster.phase("p") == "cancelled"
+    back(cluster, "a")
+    assert cluster.where("p") == []
+
+
+def test_the_former_host_of_a_move_that_is_lost_does_not_hold_it_up() -> None:
+    """The destination owns the name; what is left at the source is fenced when it is back."""
+    cluster = on_a(movable("p"), "b")
+    cluster.machines["a"].stubborn.add("p")
+    cluster.migrate("p")
+    assert cluster["p"].owner == 2
+    assert cluster.phase("p") == "migrating"
+    lose(cluster, "a", seconds=15.0)
+    assert cluster.phase("p") == "running"
+    back(cluster, "a", seconds=0.5)
+    assert cluster.where("p") == ["b"]
+
+
+# --- fences -----------------------------------------------------------------------------------
+
+
+def fence(
+    host_loss: HostLossPolicy, isolation: IsolationPolicy, **settings: float
+) -> tuple[float, float] | None:
+    """After and grace of the assignment of such a process."""
+    cluster = Cluster("a", **settings)
+    cluster.submit(process("p", host_loss=host_loss, isolation=isolation, stop=StopPolicy(2, 1)))
+    given = cluster.machines["a"].programs[cluster.machines["a"].find("p")].assignment.fence
+    return None if given is None else (given.after, given.grace)
+
+
+def test_by_default_nothing_is_fenced() -> None:
+    """A host that is cut off goes on."""
+    assert fence(ELSEWHERE, IsolationPolicy()) is None
+
+
+def test_a_fenced_process_has_ended_before_its_successor_starts() -> None:
+    """Its grace included, counted from when the master can have heard its host last."""
+    settings = CoreSettings()
+    for delay in (0.0, 5.0, 60.0):
+        given = fence(HostLossPolicy("elsewhere", delay), IsolationPolicy("stop"))
+        assert given is not None
+        assert 0.0 < sum(given) < settings.lease + delay - settings.suspect
+        assert given[1] <= 3.0
+
+
+def test_a_fence_of_a_short_lease_leaves_time_for_beats() -> None:
+    """Three tenths of a second, at a lease of 0.8 s and suspicion after 0.3 s."""
+    after, grace = fence(ELSEWHERE, IsolationPolicy("stop"), lease=0.8, suspect=0.3) or (0.0, 0.0)
+    assert after == pytest.approx(0.3)
+    assert grace == pytest.approx(0.1)
+
+
+def test_a_time_of_ones_own_is_kept() -> None:
+    """Without a successor its whole grace is given too."""
+    assert fence(HostLossPolicy(), IsolationPolicy("stop", 7.0)) == (7.0, 3.0)
+    assert fence(HostLossPolicy(), IsolationPolicy("stop")) == (CoreSettings().lease, 3.0)
+    assert fence(ELSEWHERE, IsolationPolicy("stop", 100.0)) == (100.0, 0.0)
+
+
+def test_beats_name_the_hosts_that_are_not_heard() -> None:
+    """Suspect and lost ones; not those that are expected or have left."""
+    cluster = Cluster("a", "b", "c")
+    assert cluster.state.hosts.unheard() == []
+    lose(cluster, "b", seconds=2.0)
+    lose(cluster, "c", seconds=10.0)
+    assert cluster.state.hosts.unheard() == [2, 3]
+    back(cluster, "b")
+    assert cluster.state.hosts.unheard() == [3]
