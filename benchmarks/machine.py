@@ -21,6 +21,7 @@ _DISTRIBUTIONS = (
     "rosrm-scoring",
     "rosrm-resources",
     "rosrm-migration",
+    "rosrm-checkpoint",
     "ros-jazzy-rclpy",
     "ros-jazzy-rmw-fastrtps-cpp",
 )

@@ -222,36 +222,43 @@ class MigrationOffer:
 
 @dataclass(frozen=True)
 class CheckpointView:
-    """What a checkpoint policy may know of a stateful process.
+    """What a checkpoint policy may know of a stateful process that runs.
 
     Attributes:
         spec: as submitted.
-        host: where it runs.
-        age: seconds since its newest kept state; None: none is kept.
-        kept_on: hosts that keep a state of it now.
-        hosts: every host that is up, by name, with its labels.
+        host: where it runs; it keeps a state of its own there whatever the policy says.
+        age: seconds since a newer state was kept on any other host; None: on none it ever was.
+        size: bytes of its newest state.
+        kept_on: other hosts that keep a state of it now, the newest first.
+        hosts: every host that is up, this one included, by name, with its labels.
     """
 
     spec: ProcessSpec
     host: str
     age: float | None
+    size: int
     kept_on: tuple[str, ...]
     hosts: Mapping[str, Mapping[str, str]]
 
 
 @dataclass(frozen=True)
 class CheckpointChoice:
-    """Keep the state on `hosts` (never the process's own), at most `copies` images each."""
+    """Where a state is kept from now on.
+
+    Attributes:
+        hosts: other than the process's own; (): nowhere.
+        every: seconds between two transfers to a host, at least.
+    """
 
     hosts: tuple[str, ...]
-    copies: int = 1
+    every: float = 1.0
 
 
 class CheckpointPolicy(Protocol):
-    """Decides when the state of a process is kept, how many are, and where. Pure."""
+    """Decides where the state of a process is kept, and how often. Pure."""
 
     def choose(self, process: CheckpointView) -> CheckpointChoice | None:
-        """Where to keep it now, or None: not now."""
+        """Where to keep it from now on; None: as before. Asked about once a second."""
 
 
 @dataclass(frozen=True)

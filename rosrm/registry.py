@@ -53,6 +53,7 @@ _SHIPPED_IN: Final[Mapping[str, str]] = {
     "probe": "rosrm-resources",
     "scoring": "rosrm-scoring",
     "migration": "rosrm-migration",
+    "checkpoint": "rosrm-checkpoint",
 }
 
 _log = logging.getLogger("rosrm.plugins")

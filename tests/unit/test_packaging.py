@@ -71,6 +71,7 @@ OWN = {canonicalize_name(read(project)["project"]["name"]) for project in PROJEC
 def test_every_distribution_is_looked_at() -> None:
     assert {
         "rosrm",
+        "rosrm-checkpoint",
         "rosrm-examples",
         "rosrm-migration",
         "rosrm-msgs",

@@ -1,0 +1,1 @@
+"""Checkpoint policies of rosrm."""

@@ -1,0 +1,55 @@
+"""`other-host`: a copy of the newest state on so many other hosts, the same ones for long."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+
+from rosrm.config.units import PositiveCount, PositiveSeconds
+from rosrm.ports import CheckpointChoice, CheckpointView
+
+
+@dataclass(frozen=True)
+class OtherHostOptions:
+    """What can be set.
+
+    Attributes:
+        every: seconds between two transfers to a host, at least.
+        copies: hosts that keep a state, beside the process's own.
+        apart_by: label in which they are to differ from it, as far as such hosts are up; "": none.
+    """
+
+    every: PositiveSeconds = 1.0
+    copies: PositiveCount = 1
+    apart_by: str = ""
+
+
+class OtherHost:
+    """Keeps to the hosts that have a state already, so that it seldom travels to a new one.
+
+    Which ones those are is settled by a digest of the names: different processes go to different
+    hosts, and nothing that changes with time decides.
+    """
+
+    def __init__(self, options: OtherHostOptions) -> None:
+        self._options = options
+
+    def choose(self, process: CheckpointView) -> CheckpointChoice | None:
+        """The hosts that keep it."""
+        others = sorted(name for name in process.hosts if name != process.host)
+        others.sort(key=lambda name: self._rank(name, process))
+        return CheckpointChoice(tuple(others[: self._options.copies]), self._options.every)
+
+    def _rank(self, name: str, process: CheckpointView) -> tuple[bool, bool, int]:
+        """Lower goes first."""
+        near = self._is_near(name, process)
+        new = name not in process.kept_on
+        return near, new, zlib.crc32(f"{process.spec.name}\n{name}".encode())
+
+    def _is_near(self, name: str, process: CheckpointView) -> bool:
+        """Whether it may be lost together with the process's own host."""
+        label = self._options.apart_by
+        if not label:
+            return False
+        own = process.hosts.get(process.host, {}).get(label)
+        return process.hosts[name].get(label) == own

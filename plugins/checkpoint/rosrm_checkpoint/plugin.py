@@ -1,0 +1,22 @@
+"""Registers the checkpoint policies."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rosrm.hookspecs import hookimpl
+from rosrm.ports import CheckpointOffer
+from rosrm_checkpoint.other_host import OtherHost, OtherHostOptions
+
+
+@hookimpl
+def register_checkpoint_policies() -> Sequence[CheckpointOffer]:
+    """Offer `other-host`: the state of a process is kept on another host than its own."""
+    return [
+        CheckpointOffer(
+            name="other-host",
+            create=OtherHost,
+            options=OtherHostOptions,
+            summary="the newest state of a process, on so many other hosts",
+        )
+    ]
