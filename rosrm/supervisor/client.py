@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from rosrm.core.model import (
+    Fence,
     InstanceId,
     InstanceState,
     InstanceStatus,
@@ -24,7 +25,10 @@ from rosrm.core.model import (
 from rosrm.core.supervision import (
     AmendOrdered,
     FailOrdered,
+    FenceOrdered,
+    FenceRule,
     Forgotten,
+    Heard,
     RestartOrdered,
     RestartRule,
     ShutdownOrdered,
@@ -32,7 +36,7 @@ from rosrm.core.supervision import (
     StopRule,
 )
 from rosrm.errors import SupervisorError
-from rosrm.supervisor import endpoint, paths, protocol
+from rosrm.supervisor import endpoint, lines, paths, protocol
 from rosrm.supervisor.logs import LogLimits
 
 if TYPE_CHECKING:
@@ -72,6 +76,8 @@ class LaunchOrder:
         environment: the whole of it, nothing is inherited.
         working_directory: None: one of its own, below the state directory.
         memo: kept by the supervisor for a later run of the client; see `SupervisorClient.memos`.
+        fence: when the supervisor ends it by itself; None: never.
+        heard: when the master last heard this host, monotonic; 0.0: just now.
     """
 
     instance: InstanceId
@@ -81,6 +87,8 @@ class LaunchOrder:
     restart: RestartPolicy = field(default_factory=RestartPolicy)
     stop: StopPolicy = field(default_factory=StopPolicy)
     memo: str = ""
+    fence: Fence | None = None
+    heard: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,6 +126,7 @@ class SupervisorClient:
         instances: what the supervisor knew when the connection was made: every instance that has
             not been forgotten, final statuses included.
         memos: what an earlier client wanted to be remembered of those that have not ended.
+        fenced: those that have a fence.
         notes: what the supervisor found wrong with its record, for people.
         pid: of the supervisor.
     """
@@ -125,7 +134,7 @@ class SupervisorClient:
     def __init__(self, peer: socket.socket, state_directory: Path) -> None:
         self._peer = peer
         self._state = state_directory
-        self._lines = protocol.Lines()
+        self._lines = lines.Lines()
         self._received: list[Told] = []
         self._failure: SupervisorError | None = None
         self._ending = False
@@ -134,6 +143,7 @@ class SupervisorClient:
         self._base_id = ""
         self.instances: tuple[InstanceStatus, ...] = ()
         self.memos: Mapping[InstanceId, str] = {}
+        self.fenced: frozenset[InstanceId] = frozenset()
         self.notes: tuple[str, ...] = ()
         self.pid = 0
 
@@ -180,6 +190,14 @@ class SupervisorClient:
     def stop(self, instance: InstanceId) -> None:
         """SIGINT, SIGTERM, SIGKILL to all of it; never heard of: it will never be started."""
         self._order(StopOrdered(_key(instance)))
+
+    def fence(self, instance: InstanceId) -> None:
+        """SIGKILL to all of it, and no restart; never heard of: it will never be started."""
+        self._order(FenceOrdered(_key(instance)))
+
+    def heard(self, at: float) -> None:
+        """The master is known to have heard this host at that monotonic time: fences wait."""
+        self._order(Heard(at))
 
     def restart(self, instance: InstanceId) -> None:
         """Stop it, then start it again; the restart policy does not count this."""
@@ -274,6 +292,8 @@ class SupervisorClient:
             _rule(order.restart),
             StopRule(*(getattr(order.stop, name) for name in StopRule._fields)),
             order.memo,
+            None if order.fence is None else FenceRule(order.fence.after, order.fence.grace),
+            order.heard,
         )
 
     def _choose_base(self, environment: Mapping[str, str]) -> None:
@@ -324,8 +344,8 @@ class SupervisorClient:
             self._fail(SupervisorGone(f"{self._name()} is gone; its processes go on"))
         try:
             for line in self._lines.feed(data):
-                self._take(protocol.parse(line))
-        except (protocol.ProtocolError, KeyError, TypeError, ValueError) as error:
+                self._take(lines.parse(line))
+        except (lines.ProtocolError, KeyError, TypeError, ValueError) as error:
             self._fail(SupervisorError(f"{self._name()} cannot be understood: {error}"))
 
     def _take(self, fields: Mapping[str, object]) -> None:
@@ -350,13 +370,16 @@ class SupervisorClient:
         if number != protocol.PROTOCOL:
             raise ValueError(f"it speaks protocol {number!r}, this is {protocol.PROTOCOL}")
         notes, instances, memos = fields["notes"], fields["instances"], fields["memos"]
+        fenced = fields["fenced"]
         assert isinstance(pid, int)
         assert isinstance(notes, list)
         assert isinstance(instances, list)
         assert isinstance(memos, list)
+        assert isinstance(fenced, list)
         self.pid = pid
         self.notes = tuple(str(note) for note in notes)
         self.instances = tuple(_status(value) for value in instances)
+        self.fenced = frozenset(InstanceId(*protocol.read_key(key)) for key in fenced)
         self.memos = {InstanceId(*protocol.read_key(key)): str(memo) for key, memo in memos}
 
     def _fail(self, failure: SupervisorError) -> None:

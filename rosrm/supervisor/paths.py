@@ -6,6 +6,7 @@ One folder holds all of one host::
     supervisor.lock                held by the one live supervisor; holds its pid
     supervisor.log                 its own troubles
     instances.jsonl                the durable record
+    heard                          when the master last heard this host
     logs/PROCESS.NUMBER.log        what an instance writes; .log.1 is older, and so on
     logs/PROCESS.NUMBER.*          further files of that instance (its parameters)
     work/                          working directory of the processes that name none
@@ -22,6 +23,7 @@ SOCKET = "supervisor.sock"
 LOCK = "supervisor.lock"
 OWN_LOG = "supervisor.log"
 RECORD = "instances.jsonl"
+HEARD = "heard"
 
 _LOG_NAME = re.compile(r"(.+)\.([0-9]+)\.log")
 _SAFE = frozenset("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_-.")

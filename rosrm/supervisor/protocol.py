@@ -7,13 +7,20 @@ The client orders, by the key `do`:
 
     hello        protocol, pid, log             first of all; log: the limits of `LogLimits`
     environment  id, variables                  a base that later `start`s name
-    start        instance, argv, environment, changes, directory, restart, stop, memo
+    start        instance, argv, environment, changes, directory, restart, stop, fence,
+                 heard, memo
                                                 environment: id of a base; changes: variable to
                                                 value, or null to leave it out; restart and stop:
                                                 the fields of the policies, in their order
+                                                fence: null, or [after, grace]: see `heard`, of which
+                                                the start has one of its own; 0: now
                                                 memo: a text that is kept for the client
     stop         instance                       SIGINT, SIGTERM, SIGKILL; never heard of: a start
                                                 that comes late will be refused
+    fence        instance                       SIGKILL to all of it; never heard of: as with stop
+    heard        at                             the master is known to have heard this host then (by
+                                                CLOCK_MONOTONIC); `after` seconds after the newest
+                                                what has a fence ends, by SIGKILL `grace` later
     restart      instance                       stop, then start again
     fail         instance, pid, reason, kill    this run of it counts as failed: stop it, at once by
                                                 SIGKILL where kill is true; then its restart policy
@@ -25,9 +32,10 @@ The client orders, by the key `do`:
 
 The supervisor tells, by the key `tell`:
 
-    welcome      protocol, pid, notes, instances, memos
+    welcome      protocol, pid, notes, instances, memos, fenced
                                                    the answer to hello; instances: their statuses;
                                                    memos: [instance, text] of those that have one
+                                                   fenced: those that have a fence
     status       status                            something has changed, or was ordered again
     amended      instance, restart                 the order is recorded; its status came before
     refused      message                           the connection is closed after it
@@ -40,14 +48,16 @@ A line that is not understood is refused, never guessed at; so is another protoc
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 from rosrm.core.supervision import (
     AmendOrdered,
     FailOrdered,
+    FenceOrdered,
+    FenceRule,
     Forgotten,
+    Heard,
     Instance,
     Key,
     RestartOrdered,
@@ -56,17 +66,10 @@ from rosrm.core.supervision import (
     StopOrdered,
     StopRule,
 )
+from rosrm.supervisor.lines import ProtocolError, line, parse
 from rosrm.supervisor.logs import LogLimits
 
 PROTOCOL: Final = 3
-#: Longest line that is read.
-LONGEST_LINE: Final = 8 << 20
-
-_encoder: Final = json.JSONEncoder(separators=(",", ":"))
-
-
-class ProtocolError(Exception):
-    """The peer sent what cannot be understood; its text is meant for the peer."""
 
 
 class Hello(NamedTuple):
@@ -95,6 +98,8 @@ class Launch(NamedTuple):
     restart: RestartRule
     stop: StopRule
     memo: str = ""
+    fence: FenceRule | None = None
+    heard: float = 0.0
 
     def amended(self, amendment: Amend) -> Launch:
         """How it is started after an amendment."""
@@ -127,6 +132,8 @@ Order = (
     | Environment
     | Launch
     | StopOrdered
+    | FenceOrdered
+    | Heard
     | RestartOrdered
     | FailOrdered
     | Amend
@@ -177,6 +184,8 @@ def encode_order(order: Order) -> bytes:
 
 _WORDS: Final[Mapping[type, str]] = {
     StopOrdered: "stop",
+    FenceOrdered: "fence",
+    Heard: "heard",
     RestartOrdered: "restart",
     FailOrdered: "fail",
 }
@@ -189,7 +198,7 @@ def _order_fields(order: Order) -> dict[str, Any]:
         return {"do": "environment", "id": order.id, "variables": dict(order.variables)}
     if isinstance(order, Launch):
         return {"do": "start", **launch_fields(order)}
-    if isinstance(order, (StopOrdered, RestartOrdered, FailOrdered)):
+    if isinstance(order, (StopOrdered, FenceOrdered, Heard, RestartOrdered, FailOrdered)):
         return {"do": _WORDS[type(order)], **order._asdict()}
     if isinstance(order, Amend):
         instance, restart = order.order
@@ -212,6 +221,8 @@ def launch_fields(launch: Launch) -> dict[str, Any]:
         "directory": launch.directory,
         "restart": launch.restart,
         "stop": launch.stop,
+        "fence": launch.fence,
+        "heard": launch.heard,
         "memo": launch.memo,
     }
 
@@ -250,6 +261,8 @@ def read_launch(fields: Mapping[str, Any]) -> Launch:
         read_restart(fields["restart"]),
         read_stop(fields["stop"]),
         _text(fields.get("memo", "")),  # records of before protocol 2 have none
+        read_fence(fields.get("fence")),  # and before protocol 3 none of these
+        float(fields.get("heard", 0.0)),
     )
 
 
@@ -270,6 +283,8 @@ _READERS: Final[Mapping[str, Callable[[Mapping[str, Any]], Order]]] = {
     "environment": lambda fields: Environment(_text(fields["id"]), _texts(fields["variables"])),
     "start": read_launch,
     "stop": lambda fields: StopOrdered(read_key(fields["instance"])),
+    "fence": lambda fields: FenceOrdered(read_key(fields["instance"])),
+    "heard": lambda fields: Heard(float(fields["at"])),
     "restart": lambda fields: RestartOrdered(read_key(fields["instance"])),
     "fail": _read_fail,
     "amend": _read_amend,
@@ -301,6 +316,14 @@ def read_stop(value: Sequence[Any]) -> StopRule:
     return StopRule(float(interrupt_grace), float(terminate_grace))
 
 
+def read_fence(value: Sequence[Any] | None) -> FenceRule | None:
+    """A fence from its JSON list."""
+    if value is None:
+        return None
+    after, grace = value
+    return FenceRule(float(after), float(grace))
+
+
 def _limits(value: Any) -> LogLimits:
     max_bytes, keep, instances, processes = value
     return LogLimits(int(max_bytes), int(keep), int(instances), int(processes))
@@ -326,11 +349,16 @@ def _texts(value: Any) -> dict[str, str]:
 
 
 def encode_welcome(
-    pid: int, notes: Sequence[str], statuses: Sequence[Status], memos: Mapping[Key, str]
+    pid: int,
+    notes: Sequence[str],
+    statuses: Sequence[Status],
+    memos: Mapping[Key, str],
+    fenced: Sequence[Key],
 ) -> bytes:
     """The answer to `hello`."""
     welcome = {"tell": "welcome", "protocol": PROTOCOL, "pid": pid, "notes": list(notes)}
-    return line({**welcome, "instances": statuses, "memos": list(memos.items())})
+    known = {"instances": statuses, "memos": list(memos.items()), "fenced": fenced}
+    return line({**welcome, **known})
 
 
 def encode_status(status: Status) -> bytes:
@@ -357,36 +385,3 @@ def read_status(value: Sequence[Any]) -> Status:
     """A status from its JSON list."""
     status = Status(*value)
     return status._replace(instance=read_key(status.instance))
-
-
-# --- lines ------------------------------------------------------------------------------------
-
-
-def line(fields: Mapping[str, Any]) -> bytes:
-    """A JSON object in one line."""
-    return _encoder.encode(fields).encode() + b"\n"
-
-
-def parse(text: bytes) -> dict[str, Any]:
-    """The JSON object in one line. Raises ProtocolError."""
-    try:
-        fields = json.loads(text)
-    except ValueError as error:
-        raise ProtocolError(f"not a line of JSON ({error}): {text[:80]!r}") from None
-    if not isinstance(fields, dict):
-        raise ProtocolError(f"not a JSON object: {text[:80]!r}")
-    return fields
-
-
-class Lines:
-    """Cuts a stream into lines."""
-
-    def __init__(self) -> None:
-        self._rest = b""
-
-    def feed(self, data: bytes) -> list[bytes]:
-        """The lines that `data` completes. Raises ProtocolError where one does not end."""
-        *lines, self._rest = (self._rest + data).split(b"\n")
-        if len(self._rest) > LONGEST_LINE:
-            raise ProtocolError(f"a line is longer than {LONGEST_LINE} bytes")
-        return lines

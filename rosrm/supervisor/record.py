@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Final
 
 from rosrm.core.supervision import Instance, Key, Supervision
-from rosrm.supervisor import members, paths, protocol
+from rosrm.supervisor import lines, members, paths, protocol
 from rosrm.supervisor.protocol import Launch
 
 VERSION: Final = 1
@@ -61,19 +61,19 @@ def read(state: str) -> Recorded:
     path = os.path.join(state, paths.RECORD)
     try:
         with open(path, "rb") as file:
-            *lines, tail = file.read().split(b"\n")
+            *written, tail = file.read().split(b"\n")
     except FileNotFoundError:
         return recorded
     except OSError as error:
         raise RecordError(f"{path} cannot be read: {error.strerror}") from None
     if tail:
         recorded.notes.append(f"{path}: the last {len(tail)} bytes, a torn line, were left out")
-    for number, line in enumerate(lines, 1):
+    for number, line in enumerate(written, 1):
         if not line:
             continue
         try:
-            _take(recorded, protocol.parse(line))
-        except (protocol.ProtocolError, KeyError, TypeError, ValueError) as error:
+            _take(recorded, lines.parse(line))
+        except (lines.ProtocolError, KeyError, TypeError, ValueError) as error:
             recorded.notes.append(f"{path}:{number}: left out, it cannot be read: {error}")
     return recorded
 
@@ -115,6 +115,7 @@ def _take_state(recorded: Recorded, fields: Mapping[str, Any]) -> None:
     for name in _PLAIN_FIELDS:
         if name in fields or name not in _NEW_FIELDS:
             setattr(instance, name, fields[name])
+    instance.fence = protocol.read_fence(fields.get("fence"))
     recorded.instances[instance.key] = instance
     recorded.births[instance.key] = fields["birth"]
     recorded.spawning.discard(instance.key)
@@ -123,10 +124,10 @@ def _take_state(recorded: Recorded, fields: Mapping[str, Any]) -> None:
 
 
 _PLAIN_FIELDS: Final = tuple(
-    name for name in Instance.__slots__ if name not in ("key", "restart", "stop")
+    name for name in Instance.__slots__ if name not in ("key", "restart", "stop", "fence")
 )
 #: Records of before protocol 3 have none of these.
-_NEW_FIELDS: Final = frozenset({"fault"})
+_NEW_FIELDS: Final = frozenset({"fault", "fenced", "heard", "kill_by"})
 
 
 class Record:
@@ -243,7 +244,7 @@ class Record:
             self._waiting.insert(0, b"\n")
 
     def _add(self, fields: Mapping[str, Any]) -> None:
-        self._waiting.append(protocol.line(fields))
+        self._waiting.append(lines.line(fields))
 
     def _fail(self, why: str) -> None:
         self.trouble = f"{self._path} cannot be written: {why}"

@@ -17,9 +17,10 @@ from typing import Final
 
 from rosrm.core import supervision
 from rosrm.core.supervision import Event, Key, Spawned, SpawnFailed
-from rosrm.supervisor import children, members, own_log, paths, protocol, takeover
+from rosrm.supervisor import children, heard, members, own_log, paths, protocol, takeover
 from rosrm.supervisor.connection import Connection
 from rosrm.supervisor.family import Family, mark
+from rosrm.supervisor.lines import ProtocolError
 from rosrm.supervisor.logs import LogKeeper, LogLimits
 from rosrm.supervisor.members import INSTANCE_MARK, SUPERVISOR_MARK
 from rosrm.supervisor.record import Record
@@ -48,6 +49,7 @@ class Server:
         self._core = supervision.Supervision()
         self._family = Family(state, self._selector, self._happened)
         self._record = Record(state)
+        self._heard_at = heard.LastHeard(state)
         self._logs = LogKeeper(state, limits)
         self._null = os.open(os.devnull, os.O_RDWR | os.O_CLOEXEC)
         self._launches: dict[Key, protocol.Launch] = {}
@@ -238,7 +240,7 @@ class Server:
             for line in connection.read():
                 if not connection.closing:
                     self._obey(connection, protocol.decode_order(line))
-        except protocol.ProtocolError as error:
+        except ProtocolError as error:
             self._refuse(connection, str(error))
         self._send(connection, b"")
 
@@ -246,7 +248,7 @@ class Server:
         if isinstance(order, protocol.Hello):
             self._welcome(connection, order)
         elif connection is not self._client:
-            raise protocol.ProtocolError("say hello first")
+            raise ProtocolError("say hello first")
         elif isinstance(order, protocol.Environment):
             self._learn_environment(connection, order)
         elif isinstance(order, protocol.Launch):
@@ -258,19 +260,21 @@ class Server:
         elif isinstance(order, protocol.Forget):
             for forgotten in order.instances:
                 self._happened(forgotten)
+        elif isinstance(order, supervision.Heard):
+            self._renew(order)
         else:
             self._happened(order)
 
     def _welcome(self, connection: Connection, hello: protocol.Hello) -> None:
         if connection is self._client:
-            raise protocol.ProtocolError("hello was said already")
+            raise ProtocolError("hello was said already")
         if hello.protocol != protocol.PROTOCOL:
-            raise protocol.ProtocolError(
+            raise ProtocolError(
                 f"this supervisor (pid {os.getpid()}) speaks protocol {protocol.PROTOCOL}, "
                 f"you speak {hello.protocol}"
             )
         if self._client is not None and not self._client_is_gone(self._client):
-            raise protocol.ProtocolError(
+            raise ProtocolError(
                 f"another slave (pid {self._client.pid}) is connected to the supervisor of "
                 f"{self._state}; one host has one slave"
             )
@@ -280,8 +284,9 @@ class Server:
         self._telling.clear()  # all that it would say is in the statuses
         statuses = [protocol.Status.of(instance) for instance in self._core.instances.values()]
         memos = {key: launch.memo for key, launch in self._launches.items() if launch.memo}
+        fenced = [one.key for one in self._core.instances.values() if one.fence is not None]
         self._record.flush()
-        connection.send(protocol.encode_welcome(os.getpid(), self._notes, statuses, memos))
+        connection.send(protocol.encode_welcome(os.getpid(), self._notes, statuses, memos, fenced))
 
     def _client_is_gone(self, client: Connection) -> bool:
         """Its end may have come in the same round as its successor."""
@@ -296,11 +301,20 @@ class Server:
 
     def _start(self, launch: protocol.Launch) -> None:
         if launch.environment not in self._environments:
-            raise protocol.ProtocolError(f"unknown environment {launch.environment!r}")
+            raise ProtocolError(f"unknown environment {launch.environment!r}")
         if launch.instance not in self._core.instances:
             self._launches[launch.instance] = launch
             self._record.launch(launch)
-        self._happened(supervision.StartOrdered(launch.instance, launch.restart, launch.stop))
+        self._happened(
+            supervision.StartOrdered(
+                launch.instance, launch.restart, launch.stop, launch.fence, launch.heard or None
+            )
+        )
+
+    def _renew(self, order: supervision.Heard) -> None:
+        at = min(order.at, time.monotonic())
+        self._heard_at.keep(at)
+        self._happened(supervision.Heard(at))
 
     def _amend(self, amendment: protocol.Amend) -> None:
         launch = self._launches.get(amendment.order.instance)

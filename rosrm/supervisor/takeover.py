@@ -2,6 +2,10 @@
 
 A process is known again by its pid together with its start time. Nothing is started that may run or
 may have run already; whose end nobody saw has an unknown exit code.
+
+The clocks of fences go on from the newest time at which the master is known to have heard this
+host: who is killed in between puts no fence off. After a restart of the machine nobody knows how
+long it was away, and whether there is a successor elsewhere: what has a fence is fenced.
 """
 
 from __future__ import annotations
@@ -21,7 +25,7 @@ from rosrm.core.supervision import (
     SpawnFailed,
     Supervision,
 )
-from rosrm.supervisor import members, record
+from rosrm.supervisor import heard, members, record
 from rosrm.supervisor.family import Family, mark
 from rosrm.supervisor.members import Stat
 from rosrm.supervisor.record import Recorded
@@ -31,15 +35,27 @@ def restore(state: str, core: Supervision, family: Family) -> Recorded:
     """Read the record into the core, and find the leaders that live on."""
     recorded = record.read(state)
     core.dead.update(recorded.dead)
+    newest = heard.read(state)
     for instance in recorded.instances.values():
-        if not recorded.same_boot and instance.deadline is not None:
-            instance.deadline = time.monotonic()  # the clock began anew with this boot
+        if not recorded.same_boot:
+            _begin_clock_anew(instance, time.monotonic())
+        instance.heard = max(instance.heard, newest)
         core.restore(instance)
         leader = members.read_stat(instance.pid) if instance.pid and recorded.same_boot else None
         birth = recorded.births[instance.key]
         if leader is not None and leader.alive and members.was_born(leader, birth):
             family.take_over(instance.key, leader)
     return recorded
+
+
+def _begin_clock_anew(instance: Instance, now: float) -> None:
+    """It began anew with this boot."""
+    if instance.deadline is not None:
+        instance.deadline = now
+    if instance.fence is not None:
+        instance.heard = now - instance.fence.after
+    if instance.kill_by is not None:
+        instance.kill_by = now
 
 
 def what_happened(

@@ -9,13 +9,17 @@ from hypothesis import given
 from rosrm.core.supervision import (
     AmendOrdered,
     FailOrdered,
+    FenceOrdered,
+    FenceRule,
     Forgotten,
+    Heard,
     RestartOrdered,
     RestartRule,
     ShutdownOrdered,
     StopOrdered,
     StopRule,
 )
+from rosrm.supervisor import lines as ls
 from rosrm.supervisor import protocol
 from rosrm.supervisor.logs import LogLimits
 
@@ -46,8 +50,12 @@ ORDERS = st.one_of(
         RULES,
         st.builds(StopRule, SECONDS, SECONDS),
         st.text(),
+        st.none() | st.builds(FenceRule, SECONDS, SECONDS),
+        SECONDS,
     ),
     st.builds(StopOrdered, KEYS),
+    st.builds(FenceOrdered, KEYS),
+    st.builds(Heard, SECONDS),
     st.builds(RestartOrdered, KEYS),
     st.builds(FailOrdered, KEYS, st.integers(1, 2**31), st.text(), st.booleans()),
     st.builds(protocol.Amend, st.builds(AmendOrdered, KEYS, RULES), CHANGES),
@@ -72,7 +80,7 @@ def test_lines_are_cut_wherever_the_stream_is(lines, data):
     """However the bytes come in, the lines are the same."""
     stream = b"".join(line + b"\n" for line in lines)
     cuts = sorted(data.draw(st.lists(st.integers(0, len(stream)), max_size=6)))
-    cutter, found = protocol.Lines(), []
+    cutter, found = ls.Lines(), []
     for begin, end in zip([0, *cuts], [*cuts, len(stream)], strict=True):
         found += cutter.feed(stream[begin:end])
     assert found == lines
@@ -96,11 +104,11 @@ def test_lines_are_cut_wherever_the_stream_is(lines, data):
 )
 def test_what_is_not_understood_is_refused(line, said):
     """Never guessed at: the answer says what was wrong."""
-    with pytest.raises(protocol.ProtocolError, match=said):
+    with pytest.raises(ls.ProtocolError, match=said):
         protocol.decode_order(line)
 
 
 def test_a_line_without_end_is_refused():
     """A peer cannot fill the memory."""
-    with pytest.raises(protocol.ProtocolError, match="longer than"):
-        protocol.Lines().feed(b"x" * (protocol.LONGEST_LINE + 1))
+    with pytest.raises(ls.ProtocolError, match="longer than"):
+        ls.Lines().feed(b"x" * (ls.LONGEST_LINE + 1))
