@@ -45,16 +45,22 @@ class GraphWatch:
         own = {pid & 0xFFFF for pid in pids}
         return any(self._belongs(gid, own, before) for gid in self.endpoints(name))
 
+    def is_of(self, gid: bytes, pids: Iterable[int]) -> bool:
+        """Whether an endpoint is known to be one of these processes of this host."""
+        return self._belongs(gid, {pid & 0xFFFF for pid in pids}, frozenset((gid,)))
+
     def _belongs(self, gid: bytes, own: set[int], before: frozenset[bytes]) -> bool:
         if gid[:2] != _FAST_DDS:
             return gid not in before
         return gid[_HOST] == self._own_host() and int.from_bytes(gid[_PID], "little") in own
 
     def _own_host(self) -> bytes:
+        """By our own node: another host may have a process with our very pid."""
         if not self._host:
-            own = {os.getpid() & 0xFFFF}
-            for _, gid in self._all():
-                if gid[:2] == _FAST_DDS and int.from_bytes(gid[_PID], "little") in own:
+            own, name = os.getpid() & 0xFFFF, self._node.get_fully_qualified_name()
+            for owner, gid in self._all():
+                ours = owner == name and int.from_bytes(gid[_PID], "little") == own
+                if ours and gid[:2] == _FAST_DDS:
                     self._host = gid[_HOST]
         return self._host
 
