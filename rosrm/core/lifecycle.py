@@ -215,7 +215,6 @@ def _ended(
         )  # fmt: skip
         requeue_if_clear(state, process, now)
         return
-    process.exit_code = status.exit_code or -status.exit_signal
     if run is not None:
         return  # the plan in hand knows what this end means
     if instance.restarting:  # its end was on its way when the restart was ordered
@@ -242,6 +241,8 @@ def conclude(state: MasterState, process: Process, end: End, host: Host, now: fl
     """The owning instance has ended, and no plan is under way: what becomes of the process?"""
     status = end.status
     process.owner = 0
+    if not end.gone:
+        process.exit_code = status.exit_code or -status.exit_signal
     if process.wanted is Wanted.CANCEL:
         _finish(state, process, ProcessPhase.CANCELLED, host, now, "")
     elif end.gone:

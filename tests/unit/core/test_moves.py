@@ -9,7 +9,7 @@ import pytest
 from rosrm.core import events as happened
 from rosrm.core import slave
 from rosrm.core.migration import AwaitReady, Commit, Execute, Move, Plan, Start, Stop
-from rosrm.core.model import InstanceId, MigrationPolicy
+from rosrm.core.model import InstanceId, InstanceState, MigrationPolicy
 from tests.unit.core.cluster import Cluster, Machine, StartFirstOrStopFirst, job, movable, process
 
 
@@ -486,3 +486,18 @@ def test_the_shipped_shape_of_relaunch_keeps_to_its_declared_overlap() -> None:
 
 def _id(number: int) -> Any:
     return InstanceId("p", number)
+
+
+def test_how_the_destination_ended_is_known_after_a_restart_of_the_master() -> None:
+    """It was ended by a signal while the source did not stop: that is no success."""
+    cluster = two_hosts()
+    cluster.machines["a"].stubborn.add("p")
+    cluster.migrate("p")
+    ready_on(cluster, "b")
+    machine = cluster.machines["b"]
+    machine._end(machine.find("p"), InstanceState.EXITED, cluster.now, signal=2)
+    cluster.settle()
+    cluster.restart_master()
+    cluster.machines["a"].let_go("p", cluster.now)
+    cluster.wait(1.0)
+    assert (cluster.phase("p"), cluster["p"].exit_code) == ("failed", -2)
