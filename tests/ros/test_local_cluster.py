@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 from rosrm.local_cluster import LocalCluster
-from tests.ros.clusters import PATIENCE, host, node
+from tests.ros.clusters import PATIENCE, host, node, wait_until
 
 
 def test_its_directory_may_be_relative(tmp_path, monkeypatch) -> None:
@@ -18,4 +18,5 @@ def test_its_directory_may_be_relative(tmp_path, monkeypatch) -> None:
             "the node running", lambda view: view.processes[0].state == "running", PATIENCE
         )
         (log,) = (tmp_path / "here").glob("hosts/h0/supervisor/logs/reader.*.log")
+        wait_until(lambda: "\n" in log.read_text(), "the node's first line")
         assert json.loads(log.read_text().splitlines()[0])["parameters"] == {"answer": 42}
