@@ -1,0 +1,198 @@
+"""Judges whether an instance that is ready does what its spec wants of it: looks in, verdict out.
+
+What is amiss must have been so in every look for longer than the spec's `timeout`. Only time counts
+in which the slave looked: one that was itself stopped, or found no CPU, blames nobody.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator, Mapping
+from typing import Final
+
+from rosrm.core.model import Assignment, Health
+from rosrm.core.slave.words import Look, Watch
+
+#: Seconds between two looks.
+LOOK_PERIOD: Final = 0.2
+#: Part of `timeout` over which a rate is counted, and the least number of periods of that rate.
+_WINDOW: Final = 0.25
+_PERIODS: Final = 3.0
+#: A count may be short of this many messages: where the window begins is chance.
+_SLACK: Final = 1.0
+#: Part of `timeout` that one look counts for at most, and the least of it in seconds.
+_STRIDE: Final = 0.25
+_LEAST_STRIDE: Final = 1.5 * LOOK_PERIOD
+
+
+# --- what is watched --------------------------------------------------------------------------
+
+
+def watch_of(assignment: Assignment) -> Watch | None:
+    """What is watched of an instance; None: nothing."""
+    wanted = assignment.spec.health
+    if wanted.timeout <= 0.0:
+        return None
+    return Watch(
+        wanted,
+        _names(wanted.topic, assignment, "rostopic://") if wanted.topic else (),
+        _names("~/get_state", assignment, "rosservice://") if wanted.lifecycle else (),
+        assignment.shadow,
+    )
+
+
+def _names(name: str, assignment: Assignment, scheme: str) -> tuple[str, ...]:
+    """Absolute names: below the node's visible name first, then below its alias, if it has one."""
+    spec = assignment.spec
+    nodes = dict.fromkeys((spec.name, assignment.node_name))
+    resolved = (resolve(name, spec.namespace, node, spec.remappings, scheme) for node in nodes)
+    return tuple(dict.fromkeys(resolved))
+
+
+def resolve(
+    name: str, namespace: str, node: str, remappings: Mapping[str, str], scheme: str
+) -> str:
+    """The absolute name of a topic or service after the remappings, as rcl finds it.
+
+    Args:
+        name: absolute, relative to the namespace, or below the node ("~/scan").
+        scheme: "rostopic://" or "rosservice://": rules that begin so hold for this kind alone.
+    """
+    absolute = _absolute(name, namespace, node)
+    for source, target in remappings.items():
+        before, colon, rest = source.rpartition(":")
+        if source.startswith(scheme):
+            rest = source.removeprefix(scheme)
+        elif "://" in source or source.startswith("__") or (colon and before != node):
+            continue  # of another kind, the node's own name, or for another node
+        if _absolute(rest, namespace, node) == absolute:
+            return _absolute(target.removeprefix(scheme), namespace, node)
+    return absolute
+
+
+def _absolute(name: str, namespace: str, node: str) -> str:
+    inside = f"/{namespace.strip('/')}".rstrip("/")
+    if name.startswith("/"):
+        return name
+    if name == "~" or name.startswith("~/"):
+        return f"{inside}/{node}{name[1:]}"
+    return f"{inside}/{name}"
+
+
+# --- what was seen of it ----------------------------------------------------------------------
+
+
+class _Lasting:
+    """For how long something has been amiss without a break, since it was first seen so."""
+
+    __slots__ = ("amiss", "seconds")
+
+    def __init__(self) -> None:
+        self.amiss = False
+        self.seconds = 0.0
+
+    def note(self, amiss: bool, passed: float) -> None:
+        self.seconds = self.seconds + passed if self.amiss and amiss else 0.0
+        self.amiss = amiss
+
+
+class Judgement:
+    """Of one run of an instance.
+
+    Args:
+        watch: what is watched.
+        pid: of the run.
+        now: when it was ready.
+
+    Attributes:
+        pid: of the run.
+    """
+
+    __slots__ = ("_lifecycle", "_looked", "_rate", "_stopped", "_stride", "_watch", "pid")
+
+    def __init__(self, watch: Watch, pid: int, now: float) -> None:
+        self.pid = pid
+        self._watch = watch
+        self._looked = now
+        self._stride = max(_STRIDE * watch.wanted.timeout, _LEAST_STRIDE)
+        self._stopped = _Lasting()
+        self._lifecycle = _Lasting()
+        self._rate = _Rate(watch.wanted)
+
+    def look(self, seen: Look, now: float) -> str:
+        """Take a look in; what has been amiss for too long, for people; "": nothing."""
+        gap = now - self._looked
+        passed = min(gap, self._stride)
+        self._looked = now
+        self._stopped.note(seen.stopped, passed)
+        self._lifecycle.note(seen.state not in (None, self._watch.wanted.lifecycle), passed)
+        if self._watch.topics:
+            self._rate.look(seen, now, passed, missed=gap > self._stride)
+        reasons = "; ".join(self._reasons(seen))
+        return f"unhealthy: {reasons}" if reasons else ""
+
+    def _reasons(self, seen: Look) -> Iterator[str]:
+        wanted = self._watch.wanted
+        if self._stopped.seconds > wanted.timeout:
+            yield f"stopped by a signal (SIGSTOP) for {self._stopped.seconds:.1f} s"
+        if self._lifecycle.seconds > wanted.timeout:
+            silent = f"no answer from {' or '.join(self._watch.services)}"
+            found = f"lifecycle state {seen.state}" if seen.state else silent
+            lasted = self._lifecycle.seconds
+            yield f"{found} for {lasted:.1f} s, the state {wanted.lifecycle} is wanted"
+        lasted = self._rate.amiss.seconds
+        if lasted > wanted.timeout:
+            found = seen.trouble or f"{self._rate.found:.1f} Hz"
+            least = f"at least {wanted.rate:g} Hz are wanted"
+            yield f"{wanted.topic}: {found} for {lasted:.1f} s, {least}"
+
+
+class _Rate:
+    """Whether messages come often enough, counted over a sliding window.
+
+    Attributes:
+        amiss: for how long they have not.
+    """
+
+    __slots__ = ("_counts", "_heard", "_heard_amiss", "_idle", "_least", "_window", "amiss")
+
+    def __init__(self, wanted: Health) -> None:
+        self.amiss = _Lasting()
+        self._least = wanted.rate
+        self._window = _WINDOW * wanted.timeout
+        if wanted.rate > 0.0:
+            self._window = max(self._window, _PERIODS / wanted.rate)
+        self._idle = wanted.timeout  # that a node has until it must publish
+        self._counts: deque[tuple[float, int]] = deque()
+        self._heard = 0
+        self._heard_amiss = 0
+
+    @property
+    def found(self) -> float:
+        """Hz, while it was amiss."""
+        return self._heard_amiss / self.amiss.seconds
+
+    def look(self, seen: Look, now: float, passed: float, *, missed: bool) -> None:
+        """Count; `missed`: so long after the look before that some may have been lost."""
+        if seen.heard is None or missed:
+            self._counts.clear()
+        self._heard += seen.heard or 0
+        amiss = self._is_amiss(seen, now)
+        self._idle -= passed
+        if amiss is None or self._idle > 0.0:
+            return
+        was_amiss = self.amiss.amiss
+        self.amiss.note(amiss, passed)
+        self._heard_amiss = self._heard_amiss + (seen.heard or 0) if was_amiss else 0
+
+    def _is_amiss(self, seen: Look, now: float) -> bool | None:
+        """None: it has not been listened to for long enough to say."""
+        if seen.heard is None:
+            return True
+        self._counts.append((now, self._heard))
+        while len(self._counts) > 1 and self._counts[1][0] <= now - self._window:
+            self._counts.popleft()
+        since, before = self._counts[0]
+        if now - since < self._window:
+            return None
+        return self._heard - before + _SLACK < self._least * (now - since)

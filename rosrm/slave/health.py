@@ -1,0 +1,70 @@
+"""Looks at the instances whose health is watched; what follows, the slave's core says."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any, Final
+
+from rosrm.core.model import InstanceId
+from rosrm.core.slave import Held, Look, LookedAt, Watch
+from rosrm.ros.graph import GraphWatch
+from rosrm.ros.health import HealthEar
+from rosrm.ros.participant import Participant
+from rosrm.slave.sessions import SessionTable
+from rosrm.supervisor.members import read_stat
+
+_NODE: Final = "rosrm_health"
+#: State in /proc of what a signal has stopped; "t" is what a debugger holds.
+_STOPPED: Final = "T"
+
+
+class HealthWatch:
+    """Looks at each instance that is watched, and listens only to what is asked for.
+
+    Args:
+        participant: in which a node is made when the first one asks for a topic or a state.
+        graph: tells whose a publisher is.
+        sessions: the processes of each instance.
+
+    Attributes:
+        watches: there was something to look at.
+    """
+
+    def __init__(self, participant: Participant, graph: GraphWatch, sessions: SessionTable) -> None:
+        self._participant, self._graph, self._sessions = participant, graph, sessions
+        self.watches = False
+        self._node: Any = None
+        self._ears: dict[tuple[InstanceId, int], HealthEar] = {}
+
+    def look(self, watched: Mapping[InstanceId, Held], now: float) -> Iterator[LookedAt]:
+        """One look at each.
+
+        Args:
+            watched: all that are.
+            now: monotonic seconds.
+        """
+        self.watches = bool(watched)
+        runs = {(instance, held.status.pid) for instance, held in watched.items()}
+        for run in [run for run in self._ears if run not in runs]:
+            self._ears.pop(run).close()
+        for instance, held in watched.items():
+            watch = held.watched
+            if watch is not None:
+                look = self._look(instance, held.status.pid, watch, now)
+                yield LookedAt(instance, held.status.pid, look)
+
+    def _look(self, instance: InstanceId, pid: int, watch: Watch, now: float) -> Look:
+        stat = read_stat(pid)
+        stopped = stat is not None and stat.state == _STOPPED
+        if not watch.topics and not watch.services:
+            return Look(stopped)
+        ear = self._ears.get((instance, pid))
+        if ear is None:
+            ear = self._ears[instance, pid] = self._listen(watch, now)
+        heard, trouble = ear.topic(self._sessions.members(pid), now)
+        return Look(stopped, heard, trouble, ear.state(now))
+
+    def _listen(self, watch: Watch, now: float) -> HealthEar:
+        if self._node is None:
+            self._node = self._participant.unwatched_node(_NODE)
+        return HealthEar(self._node, self._graph, watch, now)
