@@ -1,0 +1,132 @@
+"""Random faults on virtual hosts: `python -m benchmarks.chaos --minutes M --seed S`.
+
+Exit status: 0 without a violation, 1 with one, 2 when something is missing, 128 + signal number
+when a signal stopped it. Needs root. The last line is one JSON object.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from benchmarks.chaos import clocks, work
+from benchmarks.chaos.cluster import HOSTS, LEASE_S, Cluster
+from benchmarks.chaos.errands import Errands
+from benchmarks.chaos.faults import Round, draw
+from benchmarks.chaos.story import Story
+from benchmarks.chaos.trial import Stuck, Tally, Trial
+from benchmarks.machine import percentile, print_report, say
+from benchmarks.stopping import Stopped, raise_signals
+from rosrm.errors import RosrmError
+from rosrm.lab import needs
+
+#: Labs that may get stuck before a run is given up.
+_MOST_STUCK: Final = 5
+_FAILED: Final = 2
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Do faults until there were enough of them; returns the exit status."""
+    options = _parse(arguments)
+    raise_signals()
+    tally, began = Tally(), time.monotonic()
+    try:
+        needs.check_rights()
+        out = options.out or Path(tempfile.mkdtemp(prefix="rosrm-chaos-"))
+        out.mkdir(parents=True, exist_ok=True)
+        _run(options, out, tally, began)
+    except Stopped as stopped:
+        say(f"stopped by {stopped}")
+        return 128 + stopped.number
+    except (RosrmError, OSError) as error:
+        say(f"benchmarks.chaos: {error}")
+        return _FAILED
+    finally:
+        if tally.rounds:
+            _report(options, tally, time.monotonic() - began)
+    return 1 if tally.violations else 0
+
+
+def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.chaos", description=__doc__)
+    parser.add_argument("--minutes", type=float, default=5.0, help="no new fault after them")
+    parser.add_argument("--seed", type=int, default=1, help="of the faults")
+    parser.add_argument("--faults", type=int, default=500, help="no more than so many, about")
+    parser.add_argument("--out", type=Path, help="folder for settings, logs and violations")
+    parser.add_argument("--lab", default="chaos", help="what the lab is called")
+    return parser.parse_args(arguments)
+
+
+def _run(options: argparse.Namespace, out: Path, tally: Tally, began: float) -> None:
+    """In one lab, or in several, where one gets stuck."""
+    story = Story(options.seed)
+    services = list(work.services())
+    names = [service.name for service in services]
+    movable = [service.name for service in services if service.sort.strategy]
+    rounds = draw(options.seed, HOSTS, names, movable)
+    deadline = began + 60.0 * options.minutes
+    for number in itertools.count(1):
+        folder = out / f"lab{number}"
+        lines = folder / "lines"
+        lines.mkdir(parents=True, exist_ok=True)
+        try:
+            with (
+                Cluster(options.lab, folder, lambda text: story.tell(text, aloud=True)) as cluster,
+                Errands(cluster.lab, folder / "desk.log", story.tell) as errands,
+            ):
+                trial = Trial(cluster, errands, lines, out, story, tally)
+                trial.begin()
+                say(f"all is well: {len(names)} services on {len(HOSTS)} hosts")
+                for drawn in _while(rounds, options.faults, deadline, tally):
+                    trial.round(drawn)
+                trial.end()
+            break
+        except Stuck as stuck:
+            say(f"stuck: {stuck}")
+            if number == _MOST_STUCK or time.monotonic() > deadline:
+                break
+
+
+def _while(rounds: Iterator[Round], faults: int, deadline: float, tally: Tally) -> Iterator[Round]:
+    while tally.faults < faults and time.monotonic() < deadline:
+        yield next(rounds)
+
+
+def _report(options: argparse.Namespace, tally: Tally, seconds: float) -> None:
+    violations = tally.violations
+    left_out = {} if clocks.library() else {"clock": "the package libfaketime is not installed"}
+    print_report(
+        "chaos",
+        {
+            "faults": tally.faults, "violations": violations.total(), "lost": violations["lost"],
+            "doubled": violations["doubled"], "orphans": violations["orphans"],
+            "seed": options.seed, "minutes": round(seconds / 60.0, 1),
+            "violations_by_kind": dict(violations), "by_kind": dict(sorted(tally.by_kind.items())),
+            "recovery_s": _spread(tally.recovery), "whole_s": _spread(tally.whole),
+            "allowed": dict(tally.allowed), "missed": dict(tally.missed), "left_out": left_out,
+            "services": len(list(work.services())), "hosts": len(HOSTS), "lease_s": LEASE_S,
+        },
+        runs=tally.rounds,
+    )  # fmt: skip
+
+
+def _spread(seconds: Mapping[str, Sequence[float]]) -> dict[str, Any]:
+    """Middle, nearly worst and worst, by kind."""
+    return {
+        kind: {
+            "n": len(values), "p50": round(statistics.median(values), 2),
+            "p99": round(percentile(values, 0.99), 2), "max": round(max(values), 2),
+        }
+        for kind, values in sorted(seconds.items())
+    }  # fmt: skip
+
+
+if __name__ == "__main__":
+    sys.exit(main())

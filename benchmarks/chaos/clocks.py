@@ -1,0 +1,55 @@
+"""The wall clocks of the parts and of what they start, by libfaketime; never the machine's own.
+
+The PyPI package `libfaketime` brings the shared object; without it no clock is set back. Each part
+has a file with what its clock is ahead (+) or behind (-), which is read again every second.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Final
+
+_INSIDE: Final = Path("vendor/libfaketime/src/libfaketime.so.1")
+
+
+def library() -> Path | None:
+    """The shared object; None: it is not here."""
+    found = importlib.util.find_spec("libfaketime")  # without importing it
+    if found is None or found.origin is None:
+        return None
+    path = Path(found.origin).parent / _INSIDE
+    return path if path.is_file() else None
+
+
+def environment(folder: Path, part: str) -> dict[str, str]:
+    """The variables that give a part, and all that it starts, a clock of its own."""
+    path = library()
+    if path is None:
+        return {}
+    return {
+        "LD_PRELOAD": str(path),
+        "FAKETIME_TIMESTAMP_FILE": str(_file(folder, part)),
+        "FAKETIME_CACHE_DURATION": "1",
+        "FAKETIME_DONT_FAKE_MONOTONIC": "1",
+        "NO_FAKE_STAT": "1",
+    }
+
+
+def set_back(folder: Path, part: str, seconds: float) -> None:
+    """Set the clock of a part back; 0: it is right again."""
+    file = _file(folder, part)
+    new = file.with_suffix(".new")
+    new.write_text(f"{-seconds:+.2f}\n")
+    new.replace(file)  # a reader sees the old or the new
+
+
+def reset(folder: Path, parts: Iterable[str]) -> None:
+    """Let all clocks be right."""
+    for part in parts:
+        set_back(folder, part, 0.0)
+
+
+def _file(folder: Path, part: str) -> Path:
+    return folder / f"clock-{part}"

@@ -1,0 +1,64 @@
+"""A client of the master, on its host, driven by lines: `{"do": ...}` in, one line out for each.
+
+`submit` takes `entries` of a work file, `cancel` names, `migrate` a process and a host, `look`
+tells how hosts and processes stand (for a story; nothing is judged by it). Ends with its input.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from rosrm.config.work import load_work
+from rosrm.errors import NoMaster, RosrmError
+from rosrm.ros.client import MasterClient
+from rosrm.ros.settings import RosSettings
+
+#: Seconds for finding a master; a request is given 10.
+_PATIENCE = 3.0
+
+
+def main() -> None:
+    """Answer until the input ends."""
+    client: MasterClient | None = None
+    for line in sys.stdin:
+        try:
+            client = client or MasterClient.connect(RosSettings(), name="chaos", timeout=_PATIENCE)
+            answer = _answer(client, json.loads(line))
+        except NoMaster as error:
+            answer = {"no_master": str(error)}
+            if client is not None:
+                client.close()  # one that is found anew knows of no earlier master
+                client = None
+        except RosrmError as error:
+            answer = {"refused": str(error)}
+        print(json.dumps(answer), flush=True)
+
+
+def _answer(client: MasterClient, request: dict[str, Any]) -> dict[str, Any]:
+    if request["do"] == "submit":
+        with tempfile.TemporaryDirectory() as folder:
+            work = Path(folder) / "work.yaml"
+            work.write_text(json.dumps({"processes": request["entries"]}))
+            return {"message": client.submit(load_work(work))}
+    if request["do"] == "cancel":
+        return {"message": client.cancel(request["names"])}
+    if request["do"] == "migrate":
+        return {"message": client.migrate(request["process"], request["host"])}
+    view = client.list(hosts=True, processes=True, events=True, newest=200)
+    return {
+        "hosts": {row.description.name: row.state for row in view.hosts},
+        "accepting": [row.description.name for row in view.hosts if row.accepting],
+        "processes": {
+            row.name: f"{row.state} {row.host} #{row.number} {row.reason}".strip()
+            for row in view.processes
+        },
+        "events": [f"{one.elapsed:.2f} {one.kind}: {one.message}" for one in view.events],
+    }
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,128 @@
+"""What is asked of the master, by a client on its host; in a thread: faults have their times."""
+
+from __future__ import annotations
+
+import json
+import queue
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Final
+
+from benchmarks.chaos.cluster import DESK
+from benchmarks.chaos.work import ROOT
+from rosrm.lab import Lab
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+#: Seconds between two attempts.
+_PAUSE: Final = 0.3
+#: In the master's answer to a submission that it had taken already.
+_KNOWN: Final = "in use already"
+
+
+@dataclass
+class Errand:
+    """One request.
+
+    Attributes:
+        persistent: it is repeated until the master takes it.
+        done: called by `Errands.collect` when it was answered.
+        answer: the last one.
+        unsure: it was asked more than once because an answer did not come.
+    """
+
+    request: Mapping[str, Any]
+    persistent: bool = True
+    done: Callable[[Errand], None] | None = None
+    answer: dict[str, Any] = field(default_factory=dict)
+    unsure: bool = False
+
+
+class Errands:
+    """A client at the desk of a lab, and its thread."""
+
+    def __init__(self, lab: Lab, log: Path, tell: Callable[[str], None]) -> None:
+        self._tell = tell
+        self._queue: queue.Queue[Errand | None] = queue.Queue()
+        self._answered: queue.SimpleQueue[Errand] = queue.SimpleQueue()
+        self._open = 0
+        self._leaving = False
+        with log.open("ab") as sink:
+            self._desk = lab.popen(
+                DESK, [sys.executable, "-m", "benchmarks.chaos.desk"], cwd=str(ROOT),
+                stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=sink,
+            )  # fmt: skip
+        self._thread = threading.Thread(target=self._serve, name="errands", daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._leaving = True
+        self._queue.put(None)
+        self._desk.kill()
+        self._thread.join(10.0)
+        self._desk.communicate()
+
+    def send(self, errand: Errand) -> Errand:
+        """To be done after those before it."""
+        self._open += 1
+        self._queue.put(errand)
+        return errand
+
+    def collect(self) -> bool:
+        """Call `done` of what was answered; whether nothing is open any more."""
+        while not self._answered.empty():
+            errand = self._answered.get()
+            self._open -= 1
+            if errand.done is not None:
+                errand.done(errand)
+        return self._open == 0
+
+    def _serve(self) -> None:
+        while (errand := self._queue.get()) is not None:
+            self._run(errand)
+            self._answered.put(errand)
+
+    def _run(self, errand: Errand) -> None:
+        while not self._leaving:
+            errand.answer = self._ask(errand.request)
+            if not errand.persistent or _accepted(errand):
+                return
+            errand.unsure = errand.unsure or "no_master" in errand.answer
+            self._tell(f"{errand.request['do']} is asked again: {errand.answer}")
+            time.sleep(_PAUSE)  # who has no master, or whose master has no room, asks again
+
+    def _ask(self, request: Mapping[str, Any]) -> dict[str, Any]:
+        to, source = self._desk.stdin, self._desk.stdout
+        assert to is not None
+        assert source is not None
+        try:
+            to.write(json.dumps(request).encode() + b"\n")
+            to.flush()
+        except (BrokenPipeError, ValueError):
+            return {"no_master": "the client at the desk has ended"}
+        line = source.readline()
+        if not line:
+            return {"no_master": "the client at the desk has ended"}
+        answer: dict[str, Any] = json.loads(line)
+        return answer
+
+
+def _accepted(errand: Errand) -> bool:
+    if errand.unsure and _KNOWN in errand.answer.get("refused", ""):
+        return True
+    return errand.answer.keys().isdisjoint({"refused", "no_master"})

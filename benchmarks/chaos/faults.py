@@ -1,0 +1,175 @@
+"""The faults, drawn by a seed: the same seed draws the same ones. Pure."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final, Literal, TypeVar
+
+Target = Literal["master", "host", "process"]
+_Choice = TypeVar("_Choice")
+
+MASTER: Final = "master"
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of fault.
+
+    Attributes:
+        target: what it is done to.
+        weight: how often it is drawn, among all kinds.
+        lasts: it goes on until it is healed, or until what was killed is started again.
+        amounts: of it, least and most.
+    """
+
+    target: Target
+    weight: int
+    lasts: bool = True
+    amounts: tuple[float, float] = (0.0, 0.0)
+
+
+KINDS: Final = {
+    "master_kill": Kind("master", 8),
+    "master_stop": Kind("master", 6),
+    "master_cut": Kind("master", 4),
+    "master_disk_full": Kind("master", 3),
+    "master_clock": Kind("master", 2, amounts=(1.0, 3600.0)),
+    "slave_kill": Kind("host", 8),
+    "slave_stop": Kind("host", 6),
+    "supervisor_kill": Kind("host", 6, lasts=False),
+    "supervisor_stop": Kind("host", 4),
+    "process_kill": Kind("process", 12, lasts=False),
+    "process_stop": Kind("process", 6),
+    "host_cut": Kind("host", 8),
+    "host_cut_in": Kind("host", 5),
+    "host_cut_out": Kind("host", 5),
+    "host_loss": Kind("host", 5, amounts=(0.05, 0.4)),
+    "host_off": Kind("host", 6),
+    "disk_full": Kind("host", 5),
+    "host_clock": Kind("host", 3, amounts=(1.0, 3600.0)),
+}
+
+#: How many faults overlap, and how often.
+_BURSTS: Final = {1: 6, 2: 3, 3: 1}
+#: Seconds within which the faults of a burst begin.
+_WITHIN: Final = 2.0
+#: Seconds that a fault lasts: it is over before anybody is lost, or it is not.
+_SHORT: Final = (0.2, 2.0)
+_LONG: Final = (4.0, 7.0)
+_SHORT_SHARE: Final = 0.6
+#: Of a round: seconds that each job takes, how many jobs, how long the line, how many moves.
+_JOB: Final = (0.2, 3.0)
+_JOBS: Final = (2, 5)
+_LINE: Final = (0, 3)
+_MOVES: Final = {0: 3, 1: 4, 2: 1}
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One fault.
+
+    Attributes:
+        number: from 1 on.
+        kind: of `KINDS`.
+        target: a host, a process, or `MASTER`.
+        at: seconds after the begin of its round.
+        lasts: seconds until it is healed; 0: it heals by itself.
+        amount: fraction of the packets that are lost, or seconds by which the clock is set back.
+    """
+
+    number: int
+    kind: str
+    target: str
+    at: float
+    lasts: float
+    amount: float = 0.0
+
+    def __str__(self) -> str:
+        amount = f" ({self.amount:.2f})" if self.amount else ""
+        lasts = f" for {self.lasts:.1f} s" if self.lasts else ""
+        return f"fault {self.number}: {self.kind} {self.target}{amount}{lasts}"
+
+
+@dataclass(frozen=True)
+class Move:
+    """A process is asked to move to a host, which may be the one it is on."""
+
+    process: str
+    host: str
+    at: float
+
+
+@dataclass(frozen=True)
+class Round:
+    """What is done between two judgements.
+
+    Attributes:
+        faults: that overlap, in order of `at`.
+        moves: that are asked for meanwhile.
+        jobs, line: seconds that each job takes, and each of those that wait in line.
+    """
+
+    number: int
+    faults: tuple[Fault, ...]
+    moves: tuple[Move, ...]
+    jobs: tuple[float, ...]
+    line: tuple[float, ...]
+
+
+def draw(
+    seed: int, hosts: Sequence[str], processes: Sequence[str], movable: Sequence[str]
+) -> Iterator[Round]:
+    """Rounds without end.
+
+    Args:
+        seed: of all that is drawn.
+        hosts: that may be struck.
+        processes: the same.
+        movable: processes that can be asked to move.
+    """
+    chance = random.Random(seed)  # noqa: S311 - to be repeated is what it is for
+    drawn, number = 0, 0
+    while True:
+        number += 1
+        faults = _burst(chance, drawn, hosts, processes)
+        drawn += len(faults)
+        count = _weighted(chance, _MOVES)
+        moves = tuple(
+            Move(chance.choice(movable), chance.choice(hosts), chance.uniform(0.0, _WITHIN))
+            for _ in range(count)
+        )
+        yield Round(number, faults, moves, _seconds(chance, _JOBS), _seconds(chance, _LINE))
+
+
+def _burst(
+    chance: random.Random, drawn: int, hosts: Sequence[str], processes: Sequence[str]
+) -> tuple[Fault, ...]:
+    """Some faults, each on a target of its own."""
+    faults: list[Fault] = []
+    size = _weighted(chance, _BURSTS)
+    while len(faults) < size:
+        name = _weighted(chance, {name: kind.weight for name, kind in KINDS.items()})
+        kind = KINDS[name]
+        choices = {"master": [MASTER], "host": hosts, "process": processes}[kind.target]
+        target = chance.choice(choices)
+        at = chance.uniform(0.0, _WITHIN) if size > 1 else 0.0
+        span = _SHORT if chance.random() < _SHORT_SHARE else _LONG
+        lasts = chance.uniform(*span) if kind.lasts else 0.0
+        amount = chance.uniform(*kind.amounts)
+        if all(target != other.target for other in faults):
+            faults.append(Fault(0, name, target, round(at, 2), round(lasts, 2), round(amount, 2)))
+    faults.sort(key=lambda fault: fault.at)
+    return tuple(
+        Fault(drawn + place, one.kind, one.target, one.at, one.lasts, one.amount)
+        for place, one in enumerate(faults, 1)
+    )
+
+
+def _weighted(chance: random.Random, weights: Mapping[_Choice, int]) -> _Choice:
+    return chance.choices(list(weights), list(weights.values()))[0]
+
+
+def _seconds(chance: random.Random, count: tuple[int, int]) -> tuple[float, ...]:
+    return tuple(round(chance.uniform(*_JOB), 2) for _ in range(chance.randint(*count)))

@@ -1,0 +1,72 @@
+"""The ROS nodes of the workload; they tell what they do as `plain` has it.
+
+`speaker`: without state. `counter`: counts its cycles, and takes the count along when it moves.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+import rclpy
+import rclpy.node
+from rclpy.executors import ExternalShutdownException
+from rclpy.utilities import remove_ros_args
+from std_msgs.msg import Int64
+
+from benchmarks.chaos.plain import RATE, Lines
+from rosrm.node import Node
+
+
+class Speaker(rclpy.node.Node):  # type: ignore[misc]  # rclpy brings no types
+    """Stateless: `count` is of this run alone."""
+
+    def __init__(self, lines: Lines) -> None:
+        super().__init__("speaker")
+        self._lines = lines
+        self.count = 0
+        self.output = self.create_publisher(Int64, "~/count", 10)
+        self.create_timer(1.0 / RATE, self.tick)
+
+    def tick(self) -> None:
+        self.count += 1
+        self.output.publish(Int64(data=self.count))
+        self._lines.say("active", self.count)
+
+
+class Counter(Node):
+    """Stateful: `count` goes on wherever it is, and no number is ever said twice."""
+
+    def __init__(self, lines: Lines) -> None:
+        super().__init__("counter")
+        self._lines = lines
+        self.count = 0
+        self.output = self.create_publisher(Int64, "~/count", 10)
+        self.create_timer(1.0 / RATE, self.tick)
+        self.keep_state("~/state", Int64, self.save, self.restore)
+
+    def tick(self) -> None:
+        self.count += 1
+        self.output.publish(Int64(data=self.count))
+        self._lines.say("active", self.count)
+
+    def save(self) -> Int64:
+        return Int64(data=self.count)
+
+    def restore(self, state: Int64) -> None:
+        self.count = state.data
+
+
+def main(arguments: Sequence[str]) -> None:
+    kind = remove_ros_args(list(arguments))[1]
+    lines = Lines()
+    rclpy.init(args=list(arguments))
+    try:
+        rclpy.spin(Counter(lines) if kind == "counter" else Speaker(lines))
+    except (KeyboardInterrupt, ExternalShutdownException):
+        rclpy.try_shutdown()
+    lines.say("stopped")
+
+
+if __name__ == "__main__":
+    main(sys.argv)

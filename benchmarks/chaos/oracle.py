@@ -1,0 +1,166 @@
+"""Is all well? Judged by the processes that run and by what they write; knows nothing of rosrm.
+
+`amiss` says what is not as it should be at this moment, `Oracle.history` (by `rules`) what was not
+as it should have been since the last time that all was well.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+from benchmarks.chaos import rules
+from benchmarks.chaos.outputs import Outputs, Run
+from benchmarks.chaos.reality import Member, members
+from benchmarks.chaos.rules import Harm, Promise, Violation
+
+#: Seconds: who has said "active" within them is active, on a busy machine.
+FRESH: Final = 1.0
+
+
+@dataclass
+class Wanted:
+    """What was asked for and accepted.
+
+    Attributes:
+        services: by name, what each is promised.
+        jobs: that are to be done; by name, the moment in which they were accepted.
+        line: jobs that wait for one another, in the order in which they were submitted.
+    """
+
+    services: dict[str, Promise] = field(default_factory=dict)
+    jobs: dict[str, float] = field(default_factory=dict)
+    line: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Amiss:
+    """Something that is not as it should be now."""
+
+    kind: str
+    name: str
+    text: str
+
+
+class Oracle:
+    """Looks at a lab.
+
+    Args:
+        lab: its name.
+        folder: of the lines.
+        wanted: changed by whoever submits.
+    """
+
+    def __init__(self, lab: str, folder: Path, wanted: Wanted) -> None:
+        self._lab = lab
+        self._outputs = Outputs(folder)
+        self._wanted = wanted
+        self._current: dict[str, Run] = {}
+        self._done: set[str] = set()
+
+    # --- at this moment -----------------------------------------------------------------------
+
+    def amiss(self) -> list[Amiss]:
+        """What is not as it should be; nothing: all is well."""
+        now = time.monotonic()
+        there: dict[str, list[Member]] = {}
+        for member in members(self._lab):
+            there.setdefault(member.process, []).append(member)
+        found: list[Amiss] = []
+        for name, promise in self._wanted.services.items():
+            found += self._about_service(name, promise, there.pop(name, []), now)
+        for name in self._wanted.jobs:
+            found += self._about_job(name, there.pop(name, []))
+        found += [
+            Amiss("orphans", name, f"{name} is not wanted, and runs: {_told(left)}")
+            for name, left in there.items()
+        ]
+        return found
+
+    def _about_service(
+        self, name: str, promise: Promise, there: list[Member], now: float
+    ) -> Iterator[Amiss]:
+        runs = [run for run in self._outputs.read(name) if run.last > now - FRESH]
+        owners = {run.instance for run in runs}
+        if not runs:
+            yield Amiss("lost", name, f"{name}: nobody is active; there: {_told(there)}")
+        elif len(runs) > 1:
+            active = "; ".join(map(str, runs))
+            yield Amiss("doubled", name, f"{name}: more than one is active: {active}")
+        sizes = Counter(one.instance for one in there)
+        extra = {instance for instance in sizes if instance not in owners}
+        allowed = int(promise.standby)
+        if len(extra) > allowed:
+            yield Amiss("orphans", name, f"{name}: not its owner, and there: {_told(there)}")
+        elif len(extra) < allowed:
+            yield Amiss("standby", name, f"{name} has no standby: {_told(there)}")
+        elif promise.standby and len({one.host for one in there}) < 2:
+            yield Amiss("standby", name, f"{name}: its standby is on the same host")
+        if any(size != promise.members for size in sizes.values()):
+            text = f"{name}: an instance has {promise.members} processes; there: {_told(there)}"
+            yield Amiss("orphans", name, text)
+
+    def _about_job(self, name: str, there: list[Member]) -> Iterator[Amiss]:
+        if name not in self._done and any(run.told == "done" for run in self._outputs.read(name)):
+            self._done.add(name)
+        if name not in self._done:
+            yield Amiss("lost", name, f"the job {name} is not done; there: {_told(there)}")
+        elif there:
+            yield Amiss("orphans", name, f"the job {name} is done, and runs: {_told(there)}")
+
+    def left(self) -> list[Amiss]:
+        """What runs after everything was ended."""
+        found: dict[str, list[Member]] = {}
+        for member in members(self._lab):
+            found.setdefault(member.process, []).append(member)
+        return [
+            Amiss("orphans", name, f"{name} runs on after the end: {_told(those)}")
+            for name, those in found.items()
+        ]
+
+    # --- since the last time ------------------------------------------------------------------
+
+    def history(self, harms: list[Harm]) -> tuple[list[Violation], Counter[str]]:
+        """What went wrong since the last call, and what was within the promise; all is well now.
+
+        Args:
+            harms: what was done to the lab meanwhile.
+        """
+        violations: list[Violation] = []
+        allowed: Counter[str] = Counter()
+        for name, promise in self._wanted.services.items():
+            chain = rules.chain(self._outputs.read(name), self._current.get(name))
+            found, excused = rules.judge_service(name, promise, chain, harms)
+            violations += found
+            allowed += excused
+            if chain:
+                self._current[name] = chain[-1]
+                self._outputs.forget(name, chain[-1].told_at)
+        for name, accepted in self._wanted.jobs.items():
+            found, excused = rules.judge_job(name, accepted, self._outputs.read(name), harms)
+            violations += found
+            allowed += excused
+        violations += rules.judge_line(
+            {name: self._outputs.read(name) for name in self._wanted.line}
+        )
+        self._forget_jobs()
+        return violations, allowed
+
+    def _forget_jobs(self) -> None:
+        """They were judged; a process of theirs that still comes is an orphan."""
+        self._wanted.jobs.clear()
+        self._wanted.line.clear()
+
+    def told(self, names: list[str]) -> Mapping[str, list[str]]:
+        """All that is known of the newest runs of some processes, for a story."""
+        return {name: [str(run) for run in self._outputs.read(name)[-6:]] for name in names}
+
+
+def _told(there: list[Member]) -> str:
+    return ", ".join(f"{one.instance} ({one.pid} on {one.host}, {one.state})" for one in there) or (
+        "no process"
+    )

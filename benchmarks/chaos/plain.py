@@ -1,0 +1,80 @@
+"""The plain programs of the workload, and the lines by which all of it tells what it does.
+
+Run by its path, with the standard library alone. `service`: says "active" ten times a second until
+it is stopped. `family`: the same, with a child that only waits. `job SECONDS`: "active" for so
+long, then "done".
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import sys
+import time
+
+#: Hz.
+RATE = 10.0
+
+
+class Lines:
+    """Appends to the file of this process; what was said survives the death of who said it.
+
+    A line: monotonic time, instance, host, pid, time of birth, word, number. The monotonic clock is
+    the same on all hosts of a lab.
+    """
+
+    def __init__(self) -> None:
+        path = os.path.join(os.environ["CHAOS_LINES"], os.environ["ROSRM_PROCESS"])  # noqa: PTH118
+        self._file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        instance, born = os.environ["ROSRM_INSTANCE"], time.monotonic()
+        self._head = f"{instance} {socket.gethostname()} {os.getpid()} {born:.4f}"
+        self.say("born")
+
+    def say(self, word: str, number: int = 0) -> None:
+        """One line, in one write."""
+        os.write(self._file, f"{time.monotonic():.4f} {self._head} {word} {number}\n".encode())
+
+
+class Stopped(Exception):
+    """SIGINT or SIGTERM came."""
+
+
+def stop(number: int, _: object) -> None:
+    raise Stopped(number)
+
+
+def serve(lines: Lines, seconds: float) -> None:
+    """Be active for so long."""
+    begun, count = time.monotonic(), 0
+    while time.monotonic() < begun + seconds:
+        count += 1
+        lines.say("active", count)
+        time.sleep(max(0.0, begun + count / RATE - time.monotonic()))
+
+
+def have_child() -> None:
+    """A child that waits for a signal, and knows nothing of its parent's end."""
+    if os.fork() == 0:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_DFL)
+        while True:
+            signal.pause()
+
+
+def main() -> None:
+    kind = sys.argv[1]
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, stop)
+    lines = Lines()
+    try:
+        if kind == "family":
+            have_child()
+        serve(lines, float(sys.argv[2]) if kind == "job" else float("inf"))
+        lines.say("done")
+    except Stopped:
+        lines.say("stopped")
+
+
+if __name__ == "__main__":
+    main()

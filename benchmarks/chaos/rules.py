@@ -1,0 +1,211 @@
+"""What the runs of a process must be like, and which harm excuses what. Pure.
+
+Knows nothing of rosrm; what is promised for which fault stands here.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from benchmarks.chaos.outputs import Run
+
+#: Seconds after the hosts concerned reach the master again in which there may be two owners.
+_OVERLAP: Final = 1.0
+#: Seconds for the parts to hear each other once nothing keeps them from it: discovery, by DDS.
+_MEETING: Final = 3.0
+#: The same where a part was started again: it has to come up before.
+_STARTING: Final = 8.0
+#: Seconds by which lines of two processes may cross without both having been active at once.
+_CROSSING: Final = 0.05
+#: Cycles that may be repeated or left out by who follows one that was killed in the midst of one.
+_LAST_CYCLE: Final = 1
+
+
+@dataclass(frozen=True)
+class Promise:
+    """What holds of a service.
+
+    Attributes:
+        members: processes of one instance.
+        stateful: its numbers go on.
+        standby: it has a second instance, silent.
+        elsewhere: it goes to another host when its own is lost.
+        isolated: its host stops it when it is cut off.
+        kept: its state is kept on another host.
+    """
+
+    members: int = 1
+    stateful: bool = False
+    standby: bool = False
+    elsewhere: bool = False
+    isolated: bool = False
+    kept: bool = False
+
+
+@dataclass(frozen=True)
+class Harm:
+    """Something that was done to the lab, or asked for, and what it may explain.
+
+    Attributes:
+        kind: of the fault; or "move", "overlap" (a move during which both may be active).
+        hosts: that were concerned; "*": all of them.
+        process: that was struck or moved; "": none by itself.
+        begun, ended: monotonic time.
+        kills: what runs on the hosts ends.
+        hides: the hosts and the master do not hear each other.
+        restarts: a part had to be started again.
+        forgets: how a job ended there meanwhile is not known.
+    """
+
+    kind: str
+    begun: float
+    ended: float
+    hosts: frozenset[str] = frozenset()
+    process: str = ""
+    kills: bool = False
+    hides: bool = False
+    restarts: bool = False
+    forgets: bool = False
+
+    def concerns(self, host: str) -> bool:
+        """Whether it was done to a host."""
+        return host in self.hosts or "*" in self.hosts
+
+
+@dataclass(frozen=True)
+class Violation:
+    """A promise that was not kept."""
+
+    kind: str
+    name: str
+    text: str
+
+
+def chain(runs: Iterable[Run], before: Run | None) -> list[Run]:
+    """The runs that were active, in order, from the one that was active at the last judgement on.
+
+    Args:
+        runs: of one process.
+        before: that one; it may have grown.
+    """
+    active = sorted((run for run in runs if run.first), key=lambda run: run.first)
+    if before is None:
+        return active
+    return [run for run in active if run.first >= before.first]
+
+
+def judge_service(
+    name: str, promise: Promise, chained: Sequence[Run], harms: Sequence[Harm]
+) -> tuple[list[Violation], Counter[str]]:
+    """What was not as promised, and how often something happened that is allowed."""
+    allowed: Counter[str] = Counter()
+    found = [
+        Violation("state", name, f"{name} went back within one run: {run}")
+        for run in chained
+        if run.backwards
+    ]
+    for index, (one, following) in enumerate(itertools.pairwise(chained)):
+        for other in chained[index + 1 :]:
+            overlap = one.last - other.first
+            if overlap > _CROSSING:
+                excuse = _excuse_overlap(name, promise, one, other, harms)
+                if excuse:
+                    allowed[excuse] += 1
+                else:
+                    text = f"{name}: both active for {overlap:.2f} s: {one} and {other}"
+                    found.append(Violation("doubled", name, text))
+        if not _may_end(name, promise, one, harms):
+            text = f"{name}: {one} ended, and nothing was done to it; then came {following}"
+            found.append(Violation("touched", name, text))
+        if promise.stateful:
+            word, violation = _judge_state(name, promise, one, following, harms)
+            allowed[word] += bool(word)
+            found += violation
+    return found, +allowed
+
+
+def _may_end(name: str, promise: Promise, run: Run, harms: Sequence[Harm]) -> bool:
+    return any(
+        harm.process == name
+        or (harm.kills and harm.concerns(run.host))
+        or ((promise.elsewhere or promise.isolated) and harm.hides and harm.concerns(run.host))
+        for harm in harms
+    )
+
+
+def _excuse_overlap(
+    name: str, promise: Promise, one: Run, other: Run, harms: Sequence[Harm]
+) -> str:
+    """Under which title two owners are counted; "": they are not allowed."""
+    if any(harm.kind == "overlap" and harm.process == name for harm in harms):
+        return "overlaps"
+    if promise.isolated or not promise.elsewhere:
+        return ""
+    until = [
+        harm.ended + _OVERLAP + (_STARTING if harm.restarts else _MEETING)
+        for harm in harms
+        if harm.hides and (harm.concerns(one.host) or harm.concerns(other.host))
+    ]
+    return "partitioned" if until and one.last <= max(until) else ""
+
+
+def _judge_state(
+    name: str, promise: Promise, one: Run, following: Run, harms: Sequence[Harm]
+) -> tuple[str, list[Violation]]:
+    """A title for what is allowed, and a violation: at most one of them."""
+    if following.first_number == one.last_number + 1:
+        return "", []
+    struck = _struck(name, promise, one, harms)
+    from_nothing = following.first_number == 1
+    keeps = promise.standby or promise.kept
+    if struck and from_nothing and not keeps:
+        return "state_from_nothing", []
+    if struck and keeps and following.first_number >= one.last_number + 1 - _LAST_CYCLE:
+        return "state_cycle_lost", []
+    text = f"{name}: {following.first_number} after {one.last_number}: {one}, then {following}"
+    return "", [Violation("state", name, text)]
+
+
+def _struck(name: str, promise: Promise, run: Run, harms: Sequence[Harm]) -> bool:
+    """Whether it ended by force, and not by a move."""
+    return any(
+        (harm.process == name and harm.kind not in ("move", "overlap"))
+        or (harm.kills and harm.concerns(run.host))
+        or ((promise.elsewhere or promise.isolated) and harm.hides and harm.concerns(run.host))
+        for harm in harms
+    )
+
+
+def judge_job(
+    name: str, accepted: float, runs: Sequence[Run], harms: Sequence[Harm]
+) -> tuple[list[Violation], Counter[str]]:
+    """Done at least once; begun more than once only where something was done to its host."""
+    if len(runs) <= 1:
+        return [], Counter()
+    hosts = {run.host for run in runs}
+    excused = any(
+        harm.ended >= accepted
+        and (
+            harm.process == name
+            or ((harm.kills or harm.forgets) and any(harm.concerns(one) for one in hosts))
+        )
+        for harm in harms
+    )
+    if excused:
+        return [], Counter(jobs_repeated=1)
+    text = f"the job {name} ran {len(runs)} times: {'; '.join(map(str, runs))}"
+    return [Violation("repeated", name, text)], Counter()
+
+
+def judge_line(line: Mapping[str, Sequence[Run]]) -> list[Violation]:
+    """Those who wait in line are begun in the order in which they came."""
+    begun = [(name, runs[0].born) for name, runs in line.items() if runs]
+    return [
+        Violation("order", later, f"{later} began at {then:.2f}, before {earlier} at {when:.2f}")
+        for (earlier, when), (later, then) in itertools.pairwise(begun)
+        if then < when
+    ]

@@ -1,0 +1,56 @@
+"""What is told of a run: on standard error, and with what went wrong as files."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import shutil
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from benchmarks.chaos.cluster import DESK, HOSTS, Cluster
+from benchmarks.machine import say
+
+#: Lines that a story goes back.
+_LENGTH: Final = 400
+#: Of each host, what helps to find the cause.
+_KEPT: Final = {
+    DESK: ("master/journal.sqlite", "master/journal.sqlite-wal"),
+    **dict.fromkeys(HOSTS, ("slave/supervisor/instances.jsonl", "slave/supervisor/supervisor.log")),
+}
+
+
+class Story:
+    """Lines with times, in seconds of the monotonic clock, as the lines of the workload have."""
+
+    def __init__(self, seed: int) -> None:
+        self._seed = seed
+        self._lines: list[str] = []
+
+    def tell(self, text: str, *, aloud: bool = False) -> None:
+        """One line."""
+        self._lines.append(f"{time.monotonic():.2f} {time.strftime('%H:%M:%S')} {text}")
+        del self._lines[:-_LENGTH]
+        if aloud:
+            say(text)
+
+    def keep(
+        self, folder: Path, cluster: Cluster, violations: Sequence[Mapping[str, Any]],
+        seen: Mapping[str, Any],
+    ) -> None:  # fmt: skip
+        """Write a violation with all that may explain it."""
+        folder.mkdir(parents=True, exist_ok=True)
+        told = {"seed": self._seed, "violations": violations, "story": self._lines, "seen": seen}
+        (folder / "violation.json").write_text(json.dumps(told, indent=1))
+        for part in cluster.parts.values():
+            with contextlib.suppress(OSError):
+                shutil.copy(part.log, folder)
+        for host, files in _KEPT.items():
+            for file in files:
+                # A host may be off.
+                with contextlib.suppress(Exception):
+                    shutil.copy(
+                        cluster.lab.outside(host, file), folder / f"{host}-{Path(file).name}"
+                    )

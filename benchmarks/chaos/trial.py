@@ -1,0 +1,294 @@
+"""The loop: a round of faults, undone; wait until all is well; judge what happened meanwhile."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from benchmarks.chaos import work
+from benchmarks.chaos.cluster import HOSTS, Cluster
+from benchmarks.chaos.errands import Errand, Errands
+from benchmarks.chaos.faults import Fault, Move, Round
+from benchmarks.chaos.harm import Harmer
+from benchmarks.chaos.oracle import Amiss, Oracle, Wanted
+from benchmarks.chaos.rules import Harm, Promise, Violation
+from benchmarks.chaos.story import Story
+from benchmarks.machine import say
+
+#: Seconds after the last fault was undone within which all must be well.
+SETTLE_S: Final = 60.0
+#: The same for the beginning: everything starts at once, on few cores.
+_BEGIN_S: Final = 180.0
+#: Seconds between two looks.
+_LOOK: Final = 0.1
+_LOOK_AT_ALL: Final = 0.3
+#: Looks in a row at which all must be well.
+_STEADY: Final = 2
+#: Seconds that a job takes which only shows that its host takes work.
+_CANARY: Final = 0.1
+
+
+class Stuck(Exception):
+    """All is not well, and does not become so: this lab is of no more use."""
+
+
+@dataclass
+class Tally:
+    """What a run came to.
+
+    Attributes:
+        by_kind: faults that were done.
+        missed: faults that found nothing to strike, by kind and reason.
+        violations: by kind.
+        allowed: what happened within the promises, by title.
+        recovery: seconds from the undoing of the last fault of a round until all was well, by kind
+            of the fault, or "burst" for rounds of several kinds.
+        whole: the same, from the first fault on.
+    """
+
+    by_kind: Counter[str] = field(default_factory=Counter)
+    missed: Counter[str] = field(default_factory=Counter)
+    violations: Counter[str] = field(default_factory=Counter)
+    allowed: Counter[str] = field(default_factory=Counter)
+    recovery: dict[str, list[float]] = field(default_factory=dict)
+    whole: dict[str, list[float]] = field(default_factory=dict)
+    rounds: int = 0
+
+    @property
+    def faults(self) -> int:
+        """That were done."""
+        return self.by_kind.total()
+
+
+class Trial:
+    """A cluster, its workload, and who judges it.
+
+    Args:
+        cluster: that was just started.
+        lines: folder for the lines of the workload, empty.
+        out: folder for what went wrong.
+        tally: counted in.
+    """
+
+    def __init__(
+        self, cluster: Cluster, errands: Errands, lines: Path, out: Path, story: Story,
+        tally: Tally,
+    ) -> None:  # fmt: skip
+        self._cluster = cluster
+        self._errands = errands
+        self._lines = lines
+        self._out = out
+        self._story = story
+        self._tally = tally
+        self._wanted = Wanted()
+        self._harmer = Harmer(cluster)
+        self._oracle = Oracle(cluster.lab.name, lines, self._wanted)
+        self._harms: list[Harm] = []
+        self._services = {service.name: service for service in work.services()}
+
+    # --- begin and end ------------------------------------------------------------------------
+
+    def begin(self) -> None:
+        """Submit the services, and wait until all is well."""
+        entries = [service.entry(self._lines) for service in self._services.values()]
+        promises = {name: promise_of(service) for name, service in self._services.items()}
+        self._submit(entries, lambda _: self._wanted.services.update(promises))
+        self._await_well(0, "the beginning", _BEGIN_S)
+        self._oracle.history([])
+
+    def end(self) -> None:
+        """Cancel everything, stop the slaves, and look for what is left."""
+        names = list(self._wanted.services)
+        self._wanted.services.clear()
+        self._errands.send(Errand({"do": "cancel", "names": names}))
+        self._await_well(0, "everything was cancelled", SETTLE_S)
+        self._cluster.shut_down()
+        left = self._oracle.left()
+        if left:
+            self._violated(0, [Violation(one.kind, one.name, one.text) for one in left])
+
+    # --- a round ------------------------------------------------------------------------------
+
+    def round(self, drawn: Round) -> None:
+        """Do the faults of a round and undo them; judge.
+
+        Raises:
+            Stuck: something did not become well; it was told.
+        """
+        self._tally.rounds += 1
+        number = drawn.faults[-1].number
+        self._submit_jobs(drawn)
+        begun = time.monotonic()
+        done = self._do(drawn, begun)
+        self._submit_canaries(drawn.number)
+        healed = time.monotonic()
+        well = self._await_well(number, f"fault {number} was undone", SETTLE_S)
+        self._harms += self._harmer.take_done()
+        violations, allowed = self._oracle.history(self._harms)
+        self._harms.clear()
+        self._tally.allowed += allowed
+        if violations:
+            self._violated(number, violations)
+        kinds = sorted(fault.kind for fault in done)
+        if kinds:
+            word = kinds[0] if len(set(kinds)) == 1 else "burst"
+            self._tally.recovery.setdefault(word, []).append(well - healed)
+            self._tally.whole.setdefault(word, []).append(well - begun)
+            say(
+                f"{self._tally.faults} faults; {', '.join(kinds)}: well after {well - healed:.1f} s"
+            )
+
+    def _do(self, drawn: Round, begun: float) -> list[Fault]:
+        """Everything of a round in its time; returns the faults that were done."""
+        done: list[Fault] = []
+
+        def begin(fault: Fault) -> None:
+            why_not = self._harmer.begin(fault)
+            self._story.tell(f"{fault}{': not done, ' + why_not if why_not else ''}")
+            if why_not:
+                self._tally.missed[f"{fault.kind}: {why_not}"] += 1
+                return
+            self._tally.by_kind[fault.kind] += 1
+            done.append(fault)
+            due.append((begun + fault.at + fault.lasts, lambda: end(fault)))
+
+        def end(fault: Fault) -> None:
+            if self._harmer.end(fault):
+                self._story.tell(f"fault {fault.number} was undone")
+            else:
+                due.append((time.monotonic() + _LOOK, lambda: end(fault)))
+
+        due: list[tuple[float, Callable[[], None]]] = [
+            *((begun + one.at, lambda one=one: begin(one)) for one in drawn.faults),
+            *((begun + one.at, lambda one=one: self._move(one)) for one in drawn.moves),
+        ]
+        while due:
+            self._tend()
+            due.sort(key=lambda one: one[0])
+            if due[0][0] <= time.monotonic():
+                due.pop(0)[1]()
+            else:
+                time.sleep(min(_LOOK, max(0.0, due[0][0] - time.monotonic())))
+        return done
+
+    def _tend(self) -> bool:
+        self._cluster.tend()
+        return self._errands.collect()
+
+    def _await_well(self, number: int, what: str, timeout: float) -> float:
+        """Wait until all is well; returns since when."""
+        deadline, since, steady = time.monotonic() + timeout, 0.0, 0
+        while steady < _STEADY:
+            answered = self._tend()
+            looked = time.monotonic()
+            amiss = self._oracle.amiss()
+            if answered and not amiss:
+                since = since or looked
+                steady += 1
+            else:
+                since, steady = 0.0, 0
+                if looked >= deadline:
+                    self._stuck(number, what, timeout, amiss, answered=answered)
+            time.sleep(_LOOK_AT_ALL)
+        return since
+
+    # --- what is asked for ----------------------------------------------------------------
+
+    def _submit(self, entries: list[dict[str, Any]], accepted: Callable[[Errand], None]) -> None:
+        self._errands.send(Errand({"do": "submit", "entries": entries}, done=accepted))
+
+    def _submit_jobs(self, drawn: Round) -> None:
+        jobs = [
+            work.job(f"job{drawn.number}_{place}", self._lines, seconds)
+            for place, seconds in enumerate(drawn.jobs)
+        ]
+        line = [
+            work.line_job(f"line{drawn.number}_{place}", self._lines, min(1.0, seconds))
+            for place, seconds in enumerate(drawn.line)
+        ]
+        self._submit(jobs + line, self._accept([*jobs, *line], line))
+
+    def _submit_canaries(self, number: int) -> None:
+        """One job for each host: it takes work again."""
+        entries = [
+            work.job(f"canary{number}_{host}", self._lines, _CANARY, host=host) for host in HOSTS
+        ]
+        self._submit(entries, self._accept(entries, []))
+
+    def _accept(
+        self, jobs: list[dict[str, Any]], line: list[dict[str, Any]]
+    ) -> Callable[[Errand], None]:
+        sent = time.monotonic()
+
+        def accept(errand: Errand) -> None:
+            for job in jobs:
+                self._wanted.jobs[job["name"]] = sent
+                if errand.unsure:  # a master that answered nobody may have had them done by now
+                    self._harms.append(Harm("unsure", sent, time.monotonic(), process=job["name"]))
+            self._wanted.line += [job["name"] for job in line]
+
+        return accept
+
+    def _move(self, move: Move) -> None:
+        sort = self._services[move.process].sort
+        kind = "overlap" if sort.strategy == "relaunch" else "move"
+        now = time.monotonic()
+        self._harms.append(Harm(kind, now, now, process=move.process))
+        self._story.tell(f"{move.process} is asked to move to {move.host}")
+
+        def told(errand: Errand) -> None:
+            self._story.tell(f"of the move of {move.process}: {errand.answer}")
+
+        request = {"do": "migrate", "process": move.process, "host": move.host}
+        self._errands.send(Errand(request, persistent=False, done=told))
+
+    # --- what went wrong ------------------------------------------------------------------
+
+    def _stuck(
+        self, number: int, what: str, timeout: float, amiss: list[Amiss], *, answered: bool
+    ) -> None:
+        words = f"not within {timeout:g} s after {what}"
+        violations = [Violation(one.kind, one.name, f"{one.text} ({words})") for one in amiss] or [
+            Violation("lost", "", f"the master has not answered every request, {words}")
+        ]
+        if answered or amiss:
+            self._story.tell(f"stuck: {words}")
+        self._violated(number, violations)
+        raise Stuck(words)
+
+    def _violated(self, number: int, violations: list[Violation]) -> None:
+        for one in violations:
+            self._tally.violations[one.kind] += 1
+            self._story.tell(f"VIOLATION ({one.kind}): {one.text}", aloud=True)
+        folder = self._out / f"violation-{number}-{self._tally.violations.total()}"
+        names = list({one.name for one in violations if one.name})
+        seen: Mapping[str, Any] = {
+            "runs": self._oracle.told(names), "harms": [_plain(harm) for harm in self._harms],
+            "master": self._ask_master(),
+        }  # fmt: skip
+        self._story.keep(folder, self._cluster, [asdict(one) for one in violations], seen)
+        say(f"the story is in {folder}")
+
+    def _ask_master(self) -> dict[str, Any]:
+        """What the master says of itself, for the story alone."""
+        answers: list[Errand] = []
+        self._errands.send(Errand({"do": "look"}, persistent=False, done=answers.append))
+        deadline = time.monotonic() + 20.0
+        while not answers and time.monotonic() < deadline:
+            self._tend()
+            time.sleep(_LOOK)
+        return answers[0].answer if answers else {"no_master": "no answer in 20 s"}
+
+
+def promise_of(service: work.Service) -> Promise:
+    """What the oracle holds a service to."""
+    sort = service.sort
+    return Promise(sort.members, sort.stateful, sort.standby, service.elsewhere, service.isolated)
+
+
+def _plain(harm: Harm) -> dict[str, Any]:
+    return {**asdict(harm), "hosts": sorted(harm.hosts)}

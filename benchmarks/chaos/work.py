@@ -1,0 +1,133 @@
+"""What runs on the hosts: services, ROS nodes with and without state, jobs; as entries of a file.
+
+The constants switch on what a process asks for when something fails.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+ROOT: Final = Path(__file__).resolve().parents[2]
+_PLAIN: Final = str(Path(__file__).with_name("plain.py"))
+
+PLAIN: Final = 7
+FAMILIES: Final = 2
+SPEAKERS: Final = 4
+COUNTERS: Final = 5
+#: Counters with a standby on another host.
+STANDBYS: Final = 0
+#: Of each sort, the first so many go elsewhere when their host is lost; the others wait for it.
+ELSEWHERE: Final = 0
+#: Of each sort, the last so many are stopped by their host when it is cut off. They go elsewhere.
+ISOLATED: Final = 0
+
+#: The host that takes the jobs of the line, one at a time: of its 2 GiB 80 % may be in use.
+LINE_HOST: Final = "host5"
+_LINE_NEED: Final = "900MiB"
+#: Services go first: what waits for room holds up who is behind.
+_FIRST: Final = 10
+
+
+@dataclass(frozen=True)
+class Sort:
+    """A sort of services.
+
+    Attributes:
+        kind: of the program.
+        ros: it is a ROS node.
+        members: processes of one instance.
+        strategy: by which it moves; "": it stays.
+        stateful: its number goes on, whoever is active.
+        standby: it has a second instance, silent, on another host.
+    """
+
+    kind: str
+    ros: bool = False
+    members: int = 1
+    strategy: str = ""
+    stateful: bool = False
+    standby: bool = False
+
+
+@dataclass(frozen=True)
+class Service:
+    """A service that is to run all the time."""
+
+    name: str
+    sort: Sort
+    elsewhere: bool = False
+    isolated: bool = False
+
+    def entry(self, lines: Path) -> dict[str, Any]:
+        """Of a work file."""
+        entry = {
+            **_common(self.name, lines),
+            "priority": _FIRST,
+            "restart": {"when": "on-failure", "delay": 0.2, "max_delay": 1.0, "attempts": 100_000},
+        }
+        if self.sort.ros:
+            entry |= {"module": "benchmarks.chaos.nodes", "arguments": [self.sort.kind]}
+            entry |= {"ros": True, "needs": {"memory": "64MiB"}}
+            entry["environment"]["PYTHONPATH"] = str(ROOT)
+        else:
+            entry["command"] = [sys.executable, "-S", _PLAIN, self.sort.kind]
+        if self.sort.strategy:
+            entry["migration"] = {"strategy": self.sort.strategy}
+        if self.elsewhere or self.isolated:
+            entry["host_loss"] = {"then": "elsewhere"}
+        if self.isolated:
+            entry["isolation"] = {"then": "stop"}
+        if self.sort.standby:
+            entry["standby"] = {"wanted": True}
+        return entry
+
+
+_SORTS: Final = {
+    "plain": (Sort("service"), PLAIN),
+    "family": (Sort("family", members=2), FAMILIES),
+    "speaker": (Sort("speaker", ros=True, strategy="relaunch"), SPEAKERS),
+    "counter": (Sort("counter", ros=True, strategy="handoff", stateful=True), COUNTERS),
+    "guarded": (
+        Sort("counter", ros=True, strategy="handoff", stateful=True, standby=True), STANDBYS,
+    ),
+}  # fmt: skip
+
+
+def services() -> Iterator[Service]:
+    """All that run from the beginning to the end."""
+    for word, (sort, count) in _SORTS.items():
+        for number in range(1, count + 1):
+            isolated = number > count - ISOLATED
+            yield Service(f"{word}{number}", sort, number <= ELSEWHERE or isolated, isolated)
+
+
+def job(name: str, lines: Path, seconds: float, *, host: str = "") -> dict[str, Any]:
+    """The entry of a job; with a host, it runs there alone."""
+    entry = {
+        **_common(name, lines),
+        "kind": "job",
+        "command": [sys.executable, "-S", _PLAIN, "job", f"{seconds:g}"],
+        "restart": {"when": "on-failure", "delay": 0.2, "max_delay": 1.0, "attempts": 100_000},
+    }
+    if host:
+        entry["labels"] = {"required": {"name": host}}
+    return entry
+
+
+def line_job(name: str, lines: Path, seconds: float) -> dict[str, Any]:
+    """The entry of a job that waits in line with its like: there is room for one at a time."""
+    entry = job(name, lines, seconds, host=LINE_HOST)
+    return {**entry, "needs": {"memory": _LINE_NEED}}
+
+
+def _common(name: str, lines: Path) -> dict[str, Any]:
+    return {
+        "name": name,
+        "environment": {"CHAOS_LINES": str(lines)},
+        "needs": {"memory": "8MiB"},
+        "stop": {"interrupt_grace": 2.0, "terminate_grace": 2.0},
+    }

@@ -1,0 +1,125 @@
+"""What the oracle of the chaos benchmark holds against rosrm, and what it lets pass."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+import benchmarks.chaos
+from benchmarks.chaos.outputs import Outputs, Run
+from benchmarks.chaos.rules import (
+    Harm,
+    Promise,
+    chain,
+    judge_job,
+    judge_line,
+    judge_service,
+)
+
+FOLDER = Path(benchmarks.chaos.__file__).parent
+JUDGES = ["oracle.py", "reality.py", "outputs.py", "rules.py"]
+
+
+@pytest.mark.parametrize("name", JUDGES)
+def test_the_oracle_knows_nothing_of_rosrm(name):
+    """Neither by itself nor through what it imports."""
+    for node in ast.walk(ast.parse((FOLDER / name).read_text())):
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            modules = [alias.name for alias in node.names]
+            modules += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            assert not [one for one in modules if one.split(".")[0] == "rosrm"]
+            ours = [one for one in modules if one.startswith("benchmarks")]
+            assert {one.split(".")[2] + ".py" for one in ours if one.count(".") > 1} <= {*JUDGES}
+
+
+def run(instance="a#1", host="host1", first=10.0, last=20.0, numbers=(1, 100), pid=5):
+    return Run(instance, host, pid, first - 0.1, first, last, *numbers, "active", last)
+
+
+def kinds(*arguments):
+    violations, allowed = judge_service("a", *arguments)
+    return [one.kind for one in violations], dict(allowed)
+
+
+FIRST, SECOND = run(), run("a#2", "host2", 21.0, 30.0, (101, 200))
+KILLED = Harm("process_kill", 20.0, 20.0, process="a")
+CUT = Harm("host_cut", 12.0, 19.0, frozenset({"host1"}), hides=True)
+OFF = Harm("host_off", 20.0, 25.0, frozenset({"host1"}), kills=True, hides=True)
+
+
+def test_nobody_may_end_to_whom_nothing_was_done():
+    """A process that was killed, or whose host lost its power, may."""
+    plain = Promise()
+    assert kinds(plain, [FIRST, SECOND], []) == (["touched"], {})
+    assert kinds(plain, [FIRST, SECOND], [KILLED]) == ([], {})
+    assert kinds(plain, [FIRST, SECOND], [OFF]) == ([], {})
+    assert kinds(plain, [FIRST, SECOND], [CUT]) == (["touched"], {})
+    assert kinds(Promise(elsewhere=True), [FIRST, SECOND], [CUT]) == ([], {})
+    other = Harm("host_off", 20.0, 25.0, frozenset({"host2"}), kills=True)
+    assert kinds(plain, [FIRST, SECOND], [other]) == (["touched"], {})
+
+
+def test_two_active_owners_only_while_they_were_parted():
+    """And one second after; with `isolation: stop` never."""
+    longer, beside = run(last=24.0), run("a#2", "host2", 16.0, 30.0)
+    elsewhere = Promise(elsewhere=True)
+    assert kinds(elsewhere, [run(last=19.5), beside], [CUT]) == ([], {"partitioned": 1})
+    assert kinds(elsewhere, [longer, beside], [CUT])[0] == ["doubled"]
+    assert kinds(Promise(), [longer, beside], [KILLED])[0] == ["doubled"]
+    assert kinds(Promise(elsewhere=True, isolated=True), [run(last=17.0), beside], [CUT])[0] == [
+        "doubled"
+    ]
+    assert kinds(Promise(), [longer, beside], [Harm("overlap", 15.0, 15.0, process="a")]) == (
+        [],
+        {"overlaps": 1},
+    )
+
+
+def test_the_state_of_a_node_that_was_killed_may_be_lost_and_no_other():
+    """A move loses and repeats nothing; a standby, or a kept state, at most the last cycle."""
+    stateful, move = Promise(stateful=True), Harm("move", 15.0, 15.0, process="a")
+    anew, again = run("a#2", first=21.0, last=30.0), run("a#2", first=21.0, numbers=(100, 120))
+    assert kinds(stateful, [FIRST, SECOND], [move]) == ([], {})
+    assert kinds(stateful, [FIRST, anew], [move])[0] == ["state"]
+    assert kinds(stateful, [FIRST, anew], [KILLED]) == ([], {"state_from_nothing": 1})
+    assert kinds(stateful, [FIRST, again], [move])[0] == ["state"]
+    kept = Promise(stateful=True, kept=True)
+    assert kinds(kept, [FIRST, again], [KILLED]) == ([], {"state_cycle_lost": 1})
+    assert kinds(kept, [FIRST, anew], [KILLED])[0] == ["state"]
+
+
+def test_one_run_never_goes_back():
+    backwards = run()
+    backwards.backwards = 1
+    assert kinds(Promise(), [backwards], [])[0] == ["state"]
+
+
+def test_a_job_is_done_once_unless_something_was_done_to_it():
+    twice = [run("j#1"), run("j#2")]
+    assert judge_job("j", 9.0, twice[:1], []) == ([], {})
+    assert [one.kind for one in judge_job("j", 9.0, twice, [])[0]] == ["repeated"]
+    assert judge_job("j", 9.0, twice, [OFF])[0] == []
+    assert judge_job("j", 26.0, twice, [OFF])[0] != []
+
+
+def test_who_waits_in_line_keeps_its_place():
+    line = {"one": [run(first=1.0)], "two": [run(first=3.0)], "three": [run(first=2.0)]}
+    assert [(one.kind, one.name) for one in judge_line(line)] == [("order", "three")]
+
+
+def test_lines_become_runs_as_they_grow(tmp_path):
+    """Half a line is taken when it is whole; who restarted under the same name is another run."""
+    file, outputs = tmp_path / "a", Outputs(tmp_path)
+    assert outputs.read("a") == []
+    file.write_text("1.0 a#1 host1 5 0.9 born 0\n1.1 a#1 host1 5 0.9 active 1\n1.2 a#1 ho")
+    assert [(one.first, one.last_number) for one in outputs.read("a")] == [(1.1, 1)]
+    with file.open("a") as more:
+        more.write("st1 5 0.9 active 2\n3.0 a#1 host1 9 2.9 active 1\n")
+    first, second = outputs.read("a")
+    assert (first.last, first.last_number, second.pid) == (1.2, 2, 9)
+    assert chain([second, first], None) == [first, second]
+    assert chain([second, first], second) == [second]
+    outputs.forget("a", before=2.0)
+    assert outputs.read("a") == [second]
