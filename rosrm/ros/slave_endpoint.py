@@ -81,6 +81,8 @@ class SlaveEndpoint:
         self._beat_period = 1.0
         self._greeting = srv.Handshake.Response()
         self._greeted_at = 0.0
+        self._asked_at = 0.0
+        self._beat_clock = core.BeatClock()
         self._newest_beat: msg.MasterBeat | None = None
         self._incarnation = 0  # of the master that we are registered with, or about to be
         self._registered_with = 0  # the incarnation of the newest that took us in
@@ -137,6 +139,7 @@ class SlaveEndpoint:
 
     def _greet(self, now: float) -> None:
         self.link = Link.GREETING
+        self._asked_at = now
         request = srv.Handshake.Request(
             protocol_version=PROTOCOL_VERSION, software_version=__version__, role="slave",
             name=self._description.name,
@@ -146,7 +149,8 @@ class SlaveEndpoint:
         )
 
     def _take_greeting(self, answer: srv.Handshake.Response | None) -> None:
-        if answer is None:
+        now = time.monotonic()
+        if answer is None or now - self._asked_at >= _PATIENCE:  # we were stopped meanwhile
             self.link = Link.SEARCHING
             return
         fault = version_refusal(answer.protocol_version, f"the master on {answer.hostname}")
@@ -154,8 +158,9 @@ class SlaveEndpoint:
             self.failure = fault or answer.message
             return
         self.cluster = answer.master
-        self._greeting, self._greeted_at = answer, time.monotonic()
-        self._note_beat(answer.beat, self._greeted_at)
+        self._greeting, self._greeted_at = answer, now
+        self._beat_clock.restart()
+        self._note_beat(answer.beat, now)
         self.link = Link.LISTENING
         self._register_if_known()
 
@@ -165,6 +170,7 @@ class SlaveEndpoint:
         if beat is None or _speaker(beat) != _speaker(self._greeting):
             return
         self._incarnation = beat.incarnation
+        self._asked_at = time.monotonic()
         self.link = Link.REGISTERING
         self._poll_open = False
         request = srv.RegisterHost.Request(
@@ -196,6 +202,7 @@ class SlaveEndpoint:
         self._poll_anew = _FIRST_POLL_ANEW
         self._reporter.begin(self.host_id, self._beat_period)
         self.link = Link.REGISTERED
+        self._host.take(core.MasterHears(self._asked_at))
         self._host.take(core.Registered(answer.epoch, renumbers))
         greeting = self._greeting
         self._host.say(
@@ -234,7 +241,9 @@ class SlaveEndpoint:
                 return
             self._lose_master(f"the master has started again (epoch {beat.epoch})")
         self._newest_beat = beat
-        self._note_beat(beat.beat, now)
+        said_at = self._note_beat(beat.beat, now)
+        if self.link is Link.REGISTERED and self.host_id not in beat.unheard:
+            self._host.take(core.MasterHears(said_at))
         if self.link is Link.LISTENING:
             self._register_if_known()
 
@@ -242,9 +251,11 @@ class SlaveEndpoint:
         """Whether our master has been silent for longer than so many beats."""
         return now - self._beat_at > beats * self._beat_period
 
-    def _note_beat(self, beat: int, now: float) -> None:
+    def _note_beat(self, beat: int, now: float) -> float:
+        """Remember it; returns when it was said, by our clock."""
         self._master_beat, self._beat_at = beat, now
         self._reporter.note_master(beat)
+        return self._beat_clock.said_at(beat / 1e9, now)
 
     # --- asking for work -----------------------------------------------------------------
 

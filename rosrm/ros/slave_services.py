@@ -139,6 +139,7 @@ def _ordered(request: srv.ControlHost.Request) -> core.Event:
     instance = convert.instance_from_msg(request.instance)
     orders: dict[int, core.Event] = {
         kind.STOP: core.StopOrdered(instance),
+        kind.FENCE: core.FenceOrdered(instance),
         kind.RESTART: core.RestartOrdered(instance),
         kind.REPORT: core.ReportRequested(),
     }

@@ -20,6 +20,7 @@ def launch_order(
     *,
     where: Whereabouts,
     state_directory: Path,
+    heard: float = 0.0,
 ) -> LaunchOrder:
     """What the supervisor is to start for an assignment; its parameters are written to a file.
 
@@ -29,6 +30,7 @@ def launch_order(
         python: the interpreter for modules.
         where: it will run.
         state_directory: of this host's supervisor; the parameters lie beside the instance's log.
+        heard: when the master last heard this host, monotonic; 0.0: just now.
 
     Raises:
         LaunchError: what was looked for, and where.
@@ -50,6 +52,8 @@ def launch_order(
         # A shadow that has ended is never started again: the source is active all the while.
         restart=RestartPolicy("never") if assignment.shadow else spec.restart,
         stop=spec.stop,
+        fence=assignment.fence,
+        heard=heard,
     )
 
 

@@ -1,21 +1,42 @@
-"""What the supervisor remembers for a later run of the slave: how an instance becomes ready."""
+"""What the supervisor remembers for a later run of the slave: how one is ready, and healthy."""
 
 from __future__ import annotations
 
 import json
+from dataclasses import astuple
+from typing import Any
 
-from rosrm.core.slave import Awaited
-
-
-def to_memo(awaited: Awaited) -> str:
-    """As a text."""
-    return json.dumps([awaited.node_name, awaited.timeout, awaited.seen])
+from rosrm.core.model import Health
+from rosrm.core.slave import Awaited, Memo, Watch
 
 
-def from_memo(memo: str) -> Awaited | None:
+def to_memo(memo: Memo) -> str:
+    """As a text; "": there is nothing to remember."""
+    if memo.awaited is None and memo.watch is None:
+        return ""
+    awaited = None if memo.awaited is None else astuple(memo.awaited)
+    watch = None if memo.watch is None else astuple(memo.watch)
+    return json.dumps({"awaited": awaited, "watch": watch})
+
+
+def from_memo(text: str) -> Memo | None:
     """The inverse of `to_memo`; None for what another version of the slave may have written."""
     try:
-        node_name, timeout, seen = json.loads(memo)
-        return Awaited(str(node_name), float(timeout), int(seen))
-    except (TypeError, ValueError):
+        fields = json.loads(text)
+        awaited, watch = fields["awaited"], fields["watch"]
+        return Memo(
+            None if awaited is None else _awaited(awaited), None if watch is None else _watch(watch)
+        )
+    except (KeyError, TypeError, ValueError):
         return None
+
+
+def _awaited(value: Any) -> Awaited:
+    node_name, timeout, seen = value
+    return Awaited(str(node_name), float(timeout), int(seen))
+
+
+def _watch(value: Any) -> Watch:
+    (topic, rate, lifecycle, timeout), topics, services, shadow = value
+    wanted = Health(str(topic), float(rate), str(lifecycle), float(timeout))
+    return Watch(wanted, tuple(map(str, topics)), tuple(map(str, services)), bool(shadow))

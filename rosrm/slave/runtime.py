@@ -37,6 +37,7 @@ from rosrm.ros.names import STATE_CONFIG, Names, token
 from rosrm.ros.participant import Participant
 from rosrm.ros.slave_endpoint import Link, LogSlice, SlaveEndpoint, result_json
 from rosrm.slave.environment import SHADOW, Whereabouts
+from rosrm.slave.health import HealthWatch
 from rosrm.slave.launch import launch_order
 from rosrm.slave.log_reading import NOTHING_YET, newest_instance, read_log
 from rosrm.slave.memos import from_memo, to_memo
@@ -122,6 +123,7 @@ class SlaveRuntime:
             )
             opened.callback(self._participant.close)
             self._graph = GraphWatch(self._participant.node)
+            self._health = HealthWatch(self._participant, self._graph, self._sessions)
             self._limit = self._limits()
             self._environment = {**os.environ, **config.ros.environment()}
             self._endpoint = SlaveEndpoint(
@@ -175,7 +177,7 @@ class SlaveRuntime:
 
     def _serve(self, goes_on: Callable[[], bool]) -> None:
         now = time.monotonic()
-        next_sample = next_usage = next_graph = now
+        next_sample = next_usage = next_graph = next_health = now
         told = now - _PATIENCE_TOLD
         while goes_on():
             if now >= next_sample:
@@ -188,11 +190,15 @@ class SlaveRuntime:
             if awaited and now >= next_graph:
                 next_graph = now + _LOOK_AT_GRAPH
                 self._look_at_graph(awaited)
+            if now >= next_health:
+                next_health = now + core.LOOK_PERIOD
+                self._events.extend(self._health.look(self._state.watched(), now))
             if self._endpoint.link is Link.SEARCHING and now - told >= _PATIENCE_TOLD:
                 told = now
                 self.say(f"looking for a master on {self._config.ros.describe()}")
             self._work(now)
             wake = min(next_sample, next_usage, next_graph if awaited else next_sample)
+            wake = min(wake, next_health) if self._health.watches else wake
             self._participant.spin(max(0.0, wake - time.monotonic()))
             now = time.monotonic()
             self._work(now)
@@ -263,15 +269,22 @@ class SlaveRuntime:
             self._launch(command.assignments)
         elif isinstance(command, core.Stop):
             self._supervisor.stop(command.instance)
+        elif isinstance(command, core.Fence):
+            self._supervisor.fence(command.instance)
+        elif isinstance(command, core.Renew):
+            self._supervisor.heard(command.at)
         elif isinstance(command, core.Restart):
             self._supervisor.restart(command.instance)
+        elif isinstance(command, core.Fail):
+            self.say(f"{command.instance} is {command.reason}")
+            self._supervisor.fail(command.instance, command.pid, command.reason, kill=command.kill)
         elif isinstance(command, core.Amend):
             self._supervisor.amend(command.instance, command.restart, {SHADOW: None})
         elif isinstance(command, core.Settle):
             for settled in self._unsettled.pop((command.instance, command.restart), []):
                 settled(command.refusal)
         elif isinstance(command, core.Remember):
-            self._supervisor.remember(command.instance, to_memo(command.awaited))
+            self._supervisor.remember(command.instance, to_memo(command.memo))
         elif isinstance(command, core.Forget):
             self._supervisor.forget(command.instances)
         else:
@@ -285,16 +298,17 @@ class SlaveRuntime:
             Names(self._config.ros.namespace)(STATE_CONFIG),
         )
         for assignment in assignments:
-            awaited = self._state.held[assignment.instance].awaited
+            held = self._state.held[assignment.instance]
+            awaited = held.awaited
             if awaited is not None:
                 before = self._graph.endpoints(awaited.node_name)
                 self._graph_before[assignment.instance] = before
             try:
                 order = launch_order(
                     assignment, self._environment, sys.executable, where=where,
-                    state_directory=self._supervisor_state,
+                    state_directory=self._supervisor_state, heard=self._state.heard_at,
                 )  # fmt: skip
-                orders.append(replace(order, memo="" if awaited is None else to_memo(awaited)))
+                orders.append(replace(order, memo=to_memo(held.memo)))
             except LaunchError as error:
                 self.say(f"{assignment.instance} cannot be started here: {error}")
                 self.take(core.LaunchRefused(assignment.instance, str(error)))
@@ -344,9 +358,10 @@ class SlaveRuntime:
             self.say(note)
         for status in self._supervisor.instances:
             self._follow_session(status)
-        memos = {one: from_memo(memo) for one, memo in self._supervisor.memos.items()}
-        awaited = {one: memo for one, memo in memos.items() if memo is not None}
-        self.take(core.SupervisorReplaced(tuple(self._supervisor.instances), awaited))
+        found = {one: from_memo(memo) for one, memo in self._supervisor.memos.items()}
+        memos = {one: memo for one, memo in found.items() if memo is not None}
+        supervisor = self._supervisor
+        self.take(core.SupervisorReplaced(supervisor.instances, memos, supervisor.fenced))
 
     def _take_told(self, told: Sequence[Told]) -> None:
         statuses = tuple(one for one in told if isinstance(one, InstanceStatus))

@@ -12,8 +12,8 @@ The client orders, by the key `do`:
                                                 environment: id of a base; changes: variable to
                                                 value, or null to leave it out; restart and stop:
                                                 the fields of the policies, in their order
-                                                fence: null, or [after, grace]: see `heard`, of which
-                                                the start has one of its own; 0: now
+                                                fence: null, or [after, grace]: see `heard`, of
+                                                which the start has one as well; 0: now
                                                 memo: a text that is kept for the client
     stop         instance                       SIGINT, SIGTERM, SIGKILL; never heard of: a start
                                                 that comes late will be refused

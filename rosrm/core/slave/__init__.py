@@ -10,6 +10,8 @@ AssignmentsReceived     has them launched, once, or holds them until a slot is f
                         are being started are ready; one that was stopped before is refused
 LaunchRefused           reports that the host cannot run it, and why
 StopOrdered             has it stopped; one never heard of will never be started
+FenceOrdered            the same, but at once
+MasterHears             tells the supervisor, where there is a fence that this renews
 RestartOrdered          has it stopped and started again here
 RestartPolicySet        has the supervisor keep it, unless it has ended or is not known: settled
 RestartPolicyRecorded   the supervisor has it in its record: settled
@@ -18,7 +20,9 @@ SupervisorReported      follows the instance; a new run must become ready anew
 SupervisorReplaced      the same; what the new one does not know is gone; reports everything, and
                         orders again what may have been lost with the former one
 SeenInGraph             the instance is ready; a later run of this slave shall know
-TimePassed              an instance that is not ready in time is stopped; old ends are forgotten
+LookedAt                one that has been unhealthy for too long is ended as failed
+TimePassed              an instance that is not ready in time is stopped; one whose fence passed
+                        before its start is refused; old ends are forgotten
 ======================  =========================================================================
 """
 
@@ -26,10 +30,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
+from rosrm.core.slave.beat_clock import BeatClock
 from rosrm.core.slave.handlers import (
     HANDLERS,
     REMEMBER_END,
 )
+from rosrm.core.slave.health import LOOK_PERIOD
 from rosrm.core.slave.state import (
     Held,
     SlaveState,
@@ -43,12 +49,20 @@ from rosrm.core.slave.words import (
     Awaited,
     Command,
     Event,
+    Fail,
+    Fence,
+    FenceOrdered,
     Forget,
     Launch,
     LaunchRefused,
+    Look,
+    LookedAt,
+    MasterHears,
     MasterLost,
+    Memo,
     Registered,
     Remember,
+    Renew,
     Report,
     ReportRequested,
     Restart,
@@ -62,23 +76,34 @@ from rosrm.core.slave.words import (
     SupervisorReplaced,
     SupervisorReported,
     TimePassed,
+    Watch,
 )
 
 __all__ = [
     "HANDLERS",
+    "LOOK_PERIOD",
     "REMEMBER_END",
     "Amend",
     "AssignmentsReceived",
     "Awaited",
+    "BeatClock",
     "Command",
     "Event",
+    "Fail",
+    "Fence",
+    "FenceOrdered",
     "Forget",
     "Held",
     "Launch",
     "LaunchRefused",
+    "Look",
+    "LookedAt",
+    "MasterHears",
     "MasterLost",
+    "Memo",
     "Registered",
     "Remember",
+    "Renew",
     "Report",
     "ReportRequested",
     "Restart",
@@ -93,6 +118,7 @@ __all__ = [
     "SupervisorReplaced",
     "SupervisorReported",
     "TimePassed",
+    "Watch",
     "awaits_graph",
     "qualified_name",
     "step",

@@ -8,16 +8,24 @@ from types import MappingProxyType
 from typing import Any, Final
 
 from rosrm.core.model import Assignment, InstanceId, InstanceState, InstanceStatus
+from rosrm.core.slave import fencing
+from rosrm.core.slave.health import Judgement, watch_of
 from rosrm.core.slave.state import Held, SlaveState, awaits_graph, qualified_name
 from rosrm.core.slave.words import (
     Amend,
     AssignmentsReceived,
     Awaited,
     Command,
+    Fail,
+    Fence,
+    FenceOrdered,
     Forget,
     Launch,
     LaunchRefused,
+    LookedAt,
+    MasterHears,
     MasterLost,
+    Memo,
     Registered,
     Remember,
     Report,
@@ -78,7 +86,7 @@ def _assigned(state: SlaveState, event: AssignmentsReceived, now: float) -> _Com
             continue
         state.waiting[instance] = assignment
         state.held[instance] = _waiting(assignment)
-    launches = _start_waiting(state)
+    launches = _start_waiting(state, now)
     held = [state.held[one.instance] for one in event.assignments if one.instance in state.waiting]
     for one in held:
         one.status = replace(one.status, message=state.why_wait())
@@ -92,17 +100,31 @@ def _waiting(assignment: Assignment) -> Held:
     if awaits_graph(spec):
         name = qualified_name(spec.namespace, assignment.node_name)
         awaited = Awaited(name, spec.readiness.timeout)
-    return Held(InstanceStatus(assignment.instance, InstanceState.HELD), spec, awaited)
+    status = InstanceStatus(assignment.instance, InstanceState.HELD)
+    watch, fenced = watch_of(assignment), assignment.fence is not None
+    return Held(status, spec, awaited, watch=watch, fenced=fenced)
 
 
-def _start_waiting(state: SlaveState) -> _Commands:
+def _start_waiting(state: SlaveState, now: float) -> _Commands:
     """Launch what waits, as far as it may be started now."""
+    refused = _refuse_late(state, now)
     launches = []
     while state.waiting and not state.why_wait():
         instance = next(iter(state.waiting))
         launches.append(state.waiting.pop(instance))
         state.held[instance].status = InstanceStatus(instance, InstanceState.STARTING)
-    return [Launch(tuple(launches))] if launches else []
+    return [*([Launch(tuple(launches))] if launches else []), *refused]
+
+
+def _refuse_late(state: SlaveState, now: float) -> _Commands:
+    """Their successors may run elsewhere by now."""
+    late = fencing.late(state, now)
+    for instance, why in late.items():
+        del state.waiting[instance]
+        status = InstanceStatus(instance, InstanceState.REFUSED, message=why)
+        state.held[instance] = Held(status, ended_at=now)
+        _bury(state, instance)
+    return [Report(tuple(state.held[one].status for one in late))] if late else []
 
 
 def _why_not(state: SlaveState, assignment: Assignment) -> str:
@@ -118,21 +140,22 @@ def _launch_refused(state: SlaveState, event: LaunchRefused, now: float) -> _Com
     held.status = InstanceStatus(event.instance, InstanceState.REFUSED, message=event.reason)
     held.ready_by, held.ended_at = None, now
     _bury(state, event.instance)
-    return [*_start_waiting(state), Report((held.status,))]
+    return [*_start_waiting(state, now), Report((held.status,))]
 
 
-def _stop_ordered(state: SlaveState, event: StopOrdered, now: float) -> _Commands:
-    held = state.held.get(event.instance)
+def _end_ordered(state: SlaveState, event: StopOrdered | FenceOrdered, now: float) -> _Commands:
+    instance = event.instance
+    held = state.held.get(instance)
     if held is not None and held.status.state.ended:
         return [Report((held.status,))]
-    if held is not None and event.instance not in state.waiting:
-        return [Stop(event.instance)]
-    state.waiting.pop(event.instance, None)
-    _bury(state, event.instance)
+    if held is not None and instance not in state.waiting:
+        return [Fence(instance) if isinstance(event, FenceOrdered) else Stop(instance)]
+    state.waiting.pop(instance, None)
+    _bury(state, instance)
     status = InstanceStatus(
-        event.instance, InstanceState.REFUSED, message="it was stopped before it was started"
+        instance, InstanceState.REFUSED, message="it was stopped before it was started"
     )
-    state.held[event.instance] = Held(status, ended_at=now)
+    state.held[instance] = Held(status, ended_at=now)
     return [Report((status,))]
 
 
@@ -158,13 +181,23 @@ def _restart_policy_set(state: SlaveState, event: RestartPolicySet, now: float) 
         return [_not_held(event)]
     if held.status.state.ended:
         return [Report((held.status,)), Settle(event.instance, event.restart)]
+    unveiled = _unveil(held)
     waiting = state.waiting.get(event.instance)
     if waiting is not None:  # nobody but this slave knows of it yet
         spec = replace(waiting.spec, restart=event.restart)
         state.waiting[event.instance] = replace(waiting, spec=spec, shadow=False)
         return [Report((held.status,)), Settle(event.instance, event.restart)]
     held.unsettled += (event.restart,)
-    return [Amend(event.instance, event.restart)]
+    remember = [Remember(event.instance, held.memo)] if unveiled else []
+    return [Amend(event.instance, event.restart), *remember]
+
+
+def _unveil(held: Held) -> bool:
+    """It is no shadow any more: from now on its health is watched. Whether that is news."""
+    if held.watch is None or not held.watch.shadow:
+        return False
+    held.watch = replace(held.watch, shadow=False)
+    return True
 
 
 def _not_held(order: RestartPolicySet) -> Settle:
@@ -195,7 +228,7 @@ def _supervisor_reported(state: SlaveState, event: SupervisorReported, now: floa
         if (status := _follow(state, reported, now)) is not None
     ]
     # The next one first: the master hears of an end soon enough.
-    return [*_start_waiting(state), *([Report(tuple(changed))] if changed else [])]
+    return [*_start_waiting(state, now), *([Report(tuple(changed))] if changed else [])]
 
 
 def _supervisor_replaced(state: SlaveState, event: SupervisorReplaced, now: float) -> _Commands:
@@ -206,13 +239,19 @@ def _supervisor_replaced(state: SlaveState, event: SupervisorReplaced, now: floa
         if lost and not held.status.state.ended:
             del state.held[instance]
             _bury(state, instance)
+        held.judgement = None  # what it ordered may be lost
         again += [
             _amend_again(RestartPolicySet(instance, restart), held, lost=lost)
             for restart in held.unsettled
         ]
     for status in event.statuses:
-        _follow(state, status, now, event.awaited.get(status.instance))
-    return [*again, *_start_waiting(state), Report(state.statuses(), complete=True)]
+        _follow(state, status, now, event.memos.get(status.instance))
+    for instance in event.fenced & state.held.keys():
+        state.held[instance].fenced = True
+    return [
+        *fencing.renew(state), *again, *_start_waiting(state, now),
+        Report(state.statuses(), complete=True),
+    ]  # fmt: skip
 
 
 def _amend_again(order: RestartPolicySet, held: Held, *, lost: bool) -> Command:
@@ -223,12 +262,15 @@ def _amend_again(order: RestartPolicySet, held: Held, *, lost: bool) -> Command:
 
 
 def _follow(
-    state: SlaveState, reported: InstanceStatus, now: float, awaited: Awaited | None = None
+    state: SlaveState, reported: InstanceStatus, now: float, memo: Memo | None = None
 ) -> InstanceStatus | None:
     """Take over what the supervisor says; None: that is known."""
     held = state.held.get(reported.instance)
     if held is None:
-        held = state.held[reported.instance] = Held(reported, awaited=awaited)
+        known = memo or Memo()
+        held = state.held[reported.instance] = Held(
+            reported, awaited=known.awaited, watch=known.watch
+        )
         if reported.state is InstanceState.RUNNING:
             held.status = _running(held, reported, now)
     elif reported.state is InstanceState.RUNNING:
@@ -266,8 +308,22 @@ def _seen(state: SlaveState, event: SeenInGraph, now: float) -> _Commands:
     held.status = replace(held.status, state=InstanceState.READY)
     held.awaited = replace(held.awaited, seen=held.status.pid)
     return [
-        *_start_waiting(state), Remember(event.instance, held.awaited), Report((held.status,))
+        *_start_waiting(state, now), Remember(event.instance, held.memo), Report((held.status,))
     ]  # fmt: skip
+
+
+def _looked_at(state: SlaveState, event: LookedAt, now: float) -> _Commands:
+    held = state.held.get(event.instance)
+    watch = None if held is None else held.watched
+    if held is None or watch is None or held.status.pid != event.pid:
+        return []
+    if held.judgement is None or held.judgement.pid != event.pid:
+        held.judgement = Judgement(watch, event.pid, now)
+    reason = held.judgement.look(event.look, now)
+    if not reason:
+        return []
+    held.judgement = None  # should the order be lost, it comes again
+    return [Fail(event.instance, event.pid, reason, kill=event.look.stopped)]
 
 
 def _may_be_forgotten(state: SlaveState, held: Held, now: float) -> bool:
@@ -275,7 +331,7 @@ def _may_be_forgotten(state: SlaveState, held: Held, now: float) -> bool:
 
 
 def _time_passed(state: SlaveState, event: TimePassed, now: float) -> _Commands:
-    commands: _Commands = []
+    commands: _Commands = _refuse_late(state, now)
     forgotten = []
     for instance, held in state.held.items():
         awaited = held.awaited
@@ -305,7 +361,9 @@ HANDLERS: Final[Mapping[type, _Handler]] = MappingProxyType(
         MasterLost: _master_lost,
         AssignmentsReceived: _assigned,
         LaunchRefused: _launch_refused,
-        StopOrdered: _stop_ordered,
+        StopOrdered: _end_ordered,
+        FenceOrdered: _end_ordered,
+        MasterHears: fencing.master_hears,
         RestartOrdered: _restart_ordered,
         RestartPolicySet: _restart_policy_set,
         RestartPolicyRecorded: _restart_policy_recorded,
@@ -313,6 +371,7 @@ HANDLERS: Final[Mapping[type, _Handler]] = MappingProxyType(
         SupervisorReported: _supervisor_reported,
         SupervisorReplaced: _supervisor_replaced,
         SeenInGraph: _seen,
+        LookedAt: _looked_at,
         TimePassed: _time_passed,
     }
 )

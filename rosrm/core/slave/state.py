@@ -18,7 +18,8 @@ from rosrm.core.model import (
     ProcessSpec,
     RestartPolicy,
 )
-from rosrm.core.slave.words import Awaited
+from rosrm.core.slave.health import Judgement
+from rosrm.core.slave.words import Awaited, Memo, Watch
 
 _SLOTS: Final = np.left_shift(np.uint32(1), np.arange(RESOURCE_SLOTS, dtype=np.uint32))
 
@@ -32,6 +33,9 @@ class Held:
         spec: None where this slave found it running at its own start.
         awaited: None: it is ready as soon as it runs.
         ready_by: deadline for becoming ready; None: it is ready, or does not run.
+        watch: what is watched of its health; None: nothing.
+        judgement: of the run that is watched; None: none is, or it begins anew.
+        fenced: it has a fence.
         unready: why it was stopped, where it did not become ready in time.
         unsettled: restart policies that the master has set and the supervisor has not recorded
             yet, in order.
@@ -41,9 +45,23 @@ class Held:
     spec: ProcessSpec | None = None
     awaited: Awaited | None = None
     ready_by: float | None = None
+    watch: Watch | None = None
+    judgement: Judgement | None = None
+    fenced: bool = False
     unready: str = ""
     unsettled: tuple[RestartPolicy, ...] = ()
     ended_at: float = 0.0
+
+    @property
+    def memo(self) -> Memo:
+        """What a later run of this slave must know."""
+        return Memo(self.awaited, self.watch)
+
+    @property
+    def watched(self) -> Watch | None:
+        """What is watched of its health now; None: nothing."""
+        ready = self.status.state is InstanceState.READY
+        return self.watch if ready and self.watch is not None and not self.watch.shadow else None
 
 
 @dataclass(slots=True)
@@ -56,6 +74,8 @@ class SlaveState:
         waiting: assignments that are started as soon as they may be, in order.
         unheard: something was reported while no master had this host: perhaps after its
             registration was sent.
+        heard_at: when the master last heard this host, as far as is known; 0: not known.
+        renewed_at: the same, as the supervisor was told last.
     """
 
     max_processes: int = 0
@@ -63,6 +83,8 @@ class SlaveState:
     epoch: int = 0
     registered: bool = False
     unheard: bool = False
+    heard_at: float = 0.0
+    renewed_at: float = 0.0
     held: dict[InstanceId, Held] = field(default_factory=dict)
     waiting: dict[InstanceId, Assignment] = field(default_factory=dict)
     tombstones: dict[InstanceId, None] = field(default_factory=dict)
@@ -70,6 +92,10 @@ class SlaveState:
     def awaited_in_graph(self) -> Mapping[InstanceId, Held]:
         """Instances that become ready by being seen in the ROS graph."""
         return {instance: held for instance, held in self.held.items() if held.ready_by is not None}
+
+    def watched(self) -> Mapping[InstanceId, Held]:
+        """Instances whose health is watched now."""
+        return {one: held for one, held in self.held.items() if held.watched is not None}
 
     def statuses(self) -> tuple[InstanceStatus, ...]:
         """Of every instance, ended ones that are still remembered included."""

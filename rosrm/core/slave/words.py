@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from rosrm.core.model import Assignment, InstanceId, InstanceStatus, RestartPolicy
+from rosrm.core.model import Assignment, Health, InstanceId, InstanceStatus, RestartPolicy
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,6 +21,53 @@ class Awaited:
     node_name: str
     timeout: float
     seen: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Watch:
+    """What is watched of the health of an instance that is ready.
+
+    Attributes:
+        wanted: by its spec.
+        topics: absolute names of what it must publish, one of them; (): nothing.
+        services: absolute names under which its lifecycle state is asked; (): it is not.
+        shadow: it is one, and is not watched before it is none any more.
+    """
+
+    wanted: Health
+    topics: tuple[str, ...] = ()
+    services: tuple[str, ...] = ()
+    shadow: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """What was seen of an instance since the look before.
+
+    Attributes:
+        stopped: its session leader is, by a signal.
+        heard: messages on its topic; None: it cannot be listened to.
+        trouble: why it cannot; "": it can.
+        state: of its lifecycle; "": it does not answer; None: that is not known yet.
+    """
+
+    stopped: bool = False
+    heard: int | None = None
+    trouble: str = ""
+    state: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Memo:
+    """What a later run of this slave must know of an instance; its spec it does not know.
+
+    Attributes:
+        awaited: None: it is ready as soon as it runs.
+        watch: None: its health is not watched.
+    """
+
+    awaited: Awaited | None = None
+    watch: Watch | None = None
 
 
 # --- what can happen --------------------------------------------------------------------------
@@ -66,6 +113,24 @@ class StopOrdered:
 
 
 @dataclass(frozen=True, slots=True)
+class FenceOrdered:
+    """The master wants an instance to be gone at once: it has a successor."""
+
+    instance: InstanceId
+
+
+@dataclass(frozen=True, slots=True)
+class MasterHears:
+    """The master that this host is registered with had heard it when it said so.
+
+    Attributes:
+        at: when that was, by the slave's clock; not when it arrived.
+    """
+
+    at: float
+
+
+@dataclass(frozen=True, slots=True)
 class RestartOrdered:
     """The master wants an instance to start again here."""
 
@@ -106,11 +171,13 @@ class SupervisorReplaced:
 
     Attributes:
         statuses: all that it knows.
-        awaited: what it was told to remember of instances that become ready in the ROS graph.
+        memos: what it was told to remember of instances.
+        fenced: which of them have a fence.
     """
 
     statuses: tuple[InstanceStatus, ...]
-    awaited: Mapping[InstanceId, Awaited] = field(default_factory=dict)
+    memos: Mapping[InstanceId, Memo] = field(default_factory=dict)
+    fenced: frozenset[InstanceId] = frozenset()
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,6 +185,19 @@ class SeenInGraph:
     """This very instance, not a namesake, is in the ROS graph."""
 
     instance: InstanceId
+
+
+@dataclass(frozen=True, slots=True)
+class LookedAt:
+    """One that is watched was looked at.
+
+    Attributes:
+        pid: of the run that was.
+    """
+
+    instance: InstanceId
+    pid: int
+    look: Look
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,10 +223,39 @@ class Stop:
 
 
 @dataclass(frozen=True, slots=True)
+class Fence:
+    """Have the supervisor end an instance at once."""
+
+    instance: InstanceId
+
+
+@dataclass(frozen=True, slots=True)
+class Renew:
+    """Tell the supervisor when the master last heard this host."""
+
+    at: float
+
+
+@dataclass(frozen=True, slots=True)
 class Restart:
     """Have the supervisor restart an instance."""
 
     instance: InstanceId
+
+
+@dataclass(frozen=True, slots=True)
+class Fail:
+    """Have the supervisor end a run as failed, and go on by its restart policy.
+
+    Attributes:
+        pid: of the run.
+        kill: it is stopped, and cannot end in good order.
+    """
+
+    instance: InstanceId
+    pid: int
+    reason: str
+    kill: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,7 +280,7 @@ class Remember:
     """Have the supervisor keep this for a later run of this slave."""
 
     instance: InstanceId
-    awaited: Awaited
+    memo: Memo
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,7 +298,9 @@ class Report:
     complete: bool = False
 
 
-Command = Launch | Stop | Restart | Amend | Settle | Remember | Forget | Report
+Command = (
+    Launch | Stop | Fence | Renew | Restart | Fail | Amend | Settle | Remember | Forget | Report
+)
 
 Event = (
     Registered
@@ -197,6 +308,8 @@ Event = (
     | AssignmentsReceived
     | LaunchRefused
     | StopOrdered
+    | FenceOrdered
+    | MasterHears
     | RestartOrdered
     | RestartPolicySet
     | RestartPolicyRecorded
@@ -204,5 +317,6 @@ Event = (
     | SupervisorReported
     | SupervisorReplaced
     | SeenInGraph
+    | LookedAt
     | TimePassed
 )

@@ -95,9 +95,13 @@ class Host:
 
     def __init__(self) -> None:
         self.events = []
+        self.heard: list[float] = []
 
     def take(self, event) -> None:
-        self.events.append(event)
+        if isinstance(event, core.MasterHears):
+            self.heard.append(event.at)
+        else:
+            self.events.append(event)
 
     def statuses(self) -> list:
         return []
@@ -115,17 +119,21 @@ class Master:
         self._incarnation = incarnation
         self._epoch = epoch
 
-    def beat(self) -> None:
+    def beat(self, unheard=(), age: float = 0.0) -> None:
         beat = msg.MasterBeat(
             protocol_version=PROTOCOL_VERSION, incarnation=self._incarnation,
-            beat=self._slave.clock.monotonic_ns(), **self._is,
+            beat=self._slave.clock.monotonic_ns() - int(age * 1e9), unheard=list(unheard),
+            **self._is,
         )  # fmt: skip
         self._slave.wire.hear[msg.MasterBeat](beat)
 
     def greet(self) -> None:
         self._slave.newest(srv.Handshake).answer(
             srv.Handshake.Response(
-                protocol_version=PROTOCOL_VERSION, accepted=True, beat=1, **self._is
+                protocol_version=PROTOCOL_VERSION,
+                accepted=True,
+                beat=self._slave.clock.monotonic_ns(),
+                **self._is,
             )
         )
 
@@ -242,6 +250,44 @@ def test_of_two_masters_the_one_that_lives_is_kept(slave) -> None:
         slave.pass_time(3.0, ours, Master(slave, 12, epoch=epoch, pid=8))
         assert slave.link is Link.REGISTERED
     Master(slave, 13, epoch=3, pid=9).beat()
+    assert slave.link is Link.SEARCHING
+
+
+def test_beats_say_that_the_master_hears_this_host(slave) -> None:
+    """Those of the master that took it in, unless they name it among the hosts not heard."""
+    ours, another = Master(slave, 11, epoch=2), Master(slave, 12, epoch=1, pid=8)
+    slave.pass_time(PERIOD, ours)
+    ours.greet()
+    assert slave.host.heard == []  # nobody has taken it in yet
+    ours.take_in()
+    slave.host.heard.clear()
+    slave.clock.now += 1.0
+    ours.beat(unheard=[1, 7])
+    another.beat()
+    assert slave.host.heard == []
+    ours.beat(unheard=[2])
+    assert slave.host.heard == pytest.approx([slave.clock.now])
+
+
+def test_old_beats_say_who_was_heard_then(slave) -> None:
+    """A slave that was stopped finds them in its sockets."""
+    ours = Master(slave, 11)
+    slave.join(ours)
+    slave.pass_time(1.0, ours)
+    slave.host.heard.clear()
+    slave.clock.now += 1.5
+    ours.beat(age=1.3)
+    ours.beat(age=1.1)
+    now = slave.clock.now
+    assert slave.host.heard == pytest.approx([now - 1.3, now - 1.1], abs=0.01)
+
+
+def test_an_answer_that_was_taken_in_late_greets_nobody(slave) -> None:
+    """It is no round trip that would tell how old the master's words are."""
+    ours = Master(slave, 11)
+    slave.pass_time(PERIOD)
+    slave.clock.now += 10.0
+    ours.greet()
     assert slave.link is Link.SEARCHING
 
 

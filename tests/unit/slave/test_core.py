@@ -243,24 +243,24 @@ def test_what_a_former_run_of_the_slave_left_is_ready(one) -> None:
 NODE_1 = InstanceId("n", 1)
 
 
-def memo_of(commands) -> slave.Awaited:
+def memo_of(commands) -> slave.Memo:
     """What the supervisor is to remember, as a later run reads it."""
-    (memo,) = [c.awaited for c in commands if isinstance(c, slave.Remember)]
+    (memo,) = [c.memo for c in commands if isinstance(c, slave.Remember)]
     return from_memo(to_memo(memo))
 
 
-def taken_over(one: Slave, status: InstanceStatus, awaited: slave.Awaited) -> Slave:
+def taken_over(one: Slave, status: InstanceStatus, memo: slave.Memo) -> Slave:
     """Another run of the slave, which found this with the supervisor."""
     later = Slave()
     later.now = one.now
-    later.step(slave.SupervisorReplaced((status,), {status.instance: awaited}))
+    later.step(slave.SupervisorReplaced((status,), {status.instance: memo}))
     return later
 
 
 def test_a_node_that_was_still_awaited_is_awaited_by_the_next_slave(one) -> None:
     """It is not ready because the slave that waited for it was killed."""
     one.step(assigned(NODE))
-    awaited = from_memo(to_memo(one.of("n").awaited))
+    awaited = from_memo(to_memo(one.of("n").memo))
     later = taken_over(one, InstanceStatus(NODE_1, STATE.RUNNING, pid=5), awaited)
     assert later.of("n").status.state is STATE.RUNNING
     assert awaited_names(later) == ["/robot/n"]
@@ -283,7 +283,10 @@ def test_a_node_that_was_seen_is_ready_for_the_next_slave(one) -> None:
     assert later.of("n").status.state is STATE.RUNNING
 
 
-@pytest.mark.parametrize("memo", ["", "{}", "[1]", "nothing", '["/n", "soon", 0]'])
+MEMO = '{"awaited": ["/n", "soon", 0], "watch": null}'
+
+
+@pytest.mark.parametrize("memo", ["", "{}", "[1]", "nothing", '["/n", 1.0, 0]', MEMO])
 def test_a_memo_of_another_version_is_none(memo) -> None:
     """What it says is not guessed at."""
     assert from_memo(memo) is None

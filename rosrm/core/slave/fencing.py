@@ -1,0 +1,54 @@
+"""What a slave does so that an instance with a fence has ended before a successor starts elsewhere.
+
+The supervisor ends such an instance when it has not been told for too long that the master hears
+this host. The slave tells it: it alone hears the master.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from rosrm.core.model import Assignment, InstanceId
+from rosrm.core.slave.state import SlaveState
+from rosrm.core.slave.words import Command, MasterHears, Renew
+
+#: Least seconds between two words to the supervisor.
+RENEW_PERIOD: Final = 0.1
+
+
+def master_hears(state: SlaveState, event: MasterHears, now: float) -> list[Command]:
+    """Pass it on, where there is a fence that it renews."""
+    state.heard_at = max(state.heard_at, event.at)
+    if state.heard_at - state.renewed_at < RENEW_PERIOD:
+        return []
+    return renew(state)
+
+
+def renew(state: SlaveState) -> list[Command]:
+    """Tell the supervisor the newest; what has no fence needs no word."""
+    if not state.heard_at:
+        return []
+    if not any(held.fenced and not held.status.state.ended for held in state.held.values()):
+        return []
+    state.renewed_at = state.heard_at
+    return [Renew(state.heard_at)]
+
+
+def too_late(state: SlaveState, assignment: Assignment, now: float) -> str:
+    """Why an instance must not be started any more; "": it may be."""
+    fence = assignment.fence
+    if fence is None or now < state.heard_at + fence.after:
+        return ""
+    return (
+        f"fenced before it was started: for {fence.after:g} s it was not known here whether the "
+        f"master hears this host"
+    )
+
+
+def late(state: SlaveState, now: float) -> dict[InstanceId, str]:
+    """Those that wait for their start and must not be started any more, and why."""
+    return {
+        instance: why
+        for instance, assignment in state.waiting.items()
+        if (why := too_late(state, assignment, now))
+    }

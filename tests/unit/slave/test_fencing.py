@@ -1,0 +1,167 @@
+"""Fences at the slave: what it passes on, and what it starts no more."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rosrm.core import slave
+from rosrm.core.model import (
+    Assignment,
+    Fence,
+    InstanceId,
+    InstanceState,
+    InstanceStatus,
+    ProcessSpec,
+)
+
+ONE = InstanceId("p", 1)
+FENCE = Fence(after=2.0, grace=1.0)
+
+
+class Slave:
+    """A state and its clock; registered at 100 s, when the master had heard it."""
+
+    def __init__(self, **bounds) -> None:
+        self.state = slave.SlaveState(**bounds)
+        self.now = 100.0
+        self.step(slave.MasterHears(self.now))
+        self.step(slave.Registered(1))
+
+    def step(self, event, after=0.0):
+        self.now += after
+        return list(slave.step(self.state, event, self.now))
+
+    def assign(self, number=1, fence=FENCE, after=0.0):
+        instance = InstanceId("p", number)
+        spec = ProcessSpec("p", command=("true",))
+        order = slave.AssignmentsReceived((Assignment(instance, spec, 1, "p", fence=fence),))
+        return self.step(order, after)
+
+    def tell(self, state, number=1, after=0.0):
+        status = InstanceStatus(InstanceId("p", number), state, pid=5)
+        return self.step(slave.SupervisorReported((status,)), after)
+
+    def hears(self, after=0.0):
+        self.now += after
+        return self.step(slave.MasterHears(self.now))
+
+
+def refusals(commands) -> list[str]:
+    reported = [one for c in commands if isinstance(c, slave.Report) for one in c.statuses]
+    return [one.message for one in reported if one.state is InstanceState.REFUSED]
+
+
+def test_the_supervisor_hears_it_while_there_is_a_fence() -> None:
+    """And at most every 0.1 s; for instances without one nothing is said."""
+    one = Slave()
+    one.assign(fence=None)
+    assert one.hears(1.0) == []
+    one.assign(number=2, after=1.0)
+    assert one.hears(0.2) == [slave.Renew(one.now)]
+    assert one.hears(0.05) == []
+    assert one.hears(0.06) == [slave.Renew(one.now)]
+    one.tell(InstanceState.EXITED, number=2)
+    assert one.hears(1.0) == []
+
+
+def test_an_older_word_puts_nothing_off() -> None:
+    """A beat that waited to be taken in says who was heard when it was said."""
+    one = Slave()
+    one.assign()
+    one.hears(1.0)
+    assert one.step(slave.MasterHears(one.now - 0.5), 0.5) == []
+    assert one.state.heard_at == one.now - 0.5
+
+
+def test_a_fence_is_known_again_from_the_supervisor() -> None:
+    """By the next run of the slave; and another supervisor is told the newest at once."""
+    status = InstanceStatus(ONE, InstanceState.RUNNING, pid=5)
+    replaced = slave.SupervisorReplaced((status,), fenced=frozenset({ONE}))
+    one = Slave()
+    assert one.step(replaced)[0] == slave.Renew(100.0)
+    assert one.hears(1.0) == [slave.Renew(101.0)]
+    new = slave.SlaveState()
+    assert not any(isinstance(c, slave.Renew) for c in slave.step(new, replaced, 100.0))
+
+
+def test_what_is_given_out_too_late_is_not_started() -> None:
+    """The slave was stopped with the order in its sockets: the successor may run by now."""
+    one = Slave()
+    (message,) = refusals(one.assign(after=2.0))
+    assert message.startswith("fenced before it was started: for 2 s")
+    assert refusals(one.assign(number=2, after=0.0, fence=Fence(2.5, 0.0))) == []
+
+
+def test_what_waits_for_its_start_is_fenced_too() -> None:
+    """A slot that becomes free during a long cut starts nothing that may run elsewhere."""
+    one = Slave(max_processes=1)
+    one.assign(fence=None)
+    one.assign(number=2)
+    one.assign(number=3, fence=None)
+    assert one.step(slave.TimePassed(), 1.9) == []
+    one.hears()
+    assert one.step(slave.TimePassed(), 1.9) == []
+    commands = one.tell(InstanceState.EXITED, after=0.1)
+    assert len(refusals(commands)) == 1
+    (launch,) = (c for c in commands if isinstance(c, slave.Launch))
+    assert [a.instance.number for a in launch.assignments] == [3]
+    assert refusals(one.assign(number=2)) == []  # it is remembered, and not started
+
+
+def test_the_order_to_fence_is_passed_on() -> None:
+    """For what runs; one never heard of will not be started, as after an order to stop."""
+    one = Slave()
+    one.assign()
+    assert one.step(slave.FenceOrdered(ONE)) == [slave.Fence(ONE)]
+    one.tell(InstanceState.FAILED)
+    assert [type(c) for c in one.step(slave.FenceOrdered(ONE))] == [slave.Report]
+    assert len(refusals(one.step(slave.FenceOrdered(InstanceId("p", 2))))) == 1
+    assert not any(isinstance(c, slave.Launch) for c in one.assign(number=2))
+
+
+# --- when a beat was said ---------------------------------------------------------------------
+
+
+def test_beats_that_were_waiting_are_as_old_as_they_are() -> None:
+    """Stopped for 30 s: the beats of the first second are no newer than that."""
+    clock = slave.BeatClock()
+    for tenth in range(10):
+        assert clock.said_at(tenth / 10, 500.0 + tenth / 10) == pytest.approx(500.0 + tenth / 10)
+    assert clock.said_at(1.0, 530.0) == pytest.approx(501.0, abs=0.05)
+    assert clock.said_at(31.0, 531.0) == pytest.approx(531.0, abs=0.05)
+
+
+@given(
+    st.floats(-1e5, 1e5), st.floats(-5e-4, 5e-4),
+    st.lists(st.tuples(st.floats(0.05, 100.0), st.floats(0.0, 60.0)), min_size=1, max_size=40),
+)  # fmt: skip
+def test_a_beat_is_never_taken_as_newer_than_the_quickest_was_quick(ahead, drift, beats) -> None:
+    """Whatever the clocks' difference, drift and delays: too new by the least delay at most."""
+    clock = slave.BeatClock()
+    said, arrived, quickest = 1000.0, 0.0, 1e9
+    for wait, delay in beats:
+        said += wait
+        arrived = max(arrived, said + delay)  # they come in order
+        quickest = min(quickest, arrived - said)
+        beat = (said + ahead) * (1 + drift)
+        taken = clock.said_at(beat, arrived)
+        assert taken <= arrived + 1e-6
+        assert taken - said <= quickest + 2e-3 * (said - 1000.0) + 1e-6
+
+
+def test_another_pace_of_the_clock_makes_no_beat_old() -> None:
+    """An hour of beats by a clock that is 100 ppm slow: the newest is as new as the first."""
+    clock = slave.BeatClock()
+    for second in range(0, 3600, 5):
+        age = second - clock.said_at(second * (1 - 1e-4), float(second))
+        assert age < 0.01
+
+
+def test_a_new_greeting_takes_another_clock() -> None:
+    """The master's host was asleep: its beats would count as an hour old for ever."""
+    clock = slave.BeatClock()
+    clock.said_at(10.0, 100.0)
+    clock.restart()
+    assert clock.said_at(11.0, 3700.0) == 3700.0

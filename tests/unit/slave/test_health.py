@@ -1,0 +1,308 @@
+"""Who is unhealthy: what was amiss in every look for longer than its time, and nobody else."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rosrm.core import slave
+from rosrm.core.model import (
+    Assignment,
+    Health,
+    InstanceId,
+    InstanceState,
+    InstanceStatus,
+    ProcessSpec,
+    RestartPolicy,
+)
+from rosrm.core.slave.health import Judgement, resolve, watch_of
+from rosrm.slave.memos import from_memo, to_memo
+
+SCAN = Health("~/scan", 5.0, "", 4.0)
+SPEC = ProcessSpec("lidar", module="m", ros=True, namespace="/robot", health=SCAN)
+LIDAR = InstanceId("lidar", 1)
+
+
+def watched(health: Health = SCAN, **more) -> slave.Watch:
+    watch = watch_of(Assignment(LIDAR, replace(SPEC, health=health), 1, "lidar", **more))
+    assert watch is not None
+    return watch
+
+
+class Node:
+    """A node as its looks show it, and the judgement of them.
+
+    Args:
+        health: what is wanted of it.
+    """
+
+    def __init__(self, health: Health = SCAN) -> None:
+        self.judgement = Judgement(watched(health), 7, 0.0)
+        self.now = 0.0
+
+    def goes_on(self, seconds: float, rate: float | None = None, period: float = 0.2, **look):
+        """For so long; the first verdict that is not "healthy", and when."""
+        begun, told = self.now, 0
+        while self.now - begun < seconds:
+            self.now += period
+            heard = None
+            if rate is not None:
+                said = int((self.now - begun) * rate + 1e-9)
+                heard, told = said - told, said
+            verdict = self.judgement.look(slave.Look(heard=heard, **look), self.now)
+            if verdict:
+                return verdict
+        return ""
+
+
+# --- a topic ----------------------------------------------------------------------------------
+
+
+def test_a_topic_that_falls_silent_is_noticed_within_its_time_and_a_quarter() -> None:
+    """Not before `timeout`; the verdict says what was found, for how long, and what is wanted."""
+    node = Node()
+    assert node.goes_on(60.0, rate=20.0) == ""
+    silent = node.now
+    assert node.goes_on(20.0, rate=0.0).startswith("unhealthy: ~/scan: 0.0 Hz for 4.")
+    assert 4.0 < node.now - silent < 6.0
+
+
+def test_a_slow_topic_is_not_enough() -> None:
+    """Four tenths of a hertz where five are wanted; however steady."""
+    node = Node()
+    verdict = node.goes_on(20.0, rate=0.4)
+    assert verdict.endswith("at least 5 Hz are wanted")
+    assert "0.4 Hz" in verdict or "0.2 Hz" in verdict or "0.5 Hz" in verdict
+
+
+def test_a_node_has_its_time_once_more_until_it_must_publish() -> None:
+    """From when it is ready: what it loads first is its own affair."""
+    node = Node()
+    assert node.goes_on(7.5, trouble="not published as /robot/lidar/scan") == ""
+    verdict = node.goes_on(2.0, trouble="not published as /robot/lidar/scan")
+    assert verdict.startswith("unhealthy: ~/scan: not published as /robot/lidar/scan for 4.")
+
+
+def test_a_pause_shorter_than_its_time_is_forgiven() -> None:
+    """Again and again: what is amiss must last."""
+    node = Node()
+    for _ in range(10):
+        assert node.goes_on(8.0, rate=5.0) == ""
+        assert node.goes_on(2.9, rate=0.0) == ""
+
+
+@given(st.floats(0.01, 2000.0), st.floats(0.3, 300.0), st.floats(1.0, 10.0))
+def test_a_topic_as_fast_as_is_wanted_is_never_amiss(least, timeout, faster) -> None:
+    """Whatever the rate, the time and where the windows begin."""
+    node = Node(Health("scan", least, "", timeout))
+    assert node.goes_on(max(10 * timeout, 10 / least), least * faster, timeout / 10) == ""
+
+
+@given(st.floats(0.01, 2000.0), st.floats(0.3, 300.0))
+def test_a_topic_at_half_its_rate_or_less_is_always_noticed(least, timeout) -> None:
+    """Within twice its time and two windows."""
+    node = Node(Health("scan", least, "", timeout))
+    window = max(timeout / 4, 3 / least)
+    assert node.goes_on(3 * timeout + 2 * window, least / 3.1, min(0.2, timeout / 10)) != ""
+
+
+def test_a_subscription_is_counted_from_its_matching_on() -> None:
+    """What was not listened to was not silent: no verdict before its first whole window."""
+    node = Node(Health("scan", 5.0, "", 1.0))
+    assert node.goes_on(1.9, trouble="not found by discovery yet") == ""
+    assert node.goes_on(30.0, rate=5.0) == ""
+
+
+def test_a_slave_that_did_not_look_blames_nobody() -> None:
+    """It was stopped itself for a minute, and what came meanwhile was lost."""
+    node = Node()
+    assert node.goes_on(20.0, rate=5.0) == ""
+    node.now += 60.0
+    assert node.goes_on(20.0, rate=5.0) == ""
+
+
+# --- stopped, lifecycle -----------------------------------------------------------------------
+
+PLAIN = Health(timeout=4.0)
+
+
+def test_what_is_stopped_for_too_long_is_unhealthy() -> None:
+    """SIGSTOP; one that goes on in time is not."""
+    node = Node(PLAIN)
+    assert node.goes_on(3.7, stopped=True) == ""
+    assert node.goes_on(1.0) == ""
+    assert node.goes_on(3.7, stopped=True) == ""
+    assert node.goes_on(1.0, stopped=True).startswith("unhealthy: stopped by a signal (SIGSTOP) f")
+
+
+@pytest.mark.parametrize(
+    ("state", "said"),
+    [
+        ("inactive", "lifecycle state inactive for 4."),
+        ("", "no answer from /robot/lidar/get_state for 4."),
+    ],
+)
+def test_another_lifecycle_state_or_no_answer(state, said) -> None:
+    """Both are amiss; a state that is not known yet is not."""
+    node = Node(Health(lifecycle="active", timeout=4.0))
+    assert node.goes_on(10.0, state=None) == ""
+    assert node.goes_on(10.0, state="active") == ""
+    assert node.goes_on(3.0, state=state) == ""
+    assert node.goes_on(0.3, state="active") == ""
+    verdict = node.goes_on(5.0, state=state)
+    assert verdict.startswith(f"unhealthy: {said}")
+    assert verdict.endswith("the state active is wanted")
+
+
+def test_all_that_is_amiss_is_said() -> None:
+    """In one line."""
+    node = Node(Health("~/scan", 5.0, "active", 4.0))
+    while "~/scan" not in (verdict := node.goes_on(20.0, rate=0.0, state="")):
+        assert node.now < 60.0, verdict
+    assert "no answer" in verdict
+
+
+# --- names ------------------------------------------------------------------------------------
+
+RULES = {
+    "scan": "front/scan", "~/raw": "/raw", "other:points": "/wrong", "lidar:points": "/points",
+    "rosservice://image": "/wrong", "rostopic://image": "rostopic:///image", "__node": "x",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "absolute"),
+    [
+        ("/scan", "/scan"),
+        ("scan", "/robot/front/scan"),
+        ("/robot/scan", "/robot/front/scan"),
+        ("~/scan", "/robot/lidar/scan"),
+        ("~/raw", "/raw"),
+        ("points", "/points"),
+        ("image", "/image"),
+        ("__node", "/robot/__node"),
+    ],
+)
+def test_a_name_is_found_as_the_node_finds_it(name, absolute) -> None:
+    """In its namespace, below its name, by the first rule that fits."""
+    assert resolve(name, "/robot", "lidar", RULES, "rostopic://") == absolute
+    assert resolve("scan", "", "lidar", {}, "rostopic://") == "/scan"
+
+
+def test_under_an_alias_names_are_those_that_others_see() -> None:
+    """And the alias's own, for a node that does not know rosrm."""
+    spec = replace(SPEC, health=Health("~/scan", 5.0, "active", 4.0))
+    watch = watch_of(Assignment(InstanceId("lidar", 2), spec, 1, "lidar_17", shadow=True))
+    assert watch == slave.Watch(
+        spec.health,
+        ("/robot/lidar/scan", "/robot/lidar_17/scan"),
+        ("/robot/lidar/get_state", "/robot/lidar_17/get_state"),
+        shadow=True,
+    )
+
+
+def test_nothing_is_watched_without_a_time() -> None:
+    """The default."""
+    assert watch_of(Assignment(LIDAR, replace(SPEC, health=Health()), 1, "lidar")) is None
+
+
+# --- the slave's core -------------------------------------------------------------------------
+
+
+class Slave:
+    """A slave that holds one plain process whose health is watched."""
+
+    def __init__(self, shadow: bool = False) -> None:
+        self.state = slave.SlaveState(registered=True)
+        self.now = 0.0
+        spec = ProcessSpec("lidar", command=("true",), health=PLAIN)
+        self.step(slave.AssignmentsReceived((Assignment(LIDAR, spec, 1, "lidar", shadow),)))
+
+    def step(self, event) -> list[slave.Command]:
+        return list(slave.step(self.state, event, self.now))
+
+    def runs(self, pid: int) -> None:
+        status = InstanceStatus(LIDAR, InstanceState.RUNNING, pid=pid)
+        self.step(slave.SupervisorReported((status,)))
+
+    def looks(self, seconds: float, pid: int, **look) -> list[slave.Command]:
+        """What is ordered within so long."""
+        ordered, until = [], self.now + seconds
+        while self.now < until and not ordered:
+            self.now += slave.LOOK_PERIOD
+            ordered = self.step(slave.LookedAt(LIDAR, pid, slave.Look(**look)))
+        return ordered
+
+
+def test_an_unhealthy_run_is_ended_as_failed() -> None:
+    """By an order for this very run, to kill it if it is stopped; if it is lost, it comes again."""
+    one = Slave()
+    one.runs(5)
+    for _ in range(2):
+        (fail,) = one.looks(10.0, 5, stopped=True)
+        assert isinstance(fail, slave.Fail)
+        assert (fail.instance, fail.pid, fail.kill) == (LIDAR, 5, True)
+
+
+def test_a_restart_begins_anew() -> None:
+    """Looks at the run before count no more, nor do those at what is not ready."""
+    one = Slave()
+    one.runs(5)
+    assert one.looks(3.0, 5, stopped=True) == []
+    one.step(slave.SupervisorReported((InstanceStatus(LIDAR, InstanceState.BACKOFF),)))
+    assert one.state.watched() == {}
+    assert one.looks(10.0, 5, stopped=True) == []
+    one.runs(6)
+    assert one.looks(10.0, 5, stopped=True) == []
+    assert one.looks(3.0, 6, stopped=True) == []
+    assert len(one.looks(3.0, 6, stopped=True)) == 1
+
+
+def test_a_shadow_is_watched_when_it_is_none_any_more() -> None:
+    """A later run of the slave knows it too."""
+    one = Slave(shadow=True)
+    one.runs(5)
+    assert one.state.watched() == {}
+    assert one.looks(10.0, 5, stopped=True) == []
+    commands = one.step(slave.RestartPolicySet(LIDAR, RestartPolicy("always")))
+    (memo,) = [command.memo for command in commands if isinstance(command, slave.Remember)]
+    assert list(one.state.watched()) == [LIDAR]
+    later = slave.SlaveState(registered=True)
+    status = InstanceStatus(LIDAR, InstanceState.RUNNING, pid=5)
+    slave.step(later, slave.SupervisorReplaced((status,), {LIDAR: memo}), 0.0)
+    assert list(later.watched()) == [LIDAR]
+
+
+def test_a_shadow_that_waits_for_a_slot_is_watched_later() -> None:
+    """It was told before it was started."""
+    state = slave.SlaveState(registered=True, max_processes=1)
+    spec = ProcessSpec("lidar", command=("true",), health=PLAIN)
+    other = Assignment(InstanceId("other", 2), replace(spec, name="other"), 1, "other")
+    shadow = Assignment(LIDAR, spec, 1, "lidar_1", shadow=True)
+    slave.step(state, slave.AssignmentsReceived((other, shadow)), 0.0)
+    slave.step(state, slave.RestartPolicySet(LIDAR, RestartPolicy("always")), 0.0)
+    watch = state.held[LIDAR].watch
+    assert watch is not None
+    assert not watch.shadow
+
+
+@given(
+    st.builds(
+        slave.Memo,
+        st.none() | st.builds(slave.Awaited, st.text(), st.floats(0, 1e6), st.integers(0, 99)),
+        st.none()
+        | st.builds(
+            slave.Watch,
+            st.builds(Health, st.text(), st.floats(0, 1e4), st.text(), st.floats(0.1, 1e6)),
+            st.lists(st.text()).map(tuple), st.lists(st.text()).map(tuple), st.booleans(),
+        ),
+    )
+)  # fmt: skip
+def test_a_memo_survives_the_way(memo) -> None:
+    """What a later run of the slave reads is what this one wrote; nothing is written of nothing."""
+    text = to_memo(memo)
+    assert (from_memo(text) or slave.Memo()) == memo
+    assert bool(text) == (memo != slave.Memo())
