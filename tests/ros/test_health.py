@@ -1,0 +1,264 @@
+"""Alive is not healthy: real nodes that fall silent, hang or leave their state are ended."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+
+import pytest
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from std_msgs.msg import Int64, String
+
+from rosrm.core.model import Health, RestartPolicy
+from rosrm.core.slave import Watch
+from rosrm.ros.graph import GraphWatch
+from rosrm.ros.health import HealthEar
+from tests.ros.clusters import PATIENCE, alive, host, node, service, wait_gone
+
+#: Seconds: far more than a busy machine takes between two messages.
+SOON = 2.0
+AGAIN = RestartPolicy("on-failure", delay=0.2)
+
+#: A lifecycle node that publishes at 20 Hz. `last`: the number of its last message; `leaves`: with
+#: it, it leaves the state active.
+TALKER = """
+import rclpy, sys
+from rclpy.lifecycle import LifecycleNode
+from std_msgs.msg import Int64
+rclpy.init()
+node = LifecycleNode("unnamed")
+last = node.declare_parameter("last", 0).value
+leaves = node.declare_parameter("leaves", False).value
+output = node.create_publisher(Int64, "~/scan", 1)
+count = 0
+
+def tick():
+    global count
+    count += 1
+    if not last or count <= last or leaves:
+        output.publish(Int64(data=count))
+    if leaves and count == last:
+        node.trigger_deactivate()
+
+timer = node.create_timer(0.05, tick)
+node.trigger_configure()
+node.trigger_activate()
+try:
+    rclpy.spin(node)
+except BaseException:
+    pass
+"""
+
+#: Publishes a topic under an absolute name, as one type or another.
+SPEAKER = """
+import rclpy, std_msgs.msg
+rclpy.init()
+node = rclpy.create_node("unnamed")
+kind = getattr(std_msgs.msg, node.declare_parameter("type", "").value)
+output = node.create_publisher(kind, "/clash", 1)
+timer = node.create_timer(0.05, lambda: output.publish(kind()))
+try:
+    rclpy.spin(node)
+except BaseException:
+    pass
+"""
+
+SCAN = Health("~/scan", 2.0, "active", SOON)
+
+
+@pytest.fixture(scope="module")
+def cluster(make_shared):
+    """With a node that is healthy all the while."""
+    cluster = make_shared(host("h0"))
+    cluster.submit(node("healthy", TALKER, namespace="/robot", health=SCAN, restart=AGAIN))
+    cluster.wait("healthy", "running")
+    return cluster
+
+
+def failed(cluster, name: str) -> str:
+    """Why it has failed."""
+    row = cluster.ended(name)
+    assert row.state == "failed"
+    assert not alive(row.pid)
+    return row.reason
+
+
+def test_a_topic_that_falls_silent(cluster) -> None:
+    """The node lives and spins; it is ended, and its reason says what was found and wanted."""
+    cluster.submit(
+        node(
+            "quiet", TALKER, namespace="/robot", parameters={"last": 40},
+            remappings={"~/scan": "front/scan"}, health=Health("~/scan", 5.0, "", SOON),
+        )
+    )  # fmt: skip
+    reason = failed(cluster, "quiet")
+    assert reason.startswith("unhealthy: ~/scan: 0.0 Hz for 2.")
+    assert reason.endswith("at least 5 Hz are wanted")
+    assert cluster.client.explain("quiet")["reason"] == reason
+
+
+def test_a_topic_that_nobody_publishes(cluster) -> None:
+    """It never was; the reason gives the whole name that was looked for."""
+    cluster.submit(node("mute", TALKER, namespace="/robot", health=Health("scan", 1.0, "", SOON)))
+    assert "scan: not published as /robot/scan for 2." in failed(cluster, "mute")
+
+
+def test_a_node_that_leaves_its_lifecycle_state(cluster) -> None:
+    """It publishes on, and is no longer active."""
+    cluster.submit(node("idle", TALKER, parameters={"last": 40, "leaves": True}, health=SCAN))
+    assert failed(cluster, "idle").startswith("unhealthy: lifecycle state inactive for 2.")
+
+
+def test_a_node_that_is_stopped_starts_again(cluster) -> None:
+    """SIGSTOP: nothing of it moves or answers. By its policy it goes on as another process."""
+    cluster.submit(node("hung", TALKER, health=SCAN, restart=AGAIN))
+    before = cluster.wait("hung", "running")
+    os.kill(before.pid, signal.SIGSTOP)
+    event = cluster.wait_for_event("backoff", "unhealthy: ", process="hung")
+    assert "restart 1 of 5" in event.message
+    wait_gone(before.pid)
+    view = cluster.wait_until(
+        "hung runs again",
+        lambda v: any((r.name, r.state, r.restarts) == ("hung", "running", 1) for r in v.processes),
+    )
+    assert next(r.number for r in view.processes if r.name == "hung") == before.number
+    history = cluster.client.explain("hung")["history"]
+    assert any("unhealthy: " in entry["message"] for entry in history)
+    cluster.cancel("hung")
+
+
+def test_a_process_without_ros_that_is_stopped(cluster) -> None:
+    """Only a time is given: it must not be stopped for longer."""
+    cluster.submit(service("plain", health=Health(timeout=SOON)))
+    os.kill(cluster.wait("plain", "running").pid, signal.SIGSTOP)
+    assert failed(cluster, "plain").startswith("unhealthy: stopped by a signal (SIGSTOP) for 2.")
+
+
+def test_a_topic_of_two_types(cluster) -> None:
+    """Its own counts, whatever others publish; where none is its own, both types are said."""
+    health = Health("/clash", 2.0, "", SOON)
+    cluster.submit(
+        node("numbers", SPEAKER, parameters={"type": "Int64"}, health=health),
+        node("words", SPEAKER, parameters={"type": "String"}),
+    )
+    cluster.wait("numbers", "running")
+    cluster.wait("words", "running")
+    cluster.submit(node("neither", TALKER, health=health))
+    reason = failed(cluster, "neither")
+    assert "/clash: published as std_msgs/msg/Int64 and std_msgs/msg/String for 2." in reason
+    assert cluster.process("numbers").state == "running"
+    assert cluster.process("numbers").restarts == 0
+    cluster.cancel("numbers", "words")
+
+
+def test_the_next_run_of_the_slave_watches_on(cluster) -> None:
+    """What it watches the supervisor remembers; its own absence is nobody's fault."""
+    cluster.submit(service("orphan", health=Health(timeout=SOON)))
+    pid = cluster.wait("orphan", "running").pid
+    slave = cluster.slaves["h0"].process
+    slave.kill()
+    slave.wait(PATIENCE)
+    cluster.start_slave(host("h0"))
+    cluster.wait_for_hosts()
+    os.kill(pid, signal.SIGSTOP)
+    assert failed(cluster, "orphan").startswith("unhealthy: stopped by a signal")
+
+
+def test_a_healthy_node_is_never_ended(cluster) -> None:
+    """It was watched all the while, by two runs of the slave, and for a while longer here."""
+    until = time.monotonic() + 4 * SOON
+    while time.monotonic() < until:
+        cluster.client.spin(0.2)
+    row = cluster.process("healthy")
+    assert (row.state, row.restarts) == ("running", 0), row.reason
+
+
+# --- what the slave hears -----------------------------------------------------------------------
+
+
+class Listener:
+    """An ear of a slave, and a publisher for it.
+
+    Args:
+        stage: of the nodes.
+        rate: that is asked for.
+    """
+
+    def __init__(self, stage, rate: float) -> None:
+        self.node = stage.plain
+        watch = Watch(Health("/scan", rate, "", SOON), ("/scan",))
+        self.ear = HealthEar(self.node, GraphWatch(self.node), watch, time.monotonic())
+
+    def look(self) -> tuple[int | None, str]:
+        return self.ear.topic((os.getpid(),), time.monotonic())
+
+    def look_until(self, condition, what: str) -> tuple[int | None, str]:
+        deadline = time.monotonic() + PATIENCE
+        while not condition(look := self.look()):
+            assert time.monotonic() < deadline, f"{what} did not come about: {look}"
+            time.sleep(0.02)
+        return look
+
+
+def test_messages_are_counted_and_no_more_kept_than_are_asked_for(stage) -> None:
+    """A flood between two looks costs the slave as many messages as a second may hold."""
+    listener = Listener(stage, rate=5.0)
+    best_effort = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
+    output = stage.plain.create_publisher(Int64, "/scan", best_effort)
+    listener.look_until(lambda look: look[0] is not None, "matched")
+
+    def heard(look) -> bool:
+        output.publish(Int64())
+        return bool(look[0])
+
+    listener.look_until(heard, "a message")
+    for _ in range(500):
+        output.publish(Int64())
+    total, least = 0, 6
+    deadline = time.monotonic() + PATIENCE
+    while total < least:
+        assert time.monotonic() < deadline
+        look, _ = listener.look()
+        assert look is not None
+        assert look <= least
+        total += look
+    listener.ear.close()
+
+
+def test_a_type_that_this_host_does_not_know(stage, monkeypatch) -> None:
+    """It is said, and so is what is missing; once it can be read it is heard."""
+    stage.plain.create_publisher(String, "/scan", 1)
+    listener = Listener(stage, rate=5.0)
+    with monkeypatch.context() as patch:
+        patch.setitem(sys.modules, "std_msgs.msg", None)
+        look = listener.look_until(lambda look: "not published" not in look[1], "published")
+        assert look[0] is None
+        assert look[1].startswith("cannot be listened to on this host (ModuleNotFoundError: ")
+        assert "std_msgs.msg" in look[1]
+    listener.look_until(lambda look: look[0] is not None, "listened to")
+    listener.ear.close()
+
+
+def test_another_type_is_followed(stage) -> None:
+    """A publisher that comes back as another type is listened to anew."""
+    listener = Listener(stage, rate=5.0)
+    first = stage.plain.create_publisher(String, "/scan", 1)
+    listener.look_until(lambda look: look[0] is not None, "the first is heard")
+    stage.plain.destroy_publisher(first)
+    listener.look_until(lambda look: "not published" in look[1], "it is gone")
+    stage.plain.create_publisher(Int64, "/scan", 1)
+    listener.look_until(lambda look: look[0] is not None, "the second is heard")
+    listener.ear.close()
+
+
+def test_a_name_that_is_none_harms_nobody(stage) -> None:
+    """Whatever a client submits: the slave says it, and goes on."""
+    watch = Watch(Health("no topic", 1.0, "active", SOON), ("/no topic",), ("/no-node/get_state",))
+    ear = HealthEar(stage.plain, GraphWatch(stage.plain), watch, time.monotonic())
+    heard, trouble = ear.topic((1,), time.monotonic())
+    assert heard is None
+    assert "cannot be listened to" in trouble
+    assert ear.state(time.monotonic() + 60.0) == ""
+    ear.close()
