@@ -268,6 +268,21 @@ class LogSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class KeepSettings:
+    """The kept states of stateful processes.
+
+    Attributes:
+        every: seconds by which the state that a node keeps here may be behind.
+        max_bytes: of the states of other hosts' processes that are kept here, all together.
+        max_rate: bytes a second that are sent to other hosts, all together.
+    """
+
+    every: Seconds = 1.0
+    max_bytes: Annotated[int, Quantity("size", low=0, whole=True)] = 1_000_000_000
+    max_rate: Annotated[int, Quantity("size", low=65536, whole=True)] = 10_000_000
+
+
+@dataclass(frozen=True, slots=True)
 class HostControlSettings:
     """The requests that a slave takes.
 
@@ -298,6 +313,7 @@ class HostConfig:
         max_starting: most processes started at a time, until they are ready; 0: no bound.
         logs: of the processes.
         control: of requests.
+        keep: of states.
         on_stop: a slave that is stopped stops its processes, or keeps them with the supervisor.
     """
 
@@ -314,6 +330,7 @@ class HostConfig:
     max_starting: Count = 8
     logs: LogSettings = field(default_factory=LogSettings)
     control: HostControlSettings = field(default_factory=HostControlSettings)
+    keep: KeepSettings = field(default_factory=KeepSettings)
     on_stop: Literal["stop", "keep"] = "stop"
 
     def __post_init__(self) -> None:

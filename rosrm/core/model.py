@@ -200,6 +200,18 @@ class ProcessSpec:
     health: Health = Health()
 
     @property
+    def keeps_state(self) -> bool:
+        """Whether its node has a state that a successor takes over by rosrm's own protocol."""
+        migration = self.migration
+        protocol = migration.options.get("protocol", "rosrm")
+        return self.ros_node and migration.strategy == "handoff" and protocol == "rosrm"
+
+    @property
+    def ros_node(self) -> bool:
+        """Whether it is a ROS node, by its own word or as an executable of a ROS package."""
+        return self.ros or self.package is not None
+
+    @property
     def program(self) -> str:
         """What it runs, in one word: the key under which its needs are learned."""
         if self.package is not None:
@@ -248,6 +260,8 @@ class Assignment:
         shadow: it starts as the destination of a handoff: silent, and not restarted until its slave
             is told otherwise.
         fence: when its host stops it, if it and the master do not hear each other; None: never.
+        kept_on: hosts that keep a state of the process, the newest first.
+        kept_from: states of instances with a lower number are of a former life of the name.
     """
 
     instance: InstanceId
@@ -256,6 +270,8 @@ class Assignment:
     node_name: str
     shadow: bool = False
     fence: Fence | None = None
+    kept_on: tuple[str, ...] = ()
+    kept_from: int = 0
 
 
 class InstanceState(str, Enum):

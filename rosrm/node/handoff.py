@@ -10,6 +10,7 @@ from rosrm.node.destination import Destination
 from rosrm.node.identity import Identity
 from rosrm.node.member import Member
 from rosrm.node.parts import ParametersPart, Part
+from rosrm.node.revival import Revival, kept_state
 from rosrm.node.source import Source
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs.msg import StateConfig
@@ -28,7 +29,9 @@ class Handoff:
     """
 
     def __init__(self, node: Any, plain: Any, identity: Identity) -> None:
-        self.member = Member(node, plain, identity)
+        self._kept, self._damaged = kept_state(identity)
+        resting = identity.shadow or self._kept is not None
+        self.member = Member(node, plain, identity, resting=resting)
         self.identity = identity
         self._epoch = identity.epoch
         self._parts: list[Part] = []
@@ -40,11 +43,15 @@ class Handoff:
     def begin(self) -> None:
         """The node is made; its author's constructor may go on."""
         node = self.member.node
+        for fault in self._damaged:
+            node.get_logger().warning(f"a kept state is damaged, and left alone: {fault}")
         self._parts.append(ParametersPart(self._own(_PARAMETERS), node))
         if self.identity.shadow:
             self._destination = Destination(
                 self.member, self._parts, self._own(_MARK), self._become_source
             )
+        elif self._kept is not None:
+            Revival(self.member, self._parts, self._kept, self._become_source)
         else:
             self._become_source()
         self._subscription = self.member.plain.create_subscription(
@@ -55,6 +62,7 @@ class Handoff:
         return f"{self.member.visible_node}/{path}"
 
     def _become_source(self) -> None:
+        self._kept = None
         self._source = Source(self.member, self._parts, self._own(_MARK))
 
     def keep_state(
@@ -117,3 +125,5 @@ class Handoff:
         for role in (self._source, self._destination):
             if role is not None:
                 role.close()
+        if self._source is not None:
+            self._source.end()

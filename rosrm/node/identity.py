@@ -4,6 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from math import inf
+from typing import Final
+
+#: Seconds by which a kept state may be behind, where nothing is said.
+KEEP_EVERY: Final = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,6 +23,8 @@ class Identity:
         cluster: name of the master that had it started.
         epoch: of that master.
         shadow: it starts as the destination of a handoff.
+        keep: directory in which its state is kept; "": it is not.
+        keep_every: seconds by which what is kept may be behind.
     """
 
     process: str
@@ -27,6 +34,8 @@ class Identity:
     cluster: str
     epoch: int
     shadow: bool
+    keep: str = ""
+    keep_every: float = KEEP_EVERY
 
 
 def identity_from(environment: Mapping[str, str]) -> Identity | None:
@@ -44,4 +53,14 @@ def identity_from(environment: Mapping[str, str]) -> Identity | None:
         cluster=environment.get("ROSRM_MASTER", ""),
         epoch=int(epoch) if epoch.isdecimal() else 0,
         shadow=environment.get("ROSRM_SHADOW", "") == "1",
+        keep=environment.get("ROSRM_KEEP", ""),
+        keep_every=_seconds(environment.get("ROSRM_KEEP_EVERY", "")),
     )
+
+
+def _seconds(text: str) -> float:
+    try:
+        seconds = float(text)
+    except ValueError:
+        return KEEP_EVERY
+    return seconds if 0.0 <= seconds < inf else KEEP_EVERY

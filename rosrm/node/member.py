@@ -60,21 +60,24 @@ class Member:
         node: the author's.
         plain: rclpy's own methods of it.
         identity: that rosrm gave this process.
+        resting: it is not active yet: a shadow, or it goes on from a kept state first.
 
     Attributes:
         turn: held while a callback runs.
         sequence: cycles so far.
+        in_cycle: a callback of the author has begun and not ended; still so where it raised.
         on_cycle: called after each cycle.
         on_overflow: called with the topic of an input for which there was no more room.
     """
 
-    def __init__(self, node: Any, plain: Any, identity: Identity) -> None:
+    def __init__(self, node: Any, plain: Any, identity: Identity, *, resting: bool) -> None:
         self.node = node
         self.plain = plain
         self.identity = identity
         self.turn = threading.RLock()
-        self.mode = Mode.SHADOW if identity.shadow else Mode.ACTIVE
+        self.mode = Mode.SHADOW if resting else Mode.ACTIVE
         self.sequence = 0
+        self.in_cycle = False
         self._late_until = 0.0
         self.inputs: list[Input] = []
         self.outputs: list[Any] = []
@@ -212,13 +215,12 @@ class Member:
     # --- cycles ----------------------------------------------------------------------------
 
     def _cycle(self, callback: Callable[..., Any], *arguments: Any) -> Any:
+        self.in_cycle = True
         result = callback(*arguments)
-        self._cycle_ended()
-        return result
-
-    def _cycle_ended(self) -> None:
+        self.in_cycle = False
         self.sequence += 1
         self.on_cycle()
+        return result
 
     def _received(self, one: Input, message: Any, info: Any) -> None:
         with self.turn:
@@ -227,8 +229,7 @@ class Member:
                 if self._may_catch_up(one):
                     self._catch_up(one)
             elif self.mode is Mode.ACTIVE and not self._is_late(one, info):
-                one.serve(message, info)
-                self._cycle_ended()
+                self._cycle(one.serve, message, info)
 
     def _is_late(self, one: Input, info: Any) -> bool:
         """It was on its way when this node became active, and the source had processed it."""
@@ -296,8 +297,7 @@ class Member:
         kept = self.buffer.take()
         if kept is not None:
             one, message, info = kept.item
-            one.serve(message, info)
-            self._cycle_ended()
+            self._cycle(one.serve, message, info)
             return True
         return any(one.serve_held() for one in self._openings if isinstance(one, ServiceOf))
 

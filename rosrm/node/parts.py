@@ -9,6 +9,7 @@ from rcl_interfaces.msg import ParameterEvent
 from rclpy.parameter import Parameter
 from rclpy.serialization import deserialize_message, serialize_message
 
+from rosrm.kept import Block
 from rosrm.node.cuts import PartKey, part_key
 from rosrm_msgs.msg import StatePart
 
@@ -25,6 +26,9 @@ class Part:
         message_type: what travels.
         save: returns the message, or None: unchanged since the last time.
         restore: takes the message, and overwrites what the node had.
+
+    Attributes:
+        retained: what was saved is held also when it was published: it is kept elsewhere too.
     """
 
     def __init__(
@@ -40,8 +44,10 @@ class Part:
         self._save = save
         self._restore = restore
         self._key: PartKey | None = None
+        self._data: bytes | None = None
+        self._published: PartKey | None = None
         self._restored: PartKey | None = None
-        self._inherited: bytes | None = None
+        self.retained = False
         self.publisher: Any = None
 
     def has_reader(self) -> bool:
@@ -57,38 +63,42 @@ class Part:
         Raises:
             StateError: it cannot be saved, or is too large.
         """
-        data = self._saved()
-        if data is None:
-            return
-        if len(data) > largest:
-            self._key = None  # what was saved is not what was published last
-            raise StateError(
-                f"the state on {self.topic} has {len(data)} bytes, more than the {largest} that "
-                f"may travel in one message: split it in several topics, or keep less"
-            )
-        self._inherited = None
-        key = part_key(data)
-        if key != self._key:
-            self._key = key
-            self.publisher.publish(data)
+        self.refresh(largest)
+        if self._key != self._published:
+            self.publisher.publish(self._data)
+            self._published = self._key
+        if not self.retained:
+            self._data = None
 
-    def _saved(self) -> bytes | None:
-        """The state now, serialised; None: it is what was published last."""
+    def refresh(self, largest: int) -> None:
+        """Save it, if it has changed; otherwise as `publish`."""
+        try:
+            data = self._saved(largest)
+        except StateError:
+            self._key = self._data = None  # "unchanged" would speak of what nobody has
+            raise
+        if data is not None:
+            key = part_key(data)
+            if key != self._key or self._data is None:
+                self._key, self._data = key, data
+
+    def _saved(self, largest: int) -> bytes | None:
+        """The state now, serialised; None: it is what it was the last time."""
         try:
             message = self._save()
             self._check(message)
-            return self._inherited if message is None else bytes(serialize_message(message))
+            if message is None:
+                return None
+            return self._sized(bytes(serialize_message(message)), largest)
         except StateError:
-            self._key = None
             raise
         except Exception as error:  # the author's code: anything may come
-            self._key = None
             raise StateError(
                 f"saving {self.topic} raised {type(error).__name__}: {error}"
             ) from error
 
     def _check(self, message: Any) -> None:
-        if message is None and self._key is None and self._inherited is None:
+        if message is None and self._key is None:
             raise StateError(
                 f"saving {self.topic} returned None (unchanged) before it had returned any state"
             )
@@ -97,8 +107,22 @@ class Part:
                 f"saving {self.topic} returned a {type(message).__name__}, not a {self.type_name}"
             )
 
+    def _sized(self, data: bytes, largest: int) -> bytes:
+        if len(data) > largest:
+            raise StateError(
+                f"the state on {self.topic} has {len(data)} bytes, more than the {largest} that "
+                f"may travel in one message: split it in several topics, or keep less"
+            )
+        return data
+
+    def block(self) -> Block:
+        """What is kept of it. It was refreshed before, and is retained."""
+        if self._data is None or self._key is None:
+            raise StateError(f"the state on {self.topic} was not saved")
+        return Block(self._data, self._key.digest)
+
     def described(self) -> StatePart:
-        """What a mark says of it. It was published before."""
+        """What a mark says of it. It was saved before."""
         size, digest = self._key or (0, 0)
         return StatePart(topic=self.topic, type=self.type_name, size=size, digest=digest)
 
@@ -118,7 +142,8 @@ class Part:
                 f"restoring {self.topic} raised {type(error).__name__}: {error}"
             ) from error
         self._restored = key
-        self._inherited = data  # "unchanged" may be the first that the author says of it
+        # "Unchanged" may be the first that the author says of it.
+        self._key, self._data, self._published = key, data, None
 
 
 def type_name(message_type: Any) -> str:

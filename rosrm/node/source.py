@@ -12,13 +12,12 @@ from rclpy.duration import Duration
 
 from rosrm.node import channel as topics
 from rosrm.node.channel import Channel
+from rosrm.node.keep import LARGEST_PART, Keeper
 from rosrm.node.member import Member, Mode
 from rosrm.node.parts import Part, StateError
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs.msg import CoveredInput, HandoffReport, MatchedOutput, StateConfig, StateMark
 
-#: Most bytes of one part. Fast DDS carried 400 MB, but a node takes 3 s to make 200 MB of them.
-LARGEST_PART: Final = 256 << 20
 #: Seconds that a silent source waits for its last outputs to be acknowledged: readers are asked
 #: every 3 s by Fast DDS's default.
 _LAST_WORDS: Final = 4.0
@@ -53,6 +52,7 @@ class Source:
         self._marks = plain.create_publisher(StateMark, mark_topic, topics.MARK)
         for part in parts:
             part.publisher = plain.create_publisher(part.message_type, part.topic, topics.STATE)
+        self._keeper = Keeper(member, parts, self._run) if member.identity.keep else None
         member.on_cycle = self._after_cycle
         member.on_overflow = self._overflowed
 
@@ -65,8 +65,12 @@ class Source:
     # --- the state -------------------------------------------------------------------------
 
     def _after_cycle(self) -> None:
-        if self._fault:
-            return
+        if not self._fault:
+            self._show_to_followers()
+        if self._keeper is not None:
+            self._keeper.after_cycle()
+
+    def _show_to_followers(self) -> None:
         if self._attached or self._marks.get_subscription_count():
             self._show()
         else:
@@ -241,6 +245,11 @@ class Source:
         if self._channel is not None:
             self._channel.close()
             self._channel = None
+
+    def end(self) -> None:
+        """The node is destroyed."""
+        if self._keeper is not None:
+            self._keeper.close()
 
 
 def _nothing() -> None:

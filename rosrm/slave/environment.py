@@ -4,15 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final
 
 from rosrm.bootstrapper import without_bootstrapper
 from rosrm.core.model import Assignment
 from rosrm.core.slave import qualified_name
 from rosrm.ros.fast_dds import announcements
+from rosrm.ros.names import token
 
 #: Set where an instance starts as the destination of a handoff.
 SHADOW: Final = "ROSRM_SHADOW"
+#: Where its node keeps its state for the next start, and how far behind it may be, seconds.
+KEEP: Final = "ROSRM_KEEP"
+KEEP_EVERY: Final = "ROSRM_KEEP_EVERY"
 #: What tells a process who it is. A slave that was itself started by rosrm hands none of it on.
 _IDENTITY: Final = (
     "ROSRM_PROCESS",
@@ -23,6 +28,8 @@ _IDENTITY: Final = (
     "ROSRM_MASTER",
     "ROSRM_EPOCH",
     SHADOW,
+    KEEP,
+    KEEP_EVERY,
 )
 
 
@@ -34,11 +41,20 @@ class Whereabouts:
         host: name of the host in rosrm.
         cluster: name of the master that gives the orders.
         state_config: topic on which the master speaks of handoffs.
+        kept: directory of the kept states of all processes; None: none are kept.
+        keep_every: seconds by which a kept state may be behind.
     """
 
     host: str
     cluster: str
     state_config: str
+    kept: Path | None = None
+    keep_every: float = 1.0
+
+
+def kept_directory(kept: Path, process: str) -> Path:
+    """Where the state of one process is kept."""
+    return kept / token(process)
 
 
 def process_environment(
@@ -61,10 +77,13 @@ def process_environment(
     environment["ROSRM_STATE_CONFIG"] = where.state_config
     environment["ROSRM_MASTER"] = where.cluster
     environment["ROSRM_EPOCH"] = str(assignment.epoch)
-    if spec.ros or spec.package is not None:  # under an alias too it is known by this name
+    if spec.ros_node:  # under an alias too it is known by this name
         environment["ROSRM_NODE"] = qualified_name(spec.namespace, spec.name)
     if assignment.shadow:
         environment[SHADOW] = "1"
+    if spec.keeps_state and where.kept is not None:
+        environment[KEEP] = str(kept_directory(where.kept, spec.name))
+        environment[KEEP_EVERY] = f"{where.keep_every:g}"
     environment["PYTHONUNBUFFERED"] = "1"
     environment.update(spec.environment)
     if assignment.shadow:  # a move waits until it has found everybody

@@ -296,6 +296,8 @@ class SlaveRuntime:
             self._config.host,
             self._endpoint.cluster,
             Names(self._config.ros.namespace)(STATE_CONFIG),
+            self._config.state / "kept",
+            self._config.keep.every,
         )
         for assignment in assignments:
             held = self._state.held[assignment.instance]

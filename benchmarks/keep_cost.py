@@ -1,0 +1,133 @@
+"""What keeping its state costs a node, in each cycle: `python -m benchmarks.keep_cost`.
+
+A node with a timer of 10 ms and a state of a given size, in a process of its own, with and without
+a directory for its state; interleaved, and the median of the rounds. `cycle_us` is the time from
+the author's callback to its end as rosrm sees it, `cpu_us` the processor time of the whole process
+for each cycle.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from array import array
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rclpy
+from std_msgs.msg import UInt8MultiArray
+
+from benchmarks.machine import machine
+from rosrm.loopback import enter_private_network
+from rosrm.node import Node
+
+SIZES = (100, 100_000, 1_000_000, 5_000_000)
+
+
+def node(size: int, cycles: int) -> None:
+    """Runs in the child: prints what a cycle took."""
+    enter_private_network()
+    rclpy.init()
+
+    class Changing(Node):
+        def __init__(self) -> None:
+            super().__init__("changing")
+            self.state = np.zeros(size, np.uint8)
+            self.count = 0
+            self.keep_state("~/state", UInt8MultiArray, self.save, lambda _: None)
+            self.create_timer(0.01, self.tick)
+
+        def tick(self) -> None:
+            self.count += 1
+            self.state[self.count % size] += 1
+
+        def save(self) -> Any:
+            return UInt8MultiArray(data=array("B", self.state.tobytes()))
+
+    changing = Changing()
+    member: Any = changing._rosrm.member  # type: ignore[union-attr]  # noqa: SLF001
+    took: list[float] = []
+    inner = member._cycle  # noqa: SLF001
+
+    def timed(*arguments: Any) -> Any:
+        begun = time.perf_counter()
+        result = inner(*arguments)
+        took.append(time.perf_counter() - begun)
+        return result
+
+    member._cycle = timed  # noqa: SLF001
+    while changing.count < cycles // 10:
+        rclpy.spin_once(changing)
+    took.clear()
+    cpu = time.process_time()
+    while changing.count < cycles + cycles // 10:
+        rclpy.spin_once(changing)
+    cpu = time.process_time() - cpu
+    took.sort()
+    figures = {
+        "mean_us": statistics.fmean(took) * 1e6,
+        "p50_us": took[len(took) // 2] * 1e6,
+        "p99_us": took[len(took) * 99 // 100] * 1e6,
+        "cpu_us": cpu / len(took) * 1e6,
+    }
+    print(json.dumps({name: round(value, 1) for name, value in figures.items()}), flush=True)
+    changing.destroy_node()
+    rclpy.try_shutdown()
+
+
+def measured(size: int, cycles: int, *, keep: bool) -> dict[str, float]:
+    """The figures of one run."""
+    with tempfile.TemporaryDirectory() as directory:
+        environment = {
+            **os.environ, "ROSRM_PROCESS": "changing", "ROSRM_INSTANCE": "changing#1",
+            "ROSRM_STATE_CONFIG": "/rosrm/state_config", "ROS_DOMAIN_ID": "77",
+        }  # fmt: skip
+        if keep:
+            environment["ROSRM_KEEP"] = directory
+        run = subprocess.run(
+            [sys.executable, "-m", "benchmarks.keep_cost", "--node", str(size), "--cycles",
+             str(cycles)],
+            env=environment, capture_output=True, text=True, check=True, timeout=300,
+        )  # fmt: skip
+    return dict(json.loads(run.stdout.splitlines()[-1]))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--node", type=int, help=argparse.SUPPRESS)
+    parser.add_argument("--cycles", type=int, default=1000)
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--json", help="file for the figures")
+    options = parser.parse_args()
+    if options.node is not None:
+        node(options.node, options.cycles)
+        return
+    table: dict[str, Any] = {}
+    for size in SIZES:
+        rounds: dict[bool, list[dict[str, float]]] = {False: [], True: []}
+        for _ in range(options.rounds):
+            for keep in (False, True):
+                rounds[keep].append(measured(size, options.cycles, keep=keep))
+        row = {
+            word: {
+                name: statistics.median(one[name] for one in rounds[keep])
+                for name in rounds[keep][0]
+            }
+            for keep, word in ((False, "without"), (True, "with"))
+        }
+        table[str(size)] = row
+        print(size, json.dumps(row), flush=True)
+    if options.json:
+        figures = {"machine": machine(), "cycles": options.cycles, "by_size": table}
+        Path(options.json).write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
