@@ -263,7 +263,9 @@ def restarts_after(policy: RestartPolicy, status: InstanceStatus) -> bool:
     """Whether a slave would have started an instance again that ended so."""
     if status.state is InstanceState.REFUSED or policy.when == "never":
         return False
-    return policy.when == "always" or bool(status.exit_code or status.exit_signal)
+    if policy.when == "always" or status.state is InstanceState.FAILED:
+        return True  # the unhealthy have failed, though they may exit with 0
+    return bool(status.exit_code or status.exit_signal)
 
 
 def exclude(process: Process, host: Host, status: InstanceStatus) -> None:

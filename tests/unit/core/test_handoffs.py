@@ -12,8 +12,16 @@ import pytest
 
 from rosrm.core import events as happened
 from rosrm.core.commands import PublishStateConfig
+from rosrm.core.lifecycle import restarts_after
 from rosrm.core.migration import HandoffPhase, ReportPhase
-from rosrm.core.model import MigrationPolicy, ProcessSpec, RestartPolicy
+from rosrm.core.model import (
+    InstanceId,
+    InstanceState,
+    InstanceStatus,
+    MigrationPolicy,
+    ProcessSpec,
+    RestartPolicy,
+)
 from tests.unit.core.cluster import Cluster, HandOver, Machine, process
 
 ON_FAILURE = RestartPolicy("on-failure", delay=0.5)
@@ -345,6 +353,13 @@ def test_a_source_that_ends_before_the_switch_is_queued_again_by_its_policy() ->
     assert len(cluster.active()) == 1
     (told,) = cluster.told("queued")
     assert told == "p returns to the queue: restart by policy 'on-failure': exit code 3"
+
+
+@pytest.mark.parametrize(("when", "again"), [("never", False), ("on-failure", True)])
+def test_a_source_that_was_unhealthy_has_failed_though_it_exits_with_0(when, again) -> None:
+    """It was told to end, and did; its slave would have started it again."""
+    unhealthy = InstanceStatus(InstanceId("p", 1), InstanceState.FAILED, message="unhealthy: x")
+    assert restarts_after(RestartPolicy(when), unhealthy) is again
 
 
 def test_a_source_that_is_never_restarted_and_ends_before_the_switch_has_failed() -> None:
