@@ -37,6 +37,8 @@ def _awaited(value: Any) -> Awaited:
 
 
 def _watch(value: Any) -> Watch:
-    (topic, rate, lifecycle, timeout), topics, services, shadow = value
+    (topic, rate, lifecycle, timeout), topics, services, restarts, paused = value
     wanted = Health(str(topic), float(rate), str(lifecycle), float(timeout))
-    return Watch(wanted, tuple(map(str, topics)), tuple(map(str, services)), bool(shadow))
+    return Watch(
+        wanted, tuple(map(str, topics)), tuple(map(str, services)), bool(restarts), bool(paused)
+    )

@@ -181,23 +181,29 @@ def _restart_policy_set(state: SlaveState, event: RestartPolicySet, now: float) 
         return [_not_held(event)]
     if held.status.state.ended:
         return [Report((held.status,)), Settle(event.instance, event.restart)]
-    unveiled = _unveil(held)
+    news = _pause_or_watch(held, event)
     waiting = state.waiting.get(event.instance)
     if waiting is not None:  # nobody but this slave knows of it yet
         spec = replace(waiting.spec, restart=event.restart)
         state.waiting[event.instance] = replace(waiting, spec=spec, shadow=False)
         return [Report((held.status,)), Settle(event.instance, event.restart)]
     held.unsettled += (event.restart,)
-    remember = [Remember(event.instance, held.memo)] if unveiled else []
+    remember = [Remember(event.instance, held.memo)] if news else []
     return [Amend(event.instance, event.restart), *remember]
 
 
-def _unveil(held: Held) -> bool:
-    """It is no shadow any more: from now on its health is watched. Whether that is news."""
-    if held.watch is None or not held.watch.shadow:
+def _pause_or_watch(held: Held, order: RestartPolicySet) -> bool:
+    """Whether it is news: without its restart policy it is being moved, with it again it is not.
+
+    One that is never restarted cannot be told from one that moves; it is watched all the while.
+    """
+    watch = held.watch
+    if watch is None:
         return False
-    held.watch = replace(held.watch, shadow=False)
-    return True
+    paused = watch.restarts and order.restart.when == "never"
+    held.watch = replace(watch, paused=paused)
+    held.judgement = None
+    return paused != watch.paused
 
 
 def _not_held(order: RestartPolicySet) -> Settle:

@@ -37,7 +37,8 @@ def watch_of(assignment: Assignment) -> Watch | None:
         wanted,
         _names(wanted.topic, assignment, "rostopic://") if wanted.topic else (),
         _names("~/get_state", assignment, "rosservice://") if wanted.lifecycle else (),
-        assignment.shadow,
+        restarts=assignment.spec.restart.when != "never",
+        paused=assignment.shadow,
     )
 
 

@@ -61,7 +61,7 @@ class Held:
     def watched(self) -> Watch | None:
         """What is watched of its health now; None: nothing."""
         ready = self.status.state is InstanceState.READY
-        return self.watch if ready and self.watch is not None and not self.watch.shadow else None
+        return self.watch if ready and self.watch is not None and not self.watch.paused else None
 
 
 @dataclass(slots=True)

@@ -31,13 +31,15 @@ class Watch:
         wanted: by its spec.
         topics: absolute names of what it must publish, one of them; (): nothing.
         services: absolute names under which its lifecycle state is asked; (): it is not.
-        shadow: it is one, and is not watched before it is none any more.
+        restarts: its slave starts it again, unless a move is under way.
+        paused: it is not watched for now: it is a shadow, or is being moved and may be silent.
     """
 
     wanted: Health
     topics: tuple[str, ...] = ()
     services: tuple[str, ...] = ()
-    shadow: bool = False
+    restarts: bool = True
+    paused: bool = False
 
 
 @dataclass(frozen=True, slots=True)

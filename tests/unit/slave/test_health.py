@@ -200,7 +200,8 @@ def test_under_an_alias_names_are_those_that_others_see() -> None:
         spec.health,
         ("/robot/lidar/scan", "/robot/lidar_17/scan"),
         ("/robot/lidar/get_state", "/robot/lidar_17/get_state"),
-        shadow=True,
+        restarts=False,
+        paused=True,
     )
 
 
@@ -218,7 +219,8 @@ class Slave:
     def __init__(self, shadow: bool = False) -> None:
         self.state = slave.SlaveState(registered=True)
         self.now = 0.0
-        spec = ProcessSpec("lidar", command=("true",), health=PLAIN)
+        restart = RestartPolicy("always")
+        spec = ProcessSpec("lidar", command=("true",), health=PLAIN, restart=restart)
         self.step(slave.AssignmentsReceived((Assignment(LIDAR, spec, 1, "lidar", shadow),)))
 
     def step(self, event) -> list[slave.Command]:
@@ -276,6 +278,18 @@ def test_a_shadow_is_watched_when_it_is_none_any_more() -> None:
     assert list(later.watched()) == [LIDAR]
 
 
+def test_what_is_being_moved_may_be_silent() -> None:
+    """Its restart policy is suspended for the move, and its health with it; then anew."""
+    one = Slave()
+    one.runs(5)
+    one.looks(3.0, 5, stopped=True)
+    one.step(slave.RestartPolicySet(LIDAR, RestartPolicy("never")))
+    assert one.looks(20.0, 5, stopped=True) == []
+    one.step(slave.RestartPolicySet(LIDAR, RestartPolicy("always")))
+    assert one.looks(3.0, 5, stopped=True) == []
+    assert len(one.looks(3.0, 5, stopped=True)) == 1
+
+
 def test_a_shadow_that_waits_for_a_slot_is_watched_later() -> None:
     """It was told before it was started."""
     state = slave.SlaveState(registered=True, max_processes=1)
@@ -286,7 +300,7 @@ def test_a_shadow_that_waits_for_a_slot_is_watched_later() -> None:
     slave.step(state, slave.RestartPolicySet(LIDAR, RestartPolicy("always")), 0.0)
     watch = state.held[LIDAR].watch
     assert watch is not None
-    assert not watch.shadow
+    assert not watch.paused
 
 
 @given(
@@ -298,6 +312,7 @@ def test_a_shadow_that_waits_for_a_slot_is_watched_later() -> None:
             slave.Watch,
             st.builds(Health, st.text(), st.floats(0, 1e4), st.text(), st.floats(0.1, 1e6)),
             st.lists(st.text()).map(tuple), st.lists(st.text()).map(tuple), st.booleans(),
+            st.booleans(),
         ),
     )
 )  # fmt: skip
