@@ -11,11 +11,11 @@ import pytest
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Int64, String
 
-from rosrm.core.model import Health, RestartPolicy
+from rosrm.core.model import Health, MigrationPolicy, RestartPolicy
 from rosrm.core.slave import Watch
 from rosrm.ros.graph import GraphWatch
 from rosrm.ros.health import HealthEar
-from tests.ros.clusters import PATIENCE, alive, host, node, service, wait_gone
+from tests.ros.clusters import PATIENCE, STEADY, alive, host, node, service, wait_gone
 
 #: Seconds: far more than a busy machine takes between two messages.
 SOON = 2.0
@@ -173,6 +173,61 @@ def test_a_healthy_node_is_never_ended(cluster) -> None:
         cluster.client.spin(0.2)
     row = cluster.process("healthy")
     assert (row.state, row.restarts) == ("running", 0), row.reason
+
+
+#: A stateful node: its output stays below its own name under every alias.
+COUNTER = """
+import rclpy
+from std_msgs.msg import Int64
+from rosrm.node import Node
+
+class Counter(Node):
+    def __init__(self):
+        super().__init__("counter")
+        self.count = 0
+        self.output = self.create_publisher(Int64, "~/count", 10)
+        self.create_timer(0.02, self.tick)
+        self.keep_state("~/state", Int64, lambda: Int64(data=self.count), self.restore)
+
+    def tick(self):
+        self.count += 1
+        self.output.publish(Int64(data=self.count))
+
+    def restore(self, state):
+        self.count = state.data
+
+rclpy.init()
+try:
+    rclpy.spin(Counter())
+except BaseException:
+    pass
+"""
+
+
+def test_a_node_that_was_moved_is_watched_where_it_is_now(make_cluster) -> None:
+    """As a shadow it was silent and nobody minded; now it is stopped, and starts again there."""
+    cluster = make_cluster(host("h0"), host("h1"), liveness=STEADY)
+    migration = MigrationPolicy("handoff")
+    health = Health("~/count", 5.0, "", SOON)
+    cluster.submit(node("moved", COUNTER, health=health, restart=AGAIN, migration=migration))
+    before = cluster.wait("moved", "running")
+    cluster.client.migrate("moved")
+    cluster.wait_for_event("migrated", process="moved")
+    after = cluster.wait("moved", "running")
+    assert after.host != before.host
+    until = time.monotonic() + 3 * SOON
+    while time.monotonic() < until:
+        cluster.client.spin(0.2)
+    assert cluster.process("moved").restarts == 0
+    os.kill(after.pid, signal.SIGSTOP)
+    event = cluster.wait_for_event("backoff", "unhealthy: ", process="moved")
+    assert event.host == after.host
+    cluster.wait_until(
+        "it runs again",
+        lambda v: any(
+            (r.name, r.state, r.restarts) == ("moved", "running", 1) for r in v.processes
+        ),
+    )
 
 
 # --- what the slave hears -----------------------------------------------------------------------
