@@ -24,6 +24,38 @@ def begin_move(
     refusal = why_immovable(state, process)
     if refusal:
         return refusal
+    run = plan_move(state, process, destination, cause, now)
+    if isinstance(run, str):
+        state.record(now, "plugin_failed", run, process=process.name)
+        return run
+    state.runs[process.name] = run
+    demand = ranking.demand
+    state.charge_instance(
+        run.destination, destination, now, demand.amounts, demand.estimated,
+        ranking.need[:, destination.column],
+    )  # fmt: skip
+    state.set_phase(process, ProcessPhase.MIGRATING, now, f"to {destination.name}: {cause}")
+    state.record(
+        now, "migration_begun",
+        f"{process.name} moves from {run.source_host.name} to {destination.name} by "
+        f"{run.strategy}: {cause}",
+        process=process.name, host=destination.name,
+        facts={
+            "from": run.source_host.name, "to": destination.name, "strategy": run.strategy,
+            "cause": cause, "steps": [title(step) for step in run.plan.steps],
+            "overlap": run.plan.overlap, "source": run.source.number,
+            "destination": run.destination.number,
+        },
+    )  # fmt: skip
+    state.save(process)
+    state.save_run(run)
+    return ""
+
+
+def plan_move(
+    state: MasterState, process: Process, destination: Host, cause: str, now: float
+) -> Run | str:
+    """What its strategy proposes for a move of a running process, or why there is no plan."""
     source = state.instances[process.owner]
     name = process.spec.migration.strategy or ""
     move = Move(
@@ -33,32 +65,11 @@ def begin_move(
     )  # fmt: skip
     plan = _propose(state, name, move)
     if isinstance(plan, str):
-        state.record(now, "plugin_failed", plan, process=process.name)
         return plan
-    run = Run(
+    return Run(
         process.name, plan, name, source.id, source.host, move.destination, destination, cause,
         now, move.source_node, _destination_node(plan, move), state.wall,
     )  # fmt: skip
-    state.runs[process.name] = run
-    demand = ranking.demand
-    state.charge_instance(
-        move.destination, destination, now, demand.amounts, demand.estimated,
-        ranking.need[:, destination.column],
-    )  # fmt: skip
-    state.set_phase(process, ProcessPhase.MIGRATING, now, f"to {destination.name}: {cause}")
-    state.record(
-        now, "migration_begun",
-        f"{process.name} moves from {source.host.name} to {destination.name} by {name}: {cause}",
-        process=process.name, host=destination.name,
-        facts={
-            "from": source.host.name, "to": destination.name, "strategy": name, "cause": cause,
-            "steps": [title(step) for step in plan.steps], "overlap": plan.overlap,
-            "source": source.id.number, "destination": move.destination.number,
-        },
-    )  # fmt: skip
-    state.save(process)
-    state.save_run(run)
-    return ""
 
 
 def moves_under_way(state: MasterState) -> int:
@@ -75,7 +86,9 @@ def why_immovable(state: MasterState, process: Process) -> str:
         )
     if process.phase is not ProcessPhase.RUNNING:
         return f"{process.name} is {process.phase.value}; only a running process can be moved"
-    if len(process.instances) > 1:
+    standby = state.standbys.get(process.name)
+    others = process.instances - {process.owner, standby.destination.number if standby else 0}
+    if others:
         return f"an earlier instance of {process.name} is still being stopped"
     if strategy is None:
         return f"{process.name} has no migration strategy; give it `migration:` in its file"

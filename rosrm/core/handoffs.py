@@ -83,9 +83,12 @@ def _take_over(state: MasterState, run: Run, step: Configure, now: float) -> Non
 
 def handoff_reported(state: MasterState, event: happened.HandoffReported, now: float) -> None:
     """Note how far the source or the destination is."""
-    run = state.runs.get(event.process)
-    if run is None or run.destination.number != event.destination:
-        return
+    for run in (state.runs.get(event.process), state.standbys.get(event.process)):
+        if run is not None and run.destination.number == event.destination:
+            _note(state, run, event, now)
+
+
+def _note(state: MasterState, run: Run, event: happened.HandoffReported, now: float) -> None:
     if event.instance not in (run.source.number, run.destination.number):
         return
     heard = run.heard.setdefault(event.instance, Heard())

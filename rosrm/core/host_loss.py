@@ -3,7 +3,8 @@
 =========================  ======================================================================
 on a lost host             what follows
 =========================  ======================================================================
-the owner of the name      by `host_loss`: `wait`; after `delay` go `elsewhere`, or `stop`
+the owner of the name      given up at once, where a standby can take over
+                           by `host_loss`: `wait`; after `delay` go `elsewhere`, or `stop`
 one that may be the owner  as the owner: the destination of a move that may be active, or the last
                            that is left of a process
 one that is cancelled      given up at once: nothing follows it
@@ -18,7 +19,7 @@ the master that was cut off, and its hosts come back one by one.
 
 from __future__ import annotations
 
-from rosrm.core import coming_back, handoffs, lifecycle
+from rosrm.core import coming_back, failover, handoffs, lifecycle
 from rosrm.core.hosts import Host, HostCondition
 from rosrm.core.processes import LeftBehind
 from rosrm.core.state import Instance, MasterState, Process, ProcessPhase, Wanted
@@ -74,6 +75,8 @@ def _is_given_up(state: MasterState, instance: Instance, now: float) -> bool:
     if now < state.in_company_since + state.settings.lease:
         return False
     if process.owner not in (0, instance.id.number) and not _may_be_active(state, instance):
+        return True
+    if process.owner == instance.id.number and failover.is_ready(state, process):
         return True
     policy = process.spec.host_loss
     return policy.then != "wait" and now - instance.host.lost_since >= policy.delay

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from typing import Final
 
-from rosrm.core import coming_back
+from rosrm.core import coming_back, failover
 from rosrm.core import events as happened
 from rosrm.core.charges import learn_from
 from rosrm.core.commands import Order
@@ -111,6 +111,8 @@ def take_status(state: MasterState, host: Host, status: InstanceStatus, now: flo
     process.restarts = status.restarts
     if process.wanted is not Wanted.RUN and not instance.stopping:
         stop_instance(state, instance, now)
+    if status.state is InstanceState.BACKOFF and failover.is_ready(state, process):
+        stop_instance(state, instance, now)  # its standby goes on sooner, and with its state
     if process.name not in state.runs:
         _follow(state, process, instance, status, now, repeated=before is status.state)
 
@@ -239,6 +241,8 @@ def _end(
 
 def conclude(state: MasterState, process: Process, end: End, host: Host, now: float) -> None:
     """The owning instance has ended, and no plan is under way: what becomes of the process?"""
+    if failover.take_over(state, process, end, now):
+        return
     status = end.status
     process.owner = 0
     if not end.gone:

@@ -59,8 +59,13 @@ def process_row(state: MasterState, process: Process, now: float) -> ProcessRow:
         pid=owner.pid if owner else 0, restarts=process.restarts, migrations=process.migrations,
         exit_code=process.exit_code, priority=process.spec.priority,
         queue_position=state.queue.position(process.name), since=now - process.since,
-        cpu=seen.get("cpu", 0.0), memory=int(seen.get("memory", 0.0)), reason=process.reason,
+        cpu=seen.get("cpu", 0.0), memory=int(seen.get("memory", 0.0)),
+        reason=process.reason or _of_standby(process),
     )  # fmt: skip
+
+
+def _of_standby(process: Process) -> str:
+    return process.standby_reason if process.phase is ProcessPhase.RUNNING else ""
 
 
 def explanation(state: MasterState, name: str, now: float) -> Mapping[str, Any] | None:

@@ -137,6 +137,9 @@ class Process:
         decision: the newest one about it, with its kind.
         left_behind: the instance that may still run on a lost host, while this process waits in the
             queue for another one.
+        standby_at: time before which no standby is begun.
+        standby_tries: standbys that were lost, one after the other.
+        standby_reason: how it stands with its standby, for people.
         demand: what decides where it may go, and the version of what was learned that is in it.
     """
 
@@ -156,6 +159,9 @@ class Process:
     decision: Mapping[str, Any] | None = None
     decided_at: float = 0.0
     left_behind: LeftBehind | None = None
+    standby_at: float = 0.0
+    standby_tries: int = 0
+    standby_reason: str = ""
     history: list[tuple[float, str, str]] = field(default_factory=list)
     demand: tuple[int, Demand] | None = None
     plain: PlainSpec = field(init=False)

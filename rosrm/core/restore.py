@@ -39,6 +39,7 @@ def restore(state: MasterState, intents: Callable[[str], _Table], now: float) ->
         process = _restore_process(state, item, now)
         move = moves.get(process.name)
         _restore_instances(state, process, item, move, now)
+        _restore_standby(state, process, item, now)
         if move is None or not _restore_move(state, process, item, move, now):
             _restore_place(state, process, now)
     state.next_order = 1 + max((int(item["order"]) for item in stored), default=0)
@@ -72,7 +73,8 @@ def _restore_instances(
     move: Mapping[str, Any] | None, now: float,
 ) -> None:  # fmt: skip
     """Put on the books what may still run: the owner, what moves, and any other to be stopped."""
-    aliases, moving = item.get("node_names", {}), _numbers_of(move)
+    aliases, standby = item.get("node_names", {}), item.get("standby")
+    moving = _numbers_of(move) | ({int(standby["destination"])} if standby else frozenset())
     ended = move.get("ended", {}) if move is not None else {}
     for number, host_name in item["instances"].items():
         host = state.hosts.by_name.get(host_name)
@@ -100,6 +102,22 @@ def _expect_to_run(state: MasterState, process: Process, now: float) -> None:
         state.set_phase(process, ProcessPhase.STOPPING, now, f"waits for the end of {left}")
     else:
         state.enqueue(process, now, "nothing of it was left when the master started")
+
+
+def _restore_standby(
+    state: MasterState, process: Process, item: Mapping[str, Any], now: float
+) -> None:
+    """It is told of its primary again, and says how far it is."""
+    standby = item.get("standby")
+    if standby is None or int(standby["destination"]) not in process.instances:
+        return
+    try:
+        run = _run_of(state, process, standby, now)
+    except (KeyError, TypeError, ValueError):
+        state.instances[int(standby["destination"])].stopping = True  # another one follows
+        return
+    run.index = 0
+    state.standbys[process.name] = run
 
 
 # --- moves ------------------------------------------------------------------------------------

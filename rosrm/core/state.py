@@ -37,6 +37,8 @@ class MasterState:
 
     Attributes:
         over: names of the processes that are over, in the order in which they ended.
+        standbys: process name to the handoff whose destination is its standby.
+        wants_standby: names of the processes that ask for one and are not over.
         in_company_since: time since when at least one host has been heard; inf: none is.
     """
 
@@ -63,6 +65,8 @@ class MasterState:
         self.instances: dict[int, Instance] = {}
         self.runs: dict[str, Run] = {}
         self.runs_by_order: dict[int, str] = {}
+        self.standbys: dict[str, Run] = {}
+        self.wants_standby: set[str] = set()
         self.learned = LearnedNeeds()
         self.run_times: dict[str, float] = {}
         self.set_aside: set[str] = set()
@@ -134,12 +138,20 @@ class MasterState:
                 "reason": process.reason, "excluded": dict(process.excluded),
                 "migrations": process.migrations, "exit_code": process.exit_code,
                 "restarts": process.restarts, "node_names": aliases,
+                "standby": self._standby_of(process),
                 "left_behind": left and [left.number, left.host, left.node_name],
             },
         )  # fmt: skip
 
+    def _standby_of(self, process: Process) -> Mapping[str, Any] | None:
+        run = self.standbys.get(process.name)
+        return None if run is None else run_to_dict(run, ())
+
     def save_run(self, run: Run) -> None:
         """Make durable how far a move is, as it stands after the event in hand."""
+        if self.standbys.get(run.process) is run:
+            self.save(self.processes[run.process])
+            return
         self._unsaved_runs[run.process] = run
 
     def end_run(self, run: Run) -> None:
@@ -180,8 +192,11 @@ class MasterState:
         """Keep `over` in the order in which they ended."""
         if not process.phase.over:
             self.over.pop(process.name, None)
+            if process.spec.standby.wanted:
+                self.wants_standby.add(process.name)
         else:
             self.over.setdefault(process.name)
+            self.wants_standby.discard(process.name)
 
     def forget_oldest(self) -> None:
         """Of what is over keep the youngest `keep_ended`, and what is not quite gone."""

@@ -13,6 +13,7 @@ from rosrm.core.lifecycle import stop_instance
 from rosrm.core.liveness import review_liveness
 from rosrm.core.lookahead import review_slots, waits_too_long
 from rosrm.core.relief import relieve_hosts
+from rosrm.core.standbys import review_standbys
 from rosrm.core.state import Instance, MasterState, Process, ProcessPhase, Wanted
 
 #: Seconds between two reviews of what need not be looked at with every event.
@@ -30,6 +31,7 @@ def time_passed(state: MasterState, event: happened.TimePassed, now: float) -> N
     for instance in list(state.instances.values()):
         _review_instance(state, instance, now)
     review_lost_hosts(state, now)
+    review_standbys(state, now)
     _ask_for_missing_statuses(state, now)
     relieve_hosts(state, now)
     reconsider_set_aside(state, now)

@@ -159,6 +159,7 @@ class Simulation:
         machine.host_id = reply.host_id
         self._by_id[machine.host_id] = machine
         self._hosting.hear(machine, slave.Registered(self.state.epoch))
+        self._hosting.hear(machine, slave.MasterHears(inf))  # no simulated host is cut off
         self._read([machine])
 
     def _leave(self, plan: HostPlan) -> None:

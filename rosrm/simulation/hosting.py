@@ -66,7 +66,7 @@ class Hosting:
         elif isinstance(command, slave.Launch):
             for assignment in command.assignments:
                 self._launch(machine, assignment)
-        elif isinstance(command, slave.Stop):
+        elif isinstance(command, slave.Stop | slave.Fence):
             self._stop(machine, command.instance)
         elif isinstance(command, slave.Restart):
             self._restart(machine, command.instance)
@@ -219,4 +219,6 @@ def _as_event(order: Order) -> slave.Event:
     assert order.instance is not None
     if order.action == "restart":
         return slave.RestartOrdered(order.instance)
+    if order.action == "fence":
+        return slave.FenceOrdered(order.instance)
     return slave.StopOrdered(order.instance)

@@ -289,6 +289,7 @@ class Cluster:
             machine.host_id, machine.fresh = reply.host_id, False
             machine.polled.clear()
             machine.tell(slave.Registered(self.state.epoch), self.now)
+            machine.tell(slave.MasterHears(self.now), self.now)
             self.read(machine)
             self.ask_for_work(machine)
         self.settle()
@@ -402,6 +403,8 @@ class Cluster:
             for machine in self.machines.values():
                 if machine.connected and machine.host_id:
                     machine.tell(slave.TimePassed(), self.now)
+                    if machine.host_id not in self.state.hosts.unheard():
+                        machine.tell(slave.MasterHears(self.now), self.now)
                     self.ask_for_work(machine)
                     self.tell(machine.usages())
             self.tell(happened.TimePassed())

@@ -161,6 +161,9 @@ class Machine:
                     self._launch(assignment, now)
             elif isinstance(command, slave.Stop):
                 self._stop(command.instance, now)
+            elif isinstance(command, slave.Fence):
+                if command.instance in self.programs:
+                    self._end(command.instance, InstanceState.FAILED, now, signal=9)
             elif isinstance(command, slave.Restart):
                 self._restart(command.instance, now)
             elif isinstance(command, slave.Amend):
@@ -270,10 +273,8 @@ class Machine:
             event = slave.AssignmentsReceived((order.assignment,))
         else:
             assert order.instance is not None
-            if order.action == "fence":
-                self.stubborn.discard(order.instance.process)
             kinds = {
-                "stop": slave.StopOrdered, "fence": slave.StopOrdered,
+                "stop": slave.StopOrdered, "fence": slave.FenceOrdered,
                 "restart": slave.RestartOrdered,
             }  # fmt: skip
             event = kinds[order.action](order.instance)

@@ -220,9 +220,12 @@ class Air:
                 listener.reports.extend(node.said)
 
     def others(self, node: Node) -> list[Node]:
-        """The other nodes of a process that run."""
+        """The other nodes of a process that run where this one can reach them."""
         name = node.instance.process
-        return [one for _, one in self.nodes() if one.instance.process == name and one is not node]
+        return [
+            one for machine, one in self.nodes()
+            if one.instance.process == name and one is not node and machine.connected
+        ]  # fmt: skip
 
     def master_is_gone(self) -> None:
         """What it has said and nobody has heard is lost."""

@@ -155,6 +155,7 @@ class Play(RuleBasedStateMachine):
             machine.fresh = False
             machine.polled.clear()
             machine.tell(slave.Registered(self.cluster.state.epoch), self.cluster.now)
+            machine.tell(slave.MasterHears(self.cluster.now), self.cluster.now)
 
     def pick(self, things: list, which: int) -> object:
         return things[which % len(things)]

@@ -1,0 +1,189 @@
+"""Standbys: one shadow on another host, which goes on when the primary has ended."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from rosrm.core.migration import ReportPhase
+from rosrm.core.model import HostLossPolicy, InstanceState, RestartPolicy, StandbyPolicy
+from tests.unit.core.cluster import Cluster, Machine
+from tests.unit.core.test_handoffs import stateful
+
+STANDBY = StandbyPolicy(wanted=True)
+
+
+def with_standby(*others: str | Machine, **fields: Any) -> Cluster:
+    """P runs on a, and has a ready standby on b."""
+    cluster = Cluster("a", *(others or ("b",)))
+    for machine in list(cluster.machines.values())[1:]:
+        machine.busy["memory"] = 0.5
+    cluster.wait(0.5)
+    cluster.submit(stateful(standby=STANDBY, **fields))
+    cluster.wait(11.0)  # somebody has been heard for a whole lease
+    return cluster
+
+
+def lose(cluster: Cluster, name: str, seconds: float = 12.0) -> None:
+    cluster.machines[name].connected = False
+    cluster.wait(seconds)
+
+
+def test_a_process_gets_a_standby_on_another_host() -> None:
+    """Silent, ready, and said so."""
+    cluster = with_standby()
+    assert (cluster.where("p"), cluster.active()) == (["a", "b"], ["a"])
+    assert cluster.told("standby_ready") == ["the standby of p is ready on b"]
+    assert cluster.explain("p")["reason"] == ""
+    assert (cluster.phase("p"), cluster["p"].owner) == ("running", 1)
+
+
+def test_without_a_second_host_it_waits_for_one_and_says_so_once() -> None:
+    """The process itself runs all the while."""
+    cluster = Cluster("a")
+    cluster.submit(stateful(standby=STANDBY))
+    cluster.wait(30.0)
+    assert cluster.told("standby_waits") == ["p: no host has room for its standby"]
+    assert cluster.phase("p") == "running"
+    cluster.add("b")
+    cluster.wait(4.0)
+    assert cluster.active() == ["a"]
+    assert cluster.where("p") == ["a", "b"]
+
+
+@pytest.mark.parametrize("then", ["wait", "elsewhere"])
+def test_when_the_host_is_lost_the_standby_goes_on(then: str) -> None:
+    """At once, whatever else was to become of the process; the old one is fenced later."""
+    cluster = with_standby(host_loss=HostLossPolicy(then))
+    lose(cluster, "a", 10.5)
+    assert (cluster.phase("p"), cluster.active()) == ("running", ["a", "b"])
+    assert cluster["p"].owner == 2
+    cluster.machines["a"].connected = True
+    cluster.wait(0.3)
+    assert cluster.active() == ["b"]
+
+
+def test_a_new_standby_follows() -> None:
+    """On a third host, or on the first one when it is back."""
+    cluster = with_standby()
+    lose(cluster, "a")
+    cluster.machines["a"].connected = True
+    cluster.wait(5.0)
+    assert (cluster.active(), cluster.where("p")) == (["b"], ["a", "b"])
+    assert len(cluster.told("standby_ready")) == 2
+
+
+@pytest.mark.parametrize("when", ["never", "on-failure"])
+def test_when_the_primary_crashes_the_standby_goes_on(when: str) -> None:
+    """It is not started again beside it, whatever its restart policy."""
+    cluster = with_standby(restart=RestartPolicy(when))
+    machine = cluster.machines["a"]
+    if when == "on-failure":  # its supervisor waits before it starts it again
+        status = machine.slave.held[machine.find("p")].status
+        del machine.programs[machine.find("p")]
+        machine.ends[status.instance] = status
+        from dataclasses import replace
+
+        machine._supervisor_says(replace(status, state=InstanceState.BACKOFF, pid=0), cluster.now)
+        cluster.settle()
+        machine._supervisor_says(replace(status, state=InstanceState.EXITED, pid=0), cluster.now)
+    else:
+        machine.finish("p", cluster.now, code=3)
+    cluster.settle()
+    assert (cluster.phase("p"), cluster.active(), cluster["p"].owner) == ("running", ["b"], 2)
+    assert "takes over" in cluster.told("failed_over")[0]
+
+
+def test_a_standby_that_is_not_ready_does_not_go_on() -> None:
+    """The process is queued again instead, and the shadow stopped first."""
+    cluster = Cluster("a", "b")
+    cluster.machines["b"].busy["memory"] = 0.5
+    cluster.wait(0.5)
+    cluster.machines["b"].quirks["p"].add("never ready")
+    cluster.submit(stateful(standby=STANDBY, host_loss=HostLossPolicy("elsewhere")))
+    cluster.wait(11.0)
+    lose(cluster, "a")
+    assert (cluster.phase("p"), cluster.active()) == ("running", ["a", "b"])
+    assert cluster["p"].owner == cluster.machines["b"].find("p").number
+    assert not cluster.told("failed_over")
+
+
+def test_one_that_gave_up_is_replaced_after_a_while() -> None:
+    """Ever later."""
+    cluster = Cluster("a", "b")
+    cluster.wait(0.5)
+    cluster.submit(stateful(standby=STANDBY))
+    cluster.wait(5.0)
+    (standby,) = [m for m in cluster.machines.values() if m.name not in cluster.active()]
+    cluster.node(standby.name).say(ReportPhase.FAILED, "another run of the source")
+    cluster.wait(1.0)
+    assert cluster.where("p") == cluster.active()
+    assert cluster.told("standby_lost") == [
+        "p has no standby: another run of the source; another one in 2 s"
+    ]
+    cluster.wait(5.0)
+    assert len(cluster.where("p")) == 2
+
+
+def test_the_standby_keeps_apart_by_a_label() -> None:
+    """Another rack; a host without the label is not known to be one."""
+    one, two = {"rack": "1"}, {"rack": "2"}
+    cluster = Cluster(Machine("a", labels=one))
+    cluster.submit(stateful(standby=StandbyPolicy(True, ("rack",))))
+    cluster.add(Machine("b", labels=one))
+    cluster.add(Machine("c"))
+    cluster.wait(5.0)
+    assert cluster.where("p") == ["a"]
+    cluster.add(Machine("d", labels=two))
+    cluster.wait(5.0)
+    assert cluster.where("p") == ["a", "d"]
+
+
+def test_a_move_takes_the_standby_away_and_another_one_follows() -> None:
+    """It followed the source; the destination of a move is another."""
+    cluster = with_standby("b", "c")
+    assert cluster.migrate("p").accepted
+    cluster.wait(8.0)
+    assert len(cluster.told("migrated")) == 1
+    assert len(cluster.active()) == 1
+    assert len(cluster.where("p")) == 2
+    assert cluster["p"].migrations == 1
+
+
+def test_a_drained_host_keeps_no_standby() -> None:
+    """Another host takes it."""
+    cluster = with_standby("b", "c")
+    (host,) = [name for name in cluster.where("p") if name != "a"]
+    cluster.set_host(host, "drain")
+    cluster.wait(8.0)
+    assert host not in cluster.where("p")
+    assert len(cluster.where("p")) == 2
+
+
+def test_cancel_ends_both() -> None:
+    """And nothing is left on the books."""
+    cluster = with_standby()
+    cluster.cancel("p")
+    cluster.wait(1.0)
+    assert (cluster.phase("p"), cluster.where("p")) == ("cancelled", [])
+    assert not cluster.state.instances
+
+
+def test_a_restarted_master_finds_the_standby() -> None:
+    """The same one; it takes over when its primary is lost."""
+    cluster = with_standby()
+    cluster.restart_master()
+    cluster.wait(11.0)
+    assert (cluster.where("p"), cluster.active(), cluster["p"].owner) == (["a", "b"], ["a"], 1)
+    lose(cluster, "a")
+    assert (cluster.phase("p"), cluster["p"].owner) == ("running", 2)
+
+
+def test_a_restart_on_order_costs_the_standby_and_brings_a_new_one() -> None:
+    """The primary starts afresh where it is: nobody has failed."""
+    cluster = with_standby()
+    cluster.restart("p")
+    cluster.wait(1.0)
+    assert not cluster.told("failed_over")
+    assert cluster.active() == ["a"]
