@@ -13,7 +13,6 @@ from rosrm.ros.participant import Participant
 from rosrm.slave.sessions import SessionTable
 from rosrm.supervisor.members import read_stat
 
-_NODE: Final = "rosrm_health"
 #: State in /proc of what a signal has stopped; "t" is what a debugger holds.
 _STOPPED: Final = "T"
 
@@ -66,5 +65,6 @@ class HealthWatch:
 
     def _listen(self, watch: Watch, now: float) -> HealthEar:
         if self._node is None:
-            self._node = self._participant.unwatched_node(_NODE)
+            name = f"{self._participant.node.get_name()}_health"
+            self._node = self._participant.unwatched_node(name)
         return HealthEar(self._node, self._graph, watch, now)
