@@ -43,6 +43,7 @@ def test_policies_are_those_of_the_model():
     ):
         assert light._fields == tuple(field.name for field in dataclasses.fields(heavy))
         assert tuple(light()) == dataclasses.astuple(heavy())
+    assert sv.FenceRule._fields == tuple(field.name for field in dataclasses.fields(model.Fence))
 
 
 def test_status_is_that_of_the_model():
@@ -448,6 +449,9 @@ POLICIES = st.builds(
     st.integers(0, 3),
     st.sampled_from([5.0, 50.0]),
 )
+FENCES = st.none() | st.builds(
+    sv.FenceRule, st.sampled_from([0.5, 1.0, 5.0]), st.sampled_from([0.0, 0.5, 2.0])
+)
 GRACES = st.builds(sv.StopRule, st.sampled_from([0.0, 1.0]), st.sampled_from([0.0, 1.0]))
 
 
@@ -470,6 +474,9 @@ class Host(RuleBasedStateMachine):
         self.final: dict[sv.Key, protocol.Status] = {}
         self.policy_restarts: dict[sv.Key, list[float]] = {}
         self.stopped: set[sv.Key] = set()
+        self.fences: dict[sv.Key, sv.FenceRule] = {}
+        self.heard: dict[sv.Key, float] = {}
+        self.dead_by: dict[sv.Key, float] = {}
         self.left = False
 
     def happens(self, event):
@@ -490,6 +497,7 @@ class Host(RuleBasedStateMachine):
             assert key not in self.queue + self.in_hand, "ordered twice"
             assert key not in self.final, "started after its end"
             assert key not in self.stopped, "started after the user's stop"
+            assert key not in self.dead_by, "started after its fence had passed"
             self.queue.append(key)
             if isinstance(event, sv.TimePassed) and before[key] == sv.BACKOFF:
                 self.policy_restarts.setdefault(key, []).append(self.now)
@@ -515,10 +523,34 @@ class Host(RuleBasedStateMachine):
             self.final[key] = status
 
     @precondition(lambda self: sum(not i.ended for i in self.core.instances.values()) < 2)
-    @rule(restart=POLICIES, stop=GRACES)
-    def start(self, restart, stop):
+    @rule(restart=POLICIES, stop=GRACES, fence=FENCES, ago=st.sampled_from([0.0, 0.0, 0.5, 9.0]))
+    def start(self, restart, stop, fence, ago):
         self.newest += 1
-        self.happens(sv.StartOrdered(("a", self.newest), restart, stop))
+        key = ("a", self.newest)
+        if fence is not None:
+            self.fences[key], self.heard[key] = fence, self.now - ago
+        self.happens(sv.StartOrdered(key, restart, stop, fence, self.now - ago))
+        self.happens(sv.TimePassed())
+        self.look_at_fences()
+
+    @rule(ago=st.sampled_from([-1.0, 0.0, 0.5, 4.0]))
+    def master_hears(self, ago):
+        """By a word that took so long; what is fenced already stays so."""
+        self.happens(sv.Heard(self.now - ago))
+        for key in self.fences.keys() - self.dead_by.keys():
+            self.heard[key] = max(self.heard[key], min(self.now, self.now - ago))
+
+    @precondition(lambda self: self.core.instances)
+    @rule(data=st.data())
+    def fence(self, data):
+        key = data.draw(st.sampled_from(sorted(self.core.instances)))
+        self.dead_by[key] = min(self.now, self.dead_by.get(key, self.now))
+        self.happens(sv.FenceOrdered(key))
+
+    def look_at_fences(self):
+        for key, (after, grace) in self.fences.items():
+            if self.now >= self.heard[key] + after:
+                self.dead_by.setdefault(key, self.heard[key] + after + grace)
 
     @precondition(lambda self: self.core.instances)
     @rule(
@@ -590,6 +622,7 @@ class Host(RuleBasedStateMachine):
     @rule(seconds=st.sampled_from([0.0, 0.5, 1.0, 1.0, 6.0, 60.0]))
     def time_passes(self, seconds):
         self.now += seconds
+        self.look_at_fences()
         self.happens(sv.TimePassed())
 
     @invariant()
@@ -610,6 +643,25 @@ class Host(RuleBasedStateMachine):
     def what_was_stopped_is_on_its_way_out(self):
         for key in self.stopped & set(self.core.instances):
             assert self.core.instances[key].phase not in (sv.RUNNING, sv.BACKOFF), key
+
+    @invariant()
+    def what_is_fenced_is_killed_in_time(self):
+        """Nothing of it lives longer than its SIGKILL allows; and the machine wakes up for it."""
+        for key in self.leaders | self.strays:
+            by = self.dead_by.get(key)
+            if by is not None:
+                assert self.core.instances[key].phase == sv.STOPPING, key
+                assert key in self.killed or (self.now < by and self.core.deadline() <= by), key
+            elif key in self.fences:
+                assert self.core.deadline() <= self.heard[key] + self.fences[key].after, key
+        for key in self.dead_by.keys() & self.core.instances.keys():
+            assert self.core.instances[key].phase not in (sv.RUNNING, sv.BACKOFF), key
+
+    @invariant()
+    def what_was_fenced_says_so(self):
+        for key, status in self.final.items():
+            if status.message.startswith(sv.FENCED):
+                assert (status.state, key in self.dead_by) == (sv.FAILED, True), key
 
     @invariant()
     def what_is_never_restarted_does_not_wait_for_it(self):

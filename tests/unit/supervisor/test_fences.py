@@ -1,0 +1,212 @@
+"""Fences of the supervisor's state machine: when an instance ends by itself, how, and what is said.
+
+What holds in every order of events is tested in `test_supervision`.
+"""
+
+from __future__ import annotations
+
+import signal
+
+import pytest
+
+from rosrm.core import supervision as sv
+
+ONE = ("one", 7)
+FENCE = sv.FenceRule(after=10.0, grace=3.0)
+GRACES = sv.StopRule(interrupt_grace=5.0, terminate_grace=10.0)
+ALWAYS = sv.RestartRule("always", delay=1.0)
+
+
+def ordered(fence=FENCE, restart=ALWAYS, stop=GRACES, heard=None):
+    """A state machine that was told to start an instance, at time 0."""
+    core = sv.Supervision()
+    core.handle(sv.StartOrdered(ONE, restart, stop, fence, heard), 0.0)
+    return core, core.instances[ONE]
+
+
+def running(**options):
+    """The same, and it runs."""
+    core, instance = ordered(**options)
+    core.handle(sv.Spawned(ONE, 100), 0.0)
+    return core, instance
+
+
+def signals(core, until):
+    """Which signals it gets when nothing else happens, and when."""
+    sent = []
+    while (due := core.deadline()) is not None and due <= until:
+        commands = core.handle(sv.TimePassed(), due)
+        sent += [
+            (round(due, 3), signal.Signals(command.number).name)
+            for command in commands
+            if isinstance(command, sv.Signal)
+        ]
+    return sent
+
+
+def test_it_is_stopped_when_nobody_says_that_it_is_heard():
+    """By the steps of its stop, as much shorter as its fence wants; it has failed, and says why."""
+    core, instance = running()
+    assert signals(core, 13.5) == [(10.0, "SIGINT"), (11.0, "SIGTERM"), (13.0, "SIGKILL")]
+    why = "fenced: for 10 s it was not known here whether the master hears this host; "
+    steps = "SIGINT, SIGTERM after 1.0 s, SIGKILL after 3.0 s"
+    assert instance.message == why + steps
+    core.handle(sv.Exited(ONE, signal=9), 13.5)
+    assert (instance.phase, instance.message) == (sv.FAILED, f"{why}stopped by {steps}")
+    assert core.deadline() is None
+
+
+def test_its_own_graces_stay_where_they_are_short_enough():
+    """What would end by itself in good order is not hurried."""
+    core, _ = running(stop=sv.StopRule(0.5, 0.5))
+    assert signals(core, 11.5) == [(10.0, "SIGINT"), (10.5, "SIGTERM"), (11.0, "SIGKILL")]
+
+
+def test_without_a_grace_it_is_killed():
+    core, _ = running(fence=sv.FenceRule(10.0, 0.0))
+    assert signals(core, 10.0) == [(10.0, "SIGKILL")]
+
+
+def test_a_late_look_at_the_clock_kills():
+    """The supervisor itself was stopped: what should be dead by now gets no grace."""
+    core, _ = running()
+    commands = core.handle(sv.TimePassed(), 20.0)
+    assert [c.number for c in commands if isinstance(c, sv.Signal)] == [signal.SIGKILL]
+
+
+def test_every_word_puts_it_off_from_when_it_was_true():
+    """Not from when it came; and an older one changes nothing."""
+    core, _ = running()
+    core.handle(sv.Heard(8.0), 9.5)
+    assert core.deadline() == 18.0
+    core.handle(sv.Heard(7.0), 9.6)
+    assert core.deadline() == 18.0
+    core.handle(sv.Heard(99.0), 10.0)  # nobody knows that yet
+    assert core.deadline() == 20.0
+
+
+def test_the_clock_begins_with_what_the_start_knows():
+    """The master heard the host 4 s before; a start that says nothing of it counts itself."""
+    core, _ = running(heard=-4.0)
+    assert core.deadline() == 6.0
+    core, _ = running()
+    assert core.deadline() == 10.0
+
+
+def test_a_word_that_comes_after_it_has_begun_is_too_late():
+    """Its successor may count on its end."""
+    core, instance = running()
+    core.handle(sv.TimePassed(), 10.0)
+    core.handle(sv.Heard(10.5), 10.5)
+    core.handle(sv.Exited(ONE), 10.6)
+    assert instance.phase == sv.FAILED
+
+
+def test_one_without_a_fence_is_left_alone():
+    """A robot's driver goes on."""
+    core, _ = running(fence=None)
+    assert core.deadline() is None
+
+
+def test_a_restart_by_policy_does_not_put_it_off():
+    """The clock is the host's, not the run's."""
+    core, instance = running()
+    core.handle(sv.Exited(ONE, 1), 5.0)
+    core.handle(sv.TimePassed(), 6.0)
+    core.handle(sv.Spawned(ONE, 101), 6.0)
+    assert core.deadline() == 10.0
+    core.handle(sv.Exited(ONE, 1), 9.5)
+    assert instance.phase == sv.BACKOFF
+    core.handle(sv.TimePassed(), 10.0)
+    assert instance.phase == sv.FAILED
+    assert instance.message.endswith("the master hears this host; it waited for its restart "
+                                     "(exit code 1)")  # fmt: skip
+
+
+def test_a_start_that_waits_its_turn_is_given_up():
+    """And one in hand is stopped as soon as it runs."""
+    core, instance = ordered()
+    assert sv.Unspawn(ONE) in core.handle(sv.TimePassed(), 10.0)
+    core.handle(sv.SpawnFailed(ONE, ""), 10.0)
+    assert (instance.phase, instance.fenced != "") == (sv.FAILED, True)
+    core, instance = ordered()
+    core.handle(sv.TimePassed(), 10.0)
+    assert sv.Signal(ONE, signal.SIGINT) in core.handle(sv.Spawned(ONE, 100), 10.1)
+    core, instance = ordered()
+    core.handle(sv.TimePassed(), 10.0)
+    assert sv.Signal(ONE, signal.SIGKILL) in core.handle(sv.Spawned(ONE, 100), 13.1)
+
+
+def test_a_stop_under_way_becomes_as_short():
+    """It ends as was meant: the user wanted its end before its fence did."""
+    core, instance = running(stop=sv.StopRule(30.0, 30.0))
+    core.handle(sv.StopOrdered(ONE), 9.0)
+    assert signals(core, 13.0) == [(11.5, "SIGTERM"), (13.0, "SIGKILL")]
+    core.handle(sv.Exited(ONE, signal=9), 13.1)
+    assert (instance.phase, instance.message[:10]) == (sv.EXITED, "stopped by")
+
+
+def test_a_restart_under_way_becomes_an_end():
+    core, instance = running()
+    core.handle(sv.RestartOrdered(ONE), 9.0)
+    core.handle(sv.TimePassed(), 10.0)
+    core.handle(sv.RestartOrdered(ONE), 10.1)
+    core.handle(sv.Exited(ONE), 10.2)
+    assert (instance.phase, instance.fenced != "") == (sv.FAILED, True)
+
+
+@pytest.mark.parametrize(
+    ("code", "when", "phase", "fenced"),
+    [
+        (0, "on-failure", sv.EXITED, False),
+        (1, "never", sv.FAILED, False),
+        (1, "always", sv.FAILED, True),
+    ],
+)
+def test_what_had_ended_by_itself_keeps_its_end(code, when, phase, fenced):
+    """Its leader is gone, others are being stopped: a job that is done is done; no restart."""
+    core, instance = running(restart=sv.RestartRule(when))
+    core.handle(sv.Exited(ONE, code, leftovers=True), 9.5)
+    core.handle(sv.TimePassed(), 10.0)
+    core.handle(sv.Cleared(ONE), 10.5)
+    assert (instance.phase, instance.message.startswith(sv.FENCED)) == (phase, fenced)
+
+
+# --- the order ------------------------------------------------------------------------------------
+
+
+def test_the_order_to_fence_kills_what_runs():
+    """Whether it has a fence of its own or not; and it is not restarted."""
+    core, instance = running(fence=None)
+    assert core.handle(sv.FenceOrdered(ONE), 1.0)[-1] == sv.Signal(ONE, signal.SIGKILL)
+    core.handle(sv.Exited(ONE, signal=9), 1.1)
+    assert instance.phase == sv.FAILED
+    assert instance.message == "fenced: it has a successor; stopped by SIGKILL"
+
+
+def test_the_order_to_fence_kills_what_is_being_stopped():
+    """Once: after SIGKILL there is nothing harder."""
+    core, instance = running()
+    core.handle(sv.StopOrdered(ONE), 1.0)
+    assert core.handle(sv.FenceOrdered(ONE), 1.5)[-1] == sv.Signal(ONE, signal.SIGKILL)
+    assert not any(isinstance(c, sv.Signal) for c in core.handle(sv.FenceOrdered(ONE), 1.6))
+    core.handle(sv.Exited(ONE, signal=9), 1.7)
+    assert instance.message == "stopped by SIGINT, SIGKILL after 0.5 s"
+
+
+def test_the_order_to_fence_ends_what_waits():
+    core, instance = running()
+    core.handle(sv.Exited(ONE, 1), 1.0)
+    core.handle(sv.FenceOrdered(ONE), 1.1)
+    assert instance.phase == sv.FAILED
+    core, instance = ordered()
+    assert sv.Unspawn(ONE) in core.handle(sv.FenceOrdered(ONE), 0.1)
+    assert core.handle(sv.Spawned(ONE, 100), 0.2)[-1] == sv.Signal(ONE, signal.SIGKILL)
+
+
+def test_the_order_to_fence_a_stranger_is_as_one_to_stop_it():
+    """A start that comes late is refused."""
+    core = sv.Supervision()
+    core.handle(sv.FenceOrdered(ONE), 0.0)
+    core.handle(sv.StartOrdered(ONE, ALWAYS, GRACES), 1.0)
+    assert core.instances[ONE].phase == sv.REFUSED
