@@ -33,6 +33,7 @@ def environment(folder: Path, part: str) -> dict[str, str]:
         "FAKETIME_TIMESTAMP_FILE": str(_file(folder, part)),
         "FAKETIME_CACHE_DURATION": "1",
         "FAKETIME_DONT_FAKE_MONOTONIC": "1",
+        "FAKETIME_FORCE_MONOTONIC_FIX": "0",  # else who waits by the monotonic clock spins
         "NO_FAKE_STAT": "1",
     }
 

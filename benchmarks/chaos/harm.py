@@ -218,7 +218,7 @@ class Harmer:
     def _fill(self, fault: Fault, host: str) -> Harm:
         begun = time.monotonic()
         _fill(self._lab.outside(host, _FILLER))
-        return Harm(fault.kind, begun, begun, frozenset({host}))
+        return Harm(fault.kind, begun, begun, frozenset({host}), fills=True)
 
     def _free(self, host: str) -> bool:
         self._lab.outside(host, _FILLER).unlink(missing_ok=True)

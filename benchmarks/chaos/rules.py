@@ -21,8 +21,10 @@ _MEETING: Final = 3.0
 _STARTING: Final = 8.0
 #: Seconds by which lines of two processes may cross without both having been active at once.
 _CROSSING: Final = 0.05
-#: Cycles that may be repeated or left out by who follows one that was killed in the midst of one.
-_LAST_CYCLE: Final = 1
+#: Cycles that are repeated by who follows one that was killed: the one under way, and one before.
+_LAST_CYCLES: Final = 2
+#: The same where the machine is busy: what is kept is a second behind at most, ten cycles.
+_LAST_SECOND: Final = 12
 
 
 @dataclass(frozen=True)
@@ -35,7 +37,8 @@ class Promise:
         standby: it has a second instance, silent.
         elsewhere: it goes to another host when its own is lost.
         isolated: its host stops it when it is cut off.
-        kept: its state is kept on another host.
+        kept: its state is kept on its own host, on the disk.
+        copied: cycles by which a copy of its state on another host may be behind; 0: there is none.
     """
 
     members: int = 1
@@ -44,6 +47,7 @@ class Promise:
     elsewhere: bool = False
     isolated: bool = False
     kept: bool = False
+    copied: int = 0
 
 
 @dataclass(frozen=True)
@@ -59,6 +63,7 @@ class Harm:
         hides: the hosts and the master do not hear each other.
         restarts: a part had to be started again.
         forgets: how a job ended there meanwhile is not known.
+        fills: nothing more could be kept on the disk there.
     """
 
     kind: str
@@ -70,6 +75,7 @@ class Harm:
     hides: bool = False
     restarts: bool = False
     forgets: bool = False
+    fills: bool = False
 
     def concerns(self, host: str) -> bool:
         """Whether it was done to a host."""
@@ -157,23 +163,33 @@ def _judge_state(
     name: str, promise: Promise, one: Run, following: Run, harms: Sequence[Harm]
 ) -> tuple[str, list[Violation]]:
     """A title for what is allowed, and a violation: at most one of them."""
-    if following.first_number == one.last_number + 1:
+    behind = one.last_number + 1 - following.first_number
+    if behind == 0:
         return "", []
-    struck = _struck(name, promise, one, harms)
-    from_nothing = following.first_number == 1
-    keeps = promise.standby or promise.kept
-    if struck and from_nothing and not keeps:
-        return "state_from_nothing", []
-    if struck and keeps and following.first_number >= one.last_number + 1 - _LAST_CYCLE:
-        return "state_cycle_lost", []
+    if behind > 0 and _struck(name, promise, one, harms):
+        stays = following.host == one.host
+        keeps = promise.kept if stays else bool(promise.copied)
+        most = _LAST_CYCLES if stays or promise.standby else max(_LAST_CYCLES, promise.copied)
+        if behind <= most:
+            return "state_cycles_repeated", []
+        if stays and keeps and behind <= _LAST_SECOND:
+            return "state_second_repeated", []
+        if following.first_number == 1 and not keeps and not promise.standby:
+            return "state_from_nothing", []
+        if stays and any(harm.fills and harm.concerns(one.host) for harm in harms):
+            return "state_older_disk_full", []
     text = f"{name}: {following.first_number} after {one.last_number}: {one}, then {following}"
     return "", [Violation("state", name, text)]
+
+
+#: What is asked for, and ends or silences nobody by force.
+_NO_BLOWS: Final = ("move", "overlap")
 
 
 def _struck(name: str, promise: Promise, run: Run, harms: Sequence[Harm]) -> bool:
     """Whether it ended by force, and not by a move."""
     return any(
-        (harm.process == name and harm.kind not in ("move", "overlap"))
+        (harm.process == name and harm.kind not in _NO_BLOWS)
         or (harm.kills and harm.concerns(run.host))
         or ((promise.elsewhere or promise.isolated) and harm.hides and harm.concerns(run.host))
         for harm in harms

@@ -287,7 +287,10 @@ class Trial:
 def promise_of(service: work.Service) -> Promise:
     """What the oracle holds a service to."""
     sort = service.sort
-    return Promise(sort.members, sort.stateful, sort.standby, service.elsewhere, service.isolated)
+    return Promise(
+        sort.members, sort.stateful, sort.standby, service.elsewhere, service.isolated,
+        kept=sort.stateful,
+    )  # fmt: skip
 
 
 def _plain(harm: Harm) -> dict[str, Any]:

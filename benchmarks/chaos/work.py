@@ -21,9 +21,11 @@ COUNTERS: Final = 5
 #: Counters with a standby on another host.
 STANDBYS: Final = 0
 #: Of each sort, the first so many go elsewhere when their host is lost; the others wait for it.
-ELSEWHERE: Final = 0
+ELSEWHERE: Final = 2
 #: Of each sort, the last so many are stopped by their host when it is cut off. They go elsewhere.
 ISOLATED: Final = 0
+#: Of the speakers and of the counters, the first so many are watched: they must publish.
+WATCHED: Final = 1
 
 #: The host that takes the jobs of the line, one at a time: of its 2 GiB 80 % may be in use.
 LINE_HOST: Final = "host5"
@@ -61,6 +63,7 @@ class Service:
     sort: Sort
     elsewhere: bool = False
     isolated: bool = False
+    watched: bool = False
 
     def entry(self, lines: Path) -> dict[str, Any]:
         """Of a work file."""
@@ -81,6 +84,8 @@ class Service:
             entry["host_loss"] = {"then": "elsewhere"}
         if self.isolated:
             entry["isolation"] = {"then": "stop"}
+        if self.watched:
+            entry["health"] = {"topic": "~/count", "rate": 3.0, "timeout": 3.0}
         if self.sort.standby:
             entry["standby"] = {"wanted": True}
         return entry
@@ -102,7 +107,9 @@ def services() -> Iterator[Service]:
     for word, (sort, count) in _SORTS.items():
         for number in range(1, count + 1):
             isolated = number > count - ISOLATED
-            yield Service(f"{word}{number}", sort, number <= ELSEWHERE or isolated, isolated)
+            watched = sort.ros and number <= WATCHED
+            elsewhere = number <= ELSEWHERE or isolated
+            yield Service(f"{word}{number}", sort, elsewhere, isolated, watched)
 
 
 def job(name: str, lines: Path, seconds: float, *, host: str = "") -> dict[str, Any]:

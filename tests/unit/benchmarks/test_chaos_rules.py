@@ -77,17 +77,33 @@ def test_two_active_owners_only_while_they_were_parted():
     )
 
 
-def test_the_state_of_a_node_that_was_killed_may_be_lost_and_no_other():
-    """A move loses and repeats nothing; a standby, or a kept state, at most the last cycle."""
+def test_a_move_loses_and_repeats_nothing():
     stateful, move = Promise(stateful=True), Harm("move", 15.0, 15.0, process="a")
-    anew, again = run("a#2", first=21.0, last=30.0), run("a#2", first=21.0, numbers=(100, 120))
     assert kinds(stateful, [FIRST, SECOND], [move]) == ([], {})
-    assert kinds(stateful, [FIRST, anew], [move])[0] == ["state"]
-    assert kinds(stateful, [FIRST, anew], [KILLED]) == ([], {"state_from_nothing": 1})
-    assert kinds(stateful, [FIRST, again], [move])[0] == ["state"]
-    kept = Promise(stateful=True, kept=True)
-    assert kinds(kept, [FIRST, again], [KILLED]) == ([], {"state_cycle_lost": 1})
-    assert kinds(kept, [FIRST, anew], [KILLED])[0] == ["state"]
+    for first in (1, 100, 102):
+        follower = run("a#2", "host2", 21.0, 30.0, (first, first + 9))
+        assert kinds(stateful, [FIRST, follower], [move])[0] == ["state"]
+
+
+def test_the_state_of_a_node_that_was_killed_goes_on_where_it_is_kept():
+    """A second of it may be repeated; on another host it may begin anew, unless it is copied."""
+    kept, copied = Promise(stateful=True, kept=True), Promise(stateful=True, kept=True, copied=5)
+
+    def after(promise, first, host, *harms):
+        return kinds(promise, [FIRST, run("a#2", host, 21.0, 30.0, (first, 200))], [*harms, KILLED])
+
+    full = Harm("disk_full", 5.0, 30.0, frozenset({"host1"}), fills=True)
+    assert after(kept, 99, "host1") == ([], {"state_cycles_repeated": 1})
+    assert after(kept, 90, "host1") == ([], {"state_second_repeated": 1})
+    assert after(kept, 88, "host1")[0] == ["state"]
+    assert after(kept, 102, "host1")[0] == ["state"]
+    assert after(kept, 1, "host1")[0] == ["state"]
+    assert after(kept, 50, "host1", full) == ([], {"state_older_disk_full": 1})
+    assert after(kept, 1, "host2") == ([], {"state_from_nothing": 1})
+    assert after(kept, 50, "host2")[0] == ["state"]
+    assert after(copied, 96, "host2") == ([], {"state_cycles_repeated": 1})
+    assert after(copied, 1, "host2")[0] == ["state"]
+    assert after(Promise(stateful=True, standby=True), 1, "host2")[0] == ["state"]
 
 
 def test_one_run_never_goes_back():
