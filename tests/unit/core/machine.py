@@ -156,24 +156,28 @@ class Machine:
                         command.statuses,
                     )
                 )  # fmt: skip
-            elif isinstance(command, slave.Launch):
-                for assignment in command.assignments:
-                    self._launch(assignment, now)
-            elif isinstance(command, slave.Stop):
-                self._stop(command.instance, now)
-            elif isinstance(command, slave.Fence):
-                if command.instance in self.programs:
-                    self._end(command.instance, InstanceState.FAILED, now, signal=9)
-            elif isinstance(command, slave.Restart):
-                self._restart(command.instance, now)
-            elif isinstance(command, slave.Amend):
-                self.programs[command.instance].restart = command.restart
-                self.tell(slave.RestartPolicyRecorded(command.instance, command.restart), now)
-            elif isinstance(command, slave.Settle):
-                self.settled.append(command)
-            elif isinstance(command, slave.Forget):
-                for instance in command.instances:
-                    self.ends.pop(instance, None)
+            else:
+                self._carry_out(command, now)
+
+    def _carry_out(self, command: slave.Command, now: float) -> None:
+        if isinstance(command, slave.Launch):
+            for assignment in command.assignments:
+                self._launch(assignment, now)
+        elif isinstance(command, slave.Stop):
+            self._stop(command.instance, now)
+        elif isinstance(command, slave.Fence):
+            if command.instance in self.programs:
+                self._end(command.instance, InstanceState.FAILED, now, signal=9)
+        elif isinstance(command, slave.Restart):
+            self._restart(command.instance, now)
+        elif isinstance(command, slave.Amend):
+            self.programs[command.instance].restart = command.restart
+            self.tell(slave.RestartPolicyRecorded(command.instance, command.restart), now)
+        elif isinstance(command, slave.Settle):
+            self.settled.append(command)
+        elif isinstance(command, slave.Forget):
+            for instance in command.instances:
+                self.ends.pop(instance, None)
 
     def tell(self, event: slave.Event, now: float) -> None:
         """Something happens to the slave."""

@@ -1,0 +1,163 @@
+"""Hosts that are lost with all that runs there, or only not heard; processes with a standby."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from rosrm.config.settings import ControlSettings, LivenessSettings
+from rosrm.core.model import (
+    HostLossPolicy,
+    MigrationPolicy,
+    ProcessSpec,
+    RestartPolicy,
+    StandbyPolicy,
+)
+from tests.faults.watching import Watcher, instances
+from tests.ros.clusters import PATIENCE, QUICK, Cluster, alive, host, service, wait_gone, wait_until
+
+ROOT = Path(__file__).resolve().parents[2]
+SOON = {
+    "liveness": LivenessSettings(suspect=0.6, lease=2.0),
+    "control": ControlSettings(beat_period=0.1),
+}
+ELSEWHERE = HostLossPolicy("elsewhere")
+
+
+def switch_off(cluster: Cluster, name: str) -> None:
+    """As a loss of power: slave, supervisor and processes of a host end at the same moment."""
+    slave = cluster.slaves.pop(name).process
+    state = str(cluster.directory / "hosts" / name)
+    others = [pid for pid in _pids() if _belongs(pid, state)]
+    for pid in (slave.pid, *others):
+        os.kill(pid, signal.SIGSTOP)
+    for pid in (slave.pid, *others):
+        os.kill(pid, signal.SIGKILL)
+    slave.wait(PATIENCE)
+    for pid in others:
+        wait_gone(pid)
+
+
+def _pids() -> list[int]:
+    return [int(entry.name) for entry in Path("/proc").iterdir() if entry.name.isdigit()]
+
+
+def _belongs(pid: int, state: str) -> bool:
+    """A supervisor of this host, or what it has started."""
+    with contextlib.suppress(OSError):
+        entry = Path(f"/proc/{pid}")
+        words = (entry / "cmdline").read_bytes() + b"\0" + (entry / "environ").read_bytes()
+        return pid != os.getpid() and f"{state}/supervisor".encode() in words
+    return False
+
+
+def counter(name: str, **options) -> ProcessSpec:
+    """Stateful: counts by its timer, and says so."""
+    return ProcessSpec(
+        name, module="benchmarks.handoff_nodes", arguments=("count", "--rate", "50"),
+        environment={"PYTHONPATH": str(ROOT)}, ros=True, stop=QUICK,
+        migration=MigrationPolicy("handoff"), **options,
+    )  # fmt: skip
+
+
+@contextlib.contextmanager
+def held(cluster: Cluster, name: str) -> Iterator[None]:
+    """The slave of a host does and hears nothing; its processes run on."""
+    slave = cluster.slaves[name].process
+    slave.send_signal(signal.SIGSTOP)
+    try:
+        yield
+    finally:
+        slave.send_signal(signal.SIGCONT)
+
+
+def test_a_process_goes_elsewhere_and_its_old_instance_is_fenced(make_cluster) -> None:
+    """The host was only not heard: when it is, its instance has a successor, and is killed."""
+    cluster = make_cluster(host("h0"), host("h1"), **SOON)
+    deaf = (
+        "import signal, time\nfor n in (2, 15): signal.signal(n, signal.SIG_IGN)\ntime.sleep(999)"
+    )
+    cluster.submit(service("p", sys.executable, "-c", deaf, host_loss=ELSEWHERE))
+    before = cluster.wait("p", "running")
+    with held(cluster, before.host):
+        cluster.wait_for_event("host_lost", host=before.host)
+        cluster.wait_for_event("given_up", process="p")
+        after = cluster.wait("p", "running")
+        assert after.host != before.host
+    wait_gone(before.pid)
+    assert alive(after.pid)
+    cluster.wait_for_event("fenced", process="p")
+    assert set(instances(cluster, "p")) == {after.number}
+
+
+def test_a_process_that_nothing_has_followed_is_kept_by_its_host(make_cluster) -> None:
+    """No host had room meanwhile: nobody has touched it."""
+    cluster = make_cluster(host("h0"), host("h1"), **SOON)
+    cluster.submit(service("p", host_loss=ELSEWHERE))
+    before = cluster.wait("p", "running")
+    other = "h1" if before.host == "h0" else "h0"
+    cluster.client.set_host_state(other, "cordon")
+    with held(cluster, before.host):
+        cluster.wait("p", "queued")
+    after = cluster.wait("p", "running")
+    assert (after.pid, after.number, after.host) == (before.pid, before.number, before.host)
+    assert not cluster.events("fenced")
+
+
+def test_a_lost_host_comes_back_with_nothing(make_cluster) -> None:
+    """Its power was gone: what waits for it starts anew there, what does not runs elsewhere."""
+    cluster = make_cluster(host("h0"), **SOON)
+    again = RestartPolicy("on-failure", delay=0.1)
+    cluster.submit(service("waits", restart=again), service("goes", host_loss=ELSEWHERE))
+    first = cluster.wait("waits", "running"), cluster.wait("goes", "running")
+    cluster.add(host("h1"))
+    switch_off(cluster, "h0")
+    assert cluster.wait("waits", "unreachable").host == "h0"
+    wait_until(
+        lambda: cluster.client.list() and cluster.wait("goes", "running").host == "h1",
+        "it runs on h1",
+    )
+    cluster.start_slave(cluster.hosts[0])
+    wait_until(lambda: cluster.wait("waits", "running").pid != first[0].pid, "it runs again")
+    assert cluster.wait("goes", "running").host == "h1"
+
+
+@pytest.mark.parametrize("how", ["process", "host"])
+def test_a_standby_goes_on_from_the_last_state(make_cluster, how: str) -> None:
+    """The primary is killed, or its host: the count goes on where it was; a new standby follows."""
+    hosts = ("h0", "h1", "h2")
+    cluster = make_cluster(*map(host, hosts), **SOON)
+    watcher = Watcher(cluster.domain)
+    try:
+        cluster.submit(counter("moving", standby=StandbyPolicy(wanted=True)))
+        primary = cluster.wait("moving", "running")
+        cluster.wait_for_event("standby_ready", process="moving")
+        wait_until(lambda: len(watcher.outputs) > 50, "the primary is heard")
+        time.sleep(2.5)  # a master that has not heard anybody for a lease gives nothing up
+        if how == "process":
+            os.kill(primary.pid, signal.SIGKILL)
+        else:
+            switch_off(cluster, primary.host)
+        cluster.wait_for_event("failed_over", process="moving")
+        row = cluster.wait("moving", "running")
+        assert (row.number != primary.number, row.host != primary.host) == (True, True)
+        wait_until(
+            lambda: watcher.outputs[-1].instance == row.number and watcher.outputs[-1].sequence,
+            "the standby is heard",
+        )
+        said = [one.sequence for one in watcher.outputs if one.instance == primary.number]
+        goes_on = [one.sequence for one in watcher.outputs if one.instance == row.number]
+        # A state goes out after its output: of one that was killed in between nobody has it.
+        assert goes_on[0] - said[-1] in (0, 1), (said[-3:], goes_on[:3])
+        ready = [event.message for event in cluster.events("standby_ready", process="moving")]
+        cluster.wait_for_event("standby_begun", after=cluster.events("failed_over")[0].sequence)
+        assert ready[0].startswith("the standby of moving is ready on")
+    finally:
+        watcher.close()
