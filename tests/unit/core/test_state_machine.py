@@ -25,6 +25,7 @@ from rosrm.core.model import (
     ProcessSpec,
     Readiness,
     RestartPolicy,
+    StandbyPolicy,
 )
 from rosrm.core.state import ProcessPhase, Wanted
 from tests.unit.core.cluster import MIB, Cluster, HandOver, Machine, StartFirstOrStopFirst
@@ -38,7 +39,9 @@ LABELLED = "c"
 # Few of them are met often: so that much befalls the same one.
 names = st.sampled_from([*NAMES[:1] * 4, *NAMES[:2] * 2, *NAMES])
 hosts = st.sampled_from(HOSTS)
-ways = st.sampled_from(["overlap", "stop first", "handoff", "handoff, restarted"])
+ways = st.sampled_from(
+    ["overlap", "stop first", "handoff", "handoff, restarted", "handoff, standby"]
+)
 losses = st.sampled_from(["wait", "wait", "elsewhere", "elsewhere", "stop"])
 chance = st.booleans()
 #: Which of the things that are there at the moment; `Play.pick` takes it modulo their number.
@@ -53,12 +56,14 @@ def spec(
     strategy = "handoff" if moves.startswith("handoff") else "relaunch"
     migration = MigrationPolicy(strategy, overlap=moves == "overlap") if moves else None
     restart = RestartPolicy("on-failure" if moves == "handoff, restarted" else "never")
+    standby = StandbyPolicy(wanted=moves == "handoff, standby" and kind != "job")
     return ProcessSpec(
         name, command=("run",), ros=kind == "node", priority=priority,
         kind=Kind.JOB if kind == "job" else Kind.SERVICE,
         needs={"memory": memory * MIB} if memory else {},
         required_labels={"arm": "yes"} if special else {},
         migration=migration or MigrationPolicy(), restart=restart, readiness=Readiness(timeout=4.0),
+        standby=standby,
         host_loss=HostLossPolicy(loss, 1.0 if loss == "elsewhere" and memory else 0.0),
     )  # fmt: skip
 
@@ -643,6 +648,7 @@ class Play(RuleBasedStateMachine):
                           for one in running)  # fmt: skip
             shadows = {one.migration.strategy for one in (o.spec for o in running)} == {"handoff"}
             most = 2 if overlap or shadows else 1
+            most += any(one.spec.standby.wanted for one in running)
             assert len(running) <= most, [str(one.instance) for one in running]
         for name in {node.instance.process for _, node in self.nodes()}:
             active = [
@@ -691,6 +697,8 @@ class Play(RuleBasedStateMachine):
         for process in cluster.state.processes.values():
             assert process.phase.value in calm, (process.name, process.phase, process.reason)
             where = cluster.where(process.name)
+            if process.name in cluster.state.standbys:
+                where.remove(cluster.state.standbys[process.name].destination_host.name)
             assert len(where) == (process.phase is ProcessPhase.RUNNING), (process.name, where)
             assert cluster.active(process.name) == where
         self._cancel_all()
@@ -715,6 +723,7 @@ class Play(RuleBasedStateMachine):
         assert not any(machine.programs for machine in cluster.machines.values())
         assert not cluster.state.instances
         assert not cluster.state.runs
+        assert not cluster.state.standbys
         assert not len(cluster.state.queue)
         assert np.allclose(cluster.state.hosts.load, 0.0, atol=1e-6)
         assert not cluster.intents["migration"]
