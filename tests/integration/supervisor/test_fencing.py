@@ -1,0 +1,222 @@
+"""Fences with real processes: who ends in time, whoever is stopped or killed, and who goes on."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import pytest
+
+import rosrm
+from rosrm.core.model import Fence, InstanceId, InstanceState, RestartPolicy, StopPolicy
+
+from .conftest import TIMEOUT, wait_gone, wait_until
+
+SLEEPS = ("sleep", "1000")
+DEAF = ("sh", "-c", "trap '' INT TERM; echo deaf; (trap '' INT TERM; sleep 1000) & wait; wait")
+ONE = InstanceId("one", 1)
+ALWAYS = RestartPolicy("always", delay=0.05)
+
+#: A slave that says `heard` all the time: it has a singleton with a fence, and a driver without.
+SLAVE = """
+    import os, sys, time
+    from pathlib import Path
+    from rosrm.core.model import Fence, InstanceId
+    from rosrm.supervisor.client import LaunchOrder, SupervisorClient
+    client = SupervisorClient.connect(Path(sys.argv[1]))
+    fences = {"one": Fence(3.0, 0.5), "driver": None}
+    client.start([
+        LaunchOrder(InstanceId(name, 1), ("sleep", "1000"), dict(os.environ), fence=fence)
+        for name, fence in fences.items()
+    ])
+    pids = {}
+    while True:
+        client.heard(time.monotonic())
+        for status in client.receive(0.1):
+            if status.pid and status.instance.process not in pids:
+                pids[status.instance.process] = status.pid
+                if len(pids) == 2:
+                    print(client.pid, pids["one"], pids["driver"], flush=True)
+"""
+
+
+@pytest.fixture
+def slave(host):
+    root = str(Path(rosrm.__file__).parent.parent)
+    slave = subprocess.Popen(
+        [sys.executable, "-c", textwrap.dedent(SLAVE), str(host.state)],
+        stdout=subprocess.PIPE, env={**os.environ, "PYTHONPATH": root},
+    )  # fmt: skip
+    yield slave
+    slave.kill()
+    slave.wait()
+    slave.stdout.close()
+
+
+def alive(pid: int) -> bool:
+    return Path(f"/proc/{pid}").exists()
+
+
+def of_one(client):
+    return next(status for status in client.instances if status.instance == ONE)
+
+
+def test_a_stopped_slave_cannot_fence_so_its_supervisor_does(host, slave):
+    """SIGSTOP of the slave: what has a fence ends in its time, what has none goes on."""
+    supervisor, one, driver = map(int, slave.stdout.readline().split())
+    host.pids.add(supervisor)
+    os.kill(slave.pid, signal.SIGSTOP)
+    stopped = time.monotonic()
+    wait_gone(one)
+    took = time.monotonic() - stopped
+    assert 1.5 < took < TIMEOUT / 2, took  # heard 0.1 s before, on a quiet machine
+    assert alive(driver)
+    slave.kill()
+    slave.wait()
+    client = host.connect(start=False)
+    assert of_one(client).state is InstanceState.FAILED
+    assert of_one(client).message.startswith("fenced: for 3 s it was not known")
+
+
+def test_it_goes_on_while_somebody_says_heard(host, client):
+    """Several times as long as its fence; then, without another word, it ends."""
+    client.start([host.order("one", *SLEEPS, fence=Fence(2.0, 0.0), restart=ALWAYS)])
+    pid = host.running(client, "one").pid
+    until = time.monotonic() + 5.0
+    while time.monotonic() < until:
+        heard = time.monotonic()
+        client.heard(heard)
+        assert client.receive(0.1) == []
+    status = host.ended(client, "one")
+    assert time.monotonic() - heard >= 2.0
+    assert (status.state, status.restarts) == (InstanceState.FAILED, 0)
+    wait_gone(pid)
+
+
+def test_all_of_it_ends_within_its_grace(host, client):
+    """Deaf to SIGINT and SIGTERM, with long graces of its own, and with a child: SIGKILL."""
+    graces = StopPolicy(interrupt_grace=500.0, terminate_grace=500.0)
+    client.start([host.order("one", *DEAF, fence=Fence(2.0, 0.5), stop=graces)])
+    host.running(client, "one")
+    wait_until(lambda: len(host.alive()) == 2, "the shell has started its sleep")
+    assert "SIGKILL" in host.ended(client, "one").message
+    assert host.alive() == []
+
+
+def test_the_order_to_fence_leaves_nothing(host, client):
+    """Nothing is asked to end by itself; and nothing starts again."""
+    client.start([host.order("one", *DEAF, restart=ALWAYS)])
+    host.running(client, "one")
+    wait_until(lambda: len(host.alive()) == 2, "the shell has started its sleep")
+    client.fence(ONE)
+    status = host.ended(client, "one")
+    assert status.message == "fenced: it has a successor; stopped by SIGKILL"
+    assert host.alive() == []
+
+
+def test_one_that_was_fenced_before_its_start_came_is_refused(host, client):
+    """Orders may overtake one another."""
+    client.fence(ONE)
+    client.start([host.order("one", *SLEEPS)])
+    assert host.ended(client, "one").state is InstanceState.REFUSED
+    assert host.alive() == []
+
+
+def test_a_killed_supervisor_puts_no_fence_off(host, client):
+    """It is killed again and again; each next one goes on counting where the first began."""
+    client.start([host.order("one", *SLEEPS, fence=Fence(2.0, 0.0))])
+    pid = host.running(client, "one").pid
+    deadline = time.monotonic() + TIMEOUT
+    while alive(pid):
+        assert time.monotonic() < deadline, f"not fenced within {TIMEOUT} s"
+        host.kill_supervisor(client)
+        client = host.connect()
+        client.receive(0.3)
+    if not of_one(client).state.ended:
+        host.ended(client, "one")
+
+
+def test_a_supervisor_that_takes_over_knows_what_was_heard(host, client):
+    """By its start alone the instance would have been fenced long ago."""
+    heard = time.monotonic()
+    client.start([host.order("one", *SLEEPS, fence=Fence(15.0, 0.0), heard=heard - 14.0)])
+    pid = host.running(client, "one").pid
+    client.heard(time.monotonic())
+    client.remember(ONE, "after the word that counts")
+    client.start([host.order("other", "true")])
+    host.ended(client, "other")  # by then all of it was read
+    wait_until(lambda: time.monotonic() > heard + 1.5, "its start lies back so far")
+    host.kill_supervisor(client)
+    client = host.connect()
+    assert client.fenced == {ONE}
+    assert (of_one(client).state, of_one(client).pid) == (InstanceState.RUNNING, pid)
+    assert client.receive(0.5) == []
+    assert alive(pid)
+
+
+def test_without_a_supervisor_nobody_fences_until_the_next(host, client):
+    """What no supervisor watches goes on: the next one, started by the slave, ends it at once."""
+    client.start([host.order("one", *SLEEPS, fence=Fence(0.5, 0.0))])
+    pid = host.running(client, "one").pid
+    host.kill_supervisor(client)
+    begun = time.monotonic()
+    wait_until(lambda: time.monotonic() > begun + 1.0, "its fence has passed")
+    assert alive(pid)
+    client = host.connect()
+    if not of_one(client).state.ended:
+        host.ended(client, "one")
+    wait_gone(pid)
+
+
+def test_after_a_restart_of_the_machine_it_is_not_started(host, client):
+    """Nobody knows how long the host was away, and whether a successor runs elsewhere."""
+    client.start([host.order("driver", *SLEEPS, restart=ALWAYS)])
+    pids = [host.running(client, "driver").pid]
+    client.start([host.order("one", *SLEEPS, restart=ALWAYS, fence=Fence(1000.0, 0.0))])
+    pids.append(host.running(client, "one").pid)
+    host.kill_supervisor(client)
+    for pid in pids:
+        os.kill(pid, signal.SIGKILL)
+        wait_gone(pid)
+    rewrite(host, boot="another")
+    client = host.connect()
+    if not of_one(client).state.ended:
+        host.ended(client, "one")
+    client.close()
+    client = host.connect()
+    assert of_one(client).state is InstanceState.FAILED
+    assert of_one(client).message.startswith("fenced: ")
+    wait_until(host.alive, "the driver was started again")
+
+
+def rewrite(host, **header) -> None:
+    """The record as another machine, or another version, would have left it."""
+    path = host.state / "instances.jsonl"
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    for line in lines:
+        if line["record"] == "header":
+            line.update(header)
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+
+
+def test_a_record_without_fences_is_taken_over(host, client):
+    """Of an earlier version: what runs, runs on."""
+    client.start([host.order("one", *SLEEPS)])
+    pid = host.running(client, "one").pid
+    host.kill_supervisor(client)
+    path = host.state / "instances.jsonl"
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    for line in lines:
+        for name in ("fence", "fenced", "heard", "kill_by"):
+            line.pop(name, None)
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    client = host.connect()
+    assert client.notes == ()
+    assert client.fenced == frozenset()
+    assert (of_one(client).state, of_one(client).pid) == (InstanceState.RUNNING, pid)
