@@ -2,6 +2,7 @@
 
 All of it is polled from a node outside the executor, a few times a second: messages of a topic cost
 the slave no callback each, and of those that come faster than is asked for DDS keeps the newest.
+What it drops, and what best effort loses of large messages, the publisher's numbers tell.
 """
 
 from __future__ import annotations
@@ -82,6 +83,7 @@ class _TopicEar:
         self._subscription: Any = None
         self._source = ("", "")  # topic and type that are listened to
         self._kind: Any = None
+        self._last = 0
         self._looked_at_graph = -math.inf
         self._trouble = ""
 
@@ -130,17 +132,27 @@ class _TopicEar:
         return "", ()
 
     def _take(self) -> int:
-        heard = 0
-        handle = self._subscription.handle
+        """Messages since the last look, with those that were lost where numbers tell of them."""
+        alone = self._subscription.get_publisher_count() == 1
+        count, handle = 0, self._subscription.handle
         with handle:
-            while heard < self._qos.depth and handle.take_message(self._kind, True) is not None:
-                heard += 1
-        return heard
+            for _ in range(self._qos.depth):
+                taken = handle.take_message(self._kind, True)
+                if taken is None:
+                    break
+                count += self._since_last(int(taken[1]["publication_sequence_number"]), alone)
+        return count
+
+    def _since_last(self, number: int, alone: bool) -> int:
+        """By the publisher's own numbers; those of several would be mixed up."""
+        lost = number - self._last - 1 if alone and 0 < self._last < number else 0
+        self._last = number if alone else 0
+        return 1 + lost
 
     def close(self) -> None:
         if self._subscription is not None:
             self._node.destroy_subscription(self._subscription)
-            self._subscription, self._source = None, ("", "")
+            self._subscription, self._source, self._last = None, ("", ""), 0
 
 
 class _StateEar:
