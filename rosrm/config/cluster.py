@@ -61,7 +61,8 @@ def _check_rules(root: Node, config: ClusterConfig | None, problems: Problems) -
     if config is not None:
         _check_beats(root, config, problems)
     options = root.get("checkpoint", "options")
-    if options is not None and options.items and not _given(root, "checkpoint"):
+    named = root.get("checkpoint", "policy")
+    if options is not None and options.items and named is not None and named.value is None:
         problems.add(
             options.place, "checkpoint.options: options of no policy; name one in `policy`"
         )
@@ -83,7 +84,7 @@ def _check_beats(root: Node, config: ClusterConfig, problems: Problems) -> None:
 def _with_options(root: Node, config: ClusterConfig, plugins: PluginCheck) -> ClusterConfig:
     """The same with the options of plugins checked; a default choice is looked up as well."""
     scoring = _given(root, "scoring") or config.scoring.policy
-    checkpoint = _given(root, "checkpoint")
+    checkpoint = _checkpoint(root, config, plugins)
     named = root.get("migration", "strategies")
     if named is None:
         # Of the default ones those that are installed; with none of them the first is missed.
@@ -98,10 +99,21 @@ def _with_options(root: Node, config: ClusterConfig, plugins: PluginCheck) -> Cl
         config,
         scoring=replace(config.scoring, options=_options(root, "scoring", scoring, plugins)),
         checkpoint=replace(
-            config.checkpoint, options=_options(root, "checkpoint", checkpoint, plugins)
+            config.checkpoint,
+            policy=checkpoint,
+            options=_options(root, "checkpoint", checkpoint, plugins),
         ),
         migration=replace(config.migration, strategies=strategies),
     )
+
+
+def _checkpoint(root: Node, config: ClusterConfig, plugins: PluginCheck) -> str | None:
+    """As given; else the default one where it is installed, or where its options are given."""
+    policy, options = config.checkpoint.policy, root.get("checkpoint", "options")
+    if root.get("checkpoint", "policy") is not None or policy is None:
+        return policy
+    wanted = options is not None and bool(options.items)
+    return policy if wanted or plugins.has("checkpoint", policy) else None
 
 
 def _given(root: Node, section: str) -> str | None:

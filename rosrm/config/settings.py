@@ -73,9 +73,9 @@ class ScoringChoice:
 
 @dataclass(frozen=True, slots=True)
 class CheckpointChoice:
-    """The policy that keeps states of processes, with its own options; None: none are kept."""
+    """The policy that keeps states on other hosts, with its own options; None: there is none."""
 
-    policy: str | None = None
+    policy: str | None = "other-host"
     options: Options = field(default_factory=lambda: EMPTY)
 
 
@@ -200,7 +200,7 @@ class ClusterConfig:
         control: of requests.
         journal: of events and intent.
         record: of everything that the master is told, to be replayed.
-        checkpoint: the policy that keeps states of processes, if any.
+        checkpoint: the policy that keeps states of processes on other hosts, if any.
         delivery_timeout: seconds within which a slave must take up an assignment.
     """
 

@@ -16,12 +16,16 @@ _PLUGIN_TOLD_EVERY = 10.0
 def demand_of(state: MasterState, process: Process) -> Demand:
     """What decides where a process may go; made anew only when something of it has changed."""
     version = state.learned.version
-    if process.demand is None or process.demand[0] != version:
+    near = state.keeping.holdings.hosts_of(process.name, process.born)
+    known = process.demand
+    if known is None or known[0] != version or known[1].near != near:
         estimate = state.learned.estimate(process.spec, state.settings.default_needs)
-        demand = Demand(process.spec, estimate.amounts, estimate.estimated, dict(process.excluded))
+        demand = Demand(
+            process.spec, estimate.amounts, estimate.estimated, dict(process.excluded), near=near
+        )
         # Equal processes share one: thousands of them may wait.
-        process.demand = (version, state.demands.setdefault(demand.key, demand))
-    return process.demand[1]
+        known = process.demand = (version, state.demands.setdefault(demand.key, demand))
+    return known[1]
 
 
 def demand_to_move(

@@ -53,10 +53,12 @@ class Order:
     """Ask one slave for something; `OrderAnswered` follows, also when no answer comes.
 
     Attributes:
-        action: "stop", "fence", "restart", "start", "execute", "report" or "set_restart".
+        action: "stop", "fence", "restart", "start", "execute", "report", "set_restart", "keep" or
+            "drop_kept".
         assignment: for "start".
         restart: for "set_restart".
         executor, arguments, timeout: for "execute".
+        keep_on, keep_every: for "keep": hosts, seconds.
     """
 
     order: int
@@ -68,6 +70,8 @@ class Order:
     arguments: Mapping[str, Any] = field(default_factory=lambda: EMPTY)
     timeout: float = 0.0
     restart: RestartPolicy | None = None
+    keep_on: tuple[str, ...] = ()
+    keep_every: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

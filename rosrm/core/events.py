@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rosrm.core.migration import ReportPhase
-from rosrm.core.model import HostDescription, InstanceId, InstanceStatus, ProcessSpec
+from rosrm.core.model import HostDescription, InstanceId, InstanceStatus, KeptState, ProcessSpec
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,6 +81,15 @@ class UsagesReceived:
     numbers: npt.NDArray[np.uint64]
     cpu: npt.NDArray[np.float64]
     memory: npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class KeptStatesReceived:
+    """A host says all the states that it keeps, the newest of each process."""
+
+    host_id: int
+    incarnation: int
+    states: tuple[KeptState, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,6 +191,7 @@ Event = (
     | ReadingsReceived
     | StatusesReceived
     | UsagesReceived
+    | KeptStatesReceived
     | SubmissionReceived
     | CancelRequested
     | RestartRequested

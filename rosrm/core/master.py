@@ -9,6 +9,7 @@ ProcessRequested        notes that the host asks; places what waits
 ReadingsReceived        notes readings; places what waits
 StatusesReceived        moves processes through their phases; drives migrations
 UsagesReceived          lowers what is counted in flight by what now shows
+KeptStatesReceived      notes which states a host keeps
 SubmissionReceived      refuses or queues all of them; places
 CancelRequested         takes out of the queue, or stops
 RestartRequested        restarts where it runs, or queues anew what has ended
@@ -29,7 +30,7 @@ from types import MappingProxyType
 from typing import Any, Final
 
 from rosrm.core import events as happened
-from rosrm.core import handoffs, intake, lifecycle, moves, requests, upkeep
+from rosrm.core import handoffs, intake, keeping, lifecycle, moves, requests, upkeep
 from rosrm.core.assigning import place_waiting
 from rosrm.core.commands import Command
 from rosrm.core.state import MasterState
@@ -44,6 +45,7 @@ HANDLERS: Final[Mapping[type, _Handler]] = MappingProxyType(
         happened.ProcessRequested: intake.process_requested,
         happened.ReadingsReceived: intake.readings_received,
         happened.UsagesReceived: intake.usages_received,
+        happened.KeptStatesReceived: keeping.kept_states_received,
         happened.PeerRefused: intake.peer_refused,
         happened.StatusesReceived: lifecycle.statuses_received,
         happened.AssignmentWithdrawn: lifecycle.assignment_withdrawn,

@@ -324,6 +324,21 @@ class InstanceStatus:
 
 
 @dataclass(frozen=True, slots=True)
+class KeptState:
+    """A state that a host keeps of a process.
+
+    Attributes:
+        instance: whose state it is.
+        sequence: cycles that it covers.
+        size: bytes.
+    """
+
+    instance: InstanceId
+    sequence: int
+    size: int
+
+
+@dataclass(frozen=True, slots=True)
 class ResourceDescription:
     """One resource of a host.
 

@@ -21,7 +21,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from rosrm.core import events as happened
-from rosrm.core import handoffs, lifecycle
+from rosrm.core import handoffs, keeping, lifecycle
 from rosrm.core.hosts import HostCondition
 from rosrm.core.migration import AwaitReady, Commit, Configure, Start, Step, Stop
 from rosrm.core.model import InstanceId, InstanceState
@@ -41,6 +41,7 @@ def advance_all(state: MasterState, now: float) -> None:
 
 def order_answered(state: MasterState, event: happened.OrderAnswered, now: float) -> None:
     """A slave took an order, refused it, or did not answer in time."""
+    keeping.order_answered(state, event)
     name = state.runs_by_order.pop(event.order, None)
     run = state.runs.get(name) if name is not None else None
     if run is not None and run.order == event.order and event.code != "timeout":

@@ -48,6 +48,7 @@ class Demand:
         estimated: resources whose amount is a guess, not declared and not measured.
         excluded: host name to the reason why it must not go there.
         headroom: fraction by which a host must stay under each limit.
+        near: hosts that are preferred, as by one more preferred label: a state is kept there.
         key: equal for processes that every host judges alike.
     """
 
@@ -56,6 +57,7 @@ class Demand:
     estimated: frozenset[str] = frozenset()
     excluded: Mapping[str, str] = field(default_factory=lambda: EMPTY)
     headroom: float = 0.0
+    near: tuple[str, ...] = ()
     key: tuple[Any, ...] = field(init=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -64,6 +66,7 @@ class Demand:
             spec.program, spec.namespace, spec.kind, spec.priority,
             _key(self.amounts), self.estimated, _key(self.excluded), self.headroom,
             _key(spec.required_labels), _key(spec.preferred_labels), _key(spec.avoided_labels),
+            self.near,
         )  # fmt: skip
         object.__setattr__(self, "key", key)
 
@@ -96,7 +99,7 @@ class Ranking:
         self._left = list(policies)
         self._seen = len(table.touched)
         self._open = table.open() & eligible(table, demand)
-        self._tier = _tiers(table, demand.spec)
+        self._tier = _tiers(table, demand)
         self._lowest: list[int] | None = None
         self._own = -1
         self._ahead: dict[int, list[float]] = {}
@@ -309,14 +312,19 @@ def eligible(table: HostTable, demand: Demand) -> BoolArray:
     return allowed
 
 
-def _tiers(table: HostTable, spec: ProcessSpec) -> IntArray | None:
-    """(H,) lower goes first: avoided labels count up, preferred ones down; None: no such labels."""
-    if not spec.preferred_labels and not spec.avoided_labels:
+def _tiers(table: HostTable, demand: Demand) -> IntArray | None:
+    """(H,) lower goes first: avoided labels count up, preferred ones down; None: all are alike."""
+    spec = demand.spec
+    if not spec.preferred_labels and not spec.avoided_labels and not demand.near:
         return None
-    many = len(spec.preferred_labels) + 1
+    many = len(spec.preferred_labels) + 2
     tiers = np.zeros(len(table), np.int64)
     for key, value in spec.avoided_labels.items():
         tiers += many * table.labelled(key, value)
     for key, value in spec.preferred_labels.items():
         tiers -= table.labelled(key, value)
+    for name in demand.near:
+        host = table.by_name.get(name)
+        if host is not None:
+            tiers[host.column] -= 1
     return tiers

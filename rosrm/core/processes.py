@@ -131,6 +131,7 @@ class Process:
 
     Attributes:
         order: place in the line; kept when it returns to the queue.
+        born: lowest number that an instance of it can have; what lower ones kept is not its own.
         owner: number of the instance that owns the name; 0: none.
         instances: numbers of all its instances that may still run.
         excluded: host name to the reason why it cannot run there.
@@ -152,6 +153,7 @@ class Process:
     instances: set[int] = field(default_factory=set)
     reason: str = ""
     excluded: dict[str, str] = field(default_factory=dict)
+    born: int = 0
     migrations: int = 0
     moved_at: float = float("-inf")
     exit_code: int = 0

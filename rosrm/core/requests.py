@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterable
 
 from rosrm.core import events as happened
-from rosrm.core import lifecycle
+from rosrm.core import keeping, lifecycle
 from rosrm.core.assigning import reconsider_set_aside
 from rosrm.core.commands import Order, Reply
 from rosrm.core.intake import save_host
@@ -36,7 +36,9 @@ def submission_received(state: MasterState, event: happened.SubmissionReceived, 
         _refuse(state, event.request, fault)
         return
     for spec in event.specs:
-        process = Process(spec, state.next_order, ProcessPhase.QUEUED, now)
+        process = Process(
+            spec, state.next_order, ProcessPhase.QUEUED, now, born=state.next_instance
+        )
         state.next_order += 1
         state.add_process(process)
         state.enqueue(process, now)
@@ -194,6 +196,7 @@ def _restart_fault(state: MasterState, process: Process) -> str:
 def _restart(state: MasterState, process: Process, now: float) -> None:
     state.record(now, "restart_requested", f"{process.name} is restarted", process=process.name)
     if process.phase.over:
+        keeping.begin_anew(state, process)
         process.excluded.clear()
         process.demand = None
         process.order = state.next_order

@@ -52,7 +52,7 @@ def _restore_process(state: MasterState, item: Mapping[str, Any], now: float) ->
         spec_from_dict(item["spec"]), int(item["order"]), ProcessPhase(item["phase"]), now,
         wanted=Wanted(item["wanted"]), reason=item["reason"], excluded=dict(item["excluded"]),
         migrations=int(item["migrations"]), exit_code=int(item["exit_code"]),
-        restarts=int(item["restarts"]),
+        restarts=int(item["restarts"]), born=int(item.get("born", 0)),
         left_behind=LeftBehind(*left) if (left := item.get("left_behind")) else None,
     )  # fmt: skip
     state.add_process(process)

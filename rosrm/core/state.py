@@ -11,6 +11,7 @@ import numpy as np
 from rosrm.core.columns import FloatArray
 from rosrm.core.commands import Command
 from rosrm.core.fencing import fence_of
+from rosrm.core.holdings import Keeping
 from rosrm.core.hosts import Host, HostTable
 from rosrm.core.model import EMPTY, Assignment, InstanceId, ProcessSpec
 from rosrm.core.needs import LearnedNeeds
@@ -74,6 +75,7 @@ class MasterState:
         self.rankings: dict[Any, Ranking] = {}
         self.rankings_version = 0
         self.placed_at: tuple[int, ...] = ()
+        self.keeping = Keeping()
         self.next_order = 1
         self.next_instance = 1
         self.reserved_instances = 1
@@ -138,7 +140,7 @@ class MasterState:
                 "reason": process.reason, "excluded": dict(process.excluded),
                 "migrations": process.migrations, "exit_code": process.exit_code,
                 "restarts": process.restarts, "node_names": aliases,
-                "standby": self._standby_of(process),
+                "standby": self._standby_of(process), "born": process.born,
                 "left_behind": left and [left.number, left.host, left.node_name],
             },
         )  # fmt: skip
@@ -290,7 +292,13 @@ class MasterState:
     ) -> Assignment:  # fmt: skip
         """The order for a slave to run an instance."""
         fence = fence_of(spec, self.settings)
-        return Assignment(instance, spec, self.epoch, node_name or spec.name, shadow, fence)
+        kept_on: tuple[str, ...] = ()
+        born = self.processes[spec.name].born if spec.name in self.processes else 0
+        if spec.keeps_state and not shadow:
+            kept_on = self.keeping.in_reach(spec.name, born, self.hosts)
+        return Assignment(
+            instance, spec, self.epoch, node_name or spec.name, shadow, fence, kept_on, born
+        )
 
     def note_decision(self, process: Process, decision: Decision, kind: str, now: float) -> None:
         """Remember the newest decision about a process, for `explain`."""

@@ -28,10 +28,10 @@ def serve(handover: Handover) -> int:
     name = config.scoring.policy
     policy = GuardedPolicy(name, registry.scoring(name, config.scoring.options))
     strategies = registry.migrations(config.migration.strategies)
-    registry.checkpoint(config.checkpoint.policy, config.checkpoint.options)
+    checkpoint = registry.checkpoint(config.checkpoint.policy, config.checkpoint.options)
     rows = registry.rows("scoring", "migration", "checkpoint")
     fallback = fallback_of(registry, name)
-    return MasterRuntime(config, policy, strategies, rows, fallback).run()
+    return MasterRuntime(config, policy, strategies, rows, fallback, checkpoint).run()
 
 
 if __name__ == "__main__":

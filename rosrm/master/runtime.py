@@ -32,7 +32,14 @@ from rosrm.core.views import EventRow, PluginRow, Snapshot
 from rosrm.errors import Refused
 from rosrm.journal import SqliteJournal
 from rosrm.master.recorder import Recorder
-from rosrm.ports import Intent, MigrationStrategy, Record, ScoringPolicy, StoredRecord
+from rosrm.ports import (
+    CheckpointPolicy,
+    Intent,
+    MigrationStrategy,
+    Record,
+    ScoringPolicy,
+    StoredRecord,
+)
 from rosrm.recording.reading import TABLES, Header
 from rosrm.ros.client import find_master
 from rosrm.ros.master_endpoint import Identity, MasterEndpoint
@@ -68,6 +75,7 @@ class MasterRuntime:
         strategies: the migration strategies that it names.
         plugins: what `rosrm plugins` shows of the master.
         fallback: the scoring policy that decides where the first fails, with its name.
+        checkpoint: the policy that keeps states; None: they are kept on their own hosts alone.
 
     Raises:
         Refused: another master runs on this domain, or on this state directory.
@@ -82,9 +90,11 @@ class MasterRuntime:
         strategies: dict[str, MigrationStrategy],
         plugins: Sequence[PluginRow] = (),
         fallback: tuple[str, ScoringPolicy] | None = None,
+        checkpoint: CheckpointPolicy | None = None,
     ) -> None:
         self._config = config
         self._fallback = fallback
+        self._checkpoint = checkpoint
         self._plugins = list(plugins)
         self._started = time.monotonic()
         self._stopping = ""
@@ -138,6 +148,8 @@ class MasterRuntime:
             self._fallback,
         )  # fmt: skip
         state.wall = time.time()
+        state.keeping.policy = self._checkpoint
+        state.keeping.policy_name = self._config.checkpoint.policy or ""
         now = self._now()
         restore.restore(state, self._journal.intents, now)
         self._record_from(now)

@@ -32,6 +32,8 @@ _COLUMNS: Final = (
     ("accepting", "?"), ("stale", "<u4"),
 )  # fmt: skip
 
+#: Orders about kept states decide nothing of where anything runs.
+_KEEPING: Final = frozenset({"keep", "drop_kept"})
 _KINDS: Final[Mapping[str, type[Any]]] = MappingProxyType(
     {kind.__name__: kind for kind in get_args(happened.Event)}
 )
@@ -145,7 +147,7 @@ def _decision(command: Command) -> str:
         return f"assign {command.assignment.instance} to host {command.host_id} again"
     if isinstance(command, Withdraw):
         return f"withdraw {command.instance} from host {command.host_id}"
-    if isinstance(command, Order):
+    if isinstance(command, Order) and command.action not in _KEEPING:
         what = command.instance or (command.assignment.instance if command.assignment else "")
         return f"{command.action} {what} on host {command.host_id}".replace("  ", " ")
     if isinstance(command, PublishStateConfig):

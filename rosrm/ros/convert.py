@@ -229,6 +229,7 @@ def assignment_to_msg(assignment: model.Assignment) -> msg.Assignment:
         instance=instance_to_msg(assignment.instance), epoch=assignment.epoch,
         node_name=assignment.node_name, shadow=assignment.shadow,
         fence_after=float(fence.after), fence_grace=float(fence.grace),
+        kept_on=list(assignment.kept_on), kept_from=assignment.kept_from,
         spec=spec_to_msg(assignment.spec),
     )  # fmt: skip
 
@@ -241,7 +242,7 @@ def assignment_from_msg(message: msg.Assignment) -> model.Assignment:
     fence = model.Fence(message.fence_after, message.fence_grace) if message.fence_after else None
     return model.Assignment(
         instance_from_msg(message.instance), spec_from_msg(message.spec), message.epoch,
-        message.node_name, message.shadow, fence,
+        message.node_name, message.shadow, fence, tuple(message.kept_on), message.kept_from,
     )  # fmt: skip
 
 
@@ -314,6 +315,20 @@ def status_from_msg(message: msg.ProcessStatus) -> model.InstanceStatus:
         message.exit_signal, message.restarts, message.peak_memory, message.cpu_time,
         message.run_time, message.message,
     )  # fmt: skip
+
+
+def kept_to_msg(kept: model.KeptState) -> msg.KeptState:
+    """A state that a host keeps."""
+    return msg.KeptState(
+        process=kept.instance.process, number=kept.instance.number, sequence=kept.sequence,
+        size=kept.size,
+    )  # fmt: skip
+
+
+def kept_from_msg(message: msg.KeptState) -> model.KeptState:
+    """The inverse of `kept_to_msg`."""
+    instance = model.InstanceId(message.process, message.number)
+    return model.KeptState(instance, message.sequence, message.size)
 
 
 # --- rows -------------------------------------------------------------------------------------

@@ -73,6 +73,7 @@ class Hearing:
         for kind, topic, take in (
             (msg.ProcessStatusBatch, names.PROCESS_STATUS, self._take_statuses),
             (msg.ProcessUsage, names.PROCESS_USAGE, self._take_usage),
+            (msg.KeptStates, names.KEPT_STATES, self._take_kept),
         ):
             node.create_subscription(kind, path(topic), participant.counted(take), qos.STATUSES)
 
@@ -124,6 +125,15 @@ class Hearing:
                 np.asarray(message.cpu, np.float64), np.asarray(message.memory, np.float64),
             )
         )  # fmt: skip
+
+    def _take_kept(self, message: msg.KeptStates) -> None:
+        who = f"kept_states of host {message.host_id}"
+        fault = version_refusal(message.protocol_version, who)
+        if fault:
+            self._refuse(who, fault)
+            return
+        states = tuple(convert.kept_from_msg(one) for one in message.states)
+        self._tell(happened.KeptStatesReceived(message.host_id, message.incarnation, states))
 
 
 def _never_called(_message: object) -> None:

@@ -29,6 +29,8 @@ _ACTIONS: Final = {
     "execute": srv.ControlHost.Request.EXECUTE,
     "report": srv.ControlHost.Request.REPORT,
     "set_restart": srv.ControlHost.Request.SET_RESTART,
+    "keep": srv.ControlHost.Request.KEEP,
+    "drop_kept": srv.ControlHost.Request.DROP_KEPT,
 }
 
 
@@ -253,8 +255,9 @@ class HostLinks:
 def _order_request(command: Order) -> srv.ControlHost.Request:
     """An order as a message, its envelope still to be filled in."""
     request = srv.ControlHost.Request(
-        action=_ACTIONS[command.action], executor=command.executor, timeout=float(command.timeout)
-    )
+        action=_ACTIONS[command.action], executor=command.executor, timeout=float(command.timeout),
+        keep_on=list(command.keep_on), keep_every=float(command.keep_every),
+    )  # fmt: skip
     if command.instance is not None:
         request.instance = convert.instance_to_msg(command.instance)
     if command.assignment is not None:

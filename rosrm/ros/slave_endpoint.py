@@ -12,7 +12,7 @@ import numpy.typing as npt
 from rclpy.duration import Duration
 
 from rosrm.core import slave as core
-from rosrm.core.model import HostDescription, InstanceStatus
+from rosrm.core.model import HostDescription, InstanceStatus, KeptState
 from rosrm.errors import Refused
 from rosrm.ros import convert, names, qos
 from rosrm.ros.control import ControlClient, Gate, version_refusal
@@ -117,6 +117,7 @@ class SlaveEndpoint:
         self._usages = node.create_publisher(
             msg.ProcessUsage, path(names.PROCESS_USAGE), qos.STATUSES
         )
+        self._kept = node.create_publisher(msg.KeptStates, path(names.KEPT_STATES), qos.STATUSES)
         node.create_subscription(
             msg.MasterBeat, path(names.MASTER_BEAT),
             self._participant.counted(self._take_beat), qos.BEAT_IN,
@@ -333,6 +334,19 @@ class SlaveEndpoint:
                     memory=memory,
                 )
             )  # fmt: skip
+
+    def publish_kept(self, states: Sequence[KeptState]) -> bool:
+        """Say all the states that this host keeps; False: there is no master to hear it."""
+        if self.link is not Link.REGISTERED:
+            return False
+        self._kept.publish(
+            msg.KeptStates(
+                protocol_version=PROTOCOL_VERSION, host_id=self.host_id,
+                incarnation=self._description.incarnation,
+                states=[convert.kept_to_msg(one) for one in states],
+            )
+        )  # fmt: skip
+        return True
 
     def wait_until_heard(self) -> None:
         """Give the last words time to arrive: what is not acknowledged is lost when we leave."""

@@ -169,8 +169,8 @@ def test_a_suspicion_of_just_three_beat_periods_is_taken(tmp_path):
 
 
 def test_options_of_no_policy_are_refused(refusal):
-    assert "f.yaml:1:23: checkpoint.options: options of no policy" in refusal(
-        load_cluster, "checkpoint: {options: {a: 1}}"
+    assert "f.yaml:1:37: checkpoint.options: options of no policy" in refusal(
+        load_cluster, "checkpoint: {policy: null, options: {a: 1}}"
     )
 
 

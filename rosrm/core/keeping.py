@@ -1,0 +1,219 @@
+"""Keeping states: where they are kept by the checkpoint policy, and which are kept no more.
+
+A node keeps its newest state on its own host by itself. What this decides is told to the slaves
+again and again until the books say that it is so; nothing of it is durable. Each stateful process
+is looked at about once a second.
+
+==========================================  =====================================================
+what is seen                                what is ordered
+==========================================  =====================================================
+it runs, and the policy chooses hosts       `keep`: its slave ships the state to them from now on
+its slave was told something else before    `keep`: the new choice
+it is cancelled, or has finished            `drop_kept` wherever something is kept of it
+it was submitted anew                       `drop_kept` of what is kept of its former life
+a host that is not chosen keeps a state     `drop_kept`, once a newer one lies where it should
+==========================================  =====================================================
+
+What is kept of a name that this master does not know is left alone: its journal may be lost.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Final
+
+from rosrm.core import events as happened
+from rosrm.core.commands import Order
+from rosrm.core.holdings import Holding, Told
+from rosrm.core.hosts import Host, HostCondition
+from rosrm.core.model import InstanceId
+from rosrm.core.state import MasterState, Process, ProcessPhase
+from rosrm.ports import CheckpointChoice, CheckpointView
+
+#: Seconds between two looks at the same process.
+_LOOK_EVERY: Final = 1.0
+#: Seconds between two records of a policy that fails.
+_TOLD_EVERY: Final = 10.0
+#: What is kept of a process that ended so is of no use any more.
+_DONE: Final = frozenset({ProcessPhase.FINISHED, ProcessPhase.CANCELLED})
+
+
+# --- what is heard ----------------------------------------------------------------------------
+
+
+def kept_states_received(
+    state: MasterState, event: happened.KeptStatesReceived, now: float
+) -> None:
+    """Note all that a host keeps."""
+    host = state.hosts.find(event.host_id, event.incarnation)
+    if host is None:
+        return
+    # Of a journal that was lost: no instance may get a number that a kept state has already.
+    state.skip_numbers(max((one.instance.number for one in event.states), default=0))
+    state.keeping.holdings.replace(host.name, event.states, now)
+
+
+def order_answered(state: MasterState, event: happened.OrderAnswered) -> bool:
+    """Whether the answer was to an order of this module; it is noted then."""
+    name = state.keeping.orders.pop(event.order, None)
+    if name is None:
+        return False
+    told = state.keeping.told.get(name)
+    if told is not None and told.order == event.order:
+        told.taken = event.accepted
+    return True
+
+
+# --- what is asked for ----------------------------------------------------------------------
+
+
+def begin_anew(state: MasterState, process: Process) -> None:
+    """A process that is over is asked for again: a finished or cancelled one has no past."""
+    if process.phase in _DONE:
+        process.born = state.next_instance
+
+
+# --- the rounds -------------------------------------------------------------------------------
+
+
+def review(state: MasterState, now: float) -> None:
+    """Look at some of the processes of which a state is kept: at all of them once a second."""
+    keeping = state.keeping
+    names = keeping.holdings.processes()
+    share = min(1.0, (now - keeping.looked) / _LOOK_EVERY)
+    keeping.looked = now
+    if not keeping.waiting:
+        keeping.waiting = names[::-1]
+    for _ in range(math.ceil(share * len(names))):
+        if not keeping.waiting:
+            return
+        process = state.processes.get(keeping.waiting.pop())
+        if process is not None:
+            _review(state, process, now)
+
+
+def _review(state: MasterState, process: Process, now: float) -> None:
+    holdings = state.keeping.holdings.of(process.name)
+    owner = state.instances.get(process.owner)
+    if owner is not None and process.phase is ProcessPhase.RUNNING:
+        own = holdings.get(owner.host.name)
+        if own is not None and own.number == owner.id.number:
+            _choose(state, process, owner.host, holdings, now)
+    for name, holding in holdings.items():
+        if _is_stale(state, process, name, holding, holdings):
+            _drop(state, process, name, holding, now)
+
+
+def _choose(
+    state: MasterState, process: Process, host: Host, holdings: Mapping[str, Holding], now: float
+) -> None:
+    """Ask the policy, and tell the slave what is new to it."""
+    choice = _choice(state, process, host, holdings, now)
+    told = state.keeping.told.get(process.name)
+    if choice is None:
+        choice = told.choice if told is not None else CheckpointChoice(())
+    incarnation = host.description.incarnation
+    known = (
+        told is not None
+        and (told.number, told.incarnation, told.choice) == (process.owner, incarnation, choice)
+    )  # fmt: skip
+    if told is not None and known and (told.taken or now - told.at < state.settings.order_retry):
+        return
+    order = state.order_id()
+    state.keeping.orders[order] = process.name
+    state.keeping.told[process.name] = Told(process.owner, incarnation, choice, order, now)
+    state.emit(
+        Order(
+            order, host.host_id, "keep", InstanceId(process.name, process.owner),
+            keep_on=choice.hosts, keep_every=choice.every,
+        )
+    )  # fmt: skip
+    if not known and (told is None or told.choice.hosts != choice.hosts):
+        where = ", ".join(choice.hosts) or "no other host"
+        state.record(
+            now, "kept_on", f"the state of {process.name} is kept on {where}",
+            process=process.name, host=host.name,
+            facts={"hosts": list(choice.hosts), "every": choice.every},
+        )  # fmt: skip
+
+
+def _choice(
+    state: MasterState, process: Process, host: Host, holdings: Mapping[str, Holding], now: float
+) -> CheckpointChoice | None:
+    """What the policy says; None: as before. One that raises, or makes no sense, is named."""
+    keeping = state.keeping
+    if keeping.policy is None:
+        return CheckpointChoice(())
+    kept = keeping.holdings.hosts_of(process.name, process.born)
+    others = tuple(name for name in kept if name != host.name)
+    hosts = {
+        one.name: one.description.labels
+        for one in state.hosts.hosts
+        if _may_keep(state, one, others)
+    }
+    since = max((holdings[name].since for name in others), default=None)
+    view = CheckpointView(
+        process.spec, host.name, None if since is None else now - since,
+        holdings[host.name].size, others, hosts,
+    )  # fmt: skip
+    try:
+        choice = keeping.policy.choose(view)
+        return choice if choice is None else _sound(choice, view)
+    except Exception as error:  # noqa: BLE001 - a third party's code: anything may come
+        if now - keeping.failure_told >= _TOLD_EVERY:
+            keeping.failure_told = now
+            state.record(
+                now, "plugin_failed",
+                f"the checkpoint policy {keeping.policy_name!r} does not choose for "
+                f"{process.name}: {type(error).__name__}: {error}",
+                process=process.name,
+            )  # fmt: skip
+        return None
+
+
+def _may_keep(state: MasterState, host: Host, keepers: tuple[str, ...]) -> bool:
+    """A host that is silent for a moment is not given up as a keeper."""
+    condition = state.hosts.condition_of(host)
+    return condition is HostCondition.UP or (
+        condition is HostCondition.SUSPECT and host.name in keepers
+    )
+
+
+def _sound(choice: CheckpointChoice, view: CheckpointView) -> CheckpointChoice:
+    """A choice that keeps to the contract; raises for any other."""
+    strange = [name for name in choice.hosts if name not in view.hosts or name == view.host]
+    if strange or len(set(choice.hosts)) != len(choice.hosts):
+        raise ValueError(f"it chose {', '.join(choice.hosts)} for a process on {view.host}")
+    if not 0.0 < choice.every < math.inf:
+        raise ValueError(f"it chose every {choice.every} s; allowed: more than 0")
+    return choice
+
+
+def _is_stale(
+    state: MasterState, process: Process, host: str, holding: Holding,
+    holdings: Mapping[str, Holding],
+) -> bool:  # fmt: skip
+    """Nobody will go on from it, as far as can be known."""
+    if holding.number < process.born or process.phase in _DONE:
+        return True
+    owner, told = state.instances.get(process.owner), state.keeping.told.get(process.name)
+    if owner is None or process.phase is not ProcessPhase.RUNNING or host == owner.host.name:
+        return False
+    if told is None or told.number != process.owner or host in told.choice.hosts:
+        return False
+    # A copy that is no longer wanted is worth something until there is a newer one elsewhere.
+    better = told.choice.hosts or (owner.host.name,)
+    return any(name in holdings and holdings[name].age > holding.age for name in better)
+
+
+def _drop(state: MasterState, process: Process, name: str, holding: Holding, now: float) -> None:
+    host = state.hosts.by_name.get(name)
+    if host is None or state.hosts.condition_of(host) is not HostCondition.UP:
+        return  # it says again what it keeps when it comes back
+    at = state.keeping.dropped_at.get((process.name, name), -math.inf)
+    if now - at < state.settings.order_retry:
+        return
+    state.keeping.dropped_at[process.name, name] = now
+    instance = InstanceId(process.name, holding.number)
+    state.emit(Order(state.order_id(), host.host_id, "drop_kept", instance))
