@@ -10,12 +10,16 @@ from collections.abc import Sequence
 
 import rclpy
 import rclpy.node
+from rclpy.clock import Clock, ClockType
 from rclpy.executors import ExternalShutdownException
 from rclpy.utilities import remove_ros_args
 from std_msgs.msg import Int64
 
 from benchmarks.chaos.plain import RATE, Lines
 from rosrm.node import Node
+
+#: A timer of rclpy follows the wall clock otherwise, and waits where that is set back.
+STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 
 
 class Speaker(rclpy.node.Node):  # type: ignore[misc]  # rclpy brings no types
@@ -26,7 +30,7 @@ class Speaker(rclpy.node.Node):  # type: ignore[misc]  # rclpy brings no types
         self._lines = lines
         self.count = 0
         self.output = self.create_publisher(Int64, "~/count", 10)
-        self.create_timer(1.0 / RATE, self.tick)
+        self.create_timer(1.0 / RATE, self.tick, clock=STEADY)
 
     def tick(self) -> None:
         self.count += 1
@@ -42,7 +46,7 @@ class Counter(Node):
         self._lines = lines
         self.count = 0
         self.output = self.create_publisher(Int64, "~/count", 10)
-        self.create_timer(1.0 / RATE, self.tick)
+        self.create_timer(1.0 / RATE, self.tick, clock=STEADY)
         self.keep_state("~/state", Int64, self.save, self.restore)
 
     def tick(self) -> None:

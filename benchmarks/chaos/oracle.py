@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Final
 
 from benchmarks.chaos import rules
-from benchmarks.chaos.outputs import Outputs, Run
+from benchmarks.chaos.outputs import Outputs
 from benchmarks.chaos.reality import Member, members
 from benchmarks.chaos.rules import Harm, Promise, Violation
 
@@ -59,7 +59,6 @@ class Oracle:
         self._lab = lab
         self._outputs = Outputs(folder)
         self._wanted = wanted
-        self._current: dict[str, Run] = {}
         self._done: set[str] = set()
 
     # --- at this moment -----------------------------------------------------------------------
@@ -133,13 +132,12 @@ class Oracle:
         violations: list[Violation] = []
         allowed: Counter[str] = Counter()
         for name, promise in self._wanted.services.items():
-            chain = rules.chain(self._outputs.read(name), self._current.get(name))
+            chain = rules.chain(self._outputs.read(name))
             found, excused = rules.judge_service(name, promise, chain, harms)
             violations += found
             allowed += excused
             if chain:
-                self._current[name] = chain[-1]
-                self._outputs.forget(name, chain[-1].told_at)
+                self._outputs.forget(name, before=chain[-1].told_at)
         for name, accepted in self._wanted.jobs.items():
             found, excused = rules.judge_job(name, accepted, self._outputs.read(name), harms)
             violations += found

@@ -25,6 +25,8 @@ _CROSSING: Final = 0.05
 _LAST_CYCLES: Final = 2
 #: The same where the machine is busy: what is kept is a second behind at most, ten cycles.
 _LAST_SECOND: Final = 12
+#: Cycles a second.
+_RATE: Final = 10.0
 
 
 @dataclass(frozen=True)
@@ -91,17 +93,9 @@ class Violation:
     text: str
 
 
-def chain(runs: Iterable[Run], before: Run | None) -> list[Run]:
-    """The runs that were active, in order, from the one that was active at the last judgement on.
-
-    Args:
-        runs: of one process.
-        before: that one; it may have grown.
-    """
-    active = sorted((run for run in runs if run.first), key=lambda run: run.first)
-    if before is None:
-        return active
-    return [run for run in active if run.first >= before.first]
+def chain(runs: Iterable[Run]) -> list[Run]:
+    """The runs of one process that were active, in the order in which they ended to be."""
+    return sorted((run for run in runs if run.first), key=lambda run: run.last)
 
 
 def judge_service(
@@ -174,12 +168,22 @@ def _judge_state(
             return "state_cycles_repeated", []
         if stays and keeps and behind <= _LAST_SECOND:
             return "state_second_repeated", []
+        if behind <= most + _unseen(promise, one, harms):
+            return "state_unseen", []
         if following.first_number == 1 and not keeps and not promise.standby:
             return "state_from_nothing", []
         if stays and any(harm.fills and harm.concerns(one.host) for harm in harms):
             return "state_older_disk_full", []
     text = f"{name}: {following.first_number} after {one.last_number}: {one}, then {following}"
     return "", [Violation("state", name, text)]
+
+
+def _unseen(promise: Promise, run: Run, harms: Sequence[Harm]) -> float:
+    """Cycles of a run that nobody could see: it was cut off from who followed it, and went on."""
+    if not (promise.standby or promise.copied):
+        return 0.0
+    since = [harm.begun for harm in harms if harm.hides and harm.concerns(run.host)]
+    return _RATE * max(0.0, run.last - min(since)) if since else 0.0
 
 
 #: What is asked for, and ends or silences nobody by force.

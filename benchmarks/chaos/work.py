@@ -19,7 +19,7 @@ FAMILIES: Final = 2
 SPEAKERS: Final = 4
 COUNTERS: Final = 5
 #: Counters with a standby on another host.
-STANDBYS: Final = 0
+STANDBYS: Final = 2
 #: Of each sort, the first so many go elsewhere when their host is lost; the others wait for it.
 ELSEWHERE: Final = 2
 #: Of each sort, the last so many are stopped by their host when it is cut off. They go elsewhere.
