@@ -13,6 +13,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 from rosrm.core import slave
 from rosrm.core.model import (
     Assignment,
+    Health,
     InstanceId,
     InstanceState,
     InstanceStatus,
@@ -485,7 +486,8 @@ def test_who_may_ask_for_work(usage, present, stale, under) -> None:
 # --- any order of events ----------------------------------------------------------------------
 
 NUMBERS = st.integers(1, 4)
-SPECS = st.sampled_from([PLAIN, NODE])
+WATCHED = ProcessSpec("w", command=("true",), health=Health(timeout=1.0), restart=ON_FAILURE)
+SPECS = st.sampled_from([PLAIN, NODE, WATCHED])
 
 
 class AnySlave(RuleBasedStateMachine):
@@ -514,6 +516,10 @@ class AnySlave(RuleBasedStateMachine):
             elif isinstance(command, slave.Stop):
                 assert command.instance in self.alive, "a stop of what does not run"
                 self.stopped.add(command.instance)
+            elif isinstance(command, slave.Fail):
+                runs = self.alive.get(command.instance) is STATE.RUNNING
+                assert runs, "a run failed that does not run"
+                assert command.pid == 7, "another run than the one that was looked at"
             elif isinstance(command, slave.Amend):
                 assert command.instance in self.alive, "a policy for what does not run"
                 self.amending.append((command.instance, command.restart))
@@ -562,6 +568,14 @@ class AnySlave(RuleBasedStateMachine):
     def see(self, spec, number) -> None:
         self.feed(slave.SeenInGraph(InstanceId(spec.name, number)))
 
+    @rule(number=NUMBERS, pid=st.sampled_from([7, 7, 8]), looks=st.integers(1, 10))
+    def look(self, number, pid, looks) -> None:
+        """At one that is stopped, or at the run before it."""
+        for _ in range(looks):
+            self.now += slave.LOOK_PERIOD
+            instance = InstanceId(WATCHED.name, number)
+            self.feed(slave.LookedAt(instance, pid, slave.Look(stopped=True)))
+
     @rule(seconds=st.sampled_from([0.1, 5.0, 11.0, 61.0]))
     def wait(self, seconds) -> None:
         self.now += seconds
@@ -604,6 +618,12 @@ class AnySlave(RuleBasedStateMachine):
     def every_order_is_or_will_be_settled(self) -> None:
         wanted = {(i, restart) for i, h in self.state.held.items() for restart in h.unsettled}
         assert self.unsettled <= wanted | set(self.amending)
+
+    @invariant()
+    def only_ready_ones_are_watched(self) -> None:
+        for held in self.state.watched().values():
+            assert held.status.state is STATE.READY
+            assert held.status.pid
 
     @invariant()
     def only_running_ones_are_awaited(self) -> None:
