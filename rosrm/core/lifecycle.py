@@ -253,6 +253,8 @@ def conclude(state: MasterState, process: Process, end: End, host: Host, now: fl
         _requeue(state, process, host, now, status.message)
     elif end.ordered:
         _requeue(state, process, host, now, f"it was ended on {host.name}")
+    elif status.state is InstanceState.FENCED and process.spec.host_loss.then != "stop":
+        _requeue(state, process, host, now, status.message)
     elif status.state is InstanceState.REFUSED:
         exclude(process, host, status)
         _requeue(state, process, host, now, f"{host.name} cannot run it: {status.message}")

@@ -286,6 +286,7 @@ class InstanceState(str, Enum):
     EXITED = "exited"
     FAILED = "failed"
     REFUSED = "refused"
+    FENCED = "fenced"
 
     @property
     def ended(self) -> bool:
@@ -293,7 +294,9 @@ class InstanceState(str, Enum):
         return self in _ENDED
 
 
-_ENDED: Final = frozenset({InstanceState.EXITED, InstanceState.FAILED, InstanceState.REFUSED})
+_ENDED: Final = frozenset(
+    {InstanceState.EXITED, InstanceState.FAILED, InstanceState.REFUSED, InstanceState.FENCED}
+)
 
 
 @dataclass(frozen=True, slots=True)

@@ -35,14 +35,14 @@
     backoff   TimePassed       Spawn                                         starting
               RestartOrdered   Spawn, the count of restarts afresh           starting
               StopOrdered      -                                             exited
-              FencePassed      -                                             failed
-              FenceOrdered     -                                             failed
+              FencePassed      -                                             fenced
+              FenceOrdered     -                                             fenced
               AmendOrdered     - (if the policy now allows no restart)       failed, backoff
     ended     Forgotten        Drop; its number is dead                      -
 
 An instance may have a fence: `FencePassed` comes by itself when nobody has said for too long that
-the master hears this host (`Heard`; its start counts as such). What was fenced has failed, with a
-message that begins with "fenced: ", and is not restarted here, nor by the client's later orders.
+the master hears this host (`Heard`; its start counts as such). What was fenced is not restarted
+here, whatever its policy and whatever is ordered afterwards.
 
 Whatever is not in the table changes nothing; an order that changes nothing has its status told
 again, as DDS may repeat it. Every change of an instance is told (`Tell`). A signal goes to every

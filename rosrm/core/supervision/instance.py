@@ -14,7 +14,8 @@ STOPPING: Final = "stopping"
 EXITED: Final = "exited"
 FAILED: Final = "failed"
 REFUSED: Final = "refused"
-ENDED: Final = frozenset({EXITED, FAILED, REFUSED})
+FENCED: Final = "fenced"
+ENDED: Final = frozenset({EXITED, FAILED, REFUSED, FENCED})
 
 #: What becomes of a stopping instance when nothing of it is left.
 THEN_END: Final = "end"
@@ -23,8 +24,6 @@ THEN_POLICY: Final = "policy"
 
 STEPS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
 _KILL: Final = len(STEPS) - 1
-#: How the final message of an instance begins that was fenced, and by that has ended.
-FENCED: Final = "fenced: "
 #: Seconds between one SIGKILL and the next, for members that were forked in between.
 KILL_AGAIN: Final = 1.0
 #: SIGKILLs after which a shutdown no longer waits (a process stuck in the kernel).

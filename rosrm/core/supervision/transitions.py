@@ -279,7 +279,7 @@ def _take_fence(instance: Instance, event: Event, now: float) -> None:
         by = instance.heard + after + grace
     instance.kill_by = by if instance.kill_by is None else min(by, instance.kill_by)
     if instance.then != THEN_END:
-        instance.fenced = f"{FENCED}{why}"
+        instance.fenced = f"fenced: {why}"
 
 
 def _must_be_gone(instance: Instance, now: float) -> bool:
@@ -301,7 +301,7 @@ def _grace(instance: Instance, now: float) -> float:
 
 def _end_as_meant(instance: Instance, how: str) -> None:
     if instance.fenced:
-        end(instance, FAILED, f"{instance.fenced}; {how}")
+        end(instance, FENCED, f"{instance.fenced}; {how}")
     else:
         end(instance, EXITED, how)
 
@@ -325,7 +325,7 @@ def _by_policy(instance: Instance, ending: str, *, succeeded: bool, now: float) 
         end(instance, EXITED if succeeded else FAILED, "" if succeeded else ending)
         return
     if instance.fenced:
-        end(instance, FAILED, f"{instance.fenced}; {ending}")
+        end(instance, FENCED, f"{instance.fenced}; {ending}")
         return
     done = _recent_restarts(instance, now)
     if done >= rule.attempts:

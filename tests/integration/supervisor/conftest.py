@@ -67,7 +67,7 @@ class Host:
         return self.wait(client, name, InstanceState.RUNNING, number=number)
 
     def ended(self, client, name: str, number: int = 1):
-        final = (InstanceState.EXITED, InstanceState.FAILED, InstanceState.REFUSED)
+        final = tuple(state for state in InstanceState if state.ended)
         return self.wait(client, name, *final, number=number)
 
     def amend(self, client, name: str, restart: RestartPolicy) -> None:

@@ -80,7 +80,7 @@ def test_a_stopped_slave_cannot_fence_so_its_supervisor_does(host, slave):
     slave.kill()
     slave.wait()
     client = host.connect(start=False)
-    assert of_one(client).state is InstanceState.FAILED
+    assert of_one(client).state is InstanceState.FENCED
     assert of_one(client).message.startswith("fenced: for 3 s it was not known")
 
 
@@ -95,7 +95,7 @@ def test_it_goes_on_while_somebody_says_heard(host, client):
         assert client.receive(0.1) == []
     status = host.ended(client, "one")
     assert time.monotonic() - heard >= 2.0
-    assert (status.state, status.restarts) == (InstanceState.FAILED, 0)
+    assert (status.state, status.restarts) == (InstanceState.FENCED, 0)
     wait_gone(pid)
 
 
@@ -190,7 +190,7 @@ def test_after_a_restart_of_the_machine_it_is_not_started(host, client):
         host.ended(client, "one")
     client.close()
     client = host.connect()
-    assert of_one(client).state is InstanceState.FAILED
+    assert of_one(client).state is InstanceState.FENCED
     assert of_one(client).message.startswith("fenced: ")
     wait_until(host.alive, "the driver was started again")
 

@@ -167,7 +167,7 @@ class Machine:
             self._stop(command.instance, now)
         elif isinstance(command, slave.Fence):
             if command.instance in self.programs:
-                self._end(command.instance, InstanceState.FAILED, now, signal=9)
+                self._end(command.instance, InstanceState.FENCED, now, signal=9)
         elif isinstance(command, slave.Restart):
             self._restart(command.instance, now)
         elif isinstance(command, slave.Amend):

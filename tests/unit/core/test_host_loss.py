@@ -6,7 +6,13 @@ from typing import Any
 
 import pytest
 
-from rosrm.core.model import HostLossPolicy, IsolationPolicy, ProcessSpec, StopPolicy
+from rosrm.core.model import (
+    HostLossPolicy,
+    InstanceState,
+    IsolationPolicy,
+    ProcessSpec,
+    StopPolicy,
+)
 from rosrm.core.settings import CoreSettings
 from tests.unit.core.cluster import Cluster, job, movable, process
 
@@ -270,3 +276,13 @@ def test_beats_name_the_hosts_that_are_not_heard() -> None:
     assert cluster.state.hosts.unheard() == [2, 3]
     back(cluster, "b")
     assert cluster.state.hosts.unheard() == [3]
+
+
+@pytest.mark.parametrize(("then", "phase"), [("wait", "running"), ("stop", "failed")])
+def test_what_its_host_has_fenced_starts_again(then: str, phase: str) -> None:
+    """It was cut off for a moment only: nobody but its host has given it up."""
+    cluster = on_a(process("p", host_loss=HostLossPolicy(then)), "b")
+    machine = cluster.machines["a"]
+    machine._end(machine.find("p"), InstanceState.FENCED, cluster.now, signal=9)
+    cluster.settle()
+    assert cluster.phase("p") == phase
