@@ -98,7 +98,17 @@ def _give_up(state: MasterState, instance: Instance, now: float) -> None:
         now, "given_up", f"{instance.id} is given up: {host.name} is lost",
         process=instance.id.process, host=host.name, facts={"number": instance.id.number},
     )  # fmt: skip
-    follows = process is None or process.spec.host_loss.then != "stop"
-    if follows and process is not None and process.owner == instance.id.number:
+    if process is not None and _may_be_taken_back(process, instance):
         process.left_behind = LeftBehind(instance.id.number, host.name, instance.node_name)
-    lifecycle.gone(state, instance, now, f"{host.name} is lost", comes_again=follows)
+    stays = process is not None and process.spec.host_loss.then == "stop"
+    lifecycle.gone(state, instance, now, f"{host.name} is lost", comes_again=not stays)
+
+
+def _may_be_taken_back(process: Process, instance: Instance) -> bool:
+    """It owns the name, and nobody has told it to stop."""
+    runs_on = process.wanted is Wanted.RUN and not instance.stopping
+    return (
+        runs_on
+        and process.owner == instance.id.number
+        and process.spec.host_loss.then == "elsewhere"
+    )

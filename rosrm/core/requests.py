@@ -142,7 +142,7 @@ def cancel_requested(state: MasterState, event: happened.CancelRequested, now: f
 
 
 def _cancel(state: MasterState, process: Process, now: float) -> None:
-    process.wanted = Wanted.CANCEL
+    process.wanted, process.left_behind = Wanted.CANCEL, None
     state.record(
         now, "cancel_requested", f"{process.name} is to be cancelled", process=process.name
     )

@@ -286,3 +286,14 @@ def test_what_its_host_has_fenced_starts_again(then: str, phase: str) -> None:
     machine._end(machine.find("p"), InstanceState.FENCED, cluster.now, signal=9)
     cluster.settle()
     assert cluster.phase("p") == phase
+
+
+def test_what_was_cancelled_out_of_sight_is_not_taken_back() -> None:
+    """Queued anew it waits for a host; the old instance has been told to end."""
+    cluster = on_a(process("p", host_loss=ELSEWHERE), "b")
+    cluster.set_host("b", "cordon")
+    lose(cluster, "a")
+    cluster.cancel("p")
+    cluster.restart("p")
+    back(cluster, "a")
+    assert (cluster.phase("p"), cluster["p"].owner, cluster.where("p")) == ("running", 2, ["a"])
