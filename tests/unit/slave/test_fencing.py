@@ -148,7 +148,7 @@ def test_a_beat_is_never_taken_as_newer_than_the_quickest_was_quick(ahead, drift
         beat = (said + ahead) * (1 + drift)
         taken = clock.said_at(beat, arrived)
         assert taken <= arrived + 1e-6
-        assert taken - said <= quickest + 2e-3 * (said - 1000.0) + 1e-6
+        assert taken - said <= quickest + 2e-3 * (arrived - 1000.0) + 1e-6
 
 
 def test_another_pace_of_the_clock_makes_no_beat_old() -> None:
