@@ -64,6 +64,8 @@ _JOB: Final = (0.2, 3.0)
 _JOBS: Final = (2, 5)
 _LINE: Final = (0, 3)
 _MOVES: Final = {0: 3, 1: 4, 2: 1}
+#: Share of the rounds in which a service is cancelled and another one submitted.
+_RENEWED: Final = 0.3
 
 
 @dataclass(frozen=True)
@@ -109,6 +111,7 @@ class Round:
         faults: that overlap, in order of `at`.
         moves: that are asked for meanwhile.
         jobs, line: seconds that each job takes, and each of those that wait in line.
+        renews: the guest, a service, is cancelled, and another one submitted.
     """
 
     number: int
@@ -116,6 +119,7 @@ class Round:
     moves: tuple[Move, ...]
     jobs: tuple[float, ...]
     line: tuple[float, ...]
+    renews: bool
 
 
 def draw(
@@ -140,7 +144,8 @@ def draw(
             Move(chance.choice(movable), chance.choice(hosts), chance.uniform(0.0, _WITHIN))
             for _ in range(count)
         )
-        yield Round(number, faults, moves, _seconds(chance, _JOBS), _seconds(chance, _LINE))
+        jobs, line = _seconds(chance, _JOBS), _seconds(chance, _LINE)
+        yield Round(number, faults, moves, jobs, line, chance.random() < _RENEWED)
 
 
 def _burst(

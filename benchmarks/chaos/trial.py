@@ -89,6 +89,7 @@ class Trial:
         self._oracle = Oracle(cluster.lab.name, lines, self._wanted)
         self._harms: list[Harm] = []
         self._services = {service.name: service for service in work.services()}
+        self._guests = 0
 
     # --- begin and end ------------------------------------------------------------------------
 
@@ -122,6 +123,8 @@ class Trial:
         self._tally.rounds += 1
         number = drawn.faults[-1].number
         self._submit_jobs(drawn)
+        if drawn.renews:
+            self._renew()
         begun = time.monotonic()
         done = self._do(drawn, begun)
         self._submit_canaries(drawn.number)
@@ -218,6 +221,21 @@ class Trial:
             work.job(f"canary{number}_{host}", self._lines, _CANARY, host=host) for host in HOSTS
         ]
         self._submit(entries, self._accept(entries, []))
+
+    def _renew(self) -> None:
+        """Cancel the guest, and submit the next one."""
+        if self._guests:
+            old = work.guest(self._guests).name
+            self._story.tell(f"{old} is cancelled")
+
+            def cancelled(_: Errand) -> None:
+                self._wanted.services.pop(old)
+
+            self._errands.send(Errand({"do": "cancel", "names": [old]}, done=cancelled))
+        self._guests += 1
+        service = work.guest(self._guests)
+        promise = {service.name: promise_of(service)}
+        self._submit([service.entry(self._lines)], lambda _: self._wanted.services.update(promise))
 
     def _accept(
         self, jobs: list[dict[str, Any]], line: list[dict[str, Any]]

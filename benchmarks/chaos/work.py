@@ -112,6 +112,12 @@ def services() -> Iterator[Service]:
             yield Service(f"{word}{number}", sort, elsewhere, isolated, watched)
 
 
+def guest(number: int) -> Service:
+    """One of those of which there is one at a time: it is cancelled for the next one."""
+    sort = (_SORTS["plain"], _SORTS["counter"], _SORTS["family"])[number % 3][0]
+    return Service(f"guest{number}", sort, elsewhere=bool(number % 2))
+
+
 def job(name: str, lines: Path, seconds: float, *, host: str = "") -> dict[str, Any]:
     """The entry of a job; with a host, it runs there alone."""
     entry = {
