@@ -486,7 +486,7 @@ def test_who_may_ask_for_work(usage, present, stale, under) -> None:
 # --- any order of events ----------------------------------------------------------------------
 
 NUMBERS = st.integers(1, 4)
-WATCHED = ProcessSpec("w", command=("true",), health=Health(timeout=1.0), restart=ON_FAILURE)
+WATCHED = ProcessSpec("w", command=("true",), health=Health(timeout=0.5), restart=ON_FAILURE)
 SPECS = st.sampled_from([PLAIN, NODE, WATCHED])
 
 
@@ -568,12 +568,15 @@ class AnySlave(RuleBasedStateMachine):
     def see(self, spec, number) -> None:
         self.feed(slave.SeenInGraph(InstanceId(spec.name, number)))
 
-    @rule(number=NUMBERS, pid=st.sampled_from([7, 7, 8]), looks=st.integers(1, 10))
-    def look(self, number, pid, looks) -> None:
-        """At one that is stopped, or at the run before it."""
-        for _ in range(looks):
+    @rule(number=NUMBERS, pid=st.sampled_from([7, 7, 7, 8]), runs=st.booleans())
+    def look(self, number, pid, runs) -> None:
+        """At one that is stopped, or at another run of it, for longer than is allowed."""
+        instance = InstanceId(WATCHED.name, number)
+        if runs and instance in self.alive:
+            self.alive[instance] = STATE.RUNNING
+            self.feed(slave.SupervisorReported((InstanceStatus(instance, STATE.RUNNING, 7),)))
+        for _ in range(5):
             self.now += slave.LOOK_PERIOD
-            instance = InstanceId(WATCHED.name, number)
             self.feed(slave.LookedAt(instance, pid, slave.Look(stopped=True)))
 
     @rule(seconds=st.sampled_from([0.1, 5.0, 11.0, 61.0]))
@@ -585,9 +588,10 @@ class AnySlave(RuleBasedStateMachine):
     def report(self) -> None:
         self.feed(slave.ReportRequested())
 
+    @precondition(lambda self: self.alive)
     @rule(data=st.data(), state=st.sampled_from(InstanceState))
     def supervise(self, data, state) -> None:
-        if not self.alive or state is STATE.READY:
+        if state is STATE.READY:
             return
         instance = data.draw(st.sampled_from(sorted(self.alive)))
         if state.ended:
