@@ -124,7 +124,10 @@ class HostLinks:
             link = self._links[host_id] = HostLink(host_id, control, 0)
         link.close_poll()
         if link.incarnation == description.incarnation:
-            return  # the same run once more: what it has not fetched is still meant for it
+            # The same run once more: what it has not fetched is still meant for it. But it has
+            # been out of reach: with the beat that was heard before, an order would be stale.
+            self.ledger.beat[host_id] = 0
+            return
         link.incarnation = description.incarnation
         self.ledger.begin(host_id, description.incarnation)
         link.outbox.clear()

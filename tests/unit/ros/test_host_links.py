@@ -1,0 +1,57 @@
+"""Orders to a slave carry a beat that it has said lately."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+
+from rosrm.core.commands import Order
+from rosrm.core.model import HostDescription
+from rosrm.ros.host_links import HostLinks
+from rosrm.ros.readings import Runs
+
+HOST, RUN = 1, 500
+DESCRIPTION = HostDescription("shelf", RUN)
+
+
+class FakeClient:
+    """Takes the requests in place of DDS."""
+
+    def __init__(self) -> None:
+        self.beats: list[int] = []
+
+    def envelope(self, beat, epoch):
+        self.beats.append(beat)
+        return SimpleNamespace()
+
+    def call(self, *arguments):
+        pass
+
+
+def heard(links: HostLinks, beat: int, sequence: int) -> None:
+    column = np.array([HOST], np.int64)
+    one = np.ones(1, np.int64)
+    links.ledger.take(
+        Runs(column, np.array([RUN], np.uint64), one, one * sequence, np.array([beat], np.uint64),
+             one), 0.0,
+    )  # fmt: skip
+    links.heard([HOST])
+
+
+def test_an_order_to_a_slave_that_registers_again_waits_for_a_new_beat(monkeypatch):
+    """It was cut off: what it said before is old by now, and an order with that would be stale."""
+    node = SimpleNamespace(create_client=lambda *arguments, **named: None)
+    participant = SimpleNamespace(node=node, settings=SimpleNamespace(namespace="/rosrm"))
+    links = HostLinks(participant, "master test", 1, 5.0, lambda event: None)
+    client = links._client = FakeClient()
+    monkeypatch.setattr(
+        "rosrm.ros.host_links._order_request", lambda command: SimpleNamespace(envelope=None)
+    )
+    links.renew(HOST, DESCRIPTION)
+    heard(links, beat=100, sequence=1)
+    links.renew(HOST, DESCRIPTION)
+    links.order(Order(1, HOST, "report"), now=0.0)
+    assert client.beats == []
+    heard(links, beat=900, sequence=2)
+    assert client.beats == [900]
