@@ -82,6 +82,35 @@ class Kept:
     path: Path
 
 
+class Part(NamedTuple):
+    """A part of a state on its way.
+
+    Attributes:
+        number, sequence: of the instance, and of the state.
+        offset: bytes, where it begins.
+        total: bytes of the whole.
+        digest: CRC-32 of the whole.
+    """
+
+    process: str
+    number: int
+    sequence: int
+    offset: int
+    total: int
+    digest: int
+    data: bytes
+
+    @property
+    def age(self) -> tuple[int, int]:
+        """The larger, the newer."""
+        return self.number, self.sequence
+
+    @property
+    def is_last(self) -> bool:
+        """Nothing comes after it."""
+        return self.offset + len(self.data) >= self.total
+
+
 # --- the format -------------------------------------------------------------------------------
 
 
@@ -305,22 +334,68 @@ def _write_all(file: int, parts: Sequence[bytes], at: int) -> None:
             waiting[0] = waiting[0][written:]
 
 
-def write_copy(directory: Path, data: bytes) -> None:
-    """Keep a state that came from another host; the one before it is there until it is whole.
+class CopyWriter:
+    """Takes a state that comes from another host, part by part; the copy before it stays till then.
+
+    Args:
+        directory: of the process; it is made where it does not exist.
 
     Raises:
-        OSError: it cannot be written; nothing is left of it.
+        OSError: the file cannot be opened.
     """
-    directory.mkdir(mode=0o700, parents=True, exist_ok=True)
-    begun = directory / f"{COPY}.new"
+
+    def __init__(self, directory: Path) -> None:
+        directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+        self._directory = directory
+        self._begun = directory / f"{COPY}.new"
+        flags = os.O_RDWR | os.O_CREAT | os.O_TRUNC | _OPEN
+        self._file = os.open(self._begun, flags, 0o600)
+        self.size = 0
+
+    def append(self, data: bytes) -> None:
+        """Take the next part; raises `OSError`."""
+        _write_all(self._file, [data], self.size)
+        self.size += len(data)
+
+    def finish(self) -> Head:
+        """It is whole: keep it.
+
+        Raises:
+            Damaged: it is not; nothing is left of it.
+            OSError: it cannot be kept.
+        """
+        try:
+            head = read(self._begun).head
+            self._begun.replace(self._directory / COPY)
+        except (Damaged, OSError):
+            self.abandon()
+            raise
+        self._close()
+        return head
+
+    def abandon(self) -> None:
+        """Nothing more comes of it."""
+        self._close()
+        with contextlib.suppress(OSError):
+            self._begun.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            self._directory.rmdir()  # where nothing else is kept
+
+    def _close(self) -> None:
+        if self._file >= 0:
+            os.close(self._file)
+            self._file = -1
+
+
+def write_copy(directory: Path, data: bytes) -> None:
+    """Keep a state that came from another host; raises as `CopyWriter` does."""
+    copy = CopyWriter(directory)
     try:
-        flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | _OPEN
-        with os.fdopen(os.open(begun, flags, 0o600), "wb") as file:
-            file.write(data)
-        begun.replace(directory / COPY)
+        copy.append(data)
     except OSError:
-        begun.unlink(missing_ok=True)
+        copy.abandon()
         raise
+    copy.finish()
 
 
 def drop(directory: Path, up_to: int) -> bool:

@@ -53,6 +53,12 @@ class Host(Protocol):
     ) -> None:
         """Run an executor; `done(accepted, message, result)` is called in the loop's thread."""
 
+    def keep(self, instance: InstanceId, hosts: Sequence[str], every: float) -> None:
+        """Ship the state of an instance to these hosts from now on; seconds between two times."""
+
+    def drop_kept(self, instance: InstanceId) -> None:
+        """Delete what is kept of a process, of instances up to this one."""
+
     def say(self, message: str) -> None:
         """Tell the user."""
 
@@ -86,11 +92,21 @@ class SlaveServices:
             if request.action == kind.SET_RESTART:
                 self._set_restart(request, respond)
                 return
-            self._host.take(_ordered(request))
+            if request.action in (kind.KEEP, kind.DROP_KEPT):
+                self._keep_or_drop(request)
+            else:
+                self._host.take(_ordered(request))
         except Refused as refusal:
             respond(srv.ControlHost.Response(answer=refused(refusal.code, str(refusal))))
             return
         respond(srv.ControlHost.Response(answer=accepted()))
+
+    def _keep_or_drop(self, request: srv.ControlHost.Request) -> None:
+        instance = convert.instance_from_msg(request.instance)
+        if request.action == request.KEEP:
+            self._host.keep(instance, tuple(request.keep_on), request.keep_every)
+        else:
+            self._host.drop_kept(instance)
 
     def _set_restart(
         self, request: srv.ControlHost.Request, respond: Callable[[Any], None]

@@ -25,6 +25,7 @@ from rosrm.core.model import (
     Assignment,
     HostDescription,
     InstanceId,
+    InstanceState,
     InstanceStatus,
     RestartPolicy,
     StopPolicy,
@@ -33,11 +34,13 @@ from rosrm.errors import LaunchError, Refused, SupervisorError
 from rosrm.ports import ProbeContext
 from rosrm.registry import Registry
 from rosrm.ros.graph import GraphWatch
+from rosrm.ros.kept_endpoint import KeptEndpoint
 from rosrm.ros.names import STATE_CONFIG, Names, token
 from rosrm.ros.participant import Participant
 from rosrm.ros.slave_endpoint import Link, LogSlice, SlaveEndpoint, result_json
 from rosrm.slave.environment import SHADOW, Whereabouts
 from rosrm.slave.health import HealthWatch
+from rosrm.slave.keeping import Keeping
 from rosrm.slave.launch import launch_order
 from rosrm.slave.log_reading import NOTHING_YET, newest_instance, read_log
 from rosrm.slave.memos import from_memo, to_memo
@@ -98,6 +101,7 @@ class SlaveRuntime:
         self._unsettled: dict[tuple[InstanceId, RestartPolicy], list[Settled]] = {}
         self._executors: Mapping[str, Executor] = registry.executors()
         self._supervisor_state = config.state / "supervisor"
+        self._kept = config.state / "kept"
         self._closing = contextlib.ExitStack()
         with contextlib.ExitStack() as opened:
             opened.enter_context(
@@ -132,6 +136,11 @@ class SlaveRuntime:
                 self._description(probes.absent),
                 max(config.control.max_age, _BEATS_MISSED * config.period),
             )
+            self._keeping = Keeping(
+                self._kept, config.host, config.keep,
+                KeptEndpoint(self._participant, config.host),
+                post=self._post, say=self.say, publish=self._endpoint.publish_kept,
+            )  # fmt: skip
             self._closing = opened.pop_all()
         self._adopt()
 
@@ -211,6 +220,7 @@ class SlaveRuntime:
     def _cycle(self, now: float) -> None:
         """What is done at the rate of `resource_info`."""
         self._endpoint.go_on(now)
+        self._keeping.tick(now)
         sample = self._sampler.latest(now)
         for report in sample.reports:
             self.say(str(report))
@@ -245,6 +255,13 @@ class SlaveRuntime:
     def take(self, event: core.Event) -> None:
         """Something happened."""
         self._events.append(event)
+        if isinstance(event, core.Registered):
+            self._keeping.say_again()
+
+    def _post(self, call: Callable[[], None]) -> None:
+        """Have something called in the loop; may be called from any thread."""
+        self._from_threads.append(call)
+        self._wake()
 
     def _work(self, now: float) -> None:
         """Let the core decide about everything that happened, and carry it out."""
@@ -267,14 +284,10 @@ class SlaveRuntime:
     def _carry_out(self, command: core.Command) -> None:
         if isinstance(command, core.Launch):
             self._launch(command.assignments)
-        elif isinstance(command, core.Stop):
-            self._supervisor.stop(command.instance)
-        elif isinstance(command, core.Fence):
-            self._supervisor.fence(command.instance)
+        elif isinstance(command, core.Stop | core.Fence | core.Restart):
+            self._interfere(command)
         elif isinstance(command, core.Renew):
             self._supervisor.heard(command.at)
-        elif isinstance(command, core.Restart):
-            self._supervisor.restart(command.instance)
         elif isinstance(command, core.Fail):
             self.say(f"{command.instance} is {command.reason}")
             self._supervisor.fail(command.instance, command.pid, command.reason, kill=command.kill)
@@ -291,12 +304,36 @@ class SlaveRuntime:
             self._endpoint.publish_statuses(command.statuses, complete=command.complete)
 
     def _launch(self, assignments: Sequence[Assignment]) -> None:
+        """Start them, each as soon as its kept state is here."""
+        self._start([one for one in assignments if self._keeping.prepare(one, self._prepared)])
+
+    def _prepared(self, assignment: Assignment) -> None:
+        held = self._state.held.get(assignment.instance)
+        wanted = held is not None and held.status.state is InstanceState.STARTING
+        if wanted and not self._shutting_down:
+            self._start([assignment])
+
+    def _interfere(self, command: core.Stop | core.Fence | core.Restart) -> None:
+        """End an instance, or restart it; one that is being prepared has not begun."""
+        instance = command.instance
+        if self._keeping.is_preparing(instance):
+            if not isinstance(command, core.Restart):
+                self._keeping.forget(instance)
+                self.take(core.LaunchRefused(instance, "it was stopped before it was started"))
+        elif isinstance(command, core.Stop):
+            self._supervisor.stop(instance)
+        elif isinstance(command, core.Fence):
+            self._supervisor.fence(instance)
+        else:
+            self._supervisor.restart(instance)
+
+    def _start(self, assignments: Sequence[Assignment]) -> None:
         orders = []
         where = Whereabouts(
             self._config.host,
             self._endpoint.cluster,
             Names(self._config.ros.namespace)(STATE_CONFIG),
-            self._config.state / "kept",
+            self._kept,
             self._config.keep.every,
         )
         for assignment in assignments:
@@ -390,6 +427,19 @@ class SlaveRuntime:
         self._unsettled.setdefault((instance, restart), []).append(settled)
         self.take(core.RestartPolicySet(instance, restart))
 
+    def keep(self, instance: InstanceId, hosts: Sequence[str], every: float) -> None:
+        """Ship the state of an instance to these hosts from now on."""
+        self._keeping.keep(instance, hosts, every)
+
+    def drop_kept(self, instance: InstanceId) -> None:
+        """Delete what is kept of a process, of instances up to this one."""
+        lives = any(
+            one.process == instance.process and one.number <= instance.number
+            for one, held in self._state.held.items()
+            if not held.status.state.ended
+        )
+        self._keeping.drop(instance, lives=lives)
+
     def say(self, message: str) -> None:
         """Tell the user."""
         _log.info("%s", message)
@@ -427,8 +477,7 @@ class SlaveRuntime:
                 outcome = (True, "", result)
             except Exception as error:  # noqa: BLE001 - a third party's code: anything may come
                 outcome = (False, f"{executor} raised {type(error).__name__}: {error}", "")
-            self._from_threads.append(partial(done, *outcome))
-            self._wake()
+            self._post(partial(done, *outcome))
 
         threading.Thread(target=work, name=f"executor {executor}", daemon=True).start()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import sys
@@ -10,8 +11,9 @@ from pathlib import Path
 import pytest
 
 from rosrm import kept
-from rosrm.core.model import MigrationPolicy, ProcessSpec, Readiness, RestartPolicy
-from tests.ros.clusters import CALM, PATIENCE, STEADY, Cluster, host, wait_until
+from rosrm.config.settings import KeepSettings, LivenessSettings
+from rosrm.core.model import HostLossPolicy, MigrationPolicy, ProcessSpec, Readiness, RestartPolicy
+from tests.ros.clusters import CALM, PATIENCE, STEADY, Cluster, host, pids_of, wait_gone, wait_until
 
 pytestmark = pytest.mark.timeout(120)
 
@@ -72,7 +74,7 @@ def kept_directory(cluster: Cluster, on: str) -> Path:
 def counts(log: str) -> list[list[int]]:
     """What each run has counted."""
     runs: list[list[int]] = []
-    for line in log.splitlines():
+    for line in log.split("\n")[:-1]:  # the last one may not be whole
         word, _, number = line.partition(" ")
         if word == "begins":
             runs.append([])
@@ -163,3 +165,111 @@ def rewritten(directory: Path) -> bytes:
     writer.write(found.head.sequence + 1, [kept.Block(data, zlib.crc32(data))])
     writer.close()
     return kept.newest_content(directory)[1]
+
+
+# --- on other hosts ---------------------------------------------------------------------------
+
+QUICK_LEASE = LivenessSettings(suspect=1.0, lease=3.0)
+ELSEWHERE = HostLossPolicy("elsewhere")
+
+
+def kill_host(cluster: Cluster, name: str) -> None:
+    """Its slave, its supervisor and its processes, as when its power is cut."""
+    row = cluster.client.list(processes=True).processes[0]
+    slave = cluster.slaves.pop(name)
+    slave.process.kill()  # first, as it would start another supervisor
+    slave.process.wait(PATIENCE)
+    mark = str(cluster.directory / "hosts" / name)
+    victims = [pid for pid, command in pids_of(cluster.directory).items() if mark in command]
+    for pid in (*victims, row.pid):
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+    wait_gone(row.pid)
+
+
+def copies(cluster: Cluster) -> dict[str, int]:
+    """By host, the cycle up to which it keeps a copy."""
+    found = {}
+    for name in cluster.slaves:
+        head = kept.peek(kept_directory(cluster, name) / kept.COPY)
+        if head is not None:
+            found[name] = head.sequence
+    return found
+
+
+def wait_for_copy(cluster: Cluster, at_least: int, on: str | None = None) -> str:
+    """Until another host keeps a state that covers so many cycles; its name."""
+
+    def there() -> list[str]:
+        return [
+            name for name, cycle in copies(cluster).items()
+            if cycle >= at_least and on in (None, name)
+        ]  # fmt: skip
+
+    wait_until(there, f"a copy up to cycle {at_least}", PATIENCE)
+    return there()[0]
+
+
+@pytest.mark.parametrize("ballast", [0, 5_000_000])
+def test_when_its_host_is_lost_it_goes_on_elsewhere_from_the_kept_state(make_cluster, ballast):
+    """On the host that keeps it, which is preferred to others with as much room."""
+    cluster = make_cluster(*(host(f"h{n}") for n in range(3)), liveness=QUICK_LEASE)
+    cluster.submit(counter(ballast, host_loss=ELSEWHERE))
+    row = cluster.wait("counter", "running")
+    wait_for_count(cluster, 50)
+    keeper = wait_for_copy(cluster, 50)
+    assert keeper != row.host
+    before = copies(cluster)[keeper]
+    kill_host(cluster, row.host)
+    cluster.wait_for_event("given_up", process="counter")
+    after = cluster.wait("counter", "running")
+    assert after.host == keeper
+    runs = wait_for_count(cluster, before)
+    assert runs[0][0] > before
+    cluster.wait_for_log("counter", "goes on from the state kept of counter#")
+
+
+def test_a_host_that_does_not_keep_the_state_fetches_it(make_cluster):
+    """The one that does may take no work."""
+    cluster = make_cluster(*(host(f"h{n}") for n in range(3)), liveness=QUICK_LEASE)
+    cluster.submit(counter(1_000_000, host_loss=ELSEWHERE))
+    row = cluster.wait("counter", "running")
+    wait_for_count(cluster, 50)
+    keeper = wait_for_copy(cluster, 50)
+    before = copies(cluster)[keeper]
+    cluster.client.set_host_state(keeper, "cordon")
+    kill_host(cluster, row.host)
+    cluster.wait_for_event("given_up", process="counter")
+    after = cluster.wait("counter", "running")
+    assert after.host not in (keeper, row.host)
+    runs = wait_for_count(cluster, before)
+    assert runs[0][0] > before
+    assert f"was fetched from {keeper}" in cluster.log_of(after.host)
+
+
+def test_a_process_that_is_submitted_anew_begins_from_nothing(make_cluster):
+    """Cancelling it deletes what is kept of it, on every host."""
+    cluster = make_cluster(host("h0"), host("h1"), liveness=STEADY)
+    cluster.submit(counter())
+    wait_for_count(cluster, 20)
+    wait_for_copy(cluster, 20)
+    cluster.cancel("counter")
+    wait_until(
+        lambda: not any(kept_directory(cluster, name).exists() for name in cluster.slaves),
+        "nothing is kept any more", PATIENCE,
+    )  # fmt: skip
+    cluster.submit(counter())
+    assert wait_for_count(cluster, 1)[0][0] == 1
+
+
+def test_a_host_without_room_refuses_and_says_so_once(make_cluster):
+    """The process goes on, and its state is kept on its own host."""
+    hosts = [host(f"h{n}", keep=KeepSettings(max_bytes=1_000_000)) for n in range(2)]
+    cluster = make_cluster(*hosts, liveness=STEADY)
+    cluster.submit(counter(2_000_000))
+    row = cluster.wait("counter", "running")
+    said = row.host
+    wait_until(lambda: "does not keep the state" in cluster.log_of(said), "the refusal", PATIENCE)
+    wait_for_count(cluster, 100)
+    assert cluster.log_of(said).count("does not keep the state") == 1
+    assert copies(cluster) == {}

@@ -174,7 +174,7 @@ def test_files_are_the_owners_alone_and_do_not_stay_large(tmp_path):
     try:
         for sequence in range(4):
             write(directory, sequence, bytes(1_000_000) if sequence < 2 else b"small")
-        kept.write_copy(directory, b"copy")
+        kept.write_copy(directory, kept.newest_content(directory)[1])
     finally:
         os.umask(old)
     assert stat.S_IMODE(directory.stat().st_mode) == 0o700

@@ -1,0 +1,305 @@
+"""Kept states of this host: reported to the master, shipped to other hosts, fetched for a start.
+
+The loop calls it; what touches files runs in a thread of its own, and what comes of it is given
+back to the loop. So a slow disk, or a state of many megabytes, keeps no beat from going out.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+from rosrm import kept
+from rosrm.config.settings import KeepSettings
+from rosrm.core.model import Assignment, InstanceId, KeptState
+from rosrm.kept import Head, Part
+from rosrm.ros.kept_endpoint import MOST, KeptEndpoint
+from rosrm.slave.fetching import Fetch
+from rosrm.slave.kept_store import KeptStore
+
+#: Seconds between two looks at what is kept here.
+_SCAN_EVERY: Final = 1.0
+#: Seconds after which the master is told again, though nothing has changed.
+_SAY_EVERY: Final = 10.0
+#: Seconds for one part to be taken.
+_PART_TIMEOUT: Final = 3.0
+#: Seconds after which a host that did not take a state is tried again.
+_AGAIN: Final = 3.0
+
+
+@dataclass(slots=True)
+class _Shipment:
+    """Where the state of an instance goes.
+
+    Attributes:
+        sent: newest state that a host has taken.
+        due: when a host gets the next one.
+        said: why a host did not take the last one.
+    """
+
+    instance: InstanceId
+    hosts: tuple[str, ...]
+    every: float
+    sent: dict[str, tuple[int, int]] = field(default_factory=dict)
+    due: dict[str, float] = field(default_factory=dict)
+    said: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(slots=True)
+class _Transfer:
+    """One state on its way to one host.
+
+    Attributes:
+        content: None until it was read.
+        waits: the answer to a part is awaited.
+    """
+
+    shipment: _Shipment
+    host: str
+    head: Head | None = None
+    content: bytes = b""
+    digest: int = 0
+    offset: int = 0
+    waits: bool = True
+
+
+class Keeping:
+    """The kept states of one host.
+
+    Args:
+        root: directory of all of them.
+        host: name of this host.
+        settings: bounds.
+        endpoint: speaks with other slaves.
+        post: has something called in the loop; may be called from any thread.
+        say: tells the user.
+        publish: tells the master what is kept here; False: there is none.
+    """
+
+    def __init__(
+        self, root: Path, host: str, settings: KeepSettings, endpoint: KeptEndpoint, *,
+        post: Callable[[Callable[[], None]], None], say: Callable[[str], None],
+        publish: Callable[[Sequence[KeptState]], bool],
+    ) -> None:  # fmt: skip
+        self._host = host
+        self._settings = settings
+        self._endpoint = endpoint
+        self._post, self._say, self._publish = post, say, publish
+        self._store = KeptStore(root, settings.max_bytes)
+        self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        self._shipments: dict[str, _Shipment] = {}
+        self._transfers: dict[str, _Transfer] = {}
+        self._fetches: dict[InstanceId, Fetch] = {}
+        self._kept: tuple[KeptState, ...] = ()
+        self._told: tuple[KeptState, ...] | None = None
+        self._told_at = 0.0
+        self._next_scan = 0.0
+        self._budget = float(settings.max_rate)
+        self._budget_at = time.monotonic()
+        threading.Thread(target=self._work, name="kept states", daemon=True).start()
+        endpoint.serve(self)
+
+    # --- the thread ----------------------------------------------------------------------
+
+    def _work(self) -> None:
+        while (job := self._jobs.get()) is not None:
+            job()
+
+    def _in_thread(self, work: Callable[[], Any], then: Callable[[Any], None]) -> None:
+        """Have something done by the thread; `then` is called in the loop with what it returned."""
+
+        def job() -> None:
+            try:
+                outcome = work()
+            except Exception as error:  # noqa: BLE001 - the thread has to live on
+                self._post(partial(self._say, f"a kept state: {type(error).__name__}: {error}"))
+                return
+            self._post(partial(then, outcome))
+
+        self._jobs.put(job)
+
+    # --- the master's word ---------------------------------------------------------------
+
+    def keep(self, instance: InstanceId, hosts: Sequence[str], every: float) -> None:
+        """Ship the state of an instance to these hosts from now on."""
+        wanted = tuple(name for name in hosts if name != self._host)
+        known = self._shipments.get(instance.process)
+        if known is not None and known.instance.number > instance.number:
+            return
+        new = _Shipment(instance, wanted, max(every, 0.1))
+        if known is not None:
+            new.sent, new.due, new.said = known.sent, known.due, known.said
+        self._shipments[instance.process] = new
+
+    def drop(self, instance: InstanceId, *, lives: bool) -> None:
+        """Delete the states of instances up to this one, unless one of them lives here."""
+        if lives:
+            return
+        known = self._shipments.get(instance.process)
+        if known is not None and known.instance.number <= instance.number:
+            del self._shipments[instance.process]
+        drop = partial(self._store.drop, instance.process, instance.number)
+        self._in_thread(drop, lambda _: None)
+        self._next_scan = 0.0
+
+    def say_again(self) -> None:
+        """A master has taken this host in: it knows nothing yet."""
+        self._told = None
+        self._tell(time.monotonic())
+
+    # --- the loop ------------------------------------------------------------------------
+
+    def tick(self, now: float) -> None:
+        """Do what is due; called some times a second."""
+        self._endpoint.expire(now)
+        rate = float(self._settings.max_rate)
+        self._budget = min(rate, self._budget + rate * (now - self._budget_at))
+        self._budget_at = now
+        if now >= self._next_scan:
+            self._next_scan = now + _SCAN_EVERY
+            self._in_thread(self._store.scan, self._scanned)
+        for shipment in list(self._shipments.values()):
+            self._begin_due(shipment, now)
+        for transfer in list(self._transfers.values()):
+            self._go_on(transfer, now)
+        for fetch in list(self._fetches.values()):
+            fetch.go_on(now)
+
+    def _scanned(self, states: tuple[KeptState, ...]) -> None:
+        self._kept = states
+        self._tell(time.monotonic())
+
+    def _tell(self, now: float) -> None:
+        quiet = not self._kept and not self._told
+        if self._kept == self._told and (quiet or now - self._told_at < _SAY_EVERY):
+            return
+        if self._publish(self._kept):
+            self._told, self._told_at = self._kept, now
+
+    # --- to other hosts ------------------------------------------------------------------
+
+    def _begin_due(self, shipment: _Shipment, now: float) -> None:
+        process = shipment.instance.process
+        if process in self._transfers:
+            return
+        for host in shipment.hosts:
+            if now >= shipment.due.get(host, 0.0) and self._endpoint.finds_keeper(host, now):
+                shipment.due[host] = now + shipment.every
+                transfer = self._transfers[process] = _Transfer(shipment, host)
+                sent = shipment.sent.get(host, (0, 0))
+                read = partial(self._store.newer_than, process, sent)
+                self._in_thread(read, partial(self._begin, transfer))
+                return
+
+    def _begin(self, transfer: _Transfer, found: tuple[Head, bytes, int] | None) -> None:
+        if found is None:
+            self._end(transfer)
+            return
+        transfer.head, transfer.content, transfer.digest = found
+        transfer.waits = False
+        self._go_on(transfer, time.monotonic())
+
+    def _go_on(self, transfer: _Transfer, now: float) -> None:
+        """Give the next part, as soon as the bounds of this host's network allow it."""
+        head = transfer.head
+        if transfer.waits or head is None or self._budget <= 0.0:
+            return
+        data = transfer.content[transfer.offset : transfer.offset + MOST]
+        part = Part(
+            head.process, head.instance, head.sequence, transfer.offset, len(transfer.content),
+            transfer.digest, data,
+        )  # fmt: skip
+        self._budget -= len(data)
+        transfer.waits = True
+        answered = partial(self._given, transfer, len(data))
+        self._endpoint.give(transfer.host, part, now, _PART_TIMEOUT, answered)
+
+    def _given(self, transfer: _Transfer, size: int, code: str, message: str) -> None:
+        shipment, head, host = transfer.shipment, transfer.head, transfer.host
+        now = time.monotonic()
+        if code and head is not None:
+            if code == "newer":
+                shipment.sent[host] = head.age
+            elif shipment.said.get(host) != code:
+                shipment.said[host] = code
+                self._say(f"{host} does not keep the state of {shipment.instance}: {message}")
+            shipment.due[host] = now + max(_AGAIN, shipment.every)
+            self._end(transfer)
+            return
+        transfer.offset += size
+        transfer.waits = False
+        if head is not None and transfer.offset >= len(transfer.content):
+            shipment.sent[host] = head.age
+            shipment.said.pop(host, None)
+            self._end(transfer)
+        else:
+            self._go_on(transfer, now)
+
+    def _end(self, transfer: _Transfer) -> None:
+        process = transfer.shipment.instance.process
+        if self._transfers.get(process) is transfer:
+            del self._transfers[process]
+
+    # --- from other hosts ----------------------------------------------------------------
+
+    def take_part(self, part: Part, answer: Callable[[str, str], None]) -> None:
+        """A part of a state came from another host."""
+        take = partial(self._store.take, part, bounded=True)
+        self._in_thread(take, lambda outcome: answer(*outcome))
+
+    def read_part(
+        self, process: str, age: tuple[int, int], offset: int, size: int,
+        answer: Callable[[Part | None], None],
+    ) -> None:  # fmt: skip
+        """Another host wants a part of a state."""
+        read = partial(self._store.read, process, age, offset, size, time.monotonic())
+        self._in_thread(read, answer)
+
+    # --- for a start ---------------------------------------------------------------------
+
+    def prepare(self, assignment: Assignment, done: Callable[[Assignment], None]) -> bool:
+        """See to it that the newest state is here before an instance starts.
+
+        Returns:
+            True: it may start now; else `done` is called when the state has come, or does not come
+            in time.
+        """
+        if not assignment.spec.keeps_state or assignment.shadow:
+            return True
+        directory = self._store.directory(assignment.spec.name)
+        if any(head.instance < assignment.kept_from for _, head in kept.files(directory)):
+            kept.drop(directory, assignment.kept_from - 1)
+        hosts = assignment.kept_on
+        if not hosts or hosts[0] == self._host:
+            return True
+        instance = assignment.instance
+
+        def ended(message: str) -> None:
+            if self._fetches.pop(instance, None) is not None:
+                self._say(message)
+                done(assignment)
+
+        fetch = Fetch(
+            assignment, tuple(name for name in hosts if name != self._host), self._endpoint,
+            here=kept.newest_head(directory), take=self._take_fetched, ended=ended,
+        )  # fmt: skip
+        self._fetches[instance] = fetch
+        fetch.go_on(time.monotonic())
+        return False
+
+    def _take_fetched(self, part: Part, then: Callable[[tuple[str, str]], None]) -> None:
+        self._in_thread(partial(self._store.take, part, bounded=False), then)
+
+    def is_preparing(self, instance: InstanceId) -> bool:
+        """Its start waits for a state."""
+        return instance in self._fetches
+
+    def forget(self, instance: InstanceId) -> bool:
+        """It is not to start any more; False: nothing was prepared for it."""
+        return self._fetches.pop(instance, None) is not None
