@@ -39,6 +39,7 @@ class HostColumns:
         asking: (H,) it has asked for work since it came up.
         accepting: (H,) its newest reading says that it is under all its limits.
         closed: (H,) cordoned or draining.
+        untold: (H,) it was lost, and has not said yet what it holds.
         stale: (H,) bit i: the reading of slot i, which has a limit, is stale.
         heard: (H,) time of the newest message.
         period: (H,) seconds between its readings.
@@ -66,6 +67,7 @@ class HostColumns:
             "asking": np.zeros(columns, np.bool_),
             "accepting": np.zeros(columns, np.bool_),
             "closed": np.zeros(columns, np.bool_),
+            "untold": np.zeros(columns, np.bool_),
             "stale": np.zeros(columns, np.uint32),
             "heard": np.zeros(columns),
             "period": np.zeros(columns),
@@ -111,6 +113,7 @@ class HostColumns:
         self.asking: BoolArray = used["asking"]
         self.accepting: BoolArray = used["accepting"]
         self.closed: BoolArray = used["closed"]
+        self.untold: BoolArray = used["untold"]
         self.stale: npt.NDArray[np.uint32] = used["stale"]
         self.heard: FloatArray = used["heard"]
         self.period: FloatArray = used["period"]

@@ -6,14 +6,10 @@ queue; a job that has completed meanwhile has completed. Where something has, it
 
 from __future__ import annotations
 
-from typing import Final
-
 from rosrm.core.hosts import Host
 from rosrm.core.model import InstanceId, InstanceState, InstanceStatus
 from rosrm.core.processes import LeftBehind
-from rosrm.core.state import MasterState, Process, ProcessPhase
-
-_WAITING: Final = (ProcessPhase.QUEUED, ProcessPhase.SET_ASIDE)
+from rosrm.core.state import WAITING, MasterState, Process, ProcessPhase
 
 
 def take_back_all(state: MasterState, host: Host, now: float) -> None:
@@ -32,7 +28,7 @@ def take_back(state: MasterState, host: Host, status: InstanceStatus, now: float
     """
     process = state.processes.get(status.instance.process)
     left = None if process is None else process.left_behind
-    if process is None or left is None or process.phase not in _WAITING:
+    if process is None or left is None or process.phase not in WAITING:
         return False
     if (left.number, left.host) != (status.instance.number, host.name):
         return False
@@ -43,9 +39,7 @@ def take_back(state: MasterState, host: Host, status: InstanceStatus, now: float
 def _take_back(
     state: MasterState, process: Process, left: LeftBehind, host: Host, now: float
 ) -> None:
-    if process.name in state.queue:
-        state.queue.remove(process.name)
-    state.set_aside.discard(process.name)
+    state.unqueue(process)
     instance = state.add_instance(InstanceId(process.name, left.number), process.spec, host, now)
     # Not as one that was assigned a moment ago: if the host does not hold it, it is gone.
     instance.node_name, instance.state = left.node_name, InstanceState.RUNNING

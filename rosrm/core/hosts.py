@@ -120,7 +120,7 @@ class HostTable(HostColumns):
         self.usage[rows, column] = 0.0
         self.busy[rows, column] = self.load[rows, column]
         self.condition[column] = HostCondition.UP
-        self.asking[column] = self.accepting[column] = False
+        self.asking[column] = self.accepting[column] = self.untold[column] = False
         self.stale[column] = 0
         self.heard[column] = now
         self.bound[column] = description.max_processes or NO_BOUND
@@ -236,7 +236,7 @@ class HostTable(HostColumns):
         """(H,) True: may be given work now, room and number of processes aside."""
         return np.asarray(
             (self.condition == HostCondition.UP) & self.asking & self.accepting
-            & ~self.closed & (self.stale == 0)
+            & ~self.closed & ~self.untold & (self.stale == 0)
         )  # fmt: skip
 
     def why_closed(self, column: int) -> str:
@@ -254,6 +254,8 @@ class HostTable(HostColumns):
         if not self.accepting[column]:
             over = self.over_limit(column)
             return f"it is over its limit of {', '.join(over)}" if over else "it takes no work now"
+        if self.untold[column]:
+            return "it was lost, and has not said yet what it holds"
         if not self.asking[column]:
             return "it has not asked for work yet"
         return ""
@@ -297,9 +299,15 @@ class HostTable(HostColumns):
         return np.flatnonzero(over & (self.condition == HostCondition.UP))
 
     def statuses_missing(self) -> IntArray:
-        """Columns of hosts that say they sent statuses which have not come."""
-        behind = self.reported > self.status_sequence
+        """Columns of hosts from which statuses are missing, by their own word or since a loss."""
+        behind = (self.reported > self.status_sequence) | self.untold
         return np.flatnonzero(behind & (self.condition == HostCondition.UP))
+
+    def set_untold(self, host: Host, *, untold: bool) -> None:
+        """A host that was lost has come back, or has said what it holds."""
+        if bool(self.untold[host.column]) is not untold:
+            self.untold[host.column] = untold
+            self.changed()
 
     def note_statuses(self, host: Host, sequence: int, now: float) -> bool | None:
         """Take note of a status batch.

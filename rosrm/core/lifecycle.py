@@ -22,7 +22,7 @@ from rosrm.core.model import (
     RestartPolicy,
 )
 from rosrm.core.runs import End, Run
-from rosrm.core.state import Instance, MasterState, Process, ProcessPhase, Wanted
+from rosrm.core.state import WAITING, Instance, MasterState, Process, ProcessPhase, Wanted
 
 #: What the state of the owning instance means for the process.
 _PHASE: Final = {
@@ -49,6 +49,7 @@ def statuses_received(state: MasterState, event: happened.StatusesReceived, now:
         return
     if event.complete:
         state.missing_since.pop(host.column, None)
+        state.hosts.set_untold(host, untold=False)
         reconcile(state, host, event.statuses, now)
         return
     if not is_next:
@@ -171,6 +172,9 @@ def _take_stranger(state: MasterState, host: Host, status: InstanceStatus, now: 
     stranger.state, stranger.pid = status.state, status.pid
     stranger.at_once = followed
     stop_instance(state, stranger, now)
+    process = state.processes.get(status.instance.process)
+    if process is not None and process.phase in WAITING:
+        _wait_for_ends(state, process, now)
 
 
 def adopt_to_stop(state: MasterState, instance: InstanceId, host: Host, now: float) -> Instance:
@@ -308,9 +312,16 @@ def _requeue(state: MasterState, process: Process, host: Host, now: float, reaso
         if not instance.stopping:
             stop_instance(state, instance, now)
     if not requeue_if_clear(state, process, now):
-        left = ", ".join(f"{one.id} on {one.host.name}" for one in state.instances_of(process))
-        state.set_phase(process, ProcessPhase.STOPPING, now, f"waits for the end of {left}")
-        state.save(process)
+        _wait_for_ends(state, process, now)
+
+
+def _wait_for_ends(state: MasterState, process: Process, now: float) -> None:
+    """It is queued, at its place, once nothing of it runs any more."""
+    state.unqueue(process)
+    process.wanted = Wanted.REQUEUE
+    left = ", ".join(f"{one.id} on {one.host.name}" for one in state.instances_of(process))
+    state.set_phase(process, ProcessPhase.STOPPING, now, f"waits for the end of {left}")
+    state.save(process)
 
 
 def requeue_if_clear(state: MasterState, process: Process, now: float) -> bool:

@@ -77,5 +77,6 @@ def welcome_back(state: MasterState, host: Host, now: float) -> None:
     state.record(now, "host_back", f"{host.name} is heard again", host=host.name)
     if was_lost:
         host_loss.regain_sight(state, host, now)
+        state.hosts.set_untold(host, untold=True)
         state.emit(Order(state.order_id(), host.host_id, "report"))
     reconsider_set_aside(state, now)

@@ -12,10 +12,8 @@ from rosrm.core.commands import Order, Reply
 from rosrm.core.intake import save_host
 from rosrm.core.model import ProcessSpec
 from rosrm.core.relief import try_move
-from rosrm.core.state import MasterState, Process, ProcessPhase, Wanted
+from rosrm.core.state import WAITING, MasterState, Process, ProcessPhase, Wanted
 from rosrm.ports import SpecChecking
-
-_WAITING = (ProcessPhase.QUEUED, ProcessPhase.SET_ASIDE)
 
 
 def _refuse(state: MasterState, request: int, message: str, code: str = "invalid") -> None:
@@ -146,10 +144,8 @@ def _cancel(state: MasterState, process: Process, now: float) -> None:
     state.record(
         now, "cancel_requested", f"{process.name} is to be cancelled", process=process.name
     )
-    if process.phase in _WAITING:
-        if process.name in state.queue:
-            state.queue.remove(process.name)
-        state.set_aside.discard(process.name)
+    if process.phase in WAITING:
+        state.unqueue(process)
         state.set_phase(process, ProcessPhase.CANCELLED, now)
         state.record(
             now, "cancelled", f"{process.name} cancelled in the queue", process=process.name
@@ -180,7 +176,7 @@ def restart_requested(state: MasterState, event: happened.RestartRequested, now:
 
 
 def _restart_fault(state: MasterState, process: Process) -> str:
-    if process.phase in _WAITING:
+    if process.phase in WAITING:
         return f"{process.name} waits in the queue already"
     if process.name in state.runs:
         return f"{process.name} is moving"

@@ -27,10 +27,21 @@ from rosrm.ports import Intent, MigrationStrategy, Record, ScoringPolicy
 _HISTORY: Final = 12
 #: Instance numbers are made durable by so many at a time.
 _RESERVED: Final = 1000
+#: Of processes that wait for a host.
+WAITING: Final = (ProcessPhase.QUEUED, ProcessPhase.SET_ASIDE)
 #: No instance gets a number as large as this.
 _LARGEST: Final = 2**53
 
-__all__ = ["Instance", "MasterState", "Process", "ProcessPhase", "Run", "Wanted", "larger"]
+__all__ = [
+    "WAITING",
+    "Instance",
+    "MasterState",
+    "Process",
+    "ProcessPhase",
+    "Run",
+    "Wanted",
+    "larger",
+]
 
 
 class MasterState:
@@ -218,6 +229,12 @@ class MasterState:
         process.wanted = Wanted.RUN
         self.set_phase(process, ProcessPhase.QUEUED, now, reason)
         self.queue.add(process.name, process.spec.priority, process.order)
+
+    def unqueue(self, process: Process) -> None:
+        """It waits for a host no more, or not yet again."""
+        if process.name in self.queue:
+            self.queue.remove(process.name)
+        self.set_aside.discard(process.name)
 
     def instances_of(self, process: Process) -> Iterable[Instance]:
         """Every instance of a process that may still run."""

@@ -297,3 +297,20 @@ def test_what_was_cancelled_out_of_sight_is_not_taken_back() -> None:
     cluster.restart("p")
     back(cluster, "a")
     assert (cluster.phase("p"), cluster["p"].owner, cluster.where("p")) == ("running", 2, ["a"])
+
+
+def test_a_new_process_of_the_name_waits_until_the_old_one_has_ended() -> None:
+    """It was cancelled out of sight, and the name was given again; its host comes back."""
+    cluster = on_a(process("p"), "b")
+    cluster.machines["a"].stubborn.add("p")
+    lose(cluster, "a")
+    cluster.cancel("p")
+    cluster.wait(0.5)
+    cluster.set_host("b", "cordon")
+    assert cluster.submit(process("p")).accepted
+    back(cluster, "a")
+    assert (cluster.phase("p"), cluster.queue()) == ("stopping", [])
+    assert cluster["p"].reason == "waits for the end of p#1 on a"
+    cluster.machines["a"].let_go("p", cluster.now)
+    cluster.wait(0.5)
+    assert (cluster.phase("p"), cluster["p"].owner) == ("running", 2)
