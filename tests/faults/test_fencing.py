@@ -44,7 +44,8 @@ def test_the_supervisor_of_a_stopped_slave_fences(make_cluster) -> None:
 
 def test_it_has_ended_when_its_successor_starts(make_cluster) -> None:
     """With the time that the master chooses, from its lease."""
-    cluster = make_cluster(host("h0"), host("h1"), **SOON)
+    liveness = LivenessSettings(suspect=2.0, lease=6.0)
+    cluster = make_cluster(host("h0"), host("h1"), **{**SOON, "liveness": liveness})
     policies = {"isolation": IsolationPolicy("stop"), "host_loss": HostLossPolicy("elsewhere")}
     cluster.submit(service("singleton", **policies))
     before = cluster.wait("singleton", "running")

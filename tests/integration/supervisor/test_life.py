@@ -17,10 +17,12 @@ import pytest
 import rosrm
 from rosrm.core.model import InstanceId, InstanceState, RestartPolicy
 from rosrm.errors import SupervisorError
-from rosrm.supervisor import members
+from rosrm.supervisor import members, protocol
 from rosrm.supervisor.client import SupervisorClient, SupervisorEnded
 
 from .conftest import Host, command_line, wait_gone, wait_until
+
+OURS = protocol.PROTOCOL
 
 SLAVE = """
     import os, sys
@@ -82,6 +84,19 @@ def test_a_second_live_slave_is_refused(host, slave):
     """While one is connected another is turned down, and is told which one is there."""
     with pytest.raises(SupervisorError, match=f"another slave .pid {slave.pid}. is connected"):
         host.connect()
+
+
+@pytest.mark.parametrize("number", [OURS - 1, OURS + 1])
+def test_a_slave_of_another_version_is_refused(host, client, monkeypatch, number):
+    """With both numbers; what the supervisor runs goes on."""
+    client.start([host.order("kept", "sleep", "1000")])
+    pid = host.running(client, "kept").pid
+    client.close()
+    with monkeypatch.context() as patched:
+        patched.setattr(protocol, "PROTOCOL", number)
+        with pytest.raises(SupervisorError, match=f"speaks protocol {OURS}, you speak {number}"):
+            host.connect()
+    assert [status.pid for status in host.connect().instances] == [pid]
 
 
 def test_final_statuses_are_kept_until_forgotten(host):
