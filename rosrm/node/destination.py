@@ -14,6 +14,7 @@ from rosrm.node.cuts import Cut, CutAssembler
 from rosrm.node.entities import waiting
 from rosrm.node.member import Member
 from rosrm.node.parts import Part, StateError
+from rosrm.node.steady import steady_timer
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs.msg import HandoffReport, StateConfig, StateMark
 
@@ -101,7 +102,7 @@ class Destination:
         for part in self._parts:
             self.follow_part(part)
         if not self._over:
-            self._timer = member.plain.create_timer(_REVIEW, self._look)
+            self._timer = steady_timer(member.plain, _REVIEW, self._look)
             self._review()
         return channel
 

@@ -14,12 +14,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from rclpy.clock import Clock, ClockType
 from rclpy.serialization import serialize_message
 
 from rosrm.kept import LARGEST, Block, SlotWriter
 from rosrm.node.member import Member, Mode
 from rosrm.node.parts import Part, StateError
+from rosrm.node.steady import steady_timer
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs.msg import CoveredInput, StateMark
 
@@ -54,10 +54,9 @@ class Keeper:
         self._publishers: dict[str, int] = {}
         self._writer = _Writer(member)
         # What is not saved after its cycle is saved later, though no cycle follows.
-        self._late = member.plain.create_timer(
-            max(self._every, 1e-3), self._keep_late, autostart=False,
-            clock=Clock(clock_type=ClockType.STEADY_TIME),
-        )  # fmt: skip
+        self._late = steady_timer(
+            member.plain, max(self._every, 1e-3), self._keep_late, autostart=False
+        )
         self._armed = False
         atexit.register(self.close)
         if member.sequence:  # it went on from another's state, which lies elsewhere

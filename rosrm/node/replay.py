@@ -6,6 +6,8 @@ import time
 from collections.abc import Callable
 from typing import Any, Final
 
+from rosrm.node.steady import steady_timer
+
 #: Seconds of one slice; a callback that is begun is finished.
 _SLICE: Final = 0.02
 
@@ -49,7 +51,7 @@ class Replay:
 
     def _start(self) -> None:
         if self._timer is None:
-            self._timer = self._plain.create_timer(0.0, self._serve_slice)
+            self._timer = steady_timer(self._plain, 0.0, self._serve_slice)
 
     def _serve_slice(self) -> None:
         with self._turn:

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
-from rclpy.clock import Clock, ClockType
 from rclpy.serialization import deserialize_message
 
 from rosrm.kept import Kept, newest
 from rosrm.node.identity import Identity
 from rosrm.node.member import Member
 from rosrm.node.parts import Part, StateError
+from rosrm.node.steady import steady_timer
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs.msg import StateMark
 
@@ -48,9 +48,7 @@ class Revival:
         self._parts = parts
         self._kept = kept
         self._done = done
-        self._timer: Any = member.plain.create_timer(
-            0.0, self._restore, clock=Clock(clock_type=ClockType.STEADY_TIME)
-        )
+        self._timer = steady_timer(member.plain, 0.0, self._restore)
 
     def _restore(self) -> None:
         with self._member.turn:

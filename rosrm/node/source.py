@@ -15,6 +15,7 @@ from rosrm.node.channel import Channel
 from rosrm.node.keep import LARGEST_PART, Keeper
 from rosrm.node.member import Member, Mode
 from rosrm.node.parts import Part, StateError
+from rosrm.node.steady import steady_timer
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs.msg import CoveredInput, HandoffReport, MatchedOutput, StateConfig, StateMark
 
@@ -196,7 +197,7 @@ class Source:
             self._go_on(_nothing)
             return
         self._channel.say(HandoffReport.SILENT, member.sequence)
-        self._look_again = member.plain.create_timer(_LOOK, self._release_when_heard)
+        self._look_again = steady_timer(member.plain, _LOOK, self._release_when_heard)
 
     def _release_when_heard(self) -> None:
         """What is not acknowledged is lost when this node is stopped."""

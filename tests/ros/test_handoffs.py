@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from dataclasses import replace
 
 import pytest
 from std_msgs.msg import Int64
@@ -93,6 +94,19 @@ def test_the_state_goes_along(cluster) -> None:
     assert {before.host, after.host} == {"h0", "h1"}
     assert not alive(before.pid)
     cluster.cancel("good")
+
+
+def test_a_node_whose_clock_stands_still_moves(cluster) -> None:
+    """It wants simulated time, and nobody publishes any: what is ours goes by another clock."""
+    ticks = (
+        "from rclpy.clock import Clock, ClockType; clock = Clock(clock_type=ClockType.STEADY_TIME)"
+        "; self.create_timer(0.02, self.tick, clock=clock); self.keep()"
+    )
+    still = counter("still", ticks)
+    cluster.submit(replace(still, parameters={"use_sim_time": True}))
+    _, event = moved(cluster, "still")
+    assert event.kind == "migrated", event.message
+    cluster.cancel("still")
 
 
 @pytest.mark.parametrize(
