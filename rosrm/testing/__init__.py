@@ -13,6 +13,7 @@ Where a plugin says that it is absent (`SkipPlugin`), its contract is skipped wi
 For readable failures, `pytest.register_assert_rewrite("rosrm.testing")` in a conftest.py.
 """
 
+from rosrm.testing.checkpoints import CheckpointContract
 from rosrm.testing.journals import JournalContract, MemoryJournal
 from rosrm.testing.migrations import MigrationContract, before_commit
 from rosrm.testing.probes import (
@@ -26,6 +27,7 @@ from rosrm.testing.probes import (
 from rosrm.testing.scoring import ScoringContract, host_view, one_row, process_view, vetoes
 
 __all__ = [
+    "CheckpointContract",
     "FakeClock",
     "FakeProbe",
     "FakeSessions",

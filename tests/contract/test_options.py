@@ -7,6 +7,7 @@ import pytest
 from pydantic import TypeAdapter, ValidationError
 
 from rosrm.config.plain import from_plain, to_plain
+from rosrm_checkpoint.plugin import register_checkpoint_policies
 from rosrm_migration.plugin import register_migration_strategies
 from rosrm_resources.plugin import register_probes
 from rosrm_scoring.plugin import register_scoring_policies
@@ -17,6 +18,7 @@ OFFERS = {
         *register_probes(),
         *register_scoring_policies(),
         *register_migration_strategies(),
+        *register_checkpoint_policies(),
     ]
 }
 
@@ -46,6 +48,8 @@ def test_defaults_survive_the_way_to_the_slave(name):
         ("handoff", {"protocol": "paper"}, "names the topic on which the node publishes"),
         ("handoff", {"protocol": "paper", "state": "/s", "type": "Int64"}, "std_msgs/msg/Int64"),
         ("handoff", {"state": "/s"}, "go with `protocol: paper`"),
+        ("other-host", {"every": 0}, "greater than 0"),
+        ("other-host", {"copies": 0}, "is not within 1"),
         ("threshold", {"enter": 0.5, "leave": 0.6}, "must be below enter"),
     ],
 )

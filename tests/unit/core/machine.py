@@ -269,6 +269,8 @@ class Machine:
             )
         if order.action == "set_restart":
             return self._set_restart(order, now)
+        if order.action in ("keep", "drop_kept"):
+            return happened.OrderAnswered(order.order, True)
         event: slave.Event
         if order.action == "report":
             event = slave.ReportRequested()

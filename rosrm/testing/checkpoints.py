@@ -1,0 +1,72 @@
+"""What the master relies on in a checkpoint policy."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, ClassVar
+
+from rosrm.core.model import EMPTY, MigrationPolicy, ProcessSpec
+from rosrm.ports import CheckpointOffer, CheckpointPolicy, CheckpointView
+
+
+class CheckpointContract:
+    """What the master relies on in a checkpoint policy.
+
+    Attributes:
+        offer: what is tested.
+        options: settings by name; the others have their defaults.
+        spec: of a stateful process.
+    """
+
+    offer: ClassVar[CheckpointOffer]
+    options: ClassVar[Mapping[str, Any]] = EMPTY
+    spec: ClassVar[ProcessSpec] = ProcessSpec(
+        "p", command=("true",), ros=True, migration=MigrationPolicy("handoff")
+    )
+
+    def make(self) -> CheckpointPolicy:
+        """A new policy; override it where more is needed."""
+        return self.offer.create(self.offer.options(**self.options))
+
+    def views(self) -> Sequence[CheckpointView]:
+        """A process on one of five hosts: kept nowhere else yet, kept already, and all alone."""
+        hosts = {f"h{n}": {"rack": str(n % 2), "room": "1"} for n in range(5)}
+        fresh = CheckpointView(self.spec, "h0", None, 1000, (), hosts)
+        return [
+            fresh,
+            replace(fresh, age=0.5, kept_on=("h3",)),
+            replace(fresh, age=3600.0, kept_on=("h4", "h1", "gone"), size=1 << 30),
+            replace(fresh, hosts={"h0": hosts["h0"]}),
+        ]
+
+    def test_chooses_hosts_that_are_there(self) -> None:
+        """Each once, never the process's own."""
+        for view in self.views():
+            choice = self.make().choose(view)
+            if choice is not None:
+                assert set(choice.hosts) <= view.hosts.keys() - {view.host}
+                assert len(set(choice.hosts)) == len(choice.hosts)
+
+    def test_says_how_often(self) -> None:
+        """Seconds, more than none."""
+        for view in self.views():
+            choice = self.make().choose(view)
+            if choice is not None:
+                assert 0.0 < choice.every < math.inf
+
+    def test_is_pure(self) -> None:
+        """The same view gives the same choice, also with another object of the policy."""
+        policy, twin = self.make(), self.make()
+        for view in self.views():
+            assert policy.choose(view) == policy.choose(view) == twin.choose(view)
+
+    def test_stays_with_its_choice(self) -> None:
+        """Once its hosts keep the state, nothing travels to another one."""
+        for view in self.views():
+            choice = self.make().choose(view)
+            if choice is not None:
+                kept = replace(view, age=0.1, kept_on=choice.hosts)
+                again = self.make().choose(kept)
+                assert again is None or set(again.hosts) == set(choice.hosts)

@@ -1,0 +1,67 @@
+"""Every shipped checkpoint policy holds the contract that a third party's holds."""
+
+from dataclasses import replace
+from typing import ClassVar
+
+from rosrm.core.model import ProcessSpec
+from rosrm.ports import CheckpointChoice, CheckpointView
+from rosrm.testing import CheckpointContract
+from rosrm_checkpoint import plugin
+from rosrm_checkpoint.other_host import OtherHost, OtherHostOptions
+
+OFFERS = {offer.name: offer for offer in plugin.register_checkpoint_policies()}
+HOSTS = {f"h{n}": {"rack": str(n % 2)} for n in range(6)}
+
+
+class TestOtherHost(CheckpointContract):
+    offer = OFFERS["other-host"]
+
+
+class TestOtherHostWithCopiesApart(CheckpointContract):
+    offer = OFFERS["other-host"]
+    options: ClassVar = {"copies": 2, "apart_by": "rack", "every": 0.2}
+
+
+def test_each_shipped_policy_is_here():
+    """A policy that is added to the plugin must be added here."""
+    assert set(OFFERS) == {contract.offer.name for contract in CheckpointContract.__subclasses__()}
+
+
+def view(name: str = "p", **fields) -> CheckpointView:
+    spec = ProcessSpec(name, command=("true",))
+    return replace(CheckpointView(spec, "h0", None, 10, (), HOSTS), **fields)
+
+
+def choose(asked: CheckpointView, **options) -> CheckpointChoice:
+    choice = OtherHost(OtherHostOptions(**options)).choose(asked)
+    assert choice is not None
+    return choice
+
+
+def test_so_many_copies():
+    """As many as there are hosts for."""
+    assert len(choose(view(), copies=3).hosts) == 3
+    assert len(choose(view(), copies=9).hosts) == 5
+    assert choose(view(hosts={"h0": {}})).hosts == ()
+
+
+def test_apart_comes_first():
+    """Then those that are not: a copy nearby is better than none."""
+    assert set(choose(view(), copies=3, apart_by="rack").hosts) == {"h1", "h3", "h5"}
+    near = {name: labels for name, labels in HOSTS.items() if labels["rack"] == "0"}
+    assert choose(view(hosts=near), apart_by="rack").hosts in {("h2",), ("h4",)}
+
+
+def test_another_that_is_apart_takes_over_from_a_keeper_that_is_not():
+    """When it comes up, the state goes there."""
+    choice = choose(view(kept_on=("h2",)), apart_by="rack")
+    assert HOSTS[choice.hosts[0]]["rack"] == "1"
+
+
+def test_processes_are_spread_over_the_hosts():
+    """Not all states lie on one host."""
+    counts = dict.fromkeys(HOSTS, 0)
+    for number in range(500):
+        counts[choose(view(f"p{number}")).hosts[0]] += 1
+    assert counts.pop("h0") == 0
+    assert min(counts.values()) > 50

@@ -1,0 +1,284 @@
+"""Kept states in the core: what the policy is asked, what slaves are told, what a start is told."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from rosrm.core import events as happened
+from rosrm.core.commands import Assign
+from rosrm.core.model import (
+    HostLossPolicy,
+    InstanceId,
+    KeptState,
+    MigrationPolicy,
+    ProcessSpec,
+    Readiness,
+)
+from rosrm.ports import CheckpointChoice, CheckpointView
+from tests.unit.core.cluster import Cluster, job, process
+
+
+class Asked:
+    """A policy that does as it is told, and remembers what it was asked."""
+
+    def __init__(self, *hosts: str, every: float = 1.0) -> None:
+        self.answer: Any = CheckpointChoice(hosts, every)
+        self.views: list[CheckpointView] = []
+
+    def choose(self, view: CheckpointView) -> CheckpointChoice | None:
+        self.views.append(view)
+        if isinstance(self.answer, Exception):
+            raise self.answer
+        return self.answer
+
+
+def stateful(name: str = "p", **fields: Any) -> ProcessSpec:
+    fields.setdefault("host_loss", HostLossPolicy("elsewhere"))
+    fields.setdefault("readiness", Readiness("running"))
+    return process(name, ros=True, migration=MigrationPolicy("handoff"), **fields)
+
+
+def keep(cluster: Cluster, host: str, *states: tuple[str, int, int]) -> None:
+    """A host says all that it keeps: process, instance, sequence."""
+    machine = cluster.machines[host]
+    kept = tuple(
+        KeptState(InstanceId(name, number), sequence, 100) for name, number, sequence in states
+    )
+    cluster.tell(happened.KeptStatesReceived(machine.host_id, machine.incarnation, kept))
+
+
+def running(policy: Asked | None, *hosts: str, spec: ProcessSpec | None = None) -> Cluster:
+    """A stateful process that runs, its state kept on its own host."""
+    cluster = Cluster(*(hosts or ("a", "b", "c")), lease=3.0)
+    cluster.state.keeping.policy, cluster.state.keeping.policy_name = policy, "asked"
+    cluster.submit(spec or stateful())
+    cluster.wait(1.0)
+    assert cluster.phase("p") == "running"
+    keep(cluster, where(cluster), ("p", cluster["p"].owner, 5))
+    return cluster
+
+
+def where(cluster: Cluster, name: str = "p") -> str:
+    (host,) = cluster.where(name)
+    return host
+
+
+def others(cluster: Cluster) -> list[str]:
+    return [name for name in cluster.machines if name != where(cluster)]
+
+
+def assigned(cluster: Cluster) -> Any:
+    """The newest assignment."""
+    return [one for one in cluster.carried if isinstance(one, Assign)][-1].assignment
+
+
+def test_the_policys_choice_is_told_once():
+    """To the slave where the process runs; and again only when it changes."""
+    policy = Asked("b")
+    cluster = running(policy, "a", "b")
+    host = where(cluster)
+    policy.answer = CheckpointChoice((others(cluster)[0],), 2.0)
+    cluster.wait(10.0)
+    orders = cluster.orders("keep")
+    assert [(one.keep_on, one.keep_every) for one in orders[-1:]] == [((others(cluster)[0],), 2.0)]
+    assert {one.host_id for one in orders} == {cluster.machines[host].host_id}
+    assert orders[-1].instance == InstanceId("p", cluster["p"].owner)
+    told = len(orders)
+    policy.answer = None  # as before
+    cluster.wait(10.0)
+    assert len(cluster.orders("keep")) == told
+
+
+def test_what_the_policy_sees():
+    """The hosts that are up with their labels, what is kept, and how old it is."""
+    policy = Asked()
+    cluster = running(policy)
+    other = others(cluster)[0]
+    cluster.wait(1.0)
+    assert (policy.views[-1].age, policy.views[-1].kept_on) == (None, ())
+    keep(cluster, other, ("p", cluster["p"].owner, 4))
+    cluster.wait(5.0)
+    view = policy.views[-1]
+    assert view.host == where(cluster)
+    assert view.kept_on == (other,)
+    assert view.age == pytest.approx(5.0, abs=1.2)
+    assert set(view.hosts) == {"a", "b", "c"}
+    assert view.size == 100
+
+
+def test_it_is_asked_about_once_a_second_for_each_process():
+    """However many there are, and however often time passes."""
+    policy = Asked()
+    cluster = Cluster("a", "b")
+    cluster.state.keeping.policy = policy
+    names = [f"p{n}" for n in range(30)]
+    cluster.submit(*(stateful(name) for name in names))
+    cluster.wait(1.0)
+    for host in ("a", "b"):
+        mine = [name for name in names if cluster.where(name) == [host]]
+        keep(cluster, host, *((name, cluster[name].owner, 1) for name in mine))
+    policy.views.clear()
+    cluster.wait(10.0)
+    assert 8 * 30 <= len(policy.views) <= 12 * 30
+    assert {view.spec.name for view in policy.views} == set(names)
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        ValueError("no idea"),
+        CheckpointChoice(("nowhere",)),
+        CheckpointChoice(("b", "b")),
+        CheckpointChoice(("b",), every=0.0),
+        "b",
+    ],
+)
+def test_a_policy_that_raises_or_makes_no_sense_is_named(answer):
+    """And what was told before holds on."""
+    policy = Asked()
+    cluster = running(policy, "a", "b")
+    policy.answer = answer
+    if isinstance(answer, CheckpointChoice) and where(cluster) == "b":
+        cluster.migrate("p", "a")
+        cluster.wait(10.0)
+        keep(cluster, where(cluster), ("p", cluster["p"].owner, 5))
+    told = len(cluster.orders("keep"))
+    cluster.wait(25.0)
+    (first, *_) = cluster.told("plugin_failed")
+    assert "the checkpoint policy 'asked' does not choose for p" in first
+    assert len(cluster.told("plugin_failed")) <= 4
+    assert all(order.keep_on == () for order in cluster.orders("keep")[told:])
+
+
+def test_a_choice_of_the_processs_own_host_is_refused():
+    policy = Asked()
+    cluster = running(policy, "a", "b")
+    policy.answer = CheckpointChoice((where(cluster),))
+    cluster.wait(2.0)
+    assert cluster.told("plugin_failed")
+
+
+def test_a_slave_that_was_started_anew_is_told_again():
+    """It has forgotten; so has one that was told by a master before this one."""
+    policy = Asked()
+    cluster = running(policy, "a", "b")
+    policy.answer = CheckpointChoice((others(cluster)[0],))
+    cluster.wait(2.0)
+    told, machine = len(cluster.orders("keep")), cluster.machines[where(cluster)]
+    machine.incarnation += 100
+    machine.connected = False
+    cluster.wait(1.5)
+    machine.connected = True
+    cluster.register(machine)
+    keep(cluster, machine.name, ("p", cluster["p"].owner, 6))
+    cluster.wait(2.0)
+    assert len(cluster.orders("keep")) == told + 1
+
+
+def test_after_the_loss_of_its_host_the_start_is_told_where_the_state_lies():
+    """Newest first, lost hosts left out; and the host that has it is preferred."""
+    cluster = running(Asked())
+    host, (one, two) = where(cluster), others(cluster)
+    number = cluster["p"].owner
+    # Without the state, the emptier one would be chosen.
+    cluster.machines[two].busy = {"memory": 0.3, "cpu": 0.3}
+    keep(cluster, two, ("p", number, 4))
+    cluster.machines[host].connected = False
+    cluster.wait(6.0)
+    assert cluster.where("p")[-1:] == [two] or two in cluster.where("p")
+    assignment = assigned(cluster)
+    assert assignment.kept_on == (two,)
+    assert assignment.kept_from <= number < assignment.instance.number
+    assert one not in assignment.kept_on
+
+
+def test_a_failed_process_that_is_restarted_goes_on_from_its_state():
+    """It was not asked to begin anew."""
+    cluster = running(Asked())
+    host, number = where(cluster), cluster["p"].owner
+    cluster.machines[host].finish("p", cluster.now, code=1)
+    cluster.settle()
+    assert cluster.phase("p") == "failed"
+    cluster.wait(3.0)
+    assert not cluster.orders("drop_kept")
+    cluster.restart("p")
+    assignment = assigned(cluster)
+    assert assignment.kept_on == (host,)
+    assert assignment.kept_from <= number
+    assert cluster.where("p") == [host]
+
+
+def test_what_is_cancelled_is_dropped_everywhere_and_begins_from_nothing():
+    """Also on a host that was away when it was cancelled."""
+    policy = Asked()
+    cluster = running(policy)
+    host, other = where(cluster), others(cluster)[0]
+    number = cluster["p"].owner
+    policy.answer = CheckpointChoice((other,))
+    cluster.wait(2.0)
+    keep(cluster, other, ("p", number, 4))
+    cluster.machines[other].connected = False
+    cluster.wait(2.0)
+    cluster.cancel("p")
+    cluster.wait(3.0)
+    dropped = {order.host_id for order in cluster.orders("drop_kept")}
+    assert dropped == {cluster.machines[host].host_id}
+    keep(cluster, host)
+    cluster.submit(stateful())
+    assert assigned(cluster).kept_on == ()
+    assert assigned(cluster).kept_from > number
+    cluster.machines[other].connected = True
+    cluster.wait(3.0)
+    assert cluster.orders("drop_kept")[-1].host_id == cluster.machines[other].host_id
+    assert cluster.orders("drop_kept")[-1].instance == InstanceId("p", number)
+
+
+def test_where_it_was_submitted_is_not_forgotten_with_the_master():
+    """The state of a former life stays unused after a restart of the master too."""
+    cluster = running(Asked())
+    other, number = others(cluster)[0], cluster["p"].owner
+    cluster.cancel("p")
+    cluster.submit(stateful())
+    cluster.restart_master()
+    keep(cluster, other, ("p", number, 4))
+    assert cluster["p"].born > number
+
+
+def test_after_a_move_the_copies_of_the_source_are_dropped_once_there_is_a_newer_one():
+    """Not before: until then they are all there is, if the new host is lost."""
+    cluster = running(Asked(), "a", "b")
+    source = where(cluster)
+    number = cluster["p"].owner
+    (destination,) = others(cluster)
+    cluster.migrate("p", destination)
+    cluster.wait(20.0)
+    assert cluster.where("p") == [destination]
+    assert not cluster.orders("drop_kept")
+    keep(cluster, destination, ("p", cluster["p"].owner, 9))
+    cluster.wait(3.0)
+    (order, *_) = cluster.orders("drop_kept")
+    assert order.host_id == cluster.machines[source].host_id
+    assert order.instance == InstanceId("p", number)
+
+
+def test_without_a_policy_it_is_kept_on_its_own_host_alone():
+    """And a start elsewhere is told of it all the same."""
+    cluster = running(None)
+    cluster.wait(3.0)
+    assert all(order.keep_on == () for order in cluster.orders("keep"))
+    assert not cluster.orders("drop_kept")
+
+
+def test_stateless_processes_and_strangers_are_left_alone():
+    """What is kept of a name that nobody knows stays: the journal may be lost."""
+    cluster = Cluster("a")
+    cluster.submit(process("s"), job("j"))
+    keep(cluster, "a", ("unknown", 70, 3))
+    cluster.wait(3.0)
+    assert not cluster.orders("keep")
+    assert not cluster.orders("drop_kept")
+    assert assigned(cluster).kept_on == ()
+    cluster.submit(process("t"))
+    assert assigned(cluster).instance.number > 70, "no number is used twice"
