@@ -1,6 +1,6 @@
 """A client of the master, on its host, driven by lines: `{"do": ...}` in, one line out for each.
 
-`submit` takes `entries` of a work file, `cancel` names, `migrate` a process and a host, `look`
+`submit` takes the path of a work file, `cancel` names, `migrate` a process and a host, `look`
 tells how hosts and processes stand (for a story; nothing is judged by it). Ends with its input.
 """
 
@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import json
 import sys
-import tempfile
-from pathlib import Path
 from typing import Any
 
 from rosrm.config.work import load_work
@@ -40,10 +38,7 @@ def main() -> None:
 
 def _answer(client: MasterClient, request: dict[str, Any]) -> dict[str, Any]:
     if request["do"] == "submit":
-        with tempfile.TemporaryDirectory() as folder:
-            work = Path(folder) / "work.yaml"
-            work.write_text(json.dumps({"processes": request["entries"]}))
-            return {"message": client.submit(load_work(work))}
+        return {"message": client.submit(load_work(request["work"]))}
     if request["do"] == "cancel":
         return {"message": client.cancel(request["names"])}
     if request["do"] == "migrate":

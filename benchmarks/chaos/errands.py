@@ -54,13 +54,18 @@ class Errands:
         self._answered: queue.SimpleQueue[Errand] = queue.SimpleQueue()
         self._open = 0
         self._leaving = False
-        with log.open("ab") as sink:
-            self._desk = lab.popen(
+        self._lab = lab
+        self._log = log
+        self._desk = self._start_desk()
+        self._thread = threading.Thread(target=self._serve, name="errands", daemon=True)
+        self._thread.start()
+
+    def _start_desk(self) -> subprocess.Popen[bytes]:
+        with self._log.open("ab") as sink:
+            return self._lab.popen(
                 DESK, [sys.executable, "-m", "benchmarks.chaos.desk"], cwd=str(ROOT),
                 stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=sink,
             )  # fmt: skip
-        self._thread = threading.Thread(target=self._serve, name="errands", daemon=True)
-        self._thread.start()
 
     def __enter__(self) -> Self:
         return self
@@ -113,13 +118,22 @@ class Errands:
         try:
             to.write(json.dumps(request).encode() + b"\n")
             to.flush()
-        except (BrokenPipeError, ValueError):
-            return {"no_master": "the client at the desk has ended"}
-        line = source.readline()
+        except BrokenPipeError:
+            line = b""
+        else:
+            line = source.readline()
         if not line:
-            return {"no_master": "the client at the desk has ended"}
+            return self._ended()
         answer: dict[str, Any] = json.loads(line)
         return answer
+
+    def _ended(self) -> dict[str, Any]:
+        """The client has ended: another one takes its place, unless it was meant to end."""
+        ended = self._desk
+        ended.communicate()
+        if not self._leaving:
+            self._desk = self._start_desk()
+        return {"no_master": f"the client ended with {ended.returncode}, see {self._log}"}
 
 
 def _accepted(errand: Errand) -> bool:

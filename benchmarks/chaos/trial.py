@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -89,7 +90,7 @@ class Trial:
         self._oracle = Oracle(cluster.lab.name, lines, self._wanted)
         self._harms: list[Harm] = []
         self._services = {service.name: service for service in work.services()}
-        self._guests = 0
+        self._guests = self._works = 0
 
     # --- begin and end ------------------------------------------------------------------------
 
@@ -202,7 +203,11 @@ class Trial:
     # --- what is asked for ----------------------------------------------------------------
 
     def _submit(self, entries: list[dict[str, Any]], accepted: Callable[[Errand], None]) -> None:
-        self._errands.send(Errand({"do": "submit", "entries": entries}, done=accepted))
+        self._works += 1
+        # Not on the disk of the desk, which may be full.
+        work_file = self._cluster.folder / f"work{self._works}.yaml"
+        work_file.write_text(json.dumps({"processes": entries}))  # JSON is YAML too
+        self._errands.send(Errand({"do": "submit", "work": str(work_file)}, done=accepted))
 
     def _submit_jobs(self, drawn: Round) -> None:
         jobs = [

@@ -23,7 +23,7 @@ STANDBYS: Final = 2
 #: Of each sort, the first so many go elsewhere when their host is lost; the others wait for it.
 ELSEWHERE: Final = 2
 #: Of each sort, the last so many are stopped by their host when it is cut off. They go elsewhere.
-ISOLATED: Final = 0
+ISOLATED: Final = 1
 #: Of the speakers and of the counters, the first so many are watched: they must publish.
 WATCHED: Final = 1
 
