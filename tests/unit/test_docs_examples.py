@@ -167,12 +167,13 @@ TOPICS = {
     "resource_info",
     "process_status",
     "process_usage",
+    "kept_states",
     "master_beat",
     "master_load",
     "state_config",
 }
 NAMES = {value for name, value in vars(names).items() if name.isupper() and isinstance(value, str)}
-OF_A_HOST = {names.CONTROL, names.READ_LOG}
+OF_A_HOST = {names.CONTROL, names.READ_LOG, names.KEEP_STATE, names.READ_KEPT}
 
 
 def test_the_protocol_page_has_every_name():
