@@ -13,6 +13,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 from rosrm.core import slave
 from rosrm.core.model import (
     Assignment,
+    Fence,
     Health,
     InstanceId,
     InstanceState,
@@ -28,8 +29,8 @@ NODE = ProcessSpec("n", module="m", ros=True, namespace="/robot", readiness=Read
 STATE = InstanceState
 
 
-def assigned(spec=PLAIN, number=1, epoch=1) -> slave.AssignmentsReceived:
-    assignment = Assignment(InstanceId(spec.name, number), spec, epoch, spec.name)
+def assigned(spec=PLAIN, number=1, epoch=1, fence=None) -> slave.AssignmentsReceived:
+    assignment = Assignment(InstanceId(spec.name, number), spec, epoch, spec.name, fence=fence)
     return slave.AssignmentsReceived((assignment,))
 
 
@@ -490,6 +491,9 @@ WATCHED = ProcessSpec("w", command=("true",), health=Health(timeout=0.5), restar
 SPECS = st.sampled_from([PLAIN, NODE, WATCHED])
 
 
+FENCES = st.none() | st.builds(Fence, st.sampled_from([1.0, 5.0]), st.just(1.0))
+
+
 class AnySlave(RuleBasedStateMachine):
     """The supervisor here is one that obeys: it tells of each launch and stop, sooner or later."""
 
@@ -503,17 +507,19 @@ class AnySlave(RuleBasedStateMachine):
         self.stopped: set[InstanceId] = set()
         self.amending: list[tuple[InstanceId, RestartPolicy]] = []
         self.unsettled: set[tuple[InstanceId, RestartPolicy]] = set()
+        self.heard_at = 0.0
 
     def feed(self, event) -> None:
         for command in slave.step(self.state, event, self.now):
             if isinstance(command, slave.Launch):
                 for assignment in command.assignments:
+                    self.check_fence(assignment)
                     self.launched.append(assignment.instance)
                     self.alive[assignment.instance] = STATE.STARTING
             elif isinstance(command, slave.Report):
                 for status in command.statuses:
                     self.reported[status.instance] = status.state
-            elif isinstance(command, slave.Stop):
+            elif isinstance(command, (slave.Stop, slave.Fence)):
                 assert command.instance in self.alive, "a stop of what does not run"
                 self.stopped.add(command.instance)
             elif isinstance(command, slave.Fail):
@@ -528,9 +534,23 @@ class AnySlave(RuleBasedStateMachine):
             elif isinstance(command, slave.Forget):
                 assert not self.alive.keys() & set(command.instances), "a live one forgotten"
 
-    @rule(spec=SPECS, number=NUMBERS, epoch=st.integers(1, 3))
-    def assign(self, spec, number, epoch) -> None:
-        self.feed(assigned(spec, number, epoch))
+    def check_fence(self, assignment) -> None:
+        fence = assignment.fence
+        late = fence is not None and self.now >= self.heard_at + fence.after
+        assert not late, "started when its successor may run"
+
+    @rule(spec=SPECS, number=NUMBERS, epoch=st.integers(1, 3), fence=FENCES)
+    def assign(self, spec, number, epoch, fence) -> None:
+        self.feed(assigned(spec, number, epoch, fence))
+
+    @rule(ago=st.sampled_from([0.0, 0.0, 0.05, 3.0]))
+    def hear(self, ago) -> None:
+        self.heard_at = max(self.heard_at, self.now - ago)
+        self.feed(slave.MasterHears(self.now - ago))
+
+    @rule(spec=SPECS, number=NUMBERS)
+    def fence(self, spec, number) -> None:
+        self.feed(slave.FenceOrdered(InstanceId(spec.name, number)))
 
     @rule(epoch=st.integers(1, 3))
     def register(self, epoch) -> None:
