@@ -124,10 +124,10 @@ class Harmer:
     def _signal_supervisor(self, fault: Fault, number: int) -> tuple[Harm, Undo] | str:
         pid = self._cluster.supervisor(fault.target)
         outcome = self._signal(fault, pid, number, frozenset({fault.target}))
-        if isinstance(outcome, str) or number != signal.SIGKILL:
+        if isinstance(outcome, str):
             return outcome
         harm, undo = outcome
-        return replace(harm, forgets=True), undo
+        return replace(harm, forgets=number == signal.SIGKILL, deafens=True), undo
 
     def _process_kill(self, fault: Fault) -> tuple[Harm, Undo] | str:
         return self._signal_process(fault, signal.SIGKILL)

@@ -25,6 +25,10 @@ _CROSSING: Final = 0.05
 _LAST_CYCLES: Final = 2
 #: The same where the machine is busy: what is kept is a second behind at most, ten cycles.
 _LAST_SECOND: Final = 12
+#: Seconds after which a state has come to another host.
+_YOUNG: Final = 6.0
+#: What is asked for, and ends or silences nobody by force.
+_NO_BLOWS: Final = ("move", "overlap")
 #: Cycles a second.
 _RATE: Final = 10.0
 
@@ -66,6 +70,7 @@ class Harm:
         restarts: a part had to be started again.
         forgets: how a job ended there meanwhile is not known.
         fills: nothing more could be kept on the disk there.
+        deafens: who fences there did not hear that the master hears the host.
     """
 
     kind: str
@@ -78,6 +83,7 @@ class Harm:
     restarts: bool = False
     forgets: bool = False
     fills: bool = False
+    deafens: bool = False
 
     def concerns(self, host: str) -> bool:
         """Whether it was done to a host."""
@@ -133,6 +139,7 @@ def _may_end(name: str, promise: Promise, run: Run, harms: Sequence[Harm]) -> bo
         harm.process == name
         or (harm.kills and harm.concerns(run.host))
         or ((promise.elsewhere or promise.isolated) and harm.hides and harm.concerns(run.host))
+        or (promise.isolated and harm.deafens and harm.concerns(run.host))
         for harm in harms
     )
 
@@ -161,33 +168,16 @@ def _judge_state(
     if behind == 0:
         return "", []
     if behind > 0 and _struck(name, promise, one, harms):
-        stays = following.host == one.host
-        keeps = promise.kept if stays else bool(promise.copied)
-        most = _LAST_CYCLES if stays or promise.standby else max(_LAST_CYCLES, promise.copied)
-        if behind <= most:
+        if behind <= _LAST_CYCLES:
             return "state_cycles_repeated", []
-        if stays and keeps and behind <= _LAST_SECOND:
-            return "state_second_repeated", []
-        if behind <= most + _unseen(promise, one, harms):
-            return "state_unseen", []
-        if following.first_number == 1 and not keeps and not promise.standby:
+        if behind <= _most_behind(name, promise, one, following, harms):
+            return "state_seconds_repeated", []
+        if following.first_number == 1 and _may_be_lost(promise, one, following, harms):
             return "state_from_nothing", []
-        if stays and any(harm.fills and harm.concerns(one.host) for harm in harms):
+        if any(harm.fills for harm in harms):
             return "state_older_disk_full", []
     text = f"{name}: {following.first_number} after {one.last_number}: {one}, then {following}"
     return "", [Violation("state", name, text)]
-
-
-def _unseen(promise: Promise, run: Run, harms: Sequence[Harm]) -> float:
-    """Cycles of a run that nobody could see: it was cut off from who followed it, and went on."""
-    if not (promise.standby or promise.copied):
-        return 0.0
-    since = [harm.begun for harm in harms if harm.hides and harm.concerns(run.host)]
-    return _RATE * max(0.0, run.last - min(since)) if since else 0.0
-
-
-#: What is asked for, and ends or silences nobody by force.
-_NO_BLOWS: Final = ("move", "overlap")
 
 
 def _struck(name: str, promise: Promise, run: Run, harms: Sequence[Harm]) -> bool:
@@ -198,6 +188,41 @@ def _struck(name: str, promise: Promise, run: Run, harms: Sequence[Harm]) -> boo
         or ((promise.elsewhere or promise.isolated) and harm.hides and harm.concerns(run.host))
         for harm in harms
     )
+
+
+def _most_behind(
+    name: str, promise: Promise, one: Run, following: Run, harms: Sequence[Harm]
+) -> float:
+    """Cycles that may be repeated by who follows one that was struck."""
+    if following.host == one.host and promise.kept:
+        return _LAST_SECOND
+    # For a move the standby makes room; where that fails, the copy is what is left.
+    asked = any(harm.kind in _NO_BLOWS and harm.process == name for harm in harms)
+    if promise.standby and not (asked and promise.copied):
+        return _LAST_CYCLES + _unseen(one, harms, one.host)
+    return promise.copied + _unseen(one, harms) if promise.copied else 0.0
+
+
+def _unseen(run: Run, harms: Sequence[Harm], host: str = "") -> float:
+    """Cycles of a run that nobody could see: one of them was cut off, and it went on.
+
+    Args:
+        host: that was cut off; "": any, for the copies lie on any.
+    """
+    since = [harm.begun for harm in harms if harm.hides and (not host or harm.concerns(host))]
+    return _RATE * max(0.0, run.last - min(since)) if since else 0.0
+
+
+def _may_be_lost(promise: Promise, one: Run, following: Run, harms: Sequence[Harm]) -> bool:
+    """Whether there may be nothing to go on from: no copy, none yet, or none within reach."""
+    if following.host == one.host:
+        return not promise.kept
+    others = any(
+        (harm.hides or harm.kills) and not (harm.hosts and harm.hosts <= {one.host})
+        for harm in harms
+    )
+    young = one.last - one.first < _YOUNG
+    return not promise.standby and (not promise.copied or others or young)
 
 
 def judge_job(

@@ -312,7 +312,7 @@ def promise_of(service: work.Service) -> Promise:
     sort = service.sort
     return Promise(
         sort.members, sort.stateful, sort.standby, service.elsewhere, service.isolated,
-        kept=sort.stateful,
+        kept=sort.stateful, copied=work.COPIED if sort.stateful else 0,
     )  # fmt: skip
 
 

@@ -27,6 +27,9 @@ ISOLATED: Final = 1
 #: Of the speakers and of the counters, the first so many are watched: they must publish.
 WATCHED: Final = 1
 
+#: Cycles by which the copy of a state on another host may be behind: it goes there once a second.
+COPIED: Final = 30
+
 #: The host that takes the jobs of the line, one at a time: of its 2 GiB 80 % may be in use.
 LINE_HOST: Final = "host5"
 _LINE_NEED: Final = "900MiB"

@@ -103,14 +103,15 @@ def test_the_state_of_a_node_that_was_killed_goes_on_where_it_is_kept():
 
     full = Harm("disk_full", 5.0, 30.0, frozenset({"host1"}), fills=True)
     assert after(kept, 99, "host1") == ([], {"state_cycles_repeated": 1})
-    assert after(kept, 90, "host1") == ([], {"state_second_repeated": 1})
+    assert after(kept, 90, "host1") == ([], {"state_seconds_repeated": 1})
     assert after(kept, 88, "host1")[0] == ["state"]
     assert after(kept, 102, "host1")[0] == ["state"]
     assert after(kept, 1, "host1")[0] == ["state"]
     assert after(kept, 50, "host1", full) == ([], {"state_older_disk_full": 1})
     assert after(kept, 1, "host2") == ([], {"state_from_nothing": 1})
     assert after(kept, 50, "host2")[0] == ["state"]
-    assert after(copied, 96, "host2") == ([], {"state_cycles_repeated": 1})
+    assert after(copied, 96, "host2") == ([], {"state_seconds_repeated": 1})
+    assert after(copied, 95, "host2")[0] == ["state"]
     assert after(copied, 1, "host2")[0] == ["state"]
     assert after(Promise(stateful=True, standby=True), 1, "host2")[0] == ["state"]
 
@@ -123,8 +124,19 @@ def test_what_is_done_while_cut_off_is_not_known_to_the_standby():
     def taken_over(first):
         return kinds(guarded, [alone, run("a#2", "host2", 13.0, 30.0, (first, 200))], [CUT])
 
-    assert taken_over(22) == ([], {"partitioned": 1, "state_unseen": 1})
+    assert taken_over(22) == ([], {"partitioned": 1, "state_seconds_repeated": 1})
     assert taken_over(15)[0] == ["state"]
+
+
+def test_a_state_that_came_to_no_other_host_in_time_is_lost():
+    """The process was young, or the host that had the copy was struck as well."""
+    copied = Promise(stateful=True, kept=True, copied=5, elsewhere=True)
+    anew = run("a#2", "host2", 23.0, 30.0, (1, 50))
+    other = Harm("host_off", 19.0, 25.0, frozenset({"host3"}), kills=True, hides=True)
+    assert kinds(copied, [FIRST, anew], [OFF])[0] == ["state"]
+    assert kinds(copied, [FIRST, anew], [OFF, other]) == ([], {"state_from_nothing": 1})
+    young = run(first=17.0, numbers=(1, 31))
+    assert kinds(copied, [young, anew], [OFF]) == ([], {"state_from_nothing": 1})
 
 
 def test_one_run_never_goes_back():
