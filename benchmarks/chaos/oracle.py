@@ -16,7 +16,7 @@ from typing import Final
 from benchmarks.chaos import rules
 from benchmarks.chaos.outputs import Outputs
 from benchmarks.chaos.reality import Member, members
-from benchmarks.chaos.rules import Harm, Promise, Violation
+from benchmarks.chaos.rules import Harm, Judgement, Promise
 
 #: Seconds: who has said "active" within them is active, on a busy machine.
 FRESH: Final = 1.0
@@ -123,30 +123,25 @@ class Oracle:
 
     # --- since the last time ------------------------------------------------------------------
 
-    def history(self, harms: list[Harm]) -> tuple[list[Violation], Counter[str]]:
+    def history(self, harms: list[Harm]) -> Judgement:
         """What went wrong since the last call, and what was within the promise; all is well now.
 
         Args:
             harms: what was done to the lab meanwhile.
         """
-        violations: list[Violation] = []
-        allowed: Counter[str] = Counter()
+        judged = Judgement()
         for name, promise in self._wanted.services.items():
             chain = rules.chain(self._outputs.read(name))
-            found, excused = rules.judge_service(name, promise, chain, harms)
-            violations += found
-            allowed += excused
+            judged.add(rules.judge_service(name, promise, chain, harms))
             if chain:
                 self._outputs.forget(name, before=chain[-1].told_at)
         for name, accepted in self._wanted.jobs.items():
-            found, excused = rules.judge_job(name, accepted, self._outputs.read(name), harms)
-            violations += found
-            allowed += excused
-        violations += rules.judge_line(
+            judged.add(rules.judge_job(name, accepted, self._outputs.read(name), harms))
+        judged.violations += rules.judge_line(
             {name: self._outputs.read(name) for name in self._wanted.line}
         )
         self._forget_jobs()
-        return violations, allowed
+        return judged
 
     def _forget_jobs(self) -> None:
         """They were judged; a process of theirs that still comes is an orphan."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 from benchmarks.chaos.outputs import Run
@@ -99,6 +99,27 @@ class Violation:
     text: str
 
 
+@dataclass
+class Judgement:
+    """What came of looking back.
+
+    Attributes:
+        violations: what was not as promised.
+        allowed: how often something happened that is, by title.
+        parted: seconds for which a former owner went on, after what had parted it from the master.
+    """
+
+    violations: list[Violation] = field(default_factory=list)
+    allowed: Counter[str] = field(default_factory=Counter)
+    parted: list[float] = field(default_factory=list)
+
+    def add(self, other: Judgement) -> None:
+        """Take in another one."""
+        self.violations += other.violations
+        self.allowed += other.allowed
+        self.parted += other.parted
+
+
 def chain(runs: Iterable[Run]) -> list[Run]:
     """The runs of one process that were active, in the order in which they ended to be."""
     return sorted((run for run in runs if run.first), key=lambda run: run.last)
@@ -106,32 +127,25 @@ def chain(runs: Iterable[Run]) -> list[Run]:
 
 def judge_service(
     name: str, promise: Promise, chained: Sequence[Run], harms: Sequence[Harm]
-) -> tuple[list[Violation], Counter[str]]:
-    """What was not as promised, and how often something happened that is allowed."""
-    allowed: Counter[str] = Counter()
-    found = [
-        Violation("state", name, f"{name} went back within one run: {run}")
-        for run in chained
-        if run.backwards
-    ]
+) -> Judgement:
+    """Look back at the runs of a service."""
+    judged = Judgement(
+        [
+            Violation("state", name, f"{name} went back within one run: {run}")
+            for run in chained
+            if run.backwards
+        ]
+    )
     for index, (one, following) in enumerate(itertools.pairwise(chained)):
         for other in chained[index + 1 :]:
-            overlap = one.last - other.first
-            if overlap > _CROSSING:
-                excuse = _excuse_overlap(name, promise, one, other, harms)
-                if excuse:
-                    allowed[excuse] += 1
-                else:
-                    text = f"{name}: both active for {overlap:.2f} s: {one} and {other}"
-                    found.append(Violation("doubled", name, text))
+            if one.last - other.first > _CROSSING:
+                judged.add(_judge_overlap(name, promise, one, other, harms))
         if not _may_end(name, promise, one, harms):
             text = f"{name}: {one} ended, and nothing was done to it; then came {following}"
-            found.append(Violation("touched", name, text))
+            judged.violations.append(Violation("touched", name, text))
         if promise.stateful:
-            word, violation = _judge_state(name, promise, one, following, harms)
-            allowed[word] += bool(word)
-            found += violation
-    return found, +allowed
+            judged.add(_judge_state(name, promise, one, following, harms))
+    return judged
 
 
 def _may_end(name: str, promise: Promise, run: Run, harms: Sequence[Harm]) -> bool:
@@ -144,40 +158,44 @@ def _may_end(name: str, promise: Promise, run: Run, harms: Sequence[Harm]) -> bo
     )
 
 
-def _excuse_overlap(
+def _judge_overlap(
     name: str, promise: Promise, one: Run, other: Run, harms: Sequence[Harm]
-) -> str:
-    """Under which title two owners are counted; "": they are not allowed."""
+) -> Judgement:
+    """Two that were active at once: by a move that allows it, or while they were parted."""
     if any(harm.kind == "overlap" and harm.process == name for harm in harms):
-        return "overlaps"
-    if promise.isolated or not promise.elsewhere:
-        return ""
-    until = [
-        harm.ended + _OVERLAP + (_STARTING if harm.restarts else _MEETING)
+        return Judgement(allowed=Counter(overlaps=1))
+    parting = [
+        harm
         for harm in harms
         if harm.hides and (harm.concerns(one.host) or harm.concerns(other.host))
     ]
-    return "partitioned" if until and one.last <= max(until) else ""
+    until = [harm.ended + _OVERLAP + (_STARTING if harm.restarts else _MEETING) for harm in parting]
+    parted = promise.elsewhere and not promise.isolated
+    if parted and until and one.last <= max(until):
+        healed = max(harm.ended for harm in parting)
+        return Judgement(allowed=Counter(partitioned=1), parted=[max(0.0, one.last - healed)])
+    text = f"{name}: both active for {one.last - other.first:.2f} s: {one} and {other}"
+    return Judgement([Violation("doubled", name, text)])
 
 
 def _judge_state(
     name: str, promise: Promise, one: Run, following: Run, harms: Sequence[Harm]
-) -> tuple[str, list[Violation]]:
-    """A title for what is allowed, and a violation: at most one of them."""
+) -> Judgement:
+    """Whether the numbers went on; where they did not, a title for what is allowed."""
     behind = one.last_number + 1 - following.first_number
     if behind == 0:
-        return "", []
+        return Judgement()
     if behind > 0 and _struck(name, promise, one, harms):
         if behind <= _LAST_CYCLES:
-            return "state_cycles_repeated", []
+            return Judgement(allowed=Counter(state_cycles_repeated=1))
         if behind <= _most_behind(name, promise, one, following, harms):
-            return "state_seconds_repeated", []
+            return Judgement(allowed=Counter(state_seconds_repeated=1))
         if following.first_number == 1 and _may_be_lost(promise, one, following, harms):
-            return "state_from_nothing", []
+            return Judgement(allowed=Counter(state_from_nothing=1))
         if any(harm.fills for harm in harms):
-            return "state_older_disk_full", []
+            return Judgement(allowed=Counter(state_older_disk_full=1))
     text = f"{name}: {following.first_number} after {one.last_number}: {one}, then {following}"
-    return "", [Violation("state", name, text)]
+    return Judgement([Violation("state", name, text)])
 
 
 def _struck(name: str, promise: Promise, run: Run, harms: Sequence[Harm]) -> bool:
@@ -225,12 +243,10 @@ def _may_be_lost(promise: Promise, one: Run, following: Run, harms: Sequence[Har
     return not promise.standby and (not promise.copied or others or young)
 
 
-def judge_job(
-    name: str, accepted: float, runs: Sequence[Run], harms: Sequence[Harm]
-) -> tuple[list[Violation], Counter[str]]:
+def judge_job(name: str, accepted: float, runs: Sequence[Run], harms: Sequence[Harm]) -> Judgement:
     """Done at least once; begun more than once only where something was done to its host."""
     if len(runs) <= 1:
-        return [], Counter()
+        return Judgement()
     hosts = {run.host for run in runs}
     excused = any(
         harm.ended >= accepted
@@ -241,9 +257,9 @@ def judge_job(
         for harm in harms
     )
     if excused:
-        return [], Counter(jobs_repeated=1)
+        return Judgement(allowed=Counter(jobs_repeated=1))
     text = f"the job {name} ran {len(runs)} times: {'; '.join(map(str, runs))}"
-    return [Violation("repeated", name, text)], Counter()
+    return Judgement([Violation("repeated", name, text)])
 
 
 def judge_line(line: Mapping[str, Sequence[Run]]) -> list[Violation]:

@@ -46,6 +46,7 @@ class Tally:
         missed: faults that found nothing to strike, by kind and reason.
         violations: by kind.
         allowed: what happened within the promises, by title.
+        parted: seconds for which a former owner went on after what had parted it was undone.
         recovery: seconds from the undoing of the last fault of a round until all was well, by kind
             of the fault, or "burst" for rounds of several kinds.
         whole: the same, from the first fault on.
@@ -55,6 +56,7 @@ class Tally:
     missed: Counter[str] = field(default_factory=Counter)
     violations: Counter[str] = field(default_factory=Counter)
     allowed: Counter[str] = field(default_factory=Counter)
+    parted: list[float] = field(default_factory=list)
     recovery: dict[str, list[float]] = field(default_factory=dict)
     whole: dict[str, list[float]] = field(default_factory=dict)
     rounds: int = 0
@@ -132,11 +134,12 @@ class Trial:
         healed = time.monotonic()
         well = self._await_well(number, f"fault {number} was undone", SETTLE_S)
         self._harms += self._harmer.take_done()
-        violations, allowed = self._oracle.history(self._harms)
+        judged = self._oracle.history(self._harms)
         self._harms.clear()
-        self._tally.allowed += allowed
-        if violations:
-            self._violated(number, violations)
+        self._tally.allowed += judged.allowed
+        self._tally.parted += judged.parted
+        if judged.violations:
+            self._violated(number, judged.violations)
         kinds = sorted(fault.kind for fault in done)
         if kinds:
             word = kinds[0] if len(set(kinds)) == 1 else "burst"

@@ -11,6 +11,7 @@ import benchmarks.chaos
 from benchmarks.chaos.outputs import Outputs, Run
 from benchmarks.chaos.rules import (
     Harm,
+    Judgement,
     Promise,
     chain,
     judge_job,
@@ -39,8 +40,8 @@ def run(instance="a#1", host="host1", first=10.0, last=20.0, numbers=(1, 100), p
 
 
 def kinds(*arguments):
-    violations, allowed = judge_service("a", *arguments)
-    return [one.kind for one in violations], dict(allowed)
+    judged = judge_service("a", *arguments)
+    return [one.kind for one in judged.violations], dict(judged.allowed)
 
 
 FIRST, SECOND = run(), run("a#2", "host2", 21.0, 30.0, (101, 200))
@@ -66,6 +67,8 @@ def test_two_active_owners_only_while_they_were_parted():
     longer, beside = run(last=24.0), run("a#2", "host2", 16.0, 30.0)
     elsewhere = Promise(elsewhere=True)
     assert kinds(elsewhere, [run(last=19.5), beside], [CUT]) == ([], {"partitioned": 1})
+    parted = judge_service("a", elsewhere, [run(last=19.5), beside], [CUT]).parted
+    assert parted == pytest.approx([0.5])
     assert kinds(elsewhere, [longer, beside], [CUT])[0] == ["doubled"]
     assert kinds(Promise(), [longer, beside], [KILLED])[0] == ["doubled"]
     assert kinds(Promise(elsewhere=True, isolated=True), [run(last=17.0), beside], [CUT])[0] == [
@@ -147,10 +150,10 @@ def test_one_run_never_goes_back():
 
 def test_a_job_is_done_once_unless_something_was_done_to_it():
     twice = [run("j#1"), run("j#2")]
-    assert judge_job("j", 9.0, twice[:1], []) == ([], {})
-    assert [one.kind for one in judge_job("j", 9.0, twice, [])[0]] == ["repeated"]
-    assert judge_job("j", 9.0, twice, [OFF])[0] == []
-    assert judge_job("j", 26.0, twice, [OFF])[0] != []
+    assert judge_job("j", 9.0, twice[:1], []) == Judgement()
+    assert [one.kind for one in judge_job("j", 9.0, twice, []).violations] == ["repeated"]
+    assert judge_job("j", 9.0, twice, [OFF]).violations == []
+    assert judge_job("j", 26.0, twice, [OFF]).violations != []
 
 
 def test_who_waits_in_line_keeps_its_place():
