@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from rosrm.core.commands import Assign
+from rosrm.core.lost_tail import why_no_work
 from rosrm.core.model import EMPTY
 from rosrm.core.placement import Demand, Ranking
 from rosrm.core.state import MasterState, Process, ProcessPhase, larger
@@ -61,7 +62,7 @@ def decide_now(state: MasterState, process: Process) -> Decision:
 
 def place_waiting(state: MasterState, now: float) -> None:
     """Assign from the queue until its head fits nowhere (with `backfill`, until nobody fits)."""
-    if not len(state.queue) or state.placed_at == _versions(state):
+    if not len(state.queue) or state.placed_at == _versions(state) or why_no_work(state, now):
         return
     if state.settings.backfill:
         _place_any(state, now)

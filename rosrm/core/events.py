@@ -15,11 +15,17 @@ from rosrm.core.model import HostDescription, InstanceId, InstanceStatus, KeptSt
 
 @dataclass(frozen=True, slots=True)
 class HostRegistered:
-    """A slave came and named itself; `instances` is what it holds already."""
+    """A slave came and named itself.
+
+    Attributes:
+        instances: what it holds already.
+        journal_seen: newest record that a former run of this master has told it of; 0: none.
+    """
 
     request: int
     description: HostDescription
     instances: tuple[InstanceStatus, ...] = ()
+    journal_seen: int = 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,6 +11,7 @@ from rosrm.core.charges import settle_charge
 from rosrm.core.commands import Order, Reply
 from rosrm.core.hosts import Host, HostCondition, description_fault
 from rosrm.core.liveness import welcome_back
+from rosrm.core.lost_tail import note_seen
 from rosrm.core.readings import take_readings
 from rosrm.core.state import MasterState, Wanted
 from rosrm.ports import Intent
@@ -46,6 +47,7 @@ def host_registered(state: MasterState, event: happened.HostRegistered, now: flo
             "absent": dict(description.absent),
         },
     )  # fmt: skip
+    note_seen(state, host.name, event.journal_seen, now)
     host_loss.regain_sight(state, host, now)
     lifecycle.reconcile(state, host, event.instances, now, registering=True)
     _forgive(state, host)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from math import inf
 from typing import Any, Final
 
@@ -44,6 +45,23 @@ __all__ = [
 ]
 
 
+@dataclass(slots=True)
+class Tail:
+    """What is known of the end of the journal, as it was when this master started.
+
+    Attributes:
+        newest: sequence of its newest record.
+        started: time of the start.
+        fell: the machine fell before it, and not every host has come back.
+        lost: records that are known to be lost.
+    """
+
+    newest: int = _LARGEST
+    started: float = 0.0
+    fell: bool = False
+    lost: int = 0
+
+
 class MasterState:
     """The state of the master's core, with the few moves that every handler shares.
 
@@ -52,6 +70,7 @@ class MasterState:
         standbys: process name to the handoff whose destination is its standby.
         wants_standby: names of the processes that ask for one and are not over.
         in_company_since: time since when at least one host has been heard; inf: none is.
+        tail: whether the journal has lost what was newest in it.
     """
 
     def __init__(
@@ -93,6 +112,7 @@ class MasterState:
         self.next_order_id = 1
         self.wall = 0.0
         self.in_company_since = inf
+        self.tail = Tail()
         self.missing_since: dict[int, float] = {}
         self.reviewed = float("-inf")
         self.policy_told = float("-inf")

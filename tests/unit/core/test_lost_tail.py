@@ -1,0 +1,159 @@
+"""A master whose journal has lost what was newest in it: it says so, and starts nothing twice."""
+
+from __future__ import annotations
+
+import copy
+
+import pytest
+
+from rosrm.core import lost_tail
+from tests.unit.core.cluster import Cluster, process
+
+LEASE = 10.0
+
+
+class Loss:
+    """A cluster whose journal loses all that is written from here until it strikes.
+
+    Attributes:
+        seen: newest record that hosts have been told of.
+    """
+
+    def __init__(self, cluster: Cluster) -> None:
+        self.cluster = cluster
+        self.seen = 0
+        self._kept = copy.deepcopy(cluster.intents)
+        self._newest = len(cluster.records)
+
+    def strike(self, *, fell: bool = False) -> None:
+        """The master comes up from what is left; nobody is heard yet."""
+        cluster = self.cluster
+        self.seen = len(cluster.records)
+        cluster.intents.clear()
+        cluster.intents.update(self._kept)
+        cluster.kill_master()
+        lost_tail.begin(cluster.state, self._newest, cluster.now, fell=fell)
+
+    def come_back(self, host: str, seen: int) -> None:
+        """The host registers and says how much of the journal it has seen."""
+        cluster = self.cluster
+
+        def ask(kind, *fields, settle=True):
+            return Cluster.ask(cluster, kind, *fields, seen, settle=settle)
+
+        cluster.ask = ask
+        try:
+            cluster.register(cluster.machines[host])
+        finally:
+            del cluster.ask
+
+
+@pytest.fixture
+def cluster() -> Cluster:
+    return Cluster("a", "b", lease=LEASE)
+
+
+def told(cluster: Cluster) -> list:
+    return [record for record in cluster.records if record.kind == "journal_behind"]
+
+
+def test_it_is_said_once_with_how_much(cluster) -> None:
+    """The first host tells; a second one that knows no more is no news, one that knows more is."""
+    loss = Loss(cluster)
+    cluster.submit(process("p"))
+    loss.strike()
+    seen = loss.seen
+    loss.come_back("a", seen - 1)
+    (record,) = told(cluster)
+    assert record.facts["lost"] == seen - 1 - record.facts["newest"]
+    assert record.host == "a"
+    loss.come_back("b", seen - 1)
+    assert len(told(cluster)) == 1
+
+
+def test_a_whole_journal_is_not_suspected(cluster) -> None:
+    """What hosts have seen is there, and work is given at once."""
+    cluster.submit(process("p"))
+    loss = Loss(cluster)
+    loss.strike()
+    loss.come_back("a", loss.seen)
+    loss.come_back("b", loss.seen)
+    cluster.submit(process("q"))
+    assert told(cluster) == []
+    assert cluster.phase("q") == "running"
+
+
+def test_what_was_started_in_what_is_lost_is_never_there_twice(cluster) -> None:
+    """It is queued by what is left, and runs on a host that is heard later: that one ends first."""
+    cluster.set_host("a", "cordon")
+    cluster.set_host("b", "cordon")
+    cluster.submit(process("p"))
+    loss = Loss(cluster)
+    cluster.set_host("b", "uncordon")
+    assert cluster.where("p") == ["b"]
+    loss.strike()
+    loss.come_back("a", loss.seen)
+    cluster.set_host("a", "uncordon")
+    for _ in range(20):
+        cluster.wait(0.1)
+        assert cluster.where("p") == ["b"]
+    loss.come_back("b", loss.seen)
+    for _ in range(20):
+        assert len(cluster.where("p")) <= 1
+        cluster.wait(0.1)
+    cluster.wait(LEASE)
+    assert len(cluster.where("p")) == 1
+    assert cluster.phase("p") == "running"
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_after_a_fall_of_the_machine_all_known_hosts_are_heard_first(cluster, there) -> None:
+    """Though nobody has seen more than there is; a host that stays away holds it for a lease."""
+    cluster.set_host("a", "cordon")
+    cluster.set_host("b", "cordon")
+    cluster.submit(process("p"))
+    loss = Loss(cluster)
+    cluster.set_host("b", "uncordon")
+    assert cluster.where("p") == ["b"]
+    loss.strike(fell=True)
+    loss.come_back("a", 0)
+    cluster.set_host("a", "uncordon")
+    cluster.wait(2.0)
+    assert cluster.where("p") == ["b"]
+    cluster.machines["b"].connected = there
+    if there:
+        loss.come_back("b", 0)
+        cluster.wait(1.0)
+        assert len(cluster.where("p")) == 1
+    else:
+        cluster.wait(LEASE)
+        assert "a" in cluster.where("p")
+    assert cluster.phase("p") == "running"
+
+
+def test_numbers_of_what_is_lost_are_not_given_again(cluster) -> None:
+    """Also of instances that have ended and that no host remembers."""
+    loss = Loss(cluster)
+    cluster.submit(process("p"))
+    given = cluster["p"].owner
+    cluster.cancel("p")
+    loss.strike()
+    seen = loss.seen
+    for machine in cluster.machines.values():
+        machine.slave.held.clear()
+    loss.come_back("a", seen)
+    loss.come_back("b", seen)
+    cluster.wait(LEASE)
+    cluster.submit(process("q"))
+    cluster.wait(0.2)
+    assert cluster["q"].owner > given + 100
+
+
+def test_an_absurd_number_harms_nobody(cluster) -> None:
+    """A host that says nonsense costs a lease, not the numbers of instances."""
+    loss = Loss(cluster)
+    loss.strike()
+    loss.come_back("a", 2**63)
+    cluster.wait(LEASE + 0.2)
+    cluster.submit(process("p"))
+    assert cluster.phase("p") == "running"
