@@ -305,7 +305,13 @@ class SlaveRuntime:
 
     def _launch(self, assignments: Sequence[Assignment]) -> None:
         """Start them, each as soon as its kept state is here."""
-        self._start([one for one in assignments if self._keeping.prepare(one, self._prepared)])
+        ready = [one for one in assignments if self._keeping.prepare(one, self._prepared)]
+        if ready:
+            self._start(ready)
+        # Until it runs nobody else says so, and the master would take it back.
+        waiting = [self._state.held[one.instance].status for one in assignments if one not in ready]
+        if waiting:
+            self._endpoint.publish_statuses(waiting, complete=False)
 
     def _prepared(self, assignment: Assignment) -> None:
         held = self._state.held.get(assignment.instance)

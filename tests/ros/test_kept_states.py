@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from rosrm import kept
-from rosrm.config.settings import KeepSettings, LivenessSettings
+from rosrm.config.settings import CheckpointChoice, KeepSettings, LivenessSettings
 from rosrm.core.model import HostLossPolicy, MigrationPolicy, ProcessSpec, Readiness, RestartPolicy
 from tests.ros.clusters import CALM, PATIENCE, STEADY, Cluster, host, pids_of, wait_gone, wait_until
 
@@ -273,3 +273,53 @@ def test_a_host_without_room_refuses_and_says_so_once(make_cluster):
     wait_for_count(cluster, 100)
     assert cluster.log_of(said).count("does not keep the state") == 1
     assert copies(cluster) == {}
+
+
+def test_a_state_that_cannot_be_fetched_holds_up_no_start(make_cluster):
+    """The host that keeps it falls silent too: the process begins from nothing, once."""
+    cluster = make_cluster(*(host(f"h{n}") for n in range(3)), liveness=QUICK_LEASE)
+    cluster.submit(counter(1_000_000, host_loss=ELSEWHERE))
+    row = cluster.wait("counter", "running")
+    wait_for_count(cluster, 50)
+    keeper = wait_for_copy(cluster, 50)
+    kill_host(cluster, row.host)
+    cluster.wait_for_event("host_suspect", host=row.host)
+    stopped = cluster.slaves[keeper].process
+    os.kill(stopped.pid, signal.SIGSTOP)
+    try:
+        cluster.wait_for_event("given_up", process="counter")
+        after = cluster.wait("counter", "running")
+        assert after.host not in (keeper, row.host)
+        assert wait_for_count(cluster, 1)[0][0] == 1
+        assert cluster.kinds("counter").count("assigned") == 2
+    finally:
+        os.kill(stopped.pid, signal.SIGCONT)
+
+
+def test_a_moved_process_goes_on_from_the_state_that_its_new_host_keeps(make_cluster):
+    """What the old host keeps is older, and is dropped."""
+    cluster = make_cluster(
+        host("h0"), host("h1"), liveness=STEADY, checkpoint=CheckpointChoice(None)
+    )
+    cluster.submit(counter())
+    row = cluster.wait("counter", "running")
+    wait_for_count(cluster, 50)
+    (other,) = cluster.slaves.keys() - {row.host}
+    cluster.client.migrate("counter", other)
+    cluster.wait_for_event("migrated", process="counter")
+    moved = cluster.wait("counter", "running")
+    runs = wait_for_count(cluster, 60)
+    wait_until(lambda: not kept_directory(cluster, row.host).exists(), "the old state is dropped")
+    os.kill(moved.pid, signal.SIGKILL)
+    runs = wait_for_count(cluster, 1, 1)
+    assert runs[1][0] >= runs[0][-1] - 10, runs
+
+
+def test_a_node_goes_on_where_nothing_can_be_kept(make_cluster):
+    """As on a full disk; it says so once."""
+    cluster = make_cluster(host("h0"), liveness=STEADY)
+    (cluster.directory / "hosts" / "h0" / "kept").write_text("in the way")
+    cluster.submit(counter())
+    wait_for_count(cluster, 200)
+    log = cluster.log("counter")
+    assert log.count("its state is not kept: Not a directory") == 1, log
