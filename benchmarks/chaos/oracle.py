@@ -30,11 +30,13 @@ class Wanted:
         services: by name, what each is promised.
         jobs: that are to be done; by name, the moment in which they were accepted.
         line: jobs that wait for one another, in the order in which they were submitted.
+        canaries: by host, the job that only it can take, submitted when all was undone.
     """
 
     services: dict[str, Promise] = field(default_factory=dict)
     jobs: dict[str, float] = field(default_factory=dict)
     line: list[str] = field(default_factory=list)
+    canaries: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -130,9 +132,14 @@ class Oracle:
             harms: what was done to the lab meanwhile.
         """
         judged = Judgement()
+        reached = {
+            host: runs[0].born
+            for host, name in self._wanted.canaries.items()
+            if (runs := self._outputs.read(name))
+        }
         for name, promise in self._wanted.services.items():
             chain = rules.chain(self._outputs.read(name))
-            judged.add(rules.judge_service(name, promise, chain, harms))
+            judged.add(rules.judge_service(name, promise, chain, harms, reached))
             if chain:
                 self._outputs.forget(name, before=chain[-1].told_at)
         for name, accepted in self._wanted.jobs.items():
@@ -147,6 +154,7 @@ class Oracle:
         """They were judged; a process of theirs that still comes is an orphan."""
         self._wanted.jobs.clear()
         self._wanted.line.clear()
+        self._wanted.canaries.clear()
 
     def told(self, names: list[str]) -> Mapping[str, list[str]]:
         """All that is known of the newest runs of some processes, for a story."""

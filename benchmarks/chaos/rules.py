@@ -9,6 +9,7 @@ import itertools
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Final
 
 from benchmarks.chaos.outputs import Run
@@ -28,7 +29,7 @@ _LAST_SECOND: Final = 12
 #: Seconds after which a state has come to another host.
 _YOUNG: Final = 6.0
 #: What is asked for, and ends or silences nobody by force.
-_NO_BLOWS: Final = ("move", "overlap")
+MOVES: Final = ("move", "overlap")
 #: Cycles a second.
 _RATE: Final = 10.0
 
@@ -126,9 +127,18 @@ def chain(runs: Iterable[Run]) -> list[Run]:
 
 
 def judge_service(
-    name: str, promise: Promise, chained: Sequence[Run], harms: Sequence[Harm]
-) -> Judgement:
-    """Look back at the runs of a service."""
+    name: str, promise: Promise, chained: Sequence[Run], harms: Sequence[Harm],
+    reached: Mapping[str, float] = MappingProxyType({}),
+) -> Judgement:  # fmt: skip
+    """Look back at the runs of a service.
+
+    Args:
+        name: of the service.
+        promise: that was given.
+        chained: its runs, as `chain` has them.
+        harms: that were done meanwhile.
+        reached: when a host is known to have taken an order from the master again.
+    """
     judged = Judgement(
         [
             Violation("state", name, f"{name} went back within one run: {run}")
@@ -139,7 +149,7 @@ def judge_service(
     for index, (one, following) in enumerate(itertools.pairwise(chained)):
         for other in chained[index + 1 :]:
             if one.last - other.first > _CROSSING:
-                judged.add(_judge_overlap(name, promise, one, other, harms))
+                judged.add(_judge_overlap(name, promise, one, other, harms, reached))
         if not _may_end(name, promise, one, harms):
             text = f"{name}: {one} ended, and nothing was done to it; then came {following}"
             judged.violations.append(Violation("touched", name, text))
@@ -159,8 +169,9 @@ def _may_end(name: str, promise: Promise, run: Run, harms: Sequence[Harm]) -> bo
 
 
 def _judge_overlap(
-    name: str, promise: Promise, one: Run, other: Run, harms: Sequence[Harm]
-) -> Judgement:
+    name: str, promise: Promise, one: Run, other: Run, harms: Sequence[Harm],
+    reached: Mapping[str, float],
+) -> Judgement:  # fmt: skip
     """Two that were active at once: by a move that allows it, or while they were parted."""
     if any(harm.kind == "overlap" and harm.process == name for harm in harms):
         return Judgement(allowed=Counter(overlaps=1))
@@ -170,8 +181,10 @@ def _judge_overlap(
         if harm.hides and (harm.concerns(one.host) or harm.concerns(other.host))
     ]
     until = [harm.ended + _OVERLAP + (_STARTING if harm.restarts else _MEETING) for harm in parting]
+    # On a busy machine a part that was started again comes up late: what it took shows that it has.
+    until += [reached[host] + _OVERLAP for host in (one.host, other.host) if host in reached]
     parted = promise.elsewhere and not promise.isolated
-    if parted and until and one.last <= max(until):
+    if parted and parting and one.last <= max(until):
         healed = max(harm.ended for harm in parting)
         return Judgement(allowed=Counter(partitioned=1), parted=[max(0.0, one.last - healed)])
     text = f"{name}: both active for {one.last - other.first:.2f} s: {one} and {other}"
@@ -201,7 +214,7 @@ def _judge_state(
 def _struck(name: str, promise: Promise, run: Run, harms: Sequence[Harm]) -> bool:
     """Whether it ended by force, and not by a move."""
     return any(
-        (harm.process == name and harm.kind not in _NO_BLOWS)
+        (harm.process == name and harm.kind not in MOVES)
         or (harm.kills and harm.concerns(run.host))
         or ((promise.elsewhere or promise.isolated) and harm.hides and harm.concerns(run.host))
         for harm in harms
@@ -215,7 +228,7 @@ def _most_behind(
     if following.host == one.host and promise.kept:
         return _LAST_SECOND
     # For a move the standby makes room; where that fails, the copy is what is left.
-    asked = any(harm.kind in _NO_BLOWS and harm.process == name for harm in harms)
+    asked = any(harm.kind in MOVES and harm.process == name for harm in harms)
     if promise.standby and not (asked and promise.copied):
         return _LAST_CYCLES + _unseen(one, harms, one.host)
     return promise.copied + _unseen(one, harms) if promise.copied else 0.0

@@ -16,7 +16,7 @@ from benchmarks.chaos.errands import Errand, Errands
 from benchmarks.chaos.faults import Fault, Move, Round
 from benchmarks.chaos.harm import Harmer
 from benchmarks.chaos.oracle import Amiss, Oracle, Wanted
-from benchmarks.chaos.rules import Harm, Promise, Violation
+from benchmarks.chaos.rules import MOVES, Harm, Promise, Violation
 from benchmarks.chaos.story import Story
 from benchmarks.machine import say
 
@@ -29,6 +29,8 @@ _LOOK: Final = 0.1
 _LOOK_AT_ALL: Final = 0.3
 #: Looks in a row at which all must be well.
 _STEADY: Final = 2
+#: Seconds within which a move that was asked for has ended.
+_MOVE: Final = 30.0
 #: Seconds that a job takes which only shows that its host takes work.
 _CANARY: Final = 0.1
 
@@ -135,7 +137,9 @@ class Trial:
         well = self._await_well(number, f"fault {number} was undone", SETTLE_S)
         self._harms += self._harmer.take_done()
         judged = self._oracle.history(self._harms)
-        self._harms.clear()
+        # A move goes on after its round.
+        recent = time.monotonic() - _MOVE
+        self._harms = [harm for harm in self._harms if harm.kind in MOVES and harm.begun > recent]
         self._tally.allowed += judged.allowed
         self._tally.parted += judged.parted
         if judged.violations:
@@ -228,6 +232,9 @@ class Trial:
         entries = [
             work.job(f"canary{number}_{host}", self._lines, _CANARY, host=host) for host in HOSTS
         ]
+        self._wanted.canaries.update(
+            {host: entry["name"] for host, entry in zip(HOSTS, entries, strict=True)}
+        )
         self._submit(entries, self._accept(entries, []))
 
     def _renew(self) -> None:

@@ -80,6 +80,14 @@ def test_two_active_owners_only_while_they_were_parted():
     )
 
 
+def test_a_host_that_comes_up_late_is_given_its_second_from_then_on():
+    """It has reached the master at the latest when it begins a job."""
+    late, beside = run(last=40.5), run("a#2", "host2", 16.0, 50.0)
+    elsewhere = Promise(elsewhere=True)
+    assert judge_service("a", elsewhere, [late, beside], [CUT]).violations != []
+    assert judge_service("a", elsewhere, [late, beside], [CUT], {"host1": 40.0}).violations == []
+
+
 def test_who_comes_back_for_a_moment_does_not_end_the_owner():
     """A host that was lost has its power again, and starts what has a successor by now."""
     old, owner = run(last=20.0), run("a#2", "host2", 24.0, 40.0)
