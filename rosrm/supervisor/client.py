@@ -196,8 +196,12 @@ class SupervisorClient:
         self._order(FenceOrdered(_key(instance)))
 
     def heard(self, at: float) -> None:
-        """The master is known to have heard this host at that monotonic time: fences wait."""
-        self._order(Heard(at))
+        """The master is known to have heard this host at that monotonic time: fences wait.
+
+        Left out while the supervisor does not read (it is stopped): a newer one will follow.
+        """
+        if _writable(self._peer, 0.0):
+            self._order(Heard(at))
 
     def restart(self, instance: InstanceId) -> None:
         """Stop it, then start it again; the restart policy does not count this."""
