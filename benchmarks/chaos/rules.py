@@ -148,7 +148,7 @@ def judge_service(
     )
     for index, (one, following) in enumerate(itertools.pairwise(chained)):
         for other in chained[index + 1 :]:
-            if one.last - other.first > _CROSSING:
+            if _overlap(one, other) > _CROSSING:
                 judged.add(_judge_overlap(name, promise, one, other, harms, reached))
         if not _may_end(name, promise, one, harms):
             text = f"{name}: {one} ended, and nothing was done to it; then came {following}"
@@ -166,6 +166,11 @@ def _may_end(name: str, promise: Promise, run: Run, harms: Sequence[Harm]) -> bo
         or (promise.isolated and harm.deafens and harm.concerns(run.host))
         for harm in harms
     )
+
+
+def _overlap(one: Run, other: Run) -> float:
+    """Seconds for which both were active; `one` ended first."""
+    return one.last - max(one.first, other.first)
 
 
 def _judge_overlap(
@@ -187,7 +192,7 @@ def _judge_overlap(
     if parted and parting and one.last <= max(until):
         healed = max(harm.ended for harm in parting)
         return Judgement(allowed=Counter(partitioned=1), parted=[max(0.0, one.last - healed)])
-    text = f"{name}: both active for {one.last - other.first:.2f} s: {one} and {other}"
+    text = f"{name}: both active for {_overlap(one, other):.2f} s: {one} and {other}"
     return Judgement([Violation("doubled", name, text)])
 
 
