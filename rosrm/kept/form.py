@@ -1,0 +1,152 @@
+"""The form of a kept state: one file, or the same bytes on their way to another host. Pure."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, NamedTuple
+
+#: Most bytes of a file, and most blocks: what is larger is no state of ours.
+LARGEST: Final = 2 << 30
+_MOST_BLOCKS: Final = 1000
+
+_MAGIC: Final = b"rosrmKS1"
+#: Magic, instance, sequence, bytes of the name, blocks.
+_FIXED: Final = struct.Struct("<8sQQII")
+#: Bytes and CRC-32 of one block.
+_BLOCK: Final = struct.Struct("<QI")
+_CRC: Final = struct.Struct("<I")
+
+
+class Damaged(Exception):
+    """A file that holds no whole state: which, and why."""
+
+
+class Block(NamedTuple):
+    """A part of the content, with its CRC-32."""
+
+    data: bytes
+    digest: int
+
+
+@dataclass(frozen=True, slots=True)
+class Head:
+    """What a file says of itself.
+
+    Attributes:
+        process: name of the process.
+        instance: number of the instance that was in this state.
+        sequence: cycles that it covers.
+        blocks: bytes and CRC-32 of each.
+        size: bytes of the whole, this head included.
+    """
+
+    process: str
+    instance: int
+    sequence: int
+    blocks: tuple[tuple[int, int], ...]
+    size: int
+
+    @property
+    def age(self) -> tuple[int, int]:
+        """The larger, the newer."""
+        return self.instance, self.sequence
+
+
+@dataclass(frozen=True, slots=True)
+class Kept:
+    """A whole state.
+
+    Attributes:
+        blocks: the mark, then each part of the state, serialised.
+        path: where it was read.
+    """
+
+    head: Head
+    blocks: tuple[bytes, ...]
+    path: Path
+
+
+class Part(NamedTuple):
+    """A part of a state on its way.
+
+    Attributes:
+        number, sequence: of the instance, and of the state.
+        offset: bytes, where it begins.
+        total: bytes of the whole.
+        digest: CRC-32 of the whole.
+    """
+
+    process: str
+    number: int
+    sequence: int
+    offset: int
+    total: int
+    digest: int
+    data: bytes
+
+    @property
+    def age(self) -> tuple[int, int]:
+        """The larger, the newer."""
+        return self.number, self.sequence
+
+    @property
+    def is_last(self) -> bool:
+        """Nothing comes after it."""
+        return self.offset + len(self.data) >= self.total
+
+
+def encoded_head(process: str, instance: int, sequence: int, blocks: Sequence[Block]) -> bytes:
+    """The head of a file."""
+    name = process.encode()
+    head = b"".join(
+        [
+            _FIXED.pack(_MAGIC, instance, sequence, len(name), len(blocks)),
+            name,
+            *(_BLOCK.pack(len(block.data), block.digest) for block in blocks),
+        ]
+    )
+    return head + _CRC.pack(zlib.crc32(head))
+
+
+def decoded_head(data: bytes) -> tuple[Head, int]:
+    """What a file begins with, and where its blocks begin.
+
+    Raises:
+        Damaged: it is no head, or not a whole one.
+    """
+    try:
+        magic, instance, sequence, name_size, count = _FIXED.unpack_from(data)
+        end = _FIXED.size + name_size + count * _BLOCK.size
+        if magic != _MAGIC or count > _MOST_BLOCKS or end + _CRC.size > len(data):
+            raise Damaged("it is no kept state")
+        if _CRC.unpack_from(data, end)[0] != zlib.crc32(data[:end]):
+            raise Damaged("its head is damaged")
+        name = data[_FIXED.size : _FIXED.size + name_size].decode()
+    except (struct.error, UnicodeDecodeError):
+        raise Damaged("it is no kept state") from None
+    table = data[_FIXED.size + name_size : end]
+    blocks = tuple(_BLOCK.iter_unpack(table))
+    start = end + _CRC.size
+    size = start + sum(size for size, _ in blocks)
+    if size > LARGEST:
+        raise Damaged("it claims to be larger than a state can be")
+    return Head(name, instance, sequence, blocks, size), start
+
+
+def decoded(data: bytes, path: Path = Path()) -> Kept:
+    """A whole file; raises `Damaged`."""
+    head, at = decoded_head(data)
+    if len(data) < head.size:
+        raise Damaged(f"it ends after {len(data)} of {head.size} bytes")
+    blocks = []
+    for size, digest in head.blocks:
+        block = data[at : at + size]
+        if zlib.crc32(block) != digest:
+            raise Damaged("its content does not match its checksum")
+        blocks.append(block)
+        at += size
+    return Kept(head, tuple(blocks), path)

@@ -1,0 +1,397 @@
+"""What a slave does with kept states: ships, takes, fetches, deletes; real files, no ROS."""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+import zlib
+from collections.abc import Callable
+
+import pytest
+
+from rosrm import kept
+from rosrm.config.settings import KeepSettings
+from rosrm.core.model import Assignment, InstanceId, MigrationPolicy, ProcessSpec
+from rosrm.kept import Block, Part, SlotWriter
+from rosrm.slave import fetching
+from rosrm.slave.keeping import Keeping
+
+P7 = InstanceId("p", 7)
+PATIENCE = 20.0
+
+
+class Wire:
+    """In place of ROS: what one slave says to another arrives at once, unless it is cut off."""
+
+    def __init__(self, net: Net, name: str) -> None:
+        self.net, self.name = net, name
+        self.host = None
+        self.given: list[Part] = []
+
+    def serve(self, host) -> None:
+        self.host = host
+
+    def finds_keeper(self, host: str, now: float) -> bool:
+        return host not in self.net.hidden
+
+    finds_source = finds_keeper
+
+    def give(self, host, part, now, timeout, done) -> None:
+        self.given.append(part)
+        if host in self.net.silent:
+            self.net.unanswered.append(lambda: done("timeout", "no answer"))
+        else:
+            self.net.slaves[host].take_part(part, done)
+
+    def ask(self, host, wanted, now, timeout, done) -> None:
+        def answer(part: Part | None) -> None:
+            done("no such state is kept here" if part is None else part)
+
+        age = (wanted.number, wanted.sequence)
+        self.net.slaves[host].read_part(wanted.process, age, wanted.offset, 1000, answer)
+
+    def expire(self, now: float) -> None:
+        unanswered, self.net.unanswered = self.net.unanswered, []
+        for end in unanswered:
+            end()
+
+
+class Net:
+    """Slaves of several hosts, with one loop for all.
+
+    Attributes:
+        hidden: hosts that are not found.
+        silent: hosts that do not answer.
+        said: what users were told, by host.
+        told: what the master was told, by host.
+    """
+
+    def __init__(self, tmp_path) -> None:
+        self.root = tmp_path
+        self.posted: queue.Queue[Callable[[], None]] = queue.Queue()
+        self.slaves: dict[str, Keeping] = {}
+        self.wires: dict[str, Wire] = {}
+        self.hidden: set[str] = set()
+        self.silent: set[str] = set()
+        self.unanswered: list[Callable[[], None]] = []
+        self.said: dict[str, list[str]] = {}
+        self.told: dict[str, list] = {}
+        self.now = time.monotonic()
+
+    def add(self, name: str, **settings) -> Keeping:
+        self.said[name], self.told[name] = [], []
+        wire = self.wires[name] = Wire(self, name)
+
+        def publish(states) -> bool:
+            self.told[name].append(states)
+            return True
+
+        self.slaves[name] = Keeping(
+            self.root / name, name, KeepSettings(**settings), wire,
+            post=self.posted.put, say=self.said[name].append, publish=publish,
+        )  # fmt: skip
+        return self.slaves[name]
+
+    def write(self, host: str, sequence: int, size: int = 10, number: int = 7) -> None:
+        """The node of `p` keeps its state."""
+        data = bytes([sequence % 256]) * size
+        writer = SlotWriter(self.directory(host), "p", number)
+        writer.write(sequence, [Block(data, zlib.crc32(data))])
+        writer.close()
+
+    def directory(self, host: str):
+        return self.root / host / "p"
+
+    def age(self, host: str) -> tuple[int, int] | None:
+        head = kept.newest_head(self.directory(host))
+        return None if head is None else head.age
+
+    def until(self, condition: Callable[[], object], what: str, step: float = 0.1) -> None:
+        """Time passes, as fast as it can, until something holds."""
+        deadline = time.monotonic() + PATIENCE
+        while not condition():
+            assert time.monotonic() < deadline, f"not in time: {what}"
+            self.pass_time(step)
+
+    def pass_time(self, seconds: float) -> None:
+        self.now += seconds
+        for slave in self.slaves.values():
+            slave.tick(self.now)
+        self.settle()
+
+    def settle(self) -> None:
+        """All that the threads have done reaches the loop."""
+        for slave in self.slaves.values():
+            done = threading.Event()
+            slave._jobs.put(done.set)
+            assert done.wait(PATIENCE), "a thread is stuck"
+        while not self.posted.empty():
+            self.posted.get()()
+
+
+@pytest.fixture
+def net(tmp_path):
+    return Net(tmp_path)
+
+
+def assignment(*kept_on: str, kept_from: int = 0, number: int = 9, **fields) -> Assignment:
+    spec = ProcessSpec("p", command=("x",), ros=True, migration=MigrationPolicy("handoff"))
+    return Assignment(
+        InstanceId("p", number), spec, 1, "p", kept_on=kept_on, kept_from=kept_from, **fields
+    )
+
+
+# --- shipping ---------------------------------------------------------------------------------
+
+
+def test_a_state_is_shipped_when_it_has_changed(net):
+    """Byte by byte, and not again before there is a newer one."""
+    net.add("a").keep(P7, ["b"], 1.0)
+    net.add("b")
+    net.write("a", 1, 600_000)
+    net.until(lambda: net.age("b") == (7, 1), "the first state")
+    assert kept.newest_content(net.directory("b")) == kept.newest_content(net.directory("a"))
+    given = len(net.wires["a"].given)
+    assert given == 3
+    for _ in range(50):
+        net.pass_time(0.1)
+    assert len(net.wires["a"].given) == given
+    net.write("a", 2, 600_000)
+    net.until(lambda: net.age("b") == (7, 2), "the second state")
+
+
+def test_not_more_often_than_the_policy_says(net):
+    """However fast the state changes."""
+    net.add("a").keep(P7, ["b"], 2.0)
+    net.add("b")
+    for sequence in range(1, 101):
+        net.write("a", sequence)
+        net.pass_time(0.1)
+    shipped = len({part.sequence for part in net.wires["a"].given})
+    assert 4 <= shipped <= 6
+
+
+def test_to_several_hosts(net):
+    """To each of them, one after the other."""
+    net.add("a").keep(P7, ["b", "c", "a"], 1.0)
+    net.add("b")
+    net.add("c")
+    net.write("a", 5)
+    net.until(lambda: net.age("b") == net.age("c") == (7, 5), "both copies")
+
+
+def test_the_rate_is_bounded(net):
+    """Of all that is sent; a second's worth may go out at once."""
+    net.add("a", max_rate=1_000_000).keep(P7, ["b"], 1.0)
+    net.add("b")
+    net.write("a", 1, 5_000_000)
+    begun = net.now
+    net.until(lambda: net.age("b") == (7, 1), "the state")
+    assert 3.5 <= net.now - begun <= 6.0
+
+
+def test_who_does_not_answer_is_tried_again_and_named_once(net):
+    """And others get theirs all the while."""
+    net.add("a").keep(P7, ["b", "c"], 1.0)
+    net.add("b")
+    net.add("c")
+    net.silent.add("b")
+    net.write("a", 1)
+    net.until(lambda: net.age("c") == (7, 1), "the copy on c")
+    for _ in range(100):
+        net.pass_time(0.1)
+    assert net.said["a"] == ["b does not keep the state of p#7: no answer"]
+    net.silent.clear()
+    net.until(lambda: net.age("b") == (7, 1), "the copy on b")
+
+
+def test_a_newer_state_there_is_left_alone(net):
+    """An old instance that still runs somewhere does no harm."""
+    net.add("a").keep(P7, ["b"], 1.0)
+    net.add("b")
+    net.write("b", 1, number=8)
+    net.write("a", 100)
+    for _ in range(20):
+        net.pass_time(0.1)
+    assert net.age("b") == (8, 1)
+    assert net.said["a"] == []
+
+
+def test_room_is_bounded(net):
+    """By the copies of all processes together; what is there already stays."""
+    net.add("a").keep(P7, ["b"], 1.0)
+    net.add("b", max_bytes=10_000)
+    net.write("a", 1, 9_000)
+    net.until(lambda: net.age("b") == (7, 1), "the first state")
+    net.write("a", 2, 20_000)
+    net.until(lambda: net.said["a"], "a word about it")
+    assert "keep.max_bytes" in net.said["a"][0]
+    assert net.age("b") == (7, 1)
+
+
+def test_a_state_that_is_damaged_on_its_way_is_refused(net):
+    """Nothing of it is kept, and nothing of it is left."""
+    taker = net.add("b")
+    net.write("b", 1, number=6)
+    good = kept.newest_content(net.directory("b"))[1]
+    answers = []
+    part = Part("p", 7, 5, 0, len(good), zlib.crc32(good), good[:-1] + b"?")
+    taker.take_part(part, lambda *answer: answers.append(answer))
+    net.settle()
+    assert answers[0][0] == "damaged"
+    assert net.age("b") == (6, 1)
+    assert not (net.directory("b") / "copy.new").exists()
+
+
+def test_parts_out_of_order_begin_anew(net):
+    """One was lost, or two senders speak at once."""
+    taker = net.add("b")
+    answers = []
+    taker.take_part(Part("p", 7, 5, 100, 200, 0, b"x" * 50), lambda *a: answers.append(a))
+    net.settle()
+    assert answers[0][0] == "order"
+
+
+def test_a_slow_disk_holds_up_no_loop(net, monkeypatch):
+    """The loop only asks the thread."""
+    slave = net.add("a")
+    blocked, free = threading.Event(), threading.Event()
+
+    def scan():
+        blocked.set()
+        free.wait(PATIENCE)
+        return ()
+
+    monkeypatch.setattr(slave._store, "scan", scan)
+    slave.tick(net.now + 10.0)
+    assert blocked.wait(PATIENCE)
+    begun = time.monotonic()
+    for number in range(100):
+        slave.tick(net.now + 20.0 + number)
+    assert time.monotonic() - begun < PATIENCE / 4
+    free.set()
+    net.settle()
+
+
+# --- what the master is told ------------------------------------------------------------------
+
+
+def test_the_master_is_told_what_is_kept_when_it_changes(net):
+    """And a master that has just come, at once."""
+    slave = net.add("a")
+    for _ in range(30):
+        net.pass_time(0.1)
+    assert net.told["a"] in ([], [()])
+    net.write("a", 3)
+    net.until(lambda: net.told["a"] and net.told["a"][-1], "a word of it")
+    ((one,),) = [net.told["a"][-1]]
+    assert (one.instance, one.sequence) == (P7, 3)
+    before = len(net.told["a"])
+    slave.say_again()
+    assert len(net.told["a"]) == before + 1
+
+
+def test_what_lives_here_is_not_deleted(net):
+    """An order that comes late does not take the state of a running process."""
+    slave = net.add("a")
+    net.write("a", 3)
+    slave.drop(P7, lives=True)
+    net.settle()
+    assert net.age("a") == (7, 3)
+    slave.drop(InstanceId("p", 6), lives=False)
+    net.settle()
+    assert net.age("a") == (7, 3)
+    slave.drop(P7, lives=False)
+    net.settle()
+    assert not net.directory("a").exists()
+
+
+# --- fetching ---------------------------------------------------------------------------------
+
+
+def prepare(net: Net, host: str, wanted: Assignment) -> list[Assignment]:
+    """The start that follows, when time has passed; at once, or later."""
+    started: list[Assignment] = []
+    if net.slaves[host].prepare(wanted, started.append):
+        return [wanted]
+    net.until(lambda: started, "the start")
+    return started
+
+
+def test_a_start_fetches_the_newest_state(net):
+    """Part by part; then it is there as if it had been kept here."""
+    net.add("a")
+    net.add("b")
+    net.write("b", 42, 10_000)
+    wanted = assignment("b")
+    assert prepare(net, "a", wanted) == [wanted]
+    assert net.age("a") == (7, 42)
+    assert "was fetched from b for p#9" in net.said["a"][0]
+
+
+def test_the_next_host_is_asked_where_the_first_is_not_found(net, monkeypatch):
+    monkeypatch.setattr(fetching, "PATIENCE", 0.05)
+    for name in "abc":
+        net.add(name)
+    net.write("b", 42)
+    net.write("c", 41)
+    net.hidden.add("b")
+    prepare(net, "a", assignment("b", "c"))
+    assert net.age("a") == (7, 41)
+
+
+def test_without_a_state_it_starts_from_what_is_there(net, monkeypatch):
+    """And its slave says why."""
+    monkeypatch.setattr(fetching, "PATIENCE", 0.05)
+    net.add("a")
+    net.add("b")
+    prepare(net, "a", assignment("b"))
+    assert net.said["a"] == [
+        "no newer state for p#9, it starts from nothing: b: no such state is kept here"
+    ]
+    net.hidden.add("b")
+    net.write("a", 5)
+    prepare(net, "a", assignment("b"))
+    assert "it starts from cycle 5, which is here: b: its slave was not found" in net.said["a"][1]
+
+
+def test_what_is_here_and_as_new_is_not_fetched(net):
+    net.add("a")
+    net.add("b")
+    net.write("a", 42)
+    net.write("b", 41)
+    prepare(net, "a", assignment("b"))
+    assert net.age("a") == (7, 42)
+
+
+def test_the_host_that_is_named_first_starts_at_once(net):
+    """So does a shadow, which has a source to follow, and a process without a state."""
+    slave = net.add("a")
+    assert slave.prepare(assignment("a", "b"), pytest.fail)
+    assert slave.prepare(assignment(), pytest.fail)
+    assert slave.prepare(assignment("b", shadow=True), pytest.fail)
+    stateless = Assignment(P7, ProcessSpec("p", command=("x",)), 1, "p", kept_on=("b",))
+    assert slave.prepare(stateless, pytest.fail)
+
+
+def test_states_of_a_former_life_are_deleted_before_a_start(net):
+    """Wherever they came from."""
+    slave = net.add("a")
+    net.write("a", 42)
+    assert slave.prepare(assignment(kept_from=8), pytest.fail)
+    assert net.age("a") is None
+
+
+def test_a_start_that_is_called_off_does_not_happen(net):
+    """The state may come, the instance does not."""
+    slave = net.add("a")
+    net.add("b")
+    net.write("b", 42, 10_000)
+    wanted = assignment("b")
+    assert not slave.prepare(wanted, lambda _: pytest.fail("it was started"))
+    assert slave.is_preparing(wanted.instance)
+    assert slave.forget(wanted.instance)
+    for _ in range(20):
+        net.pass_time(0.1)
+    assert not slave.is_preparing(wanted.instance)
