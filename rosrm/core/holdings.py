@@ -109,6 +109,8 @@ class Keeping:
         holdings: which host keeps which.
         told: what the slave of each process was ordered last.
         orders: process of each order without an answer.
+        next_order: their numbers are apart from those of all else: a record that is replayed
+            without the policy must not number its orders otherwise.
         dropped_at: when a host was last told to drop what it keeps of a process.
         waiting: processes that are still to be looked at in this round.
         looked: time of the last look.
@@ -120,10 +122,16 @@ class Keeping:
     holdings: Holdings = field(default_factory=Holdings)
     told: dict[str, Told] = field(default_factory=dict)
     orders: dict[int, str] = field(default_factory=dict)
+    next_order: int = 1 << 40
     dropped_at: dict[tuple[str, str], float] = field(default_factory=dict)
     waiting: list[str] = field(default_factory=list)
     looked: float = -inf
     failure_told: float = -inf
+
+    def order_id(self) -> int:
+        """A number for an order about kept states."""
+        self.next_order += 1
+        return self.next_order
 
     def in_reach(self, process: str, since: int, hosts: HostTable) -> tuple[str, ...]:
         """Hosts that are heard and keep a state of an instance from a number on, newest first."""

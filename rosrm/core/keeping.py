@@ -33,6 +33,8 @@ from rosrm.ports import CheckpointChoice, CheckpointView
 
 #: Seconds between two looks at the same process.
 _LOOK_EVERY: Final = 1.0
+#: Orders to drop that are remembered, so as not to give them again at once.
+_REMEMBERED: Final = 10_000
 #: Seconds between two records of a policy that fails.
 _TOLD_EVERY: Final = 10.0
 #: What is kept of a process that ended so is of no use any more.
@@ -81,6 +83,8 @@ def review(state: MasterState, now: float) -> None:
     """Look at some of the processes of which a state is kept: at all of them once a second."""
     keeping = state.keeping
     names = keeping.holdings.processes()
+    if len(keeping.dropped_at) > _REMEMBERED:
+        keeping.dropped_at.clear()
     share = min(1.0, (now - keeping.looked) / _LOOK_EVERY)
     keeping.looked = now
     if not keeping.waiting:
@@ -88,8 +92,11 @@ def review(state: MasterState, now: float) -> None:
     for _ in range(math.ceil(share * len(names))):
         if not keeping.waiting:
             return
-        process = state.processes.get(keeping.waiting.pop())
-        if process is not None:
+        name = keeping.waiting.pop()
+        process = state.processes.get(name)
+        if process is None:
+            keeping.told.pop(name, None)
+        else:
             _review(state, process, now)
 
 
@@ -120,7 +127,7 @@ def _choose(
     )  # fmt: skip
     if told is not None and known and (told.taken or now - told.at < state.settings.order_retry):
         return
-    order = state.order_id()
+    order = state.keeping.order_id()
     state.keeping.orders[order] = process.name
     state.keeping.told[process.name] = Told(process.owner, incarnation, choice, order, now)
     state.emit(
@@ -216,4 +223,4 @@ def _drop(state: MasterState, process: Process, name: str, holding: Holding, now
         return
     state.keeping.dropped_at[process.name, name] = now
     instance = InstanceId(process.name, holding.number)
-    state.emit(Order(state.order_id(), host.host_id, "drop_kept", instance))
+    state.emit(Order(state.keeping.order_id(), host.host_id, "drop_kept", instance))

@@ -25,15 +25,21 @@ class SlotWriter:
     """
 
     def __init__(self, directory: Path, process: str, instance: int) -> None:
-        directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+        self._directory = directory
         self._process = process
         self._instance = instance
         self._files: list[int] = []
         ages = [_age_if_whole(directory / name) for name in SLOTS]
         self._next = ages.index(min(ages))
+        self._open()
+
+    def _open(self) -> None:
+        self.close()
+        self._directory.mkdir(mode=0o700, parents=True, exist_ok=True)
         flags = os.O_RDWR | os.O_CREAT | OPEN
         try:
-            self._files += [os.open(directory / name, flags, 0o600) for name in SLOTS]
+            for name in SLOTS:
+                self._files.append(os.open(self._directory / name, flags, 0o600))
         except OSError:
             self.close()
             raise
@@ -47,6 +53,8 @@ class SlotWriter:
         Raises:
             OSError: it cannot be written; the newer one is still whole.
         """
+        if not self._files or any(os.fstat(one).st_nlink == 0 for one in self._files):
+            self._open()  # what is kept of an instance before this one was deleted meanwhile
         file = self._files[self._next]
         if self._is_of_newer(file):
             return False

@@ -147,9 +147,13 @@ class Keeper:
             return
         self._closed = True
         atexit.unregister(self.close)
-        with self._member.turn:
-            if self._may_keep():
-                self._keep(time.monotonic())
+        # Another thread of the executor may be stuck in a callback: that is no reason to stay.
+        if self._member.turn.acquire(timeout=_LAST_WORDS):
+            try:
+                if self._may_keep():
+                    self._keep(time.monotonic())
+            finally:
+                self._member.turn.release()
         self._writer.close()
 
 

@@ -206,6 +206,21 @@ def test_dropped_are_the_states_of_older_instances_alone(tmp_path):
     assert not directory.exists()
 
 
+def test_a_writer_whose_files_were_deleted_goes_on_in_new_ones(tmp_path):
+    """What an instance before it kept is dropped while it runs."""
+    directory = tmp_path / "counter"
+    write(directory, 5, b"old", instance=7)
+    writer = SlotWriter(directory, "counter", 9)
+    assert kept.drop(directory, 8)
+    assert writer.write(1, blocks(b"new"))
+    assert newest(directory) == ((9, 1), (b"new",))
+    assert writer.write(2, blocks(b"newer"))
+    kept.drop(directory, 8)
+    assert writer.write(3, blocks(b"newest"))
+    writer.close()
+    assert newest(directory) == ((9, 3), (b"newest",))
+
+
 def test_links_are_not_followed(tmp_path):
     """Who may write into the directory may not have another file written."""
     victim = tmp_path / "victim"
