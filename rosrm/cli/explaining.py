@@ -27,6 +27,8 @@ def render(story: Mapping[str, Any]) -> RenderableType:
 
 def _parts(story: Mapping[str, Any]) -> Iterator[RenderableType]:
     yield _headline(story)
+    if story.get("kept"):
+        yield _kept(story["kept"])
     decision = story.get("decision")
     if decision:
         yield Text()
@@ -53,6 +55,16 @@ def _headline(story: Mapping[str, Any]) -> Text:
     if story.get("reason"):
         text.append(f": {story['reason']}")
     return text
+
+
+def _kept(kept: list[Mapping[str, Any]]) -> Text:
+    """Where its state is kept, and how far it is."""
+    places = [
+        f"{one['host']} (cycle {one['sequence']}, {formats.size(one['size'])}, "
+        f"{formats.duration(one['elapsed'])} ago)"
+        for one in kept
+    ]
+    return Text(f"Its state is kept on {', '.join(places)}.")
 
 
 def _sentence(decision: Mapping[str, Any]) -> Text:

@@ -83,11 +83,25 @@ def explanation(state: MasterState, name: str, now: float) -> Mapping[str, Any] 
         "process": name, "state": row.state, "host": row.host,
         "reason": _reason(state, process, row.queue_position),
         "decision": None if decision is None else {**decision, "elapsed": age},
+        "kept": _kept(state, process, now),
         "history": [
             {"elapsed": now - at, "kind": kind, "message": message}
             for at, kind, message in process.history
         ],
     }  # fmt: skip
+
+
+def _kept(state: MasterState, process: Process, now: float) -> list[Mapping[str, Any]]:
+    """Where a state of it is kept, the newest first."""
+    holdings = state.keeping.holdings
+    known = holdings.of(process.name)
+    return [
+        {
+            "host": host, "number": known[host].number, "sequence": known[host].sequence,
+            "size": known[host].size, "elapsed": now - known[host].since,
+        }
+        for host in holdings.hosts_of(process.name, process.born)
+    ]  # fmt: skip
 
 
 def _reason(state: MasterState, process: Process, position: int) -> str:

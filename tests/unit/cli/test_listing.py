@@ -173,6 +173,13 @@ def test_explain_json_is_the_masters_own(rosrm, client):
     assert json.loads(rosrm("explain", "talker", "--json").out) == STORY
 
 
+def test_explain_says_where_a_state_is_kept(rosrm, client, monkeypatch):
+    kept = [{"host": "beta", "number": 7, "sequence": 120, "size": 5_000_000, "elapsed": 0.4}]
+    monkeypatch.setattr(client, "explain", lambda name: {**STORY, "kept": kept})
+    lines = rosrm("explain", "talker").out.splitlines()
+    assert lines[1] == "Its state is kept on beta (cycle 120, 5.0 MB, 0.4 s ago)."
+
+
 def test_explain_of_a_process_without_a_decision(rosrm, client, monkeypatch):
     story = {**STORY, "decision": None, "history": [], "host": "", "state": "queued"}
     monkeypatch.setattr(client, "explain", lambda name: {**story, "reason": "2 before it"})

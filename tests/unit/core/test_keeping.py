@@ -263,6 +263,20 @@ def test_after_a_move_the_copies_of_the_source_are_dropped_once_there_is_a_newer
     assert order.instance == InstanceId("p", number)
 
 
+def test_an_explanation_says_where_the_state_is_kept():
+    """The newest first, with the cycle that it covers and its age."""
+    cluster = running(Asked("b", "c"))
+    number = cluster["p"].owner
+    (other, *_) = others(cluster)
+    keep(cluster, other, ("p", number, 3))
+    cluster.wait(0.5)
+    kept = cluster.explain("p")["kept"]
+    assert [(one["host"], one["number"], one["sequence"]) for one in kept] == [
+        (where(cluster), number, 5), (other, number, 3)
+    ]  # fmt: skip
+    assert kept[1]["elapsed"] == pytest.approx(0.5)
+
+
 def test_without_a_policy_it_is_kept_on_its_own_host_alone():
     """And a start elsewhere is told of it all the same."""
     cluster = running(None)
