@@ -22,16 +22,19 @@ _TO_END: Final = 0.25
 def fence_of(spec: ProcessSpec, settings: CoreSettings) -> Fence | None:
     """When its host stops an instance of a process; None: never.
 
-    Where the process goes elsewhere when its host is lost, it has ended before a successor starts,
-    unless its own `isolation.after` is longer than that.
+    Where a successor may start elsewhere when its host is lost, it has ended before that, unless
+    its own `isolation.after` is longer. One that is to go on while its host is cut off
+    (`isolation: keep`) ends only when its slave is not at work: then it is the host alone that says
+    nothing, and both would be heard by others.
     """
-    if spec.isolation.then != "stop":
-        return None
+    follows = spec.host_loss.then == "elsewhere" or spec.standby.wanted
+    stops = spec.isolation.then == "stop"
     graces = spec.stop.interrupt_grace + spec.stop.terminate_grace
-    if spec.host_loss.then != "elsewhere":
-        return Fence(spec.isolation.after or settings.lease, graces)
-    until_successor = settings.lease + spec.host_loss.delay - settings.suspect - _MARGIN
-    until_successor = max(until_successor, _MARGIN)
+    if not follows:
+        return Fence(spec.isolation.after or settings.lease, graces) if stops else None
+    delay = 0.0 if spec.standby.wanted else spec.host_loss.delay
+    until_successor = max(settings.lease + delay - settings.suspect - _MARGIN, _MARGIN)
     grace = min(graces, _TO_END * until_successor)
     after = spec.isolation.after or until_successor - grace
-    return Fence(after, min(graces, max(0.0, until_successor - after)))
+    grace = min(graces, max(0.0, until_successor - after))
+    return Fence(after, grace, alive=not stops)

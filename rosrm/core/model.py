@@ -244,10 +244,12 @@ class Fence:
     Attributes:
         after: seconds since the host last knew that the master hears it.
         grace: seconds from there until SIGKILL at the latest.
+        alive: a host whose slave is at work counts as not cut off, whatever it hears.
     """
 
     after: float
     grace: float
+    alive: bool = False
 
 
 @dataclass(frozen=True, slots=True)

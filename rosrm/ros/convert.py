@@ -229,6 +229,7 @@ def assignment_to_msg(assignment: model.Assignment) -> msg.Assignment:
         instance=instance_to_msg(assignment.instance), epoch=assignment.epoch,
         node_name=assignment.node_name, shadow=assignment.shadow,
         fence_after=float(fence.after), fence_grace=float(fence.grace),
+        fence_alive=fence.alive,
         kept_on=list(assignment.kept_on), kept_from=assignment.kept_from,
         spec=spec_to_msg(assignment.spec),
     )  # fmt: skip
@@ -239,7 +240,9 @@ def assignment_from_msg(message: msg.Assignment) -> model.Assignment:
     for name in ("fence_after", "fence_grace"):
         if not 0.0 <= getattr(message, name) < _INFINITE:
             raise Refused(f"{message.instance.process}: {name} is {getattr(message, name)}")
-    fence = model.Fence(message.fence_after, message.fence_grace) if message.fence_after else None
+    fence = None
+    if message.fence_after:
+        fence = model.Fence(message.fence_after, message.fence_grace, message.fence_alive)
     return model.Assignment(
         instance_from_msg(message.instance), spec_from_msg(message.spec), message.epoch,
         message.node_name, message.shadow, fence, tuple(message.kept_on), message.kept_from,

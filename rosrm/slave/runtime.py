@@ -34,6 +34,7 @@ from rosrm.errors import LaunchError, Refused, SupervisorError
 from rosrm.ports import ProbeContext
 from rosrm.registry import Registry
 from rosrm.ros.graph import GraphWatch
+from rosrm.ros.journal_seen import JournalSeen
 from rosrm.ros.kept_endpoint import KeptEndpoint
 from rosrm.ros.names import STATE_CONFIG, Names, token
 from rosrm.ros.participant import Participant
@@ -135,6 +136,7 @@ class SlaveRuntime:
                 self,
                 self._description(probes.absent),
                 max(config.control.max_age, _BEATS_MISSED * config.period),
+                JournalSeen(config.state / "journal_seen"),
             )
             self._keeping = Keeping(
                 self._kept, config.host, config.keep,
@@ -287,7 +289,7 @@ class SlaveRuntime:
         elif isinstance(command, core.Stop | core.Fence | core.Restart):
             self._interfere(command)
         elif isinstance(command, core.Renew):
-            self._supervisor.heard(command.at)
+            self._supervisor.heard(command.at, command.alive)
         elif isinstance(command, core.Fail):
             self.say(f"{command.instance} is {command.reason}")
             self._supervisor.fail(command.instance, command.pid, command.reason, kill=command.kill)

@@ -195,13 +195,16 @@ class SupervisorClient:
         """SIGKILL to all of it, and no restart; never heard of: it will never be started."""
         self._order(FenceOrdered(_key(instance)))
 
-    def heard(self, at: float) -> None:
-        """The master is known to have heard this host at that monotonic time: fences wait.
+    def heard(self, at: float, alive: float) -> None:
+        """Fences wait: the master is known to have heard this host, and this slave was at work.
+
+        Args:
+            at, alive: monotonic times of that.
 
         Left out while the supervisor does not read (it is stopped): a newer one will follow.
         """
         if _writable(self._peer, 0.0):
-            self._order(Heard(at))
+            self._order(Heard(at, alive))
 
     def restart(self, instance: InstanceId) -> None:
         """Stop it, then start it again; the restart policy does not count this."""
@@ -296,7 +299,7 @@ class SupervisorClient:
             _rule(order.restart),
             StopRule(*(getattr(order.stop, name) for name in StopRule._fields)),
             order.memo,
-            None if order.fence is None else FenceRule(order.fence.after, order.fence.grace),
+            _fence_rule(order.fence),
             order.heard,
         )
 
@@ -465,6 +468,10 @@ def _poll(file: object, event: int, timeout: float | None) -> bool:
 
 def _key(instance: InstanceId) -> tuple[str, int]:
     return (instance.process, instance.number)
+
+
+def _fence_rule(fence: Fence | None) -> FenceRule | None:
+    return None if fence is None else FenceRule(fence.after, fence.grace, fence.alive)
 
 
 def _rule(restart: RestartPolicy) -> RestartRule:

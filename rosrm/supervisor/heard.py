@@ -1,14 +1,15 @@
-"""When the master last heard this host, kept for a supervisor that has to take over.
+"""When the master last heard this host, and the slave was at work: for one that has to take over.
 
 The file `heard` of the state directory holds one line of fixed length, which is overwritten: the
-id of this boot, and the time by its CLOCK_MONOTONIC. So it needs no room on a full disk, and no
-compaction. Where it is missing, what the record says of each instance counts: its start.
+id of this boot, and the two times by its CLOCK_MONOTONIC. So it needs no room on a full disk, and
+no compaction. Where it is missing, what the record says of each instance counts: its start.
 """
 
 from __future__ import annotations
 
 import os
 
+from rosrm.core.supervision import Heard
 from rosrm.supervisor import members, own_log, paths
 
 
@@ -19,19 +20,20 @@ class LastHeard:
         self._path = os.path.join(state, paths.HEARD)
         self._boot = members.boot_id()
         self._file = -1
-        self._newest = 0.0
+        self._newest = Heard(0.0)
         self._trouble = ""
 
-    def keep(self, at: float) -> None:
+    def keep(self, heard: Heard) -> None:
         """Hand it to the kernel, so that it survives this process."""
-        if at <= self._newest:
+        newest = Heard(*map(max, heard, self._newest))
+        if newest == self._newest:
             return
-        self._newest = at
+        self._newest = newest
         try:
             if self._file < 0:
                 flags = os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC
                 self._file = os.open(self._path, flags, 0o600)
-            os.pwrite(self._file, f"{self._boot} {at:020.6f}\n".encode(), 0)
+            os.pwrite(self._file, _line(self._boot, newest), 0)
             self._trouble = ""
         except OSError as error:
             trouble = error.strerror or str(error)
@@ -40,11 +42,16 @@ class LastHeard:
             self._trouble = trouble
 
 
-def read(state: str) -> float:
-    """The time that was kept since this machine's start; 0.0: none."""
+def _line(boot: str, newest: Heard) -> bytes:
+    return f"{boot} {newest.at:020.6f} {newest.alive:020.6f}\n".encode()
+
+
+def read(state: str) -> Heard:
+    """The times that were kept since this machine's start; 0.0: none."""
     try:
         with open(os.path.join(state, paths.HEARD), encoding="ascii") as file:
-            boot, at = file.read(100).split()
-        return float(at) if boot == members.boot_id() else 0.0
+            boot, at, alive = file.read(100).split()
+        newest = Heard(float(at), float(alive))
     except (OSError, ValueError):
-        return 0.0
+        return Heard(0.0)
+    return newest if boot == members.boot_id() else Heard(0.0)

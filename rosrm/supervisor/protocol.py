@@ -12,15 +12,17 @@ The client orders, by the key `do`:
                                                 environment: id of a base; changes: variable to
                                                 value, or null to leave it out; restart and stop:
                                                 the fields of the policies, in their order
-                                                fence: null, or [after, grace]: see `heard`, of
-                                                which the start has one as well; 0: now
+                                                fence: null, or [after, grace, alive]: see
+                                                `heard`, of which the start has one as well; 0: now
                                                 memo: a text that is kept for the client
     stop         instance                       SIGINT, SIGTERM, SIGKILL; never heard of: a start
                                                 that comes late will be refused
     fence        instance                       SIGKILL to all of it; never heard of: as with stop
-    heard        at                             the master is known to have heard this host then (by
-                                                CLOCK_MONOTONIC); `after` seconds after the newest
-                                                what has a fence ends, by SIGKILL `grace` later
+    heard        at, alive                      the master is known to have heard this host at one
+                                                time (by CLOCK_MONOTONIC), the client was at work at
+                                                the other; `after` seconds after the newest that
+                                                counts (a fence that is `alive` counts both) what
+                                                has a fence ends, by SIGKILL `grace` later
     restart      instance                       stop, then start again
     fail         instance, pid, reason, kill    this run of it counts as failed: stop it, at once by
                                                 SIGKILL where kill is true; then its restart policy
@@ -284,7 +286,7 @@ _READERS: Final[Mapping[str, Callable[[Mapping[str, Any]], Order]]] = {
     "start": read_launch,
     "stop": lambda fields: StopOrdered(read_key(fields["instance"])),
     "fence": lambda fields: FenceOrdered(read_key(fields["instance"])),
-    "heard": lambda fields: Heard(float(fields["at"])),
+    "heard": lambda fields: Heard(float(fields["at"]), float(fields["alive"])),
     "restart": lambda fields: RestartOrdered(read_key(fields["instance"])),
     "fail": _read_fail,
     "amend": _read_amend,
@@ -320,8 +322,8 @@ def read_fence(value: Sequence[Any] | None) -> FenceRule | None:
     """A fence from its JSON list."""
     if value is None:
         return None
-    after, grace = value
-    return FenceRule(float(after), float(grace))
+    after, grace, alive = value
+    return FenceRule(float(after), float(grace), bool(alive))
 
 
 def _limits(value: Any) -> LogLimits:

@@ -312,9 +312,10 @@ class Server:
         )
 
     def _renew(self, order: supervision.Heard) -> None:
-        at = min(order.at, time.monotonic())
-        self._heard_at.keep(at)
-        self._happened(supervision.Heard(at))
+        now = time.monotonic()
+        newest = supervision.Heard(min(order.at, now), min(order.alive, now))
+        self._heard_at.keep(newest)
+        self._happened(newest)
 
     def _amend(self, amendment: protocol.Amend) -> None:
         launch = self._launches.get(amendment.order.instance)

@@ -39,7 +39,8 @@ def restore(state: str, core: Supervision, family: Family) -> Recorded:
     for instance in recorded.instances.values():
         if not recorded.same_boot:
             _begin_clock_anew(instance, time.monotonic())
-        instance.heard = max(instance.heard, newest)
+        alive = instance.fence is not None and instance.fence.alive
+        instance.heard = max(instance.heard, newest.at, newest.alive if alive else 0.0)
         core.restore(instance)
         leader = members.read_stat(instance.pid) if instance.pid and recorded.same_boot else None
         birth = recorded.births[instance.key]

@@ -19,25 +19,26 @@ RENEW_PERIOD: Final = 0.1
 def master_hears(state: SlaveState, event: MasterHears, now: float) -> list[Command]:
     """Pass it on, where there is a fence that it renews."""
     state.heard_at = max(state.heard_at, event.at)
-    if state.heard_at - state.renewed_at < RENEW_PERIOD:
-        return []
-    return renew(state)
+    return renew_in_time(state, now)
 
 
-def renew(state: SlaveState) -> list[Command]:
+def renew_in_time(state: SlaveState, now: float) -> list[Command]:
+    """Tell the supervisor the newest, unless it was told a moment ago."""
+    return renew(state, now) if now - state.renewed_at >= RENEW_PERIOD else []
+
+
+def renew(state: SlaveState, now: float) -> list[Command]:
     """Tell the supervisor the newest; what has no fence needs no word."""
-    if not state.heard_at:
-        return []
     if not any(held.fenced and not held.status.state.ended for held in state.held.values()):
         return []
-    state.renewed_at = state.heard_at
-    return [Renew(state.heard_at)]
+    state.renewed_at = now
+    return [Renew(state.heard_at, now)]
 
 
 def too_late(state: SlaveState, assignment: Assignment, now: float) -> str:
     """Why an instance must not be started any more; "": it may be."""
     fence = assignment.fence
-    if fence is None or now < state.heard_at + fence.after:
+    if fence is None or fence.alive or now < state.heard_at + fence.after:
         return ""
     return (
         f"fenced before it was started: for {fence.after:g} s it was not known here whether the "

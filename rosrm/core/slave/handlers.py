@@ -255,7 +255,7 @@ def _supervisor_replaced(state: SlaveState, event: SupervisorReplaced, now: floa
     for instance in event.fenced & state.held.keys():
         state.held[instance].fenced = True
     return [
-        *fencing.renew(state), *again, *_start_waiting(state, now),
+        *fencing.renew(state, now), *again, *_start_waiting(state, now),
         Report(state.statuses(), complete=True),
     ]  # fmt: skip
 
@@ -337,7 +337,7 @@ def _may_be_forgotten(state: SlaveState, held: Held, now: float) -> bool:
 
 
 def _time_passed(state: SlaveState, event: TimePassed, now: float) -> _Commands:
-    commands: _Commands = _refuse_late(state, now)
+    commands: _Commands = [*fencing.renew_in_time(state, now), *_refuse_late(state, now)]
     forgotten = []
     for instance, held in state.held.items():
         awaited = held.awaited

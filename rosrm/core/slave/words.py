@@ -233,9 +233,14 @@ class Fence:
 
 @dataclass(frozen=True, slots=True)
 class Renew:
-    """Tell the supervisor when the master last heard this host."""
+    """Tell the supervisor when the master last heard this host, and that this slave is at work.
+
+    Attributes:
+        at, alive: by the monotonic clock.
+    """
 
     at: float
+    alive: float
 
 
 @dataclass(frozen=True, slots=True)

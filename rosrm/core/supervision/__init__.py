@@ -41,7 +41,8 @@
     ended     Forgotten        Drop; its number is dead                      -
 
 An instance may have a fence: `FencePassed` comes by itself when nobody has said for too long that
-the master hears this host (`Heard`; its start counts as such). What was fenced is not restarted
+the master hears this host (`Heard`; its start counts as such) or, where the fence is `alive`, that
+the slave is at work. What was fenced is not restarted
 here, whatever its policy and whatever is ordered afterwards.
 
 Whatever is not in the table changes nothing; an order that changes nothing has its status told

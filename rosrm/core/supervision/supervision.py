@@ -89,7 +89,7 @@ class Supervision:
                 if self._has_turn(self.instances[key], now):
                     yield from self._apply(self.instances[key], event, now)
         elif isinstance(event, Heard):
-            self._renew(min(event.at, now))
+            self._renew(min(event.at, now), min(event.alive, now))
         elif isinstance(event, ShutdownOrdered):
             self.closing = True
             for instance in list(self.instances.values()):
@@ -101,11 +101,14 @@ class Supervision:
         elif isinstance(event, _OrderOfStranger):
             yield from self._unknown(event, now)
 
-    def _renew(self, at: float) -> None:
+    def _renew(self, heard: float, alive: float) -> None:
         """The clocks of the fences start afresh; what is fenced already stays so."""
         for instance in self.instances.values():
-            if instance.fence_at is not None and instance.heard < at:
-                instance.heard = at
+            if instance.fence is None or instance.fence_at is None:
+                continue
+            newest = max(heard, alive) if instance.fence.alive else heard
+            if instance.heard < newest:
+                instance.heard = newest
                 self._watch_deadline(instance)
 
     def _fence_in_time(self, instance: Instance, now: float) -> list[Command]:
@@ -142,7 +145,9 @@ class Supervision:
         if isinstance(event, StartOrdered):
             instance = Instance(event.instance, event.restart, event.stop)
             instance.fence = event.fence
-            instance.heard = now if event.heard is None else min(event.heard, now)
+            slave_counts = event.fence is not None and event.fence.alive
+            known = None if slave_counts else event.heard
+            instance.heard = now if known is None else min(known, now)
         else:
             instance = Instance(event.instance, RestartRule(), StopRule())
         self.instances[instance.key] = instance

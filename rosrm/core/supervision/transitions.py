@@ -134,7 +134,7 @@ def _mean_to_end(instance: Instance, event: Event, now: float) -> list[Command]:
 
 
 def _mean_to_restart(instance: Instance, event: Event, now: float) -> list[Command]:
-    if instance.then != THEN_POLICY:
+    if instance.then != THEN_POLICY or instance.fenced:
         return []  # it is meant to end, or to start again already
     instance.then = THEN_RESTART
     instance.message = stopping(instance)
@@ -274,8 +274,9 @@ def _take_fence(instance: Instance, event: Event, now: float) -> None:
     if isinstance(event, FenceOrdered) or instance.fence is None:
         why, by = "it has a successor", now
     else:
-        after, grace = instance.fence
-        why = f"for {after:g} s it was not known here whether the master hears this host"
+        after, grace, alive = instance.fence
+        unknown = "whether its slave lives" if alive else "whether the master hears this host"
+        why = f"for {after:g} s it was not known here {unknown}"
         by = instance.heard + after + grace
     instance.kill_by = by if instance.kill_by is None else min(by, instance.kill_by)
     if instance.then != THEN_END:

@@ -31,6 +31,7 @@ class FenceRule(NamedTuple):
 
     after: float
     grace: float
+    alive: bool = False
 
 
 # --- events: what happened --------------------------------------------------------------------
@@ -64,9 +65,14 @@ class FenceOrdered(NamedTuple):
 
 
 class Heard(NamedTuple):
-    """The client knows that the master heard this host `at` that time, by the monotonic clock."""
+    """The client knows that the master heard this host `at` that time, by the monotonic clock.
+
+    Attributes:
+        alive: newest time at which the client itself was at work.
+    """
 
     at: float
+    alive: float = 0.0
 
 
 class RestartOrdered(NamedTuple):

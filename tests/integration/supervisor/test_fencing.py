@@ -37,7 +37,7 @@ SLAVE = """
     ])
     pids = {}
     while True:
-        client.heard(time.monotonic())
+        client.heard(time.monotonic(), 0.0)
         for status in client.receive(0.1):
             if status.pid and status.instance.process not in pids:
                 pids[status.instance.process] = status.pid
@@ -84,6 +84,22 @@ def test_a_stopped_slave_cannot_fence_so_its_supervisor_does(host, slave):
     assert of_one(client).message.startswith("fenced: for 3 s it was not known")
 
 
+def test_one_that_counts_on_its_slave_goes_on_while_that_is_at_work(host, client):
+    """Whatever the master hears; then, without a sign of life, it ends."""
+    fences = {"one": Fence(2.0, 0.0, alive=True), "two": Fence(2.0, 0.0)}
+    client.start([host.order(name, *SLEEPS, fence=fence) for name, fence in fences.items()])
+    host.running(client, "one")
+    until, told = time.monotonic() + 5.0, []
+    while time.monotonic() < until:
+        alive = time.monotonic()
+        client.heard(0.0, alive)
+        told += client.receive(0.1)
+    assert {status.instance.process for status in told if status.state.ended} == {"two"}
+    status = host.ended(client, "one")
+    assert time.monotonic() - alive >= 2.0
+    assert "whether its slave lives" in status.message
+
+
 def test_it_goes_on_while_somebody_says_heard(host, client):
     """Several times as long as its fence; then, without another word, it ends."""
     client.start([host.order("one", *SLEEPS, fence=Fence(2.0, 0.0), restart=ALWAYS)])
@@ -91,7 +107,7 @@ def test_it_goes_on_while_somebody_says_heard(host, client):
     until = time.monotonic() + 5.0
     while time.monotonic() < until:
         heard = time.monotonic()
-        client.heard(heard)
+        client.heard(heard, 0.0)
         assert client.receive(0.1) == []
     status = host.ended(client, "one")
     assert time.monotonic() - heard >= 2.0
@@ -147,7 +163,7 @@ def test_a_supervisor_that_takes_over_knows_what_was_heard(host, client):
     heard = time.monotonic()
     client.start([host.order("one", *SLEEPS, fence=Fence(15.0, 0.0), heard=heard - 14.0)])
     pid = host.running(client, "one").pid
-    client.heard(time.monotonic())
+    client.heard(time.monotonic(), 0.0)
     client.remember(ONE, "after the word that counts")
     client.start([host.order("other", "true")])
     host.ended(client, "other")  # by then all of it was read

@@ -11,6 +11,7 @@ from rosrm.core.model import (
     InstanceState,
     IsolationPolicy,
     ProcessSpec,
+    StandbyPolicy,
     StopPolicy,
 )
 from rosrm.core.settings import CoreSettings
@@ -239,8 +240,21 @@ def fence(
 
 
 def test_by_default_nothing_is_fenced() -> None:
-    """A host that is cut off goes on."""
-    assert fence(ELSEWHERE, IsolationPolicy()) is None
+    """Nothing follows it, so it may go on."""
+    assert fence(HostLossPolicy(), IsolationPolicy()) is None
+
+
+def test_what_may_have_a_successor_is_fenced_where_its_slave_is_not_at_work() -> None:
+    """A host that is only cut off goes on, whatever it hears."""
+    cluster = Cluster("a")
+    cluster.submit(process("p", host_loss=ELSEWHERE), process("q", standby=StandbyPolicy(True)))
+    machine = cluster.machines["a"]
+    for name in ("p", "q"):
+        given = machine.programs[machine.find(name)].assignment.fence
+        assert given is not None
+        assert given.alive
+    cluster.submit(process("r", host_loss=ELSEWHERE, isolation=IsolationPolicy("stop")))
+    assert not machine.programs[machine.find("r")].assignment.fence.alive
 
 
 def test_a_fenced_process_has_ended_before_its_successor_starts() -> None:

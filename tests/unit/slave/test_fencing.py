@@ -59,9 +59,9 @@ def test_the_supervisor_hears_it_while_there_is_a_fence() -> None:
     one.assign(fence=None)
     assert one.hears(1.0) == []
     one.assign(number=2, after=1.0)
-    assert one.hears(0.2) == [slave.Renew(one.now)]
+    assert one.hears(0.2) == [slave.Renew(one.now, one.now)]
     assert one.hears(0.05) == []
-    assert one.hears(0.06) == [slave.Renew(one.now)]
+    assert one.hears(0.06) == [slave.Renew(one.now, one.now)]
     one.tell(InstanceState.EXITED, number=2)
     assert one.hears(1.0) == []
 
@@ -71,19 +71,19 @@ def test_an_older_word_puts_nothing_off() -> None:
     one = Slave()
     one.assign()
     one.hears(1.0)
-    assert one.step(slave.MasterHears(one.now - 0.5), 0.5) == []
+    assert one.step(slave.MasterHears(one.now - 0.5), 0.5) == [slave.Renew(one.now - 0.5, one.now)]
     assert one.state.heard_at == one.now - 0.5
 
 
 def test_a_fence_is_known_again_from_the_supervisor() -> None:
-    """By the next run of the slave; and another supervisor is told the newest at once."""
+    """By the next run of the slave; and a supervisor is told the newest at once."""
     status = InstanceStatus(ONE, InstanceState.RUNNING, pid=5)
     replaced = slave.SupervisorReplaced((status,), fenced=frozenset({ONE}))
     one = Slave()
-    assert one.step(replaced)[0] == slave.Renew(100.0)
-    assert one.hears(1.0) == [slave.Renew(101.0)]
+    assert one.step(replaced)[0] == slave.Renew(100.0, 100.0)
+    assert one.hears(1.0) == [slave.Renew(101.0, 101.0)]
     new = slave.SlaveState()
-    assert not any(isinstance(c, slave.Renew) for c in slave.step(new, replaced, 100.0))
+    assert slave.step(new, replaced, 100.0)[0] == slave.Renew(0.0, 100.0)
 
 
 def test_what_is_given_out_too_late_is_not_started() -> None:
@@ -100,14 +100,23 @@ def test_what_waits_for_its_start_is_fenced_too() -> None:
     one.assign(fence=None)
     one.assign(number=2)
     one.assign(number=3, fence=None)
-    assert one.step(slave.TimePassed(), 1.9) == []
+    assert refusals(one.step(slave.TimePassed(), 1.9)) == []
     one.hears()
-    assert one.step(slave.TimePassed(), 1.9) == []
+    assert refusals(one.step(slave.TimePassed(), 1.9)) == []
     commands = one.tell(InstanceState.EXITED, after=0.1)
     assert len(refusals(commands)) == 1
     (launch,) = (c for c in commands if isinstance(c, slave.Launch))
     assert [a.instance.number for a in launch.assignments] == [3]
     assert refusals(one.assign(number=2)) == []  # it is remembered, and not started
+
+
+def test_a_slave_at_work_says_so_while_it_hears_nothing() -> None:
+    """What is fenced only where its slave is not at work is started and kept in a cut."""
+    one = Slave()
+    alive = Fence(after=2.0, grace=0.0, alive=True)
+    (launch,) = one.assign(fence=alive, after=30.0)
+    assert isinstance(launch, slave.Launch)
+    assert one.step(slave.TimePassed(), 1.0) == [slave.Renew(100.0, one.now)]
 
 
 def test_the_order_to_fence_is_passed_on() -> None:

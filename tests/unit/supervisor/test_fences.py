@@ -206,3 +206,13 @@ def test_the_order_to_fence_a_stranger_is_as_one_to_stop_it():
     core.handle(sv.FenceOrdered(ONE), 0.0)
     core.handle(sv.StartOrdered(ONE, ALWAYS, GRACES), 1.0)
     assert core.instances[ONE].phase == sv.REFUSED
+
+
+def test_what_is_fenced_on_its_way_out_is_not_restarted_on_order():
+    """It had failed, and its policy was to decide: there is a successor now."""
+    core, instance = running(restart=sv.RestartRule("always"))
+    core.handle(sv.FailOrdered(ONE, instance.pid, "hung", False), 1.0)
+    core.handle(sv.FenceOrdered(ONE), 1.5)
+    core.handle(sv.RestartOrdered(ONE), 2.0)
+    core.handle(sv.Exited(ONE, signal=9), 2.5)
+    assert instance.phase == sv.FENCED

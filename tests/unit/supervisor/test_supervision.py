@@ -450,7 +450,7 @@ POLICIES = st.builds(
     st.sampled_from([5.0, 50.0]),
 )
 FENCES = st.none() | st.builds(
-    sv.FenceRule, st.sampled_from([0.5, 1.0, 5.0]), st.sampled_from([0.0, 0.5, 2.0])
+    sv.FenceRule, st.sampled_from([0.5, 1.0, 5.0]), st.sampled_from([0.0, 0.5, 2.0]), st.booleans()
 )
 GRACES = st.builds(sv.StopRule, st.sampled_from([0.0, 1.0]), st.sampled_from([0.0, 1.0]))
 
@@ -528,7 +528,7 @@ class Host(RuleBasedStateMachine):
         self.newest += 1
         key = ("a", self.newest)
         if fence is not None:
-            self.fences[key], self.heard[key] = fence, self.now - ago
+            self.fences[key], self.heard[key] = fence, self.now - (0.0 if fence.alive else ago)
         self.happens(sv.StartOrdered(key, restart, stop, fence, self.now - ago))
         self.happens(sv.TimePassed())
         self.look_at_fences()
@@ -537,8 +537,18 @@ class Host(RuleBasedStateMachine):
     def master_hears(self, ago):
         """By a word that took so long; what is fenced already stays so."""
         self.happens(sv.Heard(self.now - ago))
+        self.renew(min(self.now, self.now - ago), alive=False)
+
+    @rule()
+    def slave_is_at_work(self):
+        """It knows nothing new of the master."""
+        self.happens(sv.Heard(-99.0, self.now))
+        self.renew(self.now, alive=True)
+
+    def renew(self, at, *, alive):
         for key in self.fences.keys() - self.dead_by.keys():
-            self.heard[key] = max(self.heard[key], min(self.now, self.now - ago))
+            if self.fences[key].alive or not alive:
+                self.heard[key] = max(self.heard[key], at)
 
     @precondition(lambda self: self.core.instances)
     @rule(data=st.data())
@@ -548,7 +558,7 @@ class Host(RuleBasedStateMachine):
         self.happens(sv.FenceOrdered(key))
 
     def look_at_fences(self):
-        for key, (after, grace) in self.fences.items():
+        for key, (after, grace, _) in self.fences.items():
             if self.now >= self.heard[key] + after:
                 self.dead_by.setdefault(key, self.heard[key] + after + grace)
 
