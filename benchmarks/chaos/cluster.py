@@ -32,7 +32,7 @@ assert LINE_HOST in HOSTS
 
 #: Seconds of silence after which a host is lost. Faults last less than that, or more.
 LEASE_S: Final = 3.0
-_ROSRM: Final = str(Path(sys.executable).with_name("rosrm"))
+_ROSRM: Final = (sys.executable, "-m", "rosrm.cli")
 _MEMORY: Final = 2 * GIB
 _DISK: Final = 96 * MIB
 #: Seconds after which a service manager starts a part again that ended by itself.
@@ -189,7 +189,7 @@ class Cluster:
         self.folder.mkdir(parents=True, exist_ok=True)
         file = self.folder / f"{host}.yaml"
         file.write_text(json.dumps(settings))  # JSON is YAML too
-        command = [_ROSRM, name, "--config", str(file)]
+        command = [*_ROSRM, name, "--config", str(file)]
         return Part(name, host, command, self.folder / f"{name}-{host}.log")
 
 

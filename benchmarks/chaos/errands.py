@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 _PAUSE: Final = 0.3
 #: In the master's answer to a submission that it had taken already.
 _KNOWN: Final = "in use already"
+#: In its answer to a request that was on its way for too long.
+_STALE: Final = "old by this side's clock"
 
 
 @dataclass
@@ -107,7 +109,7 @@ class Errands:
             errand.answer = self._ask(errand.request)
             if not errand.persistent or _accepted(errand):
                 return
-            errand.unsure = errand.unsure or "no_master" in errand.answer
+            errand.unsure = errand.unsure or _may_have_been_taken(errand.answer)
             self._tell(f"{errand.request['do']} is asked again: {errand.answer}")
             time.sleep(_PAUSE)  # who has no master, or whose master has no room, asks again
 
@@ -134,6 +136,11 @@ class Errands:
         if not self._leaving:
             self._desk = self._start_desk()
         return {"no_master": f"the client ended with {ended.returncode}, see {self._log}"}
+
+
+def _may_have_been_taken(answer: Mapping[str, Any]) -> bool:
+    """An answer may have been lost: the client asks again by itself, and that may come too late."""
+    return "no_master" in answer or _STALE in answer.get("refused", "")
 
 
 def _accepted(errand: Errand) -> bool:

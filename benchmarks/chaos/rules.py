@@ -208,7 +208,7 @@ def _judge_state(
             return Judgement(allowed=Counter(state_cycles_repeated=1))
         if behind <= _most_behind(name, promise, one, following, harms):
             return Judgement(allowed=Counter(state_seconds_repeated=1))
-        if following.first_number == 1 and _may_be_lost(promise, one, following, harms):
+        if following.first_number == 1 and _may_be_lost(name, promise, one, following, harms):
             return Judgement(allowed=Counter(state_from_nothing=1))
         if any(harm.fills for harm in harms):
             return Judgement(allowed=Counter(state_older_disk_full=1))
@@ -234,9 +234,23 @@ def _most_behind(
         return _LAST_SECOND
     # For a move the standby makes room; where that fails, the copy is what is left.
     asked = any(harm.kind in MOVES and harm.process == name for harm in harms)
-    if promise.standby and not (asked and promise.copied):
+    second = asked or _is_struck_twice(name, promise, harms)
+    if promise.standby and not (second and promise.copied):
         return _LAST_CYCLES + _unseen(one, harms, one.host)
     return promise.copied + _unseen(one, harms) if promise.copied else 0.0
+
+
+def _is_struck_twice(name: str, promise: Promise, harms: Sequence[Harm]) -> bool:
+    """Whether who was to go on, or what it was to go on from, may have been struck as well."""
+    blows = [
+        harm
+        for harm in harms
+        if harm.hides or harm.kills or harm.deafens or harm.fills
+        or (harm.process == name and harm.kind not in MOVES)
+    ]  # fmt: skip
+    # What stops at once wherever the master is not heard, its standby included.
+    everywhere = promise.isolated and any("*" in harm.hosts for harm in blows)
+    return len(blows) > 1 or everywhere
 
 
 def _unseen(run: Run, harms: Sequence[Harm], host: str = "") -> float:
@@ -249,16 +263,15 @@ def _unseen(run: Run, harms: Sequence[Harm], host: str = "") -> float:
     return _RATE * max(0.0, run.last - min(since)) if since else 0.0
 
 
-def _may_be_lost(promise: Promise, one: Run, following: Run, harms: Sequence[Harm]) -> bool:
+def _may_be_lost(
+    name: str, promise: Promise, one: Run, following: Run, harms: Sequence[Harm]
+) -> bool:
     """Whether there may be nothing to go on from: no copy, none yet, or none within reach."""
     if following.host == one.host:
         return not promise.kept
-    others = any(
-        (harm.hides or harm.kills) and not (harm.hosts and harm.hosts <= {one.host})
-        for harm in harms
-    )
-    young = one.last - one.first < _YOUNG
-    return not promise.standby and (not promise.copied or others or young)
+    if _is_struck_twice(name, promise, harms) or one.last - one.first < _YOUNG:
+        return True
+    return not (promise.standby or promise.copied)
 
 
 def judge_job(name: str, accepted: float, runs: Sequence[Run], harms: Sequence[Harm]) -> Judgement:

@@ -150,6 +150,20 @@ def test_a_state_that_came_to_no_other_host_in_time_is_lost():
     assert kinds(copied, [young, anew], [OFF]) == ([], {"state_from_nothing": 1})
 
 
+def test_a_standby_bears_one_fault_and_the_copy_another():
+    """What is stopped wherever the master is not heard loses both at once when the master is."""
+    guarded = Promise(stateful=True, standby=True, elsewhere=True, kept=True, copied=5)
+    isolated = Promise(
+        stateful=True, standby=True, elsewhere=True, isolated=True, kept=True, copied=5
+    )
+    silent = Harm("master_stop", 20.0, 25.0, frozenset({"*"}), hides=True)
+    other = Harm("slave_kill", 20.0, 22.0, frozenset({"host3"}), hides=True)
+    behind = run("a#2", "host2", 23.0, 30.0, (97, 200))
+    assert kinds(guarded, [FIRST, behind], [OFF])[0] == ["state"]
+    assert kinds(guarded, [FIRST, behind], [OFF, other]) == ([], {"state_seconds_repeated": 1})
+    assert kinds(isolated, [FIRST, behind], [silent]) == ([], {"state_seconds_repeated": 1})
+
+
 def test_one_run_never_goes_back():
     backwards = run()
     backwards.backwards = 1
