@@ -97,13 +97,13 @@ class Stage:
 
     def instance(
         self, make: Callable[..., Any], number: int, *, name: str = "counter", alias: str = "",
-        shadow: bool = False, **named: Any,
+        shadow: bool = False, keep: Any = "", **named: Any,
     ) -> Any:  # fmt: skip
         """A node that was started by a slave, as it sees it."""
         variables = {
             "ROSRM_INSTANCE": f"{name}#{number}", "ROSRM_PROCESS": name, "ROSRM_NODE": f"/{name}",
             "ROSRM_STATE_CONFIG": TOPIC, "ROSRM_MASTER": CLUSTER, "ROSRM_EPOCH": str(EPOCH),
-            "ROSRM_SHADOW": "1" if shadow else "",
+            "ROSRM_SHADOW": "1" if shadow else "", "ROSRM_KEEP": str(keep),
         }  # fmt: skip
         with pytest.MonkeyPatch.context() as patch:
             for variable, value in variables.items():

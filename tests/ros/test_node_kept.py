@@ -1,0 +1,175 @@
+"""A node that goes on from its kept state: what it does first, and what it does not do again."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from std_msgs.msg import Int64
+from std_srvs.srv import Trigger
+
+from rosrm import kept
+from rosrm_msgs.msg import HandoffReport
+from tests.ros.nodes import RELIABLE, Conductor, Counter
+
+LATCHED = QoSProfile(
+    depth=10, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
+)
+
+
+class Busy(Counter):
+    """With a latched input, a service, a parameter and a timer that it has cancelled."""
+
+    def __init__(self, **named) -> None:
+        super().__init__(**named)
+        self.seen: list[int] = []
+        self.declare_parameter("gain", 1.0)
+        self.create_subscription(Int64, "settings", self.take, LATCHED)
+        self.once = self.create_timer(0.01, self.run_once)
+        self.runs = 0
+        self.create_service(Trigger, "~/poke", self.poke)
+        self.fails_at = 0
+
+    def take(self, message: Int64) -> None:
+        self.seen.append(message.data)
+        self.total += message.data
+
+    def run_once(self) -> None:
+        self.runs += 1
+        self.once.cancel()
+
+    def poke(self, _request, response):
+        response.message = str(self.count)
+        return response
+
+    def tick(self) -> None:
+        super().tick()
+        if self.count == self.fails_at:
+            raise ValueError("the author's mistake")
+
+
+def crash(stage, node) -> None:
+    """It is no more, and had no time for a last word."""
+    node._rosrm._source._keeper._closed = True
+    stage.remove(node)
+
+
+def kept_up_to(directory, sequence: int) -> bool:
+    head = kept.newest_head(directory)
+    return head is not None and head.sequence >= sequence
+
+
+def test_what_was_processed_is_not_processed_again(stage, tmp_path):
+    """A latched message comes again to the new node, as it would to any; it is known already."""
+    talker = stage.plain.create_publisher(Int64, "settings", LATCHED)
+    talker.publish(Int64(data=5))
+    first = stage.instance(Busy, 1, keep=tmp_path)
+    stage.spin_until(lambda: first.seen == [5], "the message")
+    at = first._rosrm.member.sequence
+    stage.spin_until(lambda: kept_up_to(tmp_path, at), "a state that covers it")
+    crash(stage, first)
+    second = stage.instance(Busy, 1, keep=tmp_path)
+    talker.publish(Int64(data=7))
+    stage.spin_until(lambda: second.seen, "the next message")
+    assert second.seen == [7]
+    assert second.total == 12
+
+
+def test_it_goes_on_as_it_was(stage, tmp_path):
+    """State, parameters, timers, services: before its first cycle, whatever came first."""
+    first = stage.instance(Busy, 1, keep=tmp_path)
+    first.set_parameters([Parameter("gain", value=2.5)])
+    stage.spin_until(lambda: first.count >= 20 and first.runs == 1, "twenty counts")
+    stage.remove(first)  # in good order: the last state is kept
+    counts = stage.listen(Int64, "count")
+    second = stage.instance(Busy, 2, keep=tmp_path)
+    assert second.count == 0
+    stage.spin_until(lambda: len(counts) >= 5, "further counts")
+    assert [one.data for one in counts] == list(
+        range(first.count + 1, first.count + 1 + len(counts))
+    )
+    assert second.get_parameter("gain").value == 2.5
+    assert second.runs == 0
+    assert second.once.is_canceled()
+    client = stage.plain.create_client(Trigger, "/counter/poke")
+    stage.spin_until(client.service_is_ready, "the service")
+
+
+def test_the_state_in_the_middle_of_a_cycle_is_not_kept(stage, tmp_path):
+    """The callback raised: what is kept is the state before it."""
+    first = stage.instance(Busy, 1, keep=tmp_path)
+    stage.spin_until(lambda: first.count >= 5, "five counts")
+    first.fails_at = first.count + 5
+    with pytest.raises(ValueError, match="mistake"):
+        stage.spin_until(lambda: False, "a fault")
+    failed_at = first.count
+    stage.remove(first)
+    second = stage.instance(Busy, 1, keep=tmp_path)
+    stage.spin_until(lambda: second.count > 0, "a count")
+    assert second.count <= failed_at
+
+
+def test_a_revived_node_can_be_moved(stage, tmp_path):
+    """It is a source like any other; and who takes over keeps its own state from then on."""
+    first = stage.instance(Counter, 1, keep=tmp_path / "a")
+    stage.spin_until(lambda: first.count >= 10, "ten counts")
+    stage.remove(first)
+    counts = stage.listen(Int64, "count", RELIABLE)
+    second = stage.instance(Counter, 2, keep=tmp_path / "a")
+    stage.spin_until(lambda: counts, "a count")
+    shadow = stage.instance(
+        Counter, 3, alias="counter_1700000000", shadow=True, keep=tmp_path / "b"
+    )
+    conductor = Conductor(stage, source=2, destination=3)
+    conductor.hand_over()
+    conductor.wait(3, HandoffReport.ACTIVE)
+    at = second.count
+    stage.spin_until(lambda: shadow.count >= at + 5, "counts of the successor")
+    stage.spin_until(lambda: kept_up_to(tmp_path / "b", 1), "its own kept state")
+    assert kept.newest_head(tmp_path / "b").instance == 3
+    assert [one.data for one in counts] == list(range(counts[0].data, counts[-1].data + 1))
+    assert kept.newest_head(tmp_path / "a").instance == 2
+
+
+def test_a_damaged_state_gives_way_to_the_one_before(stage, tmp_path):
+    """At most one write is lost; only without any it begins from nothing."""
+    first = stage.instance(Counter, 1, keep=tmp_path)
+    stage.spin_until(lambda: first.count >= 30, "thirty counts")
+    stage.remove(first)
+    (newest, head), (_, before) = kept.files(tmp_path)
+    newest.write_bytes(newest.read_bytes()[: head.size - 3])
+    second = stage.instance(Counter, 1, keep=tmp_path)
+    stage.spin_until(lambda: second.count > 0, "a count")
+    assert second._rosrm.member.sequence <= before.sequence + 1
+    assert second.count > 20
+    crash(stage, second)
+    for path, _ in kept.files(tmp_path):
+        path.write_bytes(b"nonsense")
+    third = stage.instance(Counter, 1, keep=tmp_path)
+    stage.spin_until(lambda: third.count > 0, "a count")
+    assert third.count <= 2
+
+
+class Slow(Counter):
+    """Has no cycle but its input, and takes its time to save."""
+
+    def __init__(self, **named) -> None:
+        super().__init__(period=1000.0, **named)
+
+    def save(self) -> Int64:
+        time.sleep(0.05)
+        return super().save()
+
+
+def test_what_is_not_kept_at_once_is_kept_though_no_cycle_follows(stage, tmp_path):
+    """A state that takes long to save is saved less often, but not later than it is said."""
+    talker = stage.plain.create_publisher(Int64, "add", LATCHED)
+    node = stage.instance(Slow, 1, keep=tmp_path)
+    for _ in range(5):
+        talker.publish(Int64(data=1))
+    stage.spin_until(lambda: node.total == 5, "five messages")
+    writes = node._rosrm._source._keeper
+    assert writes._kept < node._rosrm.member.sequence
+    stage.spin_until(lambda: kept_up_to(tmp_path, 5), "the last state")
