@@ -7,6 +7,7 @@ RosrmError                  what a user reads: no traceback is shown for it
 ├── NoMaster                no master answered in time
 ├── LaunchError             a process that cannot be started on this host
 ├── JournalError            the durable record cannot be read or written
+│   └── JournalBlocked      not just now: it may pass by itself
 ├── RecordError             the record of a master's run cannot be read
 ├── SupervisorError         the supervisor cannot be started or reached
 └── LabError                a virtual host or its network cannot be made, or is not there
@@ -58,6 +59,10 @@ class LaunchError(RosrmError):
 
 class JournalError(RosrmError):
     """The durable record cannot be read or written."""
+
+
+class JournalBlocked(JournalError):
+    """The durable record cannot be written just now; nothing was changed, it may be tried again."""
 
 
 class RecordError(RosrmError):

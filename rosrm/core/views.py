@@ -123,11 +123,13 @@ class Snapshot:
         master: name of the master.
         uptime: of the master, seconds.
         last_sequence: of the event record.
+        trouble: why the master takes no new work now; "": it does.
     """
 
     master: str
     uptime: float
     last_sequence: int
+    trouble: str = ""
     hosts: Sequence[HostRow] = ()
     processes: Sequence[ProcessRow] = ()
     plugins: Sequence[PluginRow] = ()

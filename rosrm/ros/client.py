@@ -238,6 +238,7 @@ class MasterClient:
         answer = self._call(srv.List, self._names(names.LIST), request, "the master")
         return Snapshot(
             master=answer.master, uptime=answer.uptime, last_sequence=answer.last_sequence,
+            trouble=answer.trouble,
             hosts=[convert.host_row_from_msg(row) for row in answer.host_list],
             processes=[convert.process_row_from_msg(row) for row in answer.process_list],
             plugins=[convert.plugin_row_from_msg(row) for row in answer.plugin_list],
@@ -299,10 +300,20 @@ class MasterClient:
         if response is None:
             raise NoMaster(
                 f"{who} did not answer {path} within {self._timeout:g} s "
-                f"({self._participant.settings.describe()})"
+                f"({self._participant.settings.describe()}){self._trouble(kind)}"
             )
         check_answer(response.answer, who)
         return response
+
+    def _trouble(self, kind: Any) -> str:
+        """Why the master left a request open, if it says so: it may still carry it out."""
+        if kind is srv.List:
+            return ""
+        request = srv.List.Request(protocol_version=PROTOCOL_VERSION)
+        client, deadline = self._client(srv.List, names.LIST), time.monotonic() + _AGAIN
+        answer = _ask_until_answered(self._participant, client, request, deadline, _GREET_AGAIN)
+        trouble = answer.trouble if answer is not None else ""
+        return f": {trouble}. What was asked for may still be carried out then" if trouble else ""
 
     def close(self) -> None:
         """Leave ROS."""

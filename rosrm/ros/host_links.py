@@ -184,8 +184,12 @@ class HostLinks:
         if link.outbox:
             self._with_work.add(link.host_id)
 
-    def flush(self) -> None:
-        """Answer the open requests of hosts for which there are assignments."""
+    def flush(self, journal: int) -> None:
+        """Answer the open requests of hosts for which there are assignments.
+
+        Args:
+            journal: sequence of the newest record that is written.
+        """
         while self._with_work:
             link = self._links[self._with_work.pop()]
             if not link.outbox or link.poll is None:
@@ -196,6 +200,7 @@ class HostLinks:
             respond(
                 srv.RequestProcess.Response(
                     answer=accepted(epoch=self._epoch),
+                    journal=journal,
                     assignments=[convert.assignment_to_msg(one) for one in batch],
                 )
             )

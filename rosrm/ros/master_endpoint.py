@@ -119,9 +119,13 @@ class MasterEndpoint:
         """Keep an assignment for the answer to the host's request."""
         self._links.assign(command)
 
-    def flush(self) -> None:
-        """Answer the open requests of hosts for which there are assignments."""
-        self._links.flush()
+    def flush(self, journal: int) -> None:
+        """Answer the open requests of hosts for which there are assignments.
+
+        Args:
+            journal: sequence of the newest record that is written.
+        """
+        self._links.flush(journal)
 
     def withdraw(self, command: Withdraw, now: float) -> None:
         """Take an assignment back, or order its end."""
@@ -139,19 +143,20 @@ class MasterEndpoint:
         """End what was not answered in time."""
         self._links.expire(now)
 
-    def beat(self, uptime: float, unheard: Sequence[int]) -> None:
+    def beat(self, uptime: float, unheard: Sequence[int], journal: int) -> None:
         """Say that the master lives, and now and then how it keeps up.
 
         Args:
             uptime: seconds.
             unheard: numbers of the hosts that it does not hear.
+            journal: sequence of the newest record that is written.
         """
         identity = self._identity
         self._beats.publish(
             msg.MasterBeat(
                 protocol_version=PROTOCOL_VERSION, name=identity.name, hostname=identity.hostname,
                 pid=identity.pid, epoch=identity.epoch, incarnation=identity.incarnation,
-                beat=self._beat(), uptime=uptime, unheard=list(unheard),
+                beat=self._beat(), uptime=uptime, journal=journal, unheard=list(unheard),
             )
         )  # fmt: skip
         if uptime - self._load_at >= _LOAD_EVERY:

@@ -10,7 +10,7 @@ from rosrm.config.settings import ControlSettings
 from rosrm.core import events as happened
 from rosrm.core.commands import Reply
 from rosrm.core.views import Snapshot
-from rosrm.errors import Refused
+from rosrm.errors import JournalError, Refused
 from rosrm.ros import convert, names
 from rosrm.ros.control import ControlServer, Gate, accepted, refused, version_refusal
 from rosrm.ros.host_links import HostLink, HostLinks
@@ -167,7 +167,8 @@ class MasterServices:
                 self._links.renew(reply.host_id, description)
             respond(response)
 
-        self._tell(happened.HostRegistered(self._keep(answer), description, statuses))
+        token = self._keep(answer)
+        self._tell(happened.HostRegistered(token, description, statuses, int(request.journal_seen)))
 
     def _left(self, request: srv.Leave.Request, token: int) -> happened.Event:
         link = self._links.find(request.host_id, request.incarnation)
@@ -205,11 +206,15 @@ class MasterServices:
         if fault:
             open_request.answer(srv.List.Response(answer=refused("version", fault)))
             return
-        view = self._queries.snapshot(request)
+        try:
+            view = self._queries.snapshot(request)
+        except JournalError as trouble:
+            open_request.answer(srv.List.Response(answer=refused("journal", str(trouble))))
+            return
         open_request.answer(
             srv.List.Response(
                 answer=accepted(epoch=self._identity.epoch), master=view.master,
-                uptime=view.uptime, last_sequence=view.last_sequence,
+                uptime=view.uptime, last_sequence=view.last_sequence, trouble=view.trouble,
                 host_list=[convert.host_row_to_msg(row) for row in view.hosts],
                 process_list=[convert.process_row_to_msg(row) for row in view.processes],
                 plugin_list=[convert.plugin_row_to_msg(row) for row in view.plugins],

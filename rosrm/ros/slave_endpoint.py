@@ -16,6 +16,7 @@ from rosrm.core.model import HostDescription, InstanceStatus, KeptState
 from rosrm.errors import Refused
 from rosrm.ros import convert, names, qos
 from rosrm.ros.control import ControlClient, Gate, version_refusal
+from rosrm.ros.journal_seen import JournalSeen, Seen
 from rosrm.ros.participant import Participant
 from rosrm.ros.reporting import Reporter
 from rosrm.ros.slave_services import Host, LogSlice, SlaveServices, result_json
@@ -65,11 +66,13 @@ class SlaveEndpoint:
     """
 
     def __init__(
-        self, participant: Participant, host: Host, description: HostDescription, max_age: float
-    ) -> None:
+        self, participant: Participant, host: Host, description: HostDescription, max_age: float,
+        seen: JournalSeen | None = None,
+    ) -> None:  # fmt: skip
         self._participant = participant
         self._host = host
         self._description = description
+        self._seen = seen or JournalSeen()
         self.link = Link.SEARCHING
         self.failure = ""
         self.superseded = False
@@ -87,6 +90,7 @@ class SlaveEndpoint:
         self._incarnation = 0  # of the master that we are registered with, or about to be
         self._registered_with = 0  # the incarnation of the newest that took us in
         self._taken_since: float | None = None
+        self._waits_since: float | None = None
         self._told = ""
         self._poll_open = False
         self._poll_anew = _FIRST_POLL_ANEW
@@ -178,6 +182,7 @@ class SlaveEndpoint:
             envelope=self._control.envelope(self._master_beat, self._greeting.epoch),
             host=convert.host_to_msg(self._description),
             instances=[convert.status_to_msg(status) for status in self._host.statuses()],
+            journal_seen=self._seen.of_former_run(self.cluster, self._incarnation),
         )
         self._control.call(
             self._clients[srv.RegisterHost], request, time.monotonic() + _PATIENCE,
@@ -190,6 +195,10 @@ class SlaveEndpoint:
             self.link = Link.SEARCHING
             return
         answer = response.answer
+        if answer.code == "journal":
+            self._wait_for_journal(answer.message, now)
+            return
+        self._waits_since = None
         if not answer.accepted:
             self._turned_down(answer, now)
             return
@@ -210,6 +219,13 @@ class SlaveEndpoint:
             f"registered with master {greeting.master} (pid {greeting.pid} on {greeting.hostname}) "
             f"as host {self.host_id}"
         )
+
+    def _wait_for_journal(self, why: str, now: float) -> None:
+        """The master can take nobody in just now: ask again, and say so once."""
+        self.link = Link.SEARCHING
+        if self._waits_since is None:
+            self._waits_since = now
+            self._host.say(f"the master takes no host in, asking on: {why}")
 
     def _turned_down(self, answer: msg.Answer, now: float) -> None:
         """A name may still be held by a former run of this very slave: ask again for a moment."""
@@ -243,6 +259,8 @@ class SlaveEndpoint:
             self._lose_master(f"the master has started again (epoch {beat.epoch})")
         self._newest_beat = beat
         said_at = self._note_beat(beat.beat, now)
+        if self.link is Link.REGISTERED:
+            self._seen.note(Seen(beat.journal, beat.incarnation, self.cluster))
         if self.link is Link.REGISTERED and self.host_id not in beat.unheard:
             self._host.take(core.MasterHears(said_at))
         if self.link is Link.LISTENING:
@@ -284,6 +302,7 @@ class SlaveEndpoint:
             if answer.code in ("unknown", "stale"):
                 self._lose_master(f"the master does not know this host any more: {answer.message}")
             return
+        self._seen.note(Seen(response.journal, self._incarnation, self.cluster))
         try:
             work = tuple(convert.assignment_from_msg(one) for one in response.assignments)
         except Refused as refusal:

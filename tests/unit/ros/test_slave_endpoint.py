@@ -7,6 +7,7 @@ import pytest
 from rosrm.core import slave as core
 from rosrm.core.model import HostDescription
 from rosrm.ros import slave_endpoint
+from rosrm.ros.journal_seen import JournalSeen, Seen
 from rosrm.ros.slave_endpoint import Link, SlaveEndpoint
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs import msg, srv
@@ -96,6 +97,7 @@ class Host:
     def __init__(self) -> None:
         self.events = []
         self.heard: list[float] = []
+        self.said: list[str] = []
 
     def take(self, event) -> None:
         if isinstance(event, core.MasterHears):
@@ -107,7 +109,7 @@ class Host:
         return []
 
     def say(self, message: str) -> None:
-        pass
+        self.said.append(message)
 
 
 class Master:
@@ -119,11 +121,11 @@ class Master:
         self._incarnation = incarnation
         self._epoch = epoch
 
-    def beat(self, unheard=(), age: float = 0.0) -> None:
+    def beat(self, unheard=(), age: float = 0.0, journal: int = 0) -> None:
         beat = msg.MasterBeat(
             protocol_version=PROTOCOL_VERSION, incarnation=self._incarnation,
             beat=self._slave.clock.monotonic_ns() - int(age * 1e9), unheard=list(unheard),
-            **self._is,
+            journal=journal, **self._is,
         )  # fmt: skip
         self._slave.wire.hear[msg.MasterBeat](beat)
 
@@ -132,6 +134,7 @@ class Master:
             srv.Handshake.Response(
                 protocol_version=PROTOCOL_VERSION,
                 accepted=True,
+                master="m",
                 beat=self._slave.clock.monotonic_ns(),
                 **self._is,
             )
@@ -147,10 +150,10 @@ class Master:
 class Slave:
     """The endpoint, and all that is around it."""
 
-    def __init__(self, clock: Clock) -> None:
+    def __init__(self, clock: Clock, seen: JournalSeen | None = None) -> None:
         self.clock, self.wire, self.host = clock, Wire(), Host()
         description = HostDescription("h0", 5)
-        self.endpoint = SlaveEndpoint(self.wire, self.host, description, max_age=5.0)
+        self.endpoint = SlaveEndpoint(self.wire, self.host, description, max_age=5.0, seen=seen)
 
     @property
     def link(self) -> Link:
@@ -316,3 +319,62 @@ def test_a_request_for_work_that_was_lost_is_soon_repeated(slave) -> None:
     before = len(slave.sent(srv.RequestProcess))
     slave.pass_time(29.0, master)
     assert len(slave.sent(srv.RequestProcess)) == before + 1
+
+
+# --- what is remembered of the master's journal ------------------------------------------------
+
+
+def test_what_a_former_run_said_of_its_journal_is_given_back(monkeypatch, tmp_path) -> None:
+    """Also by a later run of the slave; to the run that said it, there is nothing to tell."""
+    clock = Clock()
+    monkeypatch.setattr(slave_endpoint, "time", clock)
+    path = tmp_path / "journal_seen"
+    slave = Slave(clock, JournalSeen(path))
+    old = Master(slave, 11, epoch=2)
+    slave.join(old)
+    assert slave.newest(srv.RegisterHost).request.journal_seen == 0
+    old.beat(journal=40)
+    old.beat(journal=41)
+    slave.pass_time(PERIOD)
+    again = Slave(clock, JournalSeen(path))
+    for one in (slave, again):
+        told = Master(one, 12, epoch=3, pid=8)
+        one.pass_time(3.0, told)
+        told.greet()
+        assert one.newest(srv.RegisterHost).request.journal_seen == 41
+        told.take_in()
+        told.beat(journal=7)
+    assert JournalSeen(path).of_former_run("m", 12) == 0
+    assert JournalSeen(path).of_former_run("m", 13) == 7
+    assert JournalSeen(path).of_former_run("another", 13) == 0
+
+
+def test_a_journal_that_cannot_be_remembered_is_remembered_in_memory(tmp_path) -> None:
+    """The disk of the slave is full, or what is on it makes no sense."""
+    path = tmp_path / "journal_seen"
+    path.write_bytes(b"\xff nonsense")
+    seen = JournalSeen(path)
+    assert seen.of_former_run("m", 2) == 0
+    path.unlink()
+    path.mkdir()
+    seen.note(Seen(5, 1, "m"))
+    assert seen.of_former_run("m", 2) == 5
+
+
+def test_a_master_that_cannot_write_is_asked_again(slave) -> None:
+    """It takes nobody in for now: that is no reason to give up, and is said once."""
+    ours = Master(slave, 11)
+    slave.pass_time(PERIOD)
+    ours.beat()
+    ours.greet()
+    answer = msg.Answer(protocol_version=PROTOCOL_VERSION, code="journal", message="a full disk")
+    for _ in range(3):
+        slave.newest(srv.RegisterHost).answer(srv.RegisterHost.Response(answer=answer))
+        assert slave.link is Link.SEARCHING
+        slave.pass_time(PERIOD)
+        ours.beat()
+        ours.greet()
+    assert slave.endpoint.failure == ""
+    assert [word for word in slave.host.said if "a full disk" in word] == slave.host.said[:1]
+    ours.take_in()
+    assert slave.link is Link.REGISTERED

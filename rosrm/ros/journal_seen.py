@@ -1,0 +1,80 @@
+"""What a slave has been told of its master's journal: whoever is told less later has lost a part.
+
+The file `journal_seen` of the slave's state directory holds one line, which is overwritten in its
+place: so it needs no room on a full disk. It survives the slave, not a fall of its machine; nor
+do the processes that it may be asked about.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Final, NamedTuple
+
+#: Bytes read of the file, at most.
+_LONGEST: Final = 1000
+
+
+class Seen(NamedTuple):
+    """What one run of a master has said of its journal.
+
+    Attributes:
+        sequence: of its newest record.
+        incarnation: of that run.
+        master: its name.
+    """
+
+    sequence: int
+    incarnation: int
+    master: str
+
+
+_NOTHING: Final = Seen(0, 0, "")
+
+
+class JournalSeen:
+    """Remembers the newest record that the master has told of.
+
+    Args:
+        path: of the file; None: it is remembered in memory alone.
+    """
+
+    def __init__(self, path: Path | None = None) -> None:
+        self._path = path
+        self._file = -1
+        self._newest = _read(path) if path is not None else _NOTHING
+
+    def note(self, newest: Seen) -> None:
+        """The master that this slave is registered with has said how far its journal is."""
+        known = self._newest
+        if newest.incarnation == known.incarnation and newest.sequence <= known.sequence:
+            return
+        self._newest = newest
+        if self._path is None:
+            return
+        try:
+            self._keep(self._path, newest)
+        except OSError:
+            return  # it is remembered in memory, and tried again with the next one
+
+    def _keep(self, path: Path, newest: Seen) -> None:
+        if self._file < 0:
+            self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        line = f"{newest.sequence:020d} {newest.incarnation:020d} {newest.master}\n".encode()
+        os.pwrite(self._file, line, 0)
+        os.ftruncate(self._file, len(line))
+
+    def of_former_run(self, master: str, incarnation: int) -> int:
+        """The newest record that another run of this master has told of; 0: none."""
+        newest = self._newest
+        former = newest.master == master and newest.incarnation != incarnation
+        return newest.sequence if former else 0
+
+
+def _read(path: Path) -> Seen:
+    try:
+        line, end, _ = path.read_bytes()[:_LONGEST].decode().partition("\n")
+        sequence, incarnation, master = line.split(" ", 2)
+        return Seen(int(sequence), int(incarnation), master) if end else _NOTHING
+    except (OSError, ValueError):
+        return _NOTHING
