@@ -7,6 +7,7 @@ and survives a power failure too.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import sqlite3
 import time
@@ -14,7 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from rosrm.errors import JournalError
+from rosrm.journal_faults import fault_of, no_journal, other_version
 from rosrm.ports import Intent, Record, StoredRecord
 
 #: Version of the tables; a file of another one is refused.
@@ -31,6 +32,8 @@ CREATE TABLE IF NOT EXISTS intent (
 ) WITHOUT ROWID;
 """
 
+#: Milliseconds for which a write waits for another program that holds the file.
+_PATIENCE_MS: Final = 200
 #: Old records are deleted once so many too many have gathered.
 _PRUNE_EVERY: Final = 1000
 
@@ -63,9 +66,7 @@ class SqliteJournal:
         try:
             path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
         except OSError as error:
-            raise JournalError(
-                f"the journal {path} cannot be used ({error}); give the master another `state:`"
-            ) from error
+            raise fault_of(path, error) from error
         self._database = self._guarded(lambda: self._open(sync))
         newest = self._guarded(
             lambda: self._database.execute("SELECT max(sequence) FROM record").fetchone()
@@ -74,48 +75,33 @@ class SqliteJournal:
         self._since_pruned = 0
 
     def _open(self, sync: str) -> sqlite3.Connection:
+        if self._path.is_file() and not self._path.stat().st_size:
+            raise sqlite3.DatabaseError("it is empty: not even tables are in it")
         database = sqlite3.connect(self._path, isolation_level=None, timeout=2.0)
         database.execute("PRAGMA journal_mode=WAL")
         database.execute(f"PRAGMA synchronous={'FULL' if sync == 'full' else 'NORMAL'}")
         (version,) = database.execute("PRAGMA user_version").fetchone()
         if version not in (0, SCHEMA):
-            raise JournalError(
-                f"{self._path} was written by another version of rosrm (tables {version}, here "
-                f"{SCHEMA}); use that version, or move the file away to start with an empty journal"
-            )
-        database.executescript(_TABLES)
-        database.execute(f"PRAGMA user_version={SCHEMA}")
-        (verdict,) = database.execute("PRAGMA quick_check(1)").fetchone()
+            raise other_version(self._path, version, SCHEMA)
+        # 0.14 s for 100,000 events, where quick_check takes 0.09 s and misses damaged indexes.
+        (verdict,) = database.execute("PRAGMA integrity_check(1)").fetchone()
         if verdict != "ok":
             raise sqlite3.DatabaseError(verdict)
+        if version == 0:
+            self._make(database)
+        database.execute(f"PRAGMA busy_timeout={_PATIENCE_MS}")
         return database
+
+    def _make(self, database: sqlite3.Connection) -> None:
+        if database.execute("SELECT 1 FROM sqlite_master").fetchone() is not None:
+            raise no_journal(self._path)
+        database.executescript(f"BEGIN IMMEDIATE; {_TABLES}; PRAGMA user_version={SCHEMA}; COMMIT;")
 
     def _guarded(self, act: Callable[[], Any]) -> Any:
         try:
             return act()
         except sqlite3.Error as error:
-            raise JournalError(self._advice(error)) from error
-
-    def _advice(self, error: sqlite3.Error) -> str:
-        text = str(error)
-        if "full" in text:
-            todo = "the disk is full: make room; nothing that was answered is lost"
-        elif "I/O" in text:
-            todo = (
-                "the disk does not take what is written: make room, look at quotas and at the "
-                "disk itself; nothing that was answered is lost"
-            )
-        elif "unable to open" in text or "readonly" in text:
-            todo = "look at its owner and permissions, or give the master another `state:`"
-        elif "locked" in text:
-            todo = "another program holds it: is a second master running on this state directory?"
-        else:
-            todo = (
-                "the file is damaged: restore it from a backup, or move it away to start with an "
-                "empty journal (running processes are then stopped as unknown when their slaves "
-                "register)"
-            )
-        return f"the journal {self._path} cannot be used ({text}); {todo}"
+            raise fault_of(self._path, error) from error
 
     @property
     def last_sequence(self) -> int:
@@ -125,7 +111,12 @@ class SqliteJournal:
     def write(
         self, records: Sequence[Record], intents: Sequence[Intent], now: float
     ) -> Sequence[StoredRecord]:
-        """Append records and replace intents in one atomic group; raises `JournalError`."""
+        """Append records and replace intents in one atomic group.
+
+        Raises:
+            JournalBlocked: not just now; nothing was changed, and the same may be tried again.
+            JournalError: the file is damaged.
+        """
         wall = self._wall()
         first = self._sequence + 1
         stored = [StoredRecord(first + i, wall, now, record) for i, record in enumerate(records)]
@@ -134,12 +125,15 @@ class SqliteJournal:
         self._sequence += len(stored)
         self._since_pruned += len(stored)
         if self._since_pruned >= _PRUNE_EVERY:
-            self._since_pruned = 0
-            oldest = self._sequence - self._keep
-            self._guarded(
-                lambda: self._database.execute("DELETE FROM record WHERE sequence <= ?", (oldest,))
-            )
+            self._prune()
         return stored
+
+    def _prune(self) -> None:
+        """What was asked for is written; where this fails there is a next time."""
+        self._since_pruned = 0
+        oldest = self._sequence - self._keep
+        with contextlib.suppress(sqlite3.Error):
+            self._database.execute("DELETE FROM record WHERE sequence <= ?", (oldest,))
 
     def _write(
         self,
@@ -205,7 +199,7 @@ class SqliteJournal:
         )
         return [
             StoredRecord(
-                row[0], row[1], row[2], Record(row[3], row[4], row[5], row[6], self._value(row[7]))
+                row[0], row[1], row[2], Record(row[3], row[4], row[5], row[6], _facts(row[7]))
             )
             for row in reversed(rows)
         ]
@@ -214,11 +208,20 @@ class SqliteJournal:
         try:
             return json.loads(text)
         except ValueError as error:
-            raise JournalError(self._advice(sqlite3.DatabaseError(str(error)))) from error
+            raise fault_of(self._path, sqlite3.DatabaseError(str(error))) from error
 
     def close(self) -> None:
         """Flush and release the files."""
         self._guarded(self._database.close)
+
+
+def _facts(text: str) -> Mapping[str, Any]:
+    """A record is for people: damaged facts must not keep them from reading the others."""
+    try:
+        facts = json.loads(text)
+    except ValueError:
+        facts = None
+    return facts if isinstance(facts, dict) else {"unreadable": text}
 
 
 def _plain(value: object) -> object:

@@ -19,6 +19,7 @@ from rosrm.errors import RosrmError
 from rosrm.ros.settings import RosSettings
 
 if TYPE_CHECKING:
+    from rosrm.core.views import Snapshot
     from rosrm.ros.client import MasterClient
 
 #: Seconds from the start of the command within which it says that there is no master: less than 3,
@@ -45,6 +46,12 @@ def master(ctx: typer.Context, domain: int | None) -> Iterator[MasterClient]:
     """A connection to the master for one command."""
     with connect(ros_settings(ctx, domain)) as client:
         yield client
+
+
+def say_trouble(snapshot: Snapshot) -> None:
+    """Tell people beside the listing that the master takes no new work, and why."""
+    if snapshot.trouble:
+        typer.echo(f"rosrm: {snapshot.trouble}", err=True)
 
 
 def connect(settings: RosSettings) -> MasterClient:

@@ -47,6 +47,7 @@ def events(  # noqa: PLR0917 - an argument for each option
 
     with connection.master(ctx, domain) as client:
         snapshot = client.list(events=True, process=process, host=host, newest=newest)
+        connection.say_trouble(snapshot)
         if as_json and not follow:
             json_forms.show(json_forms.forms(snapshot.events))
             return

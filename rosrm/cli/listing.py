@@ -21,6 +21,7 @@ def status(ctx: typer.Context, as_json: AsJson = False, domain: Domain = None) -
 
     with connection.master(ctx, domain) as client:
         snapshot = client.list(hosts=True, processes=True, events=True, newest=5)
+    connection.say_trouble(snapshot)
     if as_json:
         json_forms.show(json_forms.status_form(snapshot))
     else:
@@ -42,8 +43,9 @@ def ps(
     from rosrm.cli import json_forms, tables
 
     with connection.master(ctx, domain) as client:
-        rows = client.list(processes=True).processes
-    shown = [row for row in rows if not host or row.host == host]
+        snapshot = client.list(processes=True)
+    connection.say_trouble(snapshot)
+    shown = [row for row in snapshot.processes if not host or row.host == host]
     if as_json:
         json_forms.show(json_forms.forms(shown))
         return
@@ -64,7 +66,9 @@ def hosts(ctx: typer.Context, as_json: AsJson = False, domain: Domain = None) ->
     from rosrm.cli import json_forms, tables
 
     with connection.master(ctx, domain) as client:
-        rows = client.list(hosts=True).hosts
+        snapshot = client.list(hosts=True)
+    connection.say_trouble(snapshot)
+    rows = snapshot.hosts
     if as_json:
         json_forms.show(json_forms.forms(rows))
     elif rows:

@@ -31,6 +31,12 @@ def master(
         Path | None,
         typer.Option("--config", metavar="FILE", help="cluster.yaml; without it, the defaults."),
     ] = None,
+    recover: Annotated[
+        bool,
+        typer.Option(
+            "--recover", help="Go on with what can still be read of a damaged journal, once."
+        ),
+    ] = False,
     domain: Domain = None,
 ) -> None:
     """Start the master of a cluster.
@@ -44,6 +50,8 @@ def master(
     file = config or ctx.ensure_object(Common).cluster
     settings = load_cluster(file, registry) if file else default_cluster(registry)
     settings = replace(settings, ros=_with_domain(settings.ros, ctx, domain))
+    if recover:
+        typer.echo(_recover(settings.state), err=True)
     typer.echo(_says(settings), err=True)
     become("rosrm.master.run", settings.to_json())
 
@@ -93,6 +101,14 @@ def _without_this_folder() -> list[str]:
 def _with_domain(settings: RosSettings, ctx: typer.Context, domain: int | None) -> RosSettings:
     chosen = ctx.ensure_object(Common).domain if domain is None else domain
     return settings if chosen is None else replace(settings, domain=chosen)
+
+
+def _recover(state: Path) -> str:
+    from rosrm.journal_recovery import recover
+    from rosrm.state_directory import only_one
+
+    with only_one(state, "master", code="second_master", remedy="another `state:`"):
+        return recover(state / "journal.sqlite")
 
 
 def _says(settings: ClusterConfig) -> str:

@@ -16,7 +16,7 @@ from typing import Any, Final
 
 from rosrm.config.settings import ClusterConfig
 from rosrm.core import events as happened
-from rosrm.core import listing, restore
+from rosrm.core import lost_tail, restore
 from rosrm.core.commands import (
     Assign,
     Command,
@@ -28,10 +28,13 @@ from rosrm.core.commands import (
 )
 from rosrm.core.master import step
 from rosrm.core.state import MasterState
-from rosrm.core.views import EventRow, PluginRow, Snapshot
-from rosrm.errors import Refused
+from rosrm.core.views import PluginRow
+from rosrm.errors import JournalBlocked, Refused
 from rosrm.journal import SqliteJournal
+from rosrm.journal_faults import unreadable
+from rosrm.master.reading import Reading
 from rosrm.master.recorder import Recorder
+from rosrm.master.standstill import Standstill
 from rosrm.ports import (
     CheckpointPolicy,
     Intent,
@@ -54,11 +57,13 @@ _log = logging.getLogger("rosrm.master")
 _TICK: Final = 0.05
 #: Seconds in which a master that runs already would be discovered.
 _DISCOVERY: Final = 1.0
-_DEFAULT_EVENTS: Final = 1000
 #: Thresholds of the garbage collector: with Python's own a burst of submissions is a third slower.
 _COLLECT_AT: Final = (10_000, 20, 20)
 #: Seconds within which two masters came up at once.
 _AT_ONCE: Final = 1.0
+#: Seconds between two attempts to write what could not be written.
+_TRY_AGAIN: Final = 0.5
+_BOOT_ID: Final = Path("/proc/sys/kernel/random/boot_id")
 
 
 def monotonic_ns() -> int:
@@ -99,6 +104,8 @@ class MasterRuntime:
         self._started = time.monotonic()
         self._stopping = ""
         self._recorder: Recorder | None = None
+        self._held: Standstill | None = None
+        self._behind = 0.0  # seconds by which the core's clock is behind, since nothing was decided
         self._closing = contextlib.ExitStack()
         with contextlib.ExitStack() as opened:
             opened.enter_context(
@@ -132,15 +139,15 @@ class MasterRuntime:
     def _restored(
         self, policy: ScoringPolicy, strategies: dict[str, MigrationStrategy]
     ) -> MasterState:
-        known = self._journal.intents("cluster").get("epoch", {"epoch": 0})
-        epoch = int(known["epoch"]) + 1
+        newest, fell, epoch = self._last_run()
+        epoch += 1
         self._journal.write(
             [
                 Record(
                     "master_started", message=f"master {self._config.name} started, epoch {epoch}"
                 )
             ],
-            [Intent("cluster", "epoch", {"epoch": epoch})],
+            [Intent("cluster", "epoch", {"epoch": epoch, "boot": _boot()})],
             0.0,
         )
         state = MasterState(
@@ -151,9 +158,21 @@ class MasterRuntime:
         state.keeping.policy = self._checkpoint
         state.keeping.policy_name = self._config.checkpoint.policy or ""
         now = self._now()
-        restore.restore(state, self._journal.intents, now)
+        try:
+            restore.restore(state, self._journal.intents, now)
+        except (AttributeError, KeyError, TypeError, ValueError) as fault:
+            raise unreadable(self._config.state / "journal.sqlite", fault) from fault
+        lost_tail.begin(state, newest, now, fell=fell)
         self._record_from(now)
         return state
+
+    def _last_run(self) -> tuple[int, bool, int]:
+        """The newest record, whether the machine fell since, and the last epoch."""
+        known = self._journal.intents("cluster").get("epoch", {"epoch": 0})
+        last = self._journal.records(newest=1)
+        stopped = not last or last[0].record.kind == "master_stopped"
+        fell = not stopped and known.get("boot", _boot()) != _boot()
+        return self._journal.last_sequence, fell, int(known["epoch"])
 
     def _record_from(self, now: float) -> None:
         """Begin the record of this run, if one is wanted, with what the state was restored from."""
@@ -176,7 +195,13 @@ class MasterRuntime:
             int.from_bytes(os.urandom(7), "big") | 1,
         )  # fmt: skip
         control = self._config.control
-        return MasterEndpoint(self._participant, identity, self, monotonic_ns, control)
+        reading = Reading(
+            self._config.name, self._state, self._journal, self._plugins,
+            uptime=lambda: self._now() - self._started,
+            core_now=lambda: self._core_now(self._now()),
+            trouble=lambda: self._held.refusal if self._held is not None else "",
+        )  # fmt: skip
+        return MasterEndpoint(self._participant, identity, reading, monotonic_ns, control)
 
     def _now(self) -> float:
         return time.monotonic()
@@ -199,10 +224,19 @@ class MasterRuntime:
                     self._tick(now)
                 if now >= next_beat:
                     next_beat = now + self._config.control.beat_period
-                    self._endpoint.beat(now - self._started, self._state.hosts.unheard())
+                    self._endpoint.beat(
+                        now - self._started, self._state.hosts.unheard(),
+                        self._journal.last_sequence,
+                    )  # fmt: skip
                 self._take_in(now)
-            self._write([Record("master_stopped", message=f"master stopped: {self._stopping}")], [])
+            self._say_stopped()
         return 1 if self._stopping.startswith("refused") else 0
+
+    def _say_stopped(self) -> None:
+        try:
+            self._write([Record("master_stopped", message=f"master stopped: {self._stopping}")], [])
+        except JournalBlocked as fault:
+            _log.warning("%s; what was decided last was not written, nor carried out", fault)
 
     def _stop(self, number: int, _frame: Any) -> None:
         self._stopping = self._stopping or signal.Signals(number).name
@@ -234,13 +268,17 @@ class MasterRuntime:
 
     def _take_in(self, now: float) -> None:
         """Everything that happened goes to the core, in order, as one durable group."""
+        if self._held is not None and not self._write_held(self._held, now):
+            self._held.take(self._state, self._endpoint.take_events(), self._endpoint.reply)
+            return
         self._state.wall = time.time()
-        while events := self._endpoint.take_events():
+        core_now = self._core_now(now)
+        while self._held is None and (events := self._endpoint.take_events()):
             commands: list[Command] = []
             for event in events:
-                decided = step(self._state, event, now)
+                decided = step(self._state, event, core_now)
                 if self._recorder is not None:
-                    self._recorder.note(event, now, self._state.wall, decided)
+                    self._recorder.note(event, core_now, self._state.wall, decided)
                 commands += decided
             if commands:
                 self._carry_out(commands, now)
@@ -248,7 +286,43 @@ class MasterRuntime:
     def _carry_out(self, commands: Sequence[Command], now: float) -> None:
         records = [command for command in commands if isinstance(command, Record)]
         intents = [command for command in commands if isinstance(command, Intent)]
-        stored = self._write(records, intents) if records or intents else ()
+        try:
+            stored = self._write(records, intents) if records or intents else ()
+        except JournalBlocked as fault:
+            self._held = Standstill(commands, str(fault), now, self._core_now(now), now)
+            _log.error("%s. What runs goes on; nothing new is taken in until then", fault)
+            return
+        self._act_on(commands, stored, now)
+
+    def _write_held(self, held: Standstill, now: float) -> bool:
+        """Try again to write what could not be written; False: it cannot still."""
+        if now - held.tried < _TRY_AGAIN:
+            return False
+        held.tried = now
+        records = [command for command in held.commands if isinstance(command, Record)]
+        intents = [command for command in held.commands if isinstance(command, Intent)]
+        length = now - held.since
+        back = Record(
+            "journal_back", message=f"for {length:.1f} s nothing was decided: {held.reason}",
+            facts={"seconds": round(length, 1)},
+        )  # fmt: skip
+        try:
+            stored = self._write([back, *records], intents)
+        except JournalBlocked as fault:
+            held.reason = str(fault)
+            return False
+        self._held, self._behind = None, now - held.core_now
+        self._endpoint.events[:0] = held.waiting()
+        self._act_on(held.commands, stored, now)
+        return True
+
+    def _core_now(self, now: float) -> float:
+        return now - self._behind if self._held is None else self._held.core_now
+
+    def _act_on(
+        self, commands: Sequence[Command], stored: Sequence[StoredRecord], now: float
+    ) -> None:
+        """All of it is durable: carry it out."""
         # What a slave can begin with goes first, people's answers and the log come after.
         # A registration opens the link that orders to this host need.
         replies = [command for command in commands if isinstance(command, Reply)]
@@ -256,7 +330,7 @@ class MasterRuntime:
             if reply.host_id:
                 self._endpoint.reply(reply)
         self._act(commands, now)
-        self._endpoint.flush()
+        self._endpoint.flush(self._journal.last_sequence)
         for reply in replies:
             if not reply.host_id:
                 self._endpoint.reply(reply)
@@ -282,60 +356,10 @@ class MasterRuntime:
     ) -> Sequence[StoredRecord]:
         return self._journal.write(records, intents, self._now() - self._started)
 
-    # --- what may be read ----------------------------------------------------------------
 
-    def snapshot(self, request: Any) -> Snapshot:
-        """The listings that were asked for."""
-        now = self._now()
-        state = self._state
-        return Snapshot(
-            master=self._config.name,
-            uptime=now - self._started,
-            last_sequence=self._journal.last_sequence,
-            hosts=listing.host_rows(state, now) if request.hosts else (),
-            processes=self._processes(request.process, now) if request.processes else (),
-            plugins=self._all_plugins() if request.plugins else (),
-            events=self._events(request) if request.events else (),
-        )
-
-    def _processes(self, name: str, now: float) -> Sequence[Any]:
-        if not name:
-            return listing.process_rows(self._state, now)
-        process = self._state.processes.get(name)
-        return [listing.process_row(self._state, process, now)] if process is not None else []
-
-    def _events(self, request: Any) -> list[EventRow]:
-        stored = self._journal.records(
-            after=request.after_sequence, process=request.process, host=request.host,
-            newest=request.max_events or _DEFAULT_EVENTS,
-        )  # fmt: skip
-        return [_event_row(one) for one in stored]
-
-    def _all_plugins(self) -> list[PluginRow]:
-        rows = list(self._plugins)
-        for host in self._state.hosts.hosts:
-            described = host.description
-            rows += [
-                PluginRow(
-                    "probe", resource.name, "", "selected", f"scope {resource.scope}", host.name
-                )
-                for resource in described.resources
-            ]
-            rows += [
-                PluginRow("probe", name, "", "absent", reason, host.name)
-                for name, reason in described.absent.items()
-            ]
-        return rows
-
-    def explain(self, name: str) -> str | None:
-        """The story of a process as JSON."""
-        story = listing.explanation(self._state, name, self._now())
-        return None if story is None else json.dumps(story, default=dict)
-
-
-def _event_row(stored: StoredRecord) -> EventRow:
-    record = stored.record
-    return EventRow(
-        stored.sequence, stored.wall_time, stored.elapsed, record.kind, record.process,
-        record.host, record.message, record.facts,
-    )  # fmt: skip
+def _boot() -> str:
+    """Another one after each start of this machine."""
+    try:
+        return _BOOT_ID.read_text().strip()
+    except OSError:
+        return ""

@@ -13,7 +13,7 @@ import textwrap
 
 import pytest
 
-from rosrm.errors import JournalError
+from rosrm.errors import JournalBlocked, JournalError
 from rosrm.journal import SqliteJournal
 from rosrm.ports import Intent, Record
 
@@ -112,7 +112,21 @@ def spoil_value(path):
         database.execute("UPDATE intent SET value = '{'")
 
 
-@pytest.mark.parametrize("spoil", [spoil_header, spoil_middle, spoil_end, spoil_value])
+def spoil_all(path):
+    path.write_bytes(b"")
+
+
+def spoil_index(path):
+    with sqlite3.connect(path) as database:
+        database.execute("PRAGMA writable_schema = ON")
+        database.execute(
+            "UPDATE sqlite_schema SET sql = replace(sql, '!= ', '= ') WHERE name = 'record_process'"
+        )
+
+
+@pytest.mark.parametrize(
+    "spoil", [spoil_header, spoil_middle, spoil_end, spoil_value, spoil_all, spoil_index]
+)
 def test_a_damaged_file_is_refused(path, spoil) -> None:
     """With its path and what to do; it is not repaired, overwritten or taken for an empty one."""
     fill(path, 200)
@@ -141,7 +155,7 @@ def test_a_stranger_s_database_is_refused(path) -> None:
     path.parent.mkdir()
     with sqlite3.connect(path) as database:
         database.execute("CREATE TABLE record (something INTEGER)")
-    with pytest.raises(JournalError, match="cannot be used"):
+    with pytest.raises(JournalError, match="database of another program"):
         SqliteJournal(path)
 
 
@@ -190,7 +204,10 @@ def test_a_full_disk_is_said(path) -> None:
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root may mount a small file system")
 def test_a_full_file_system_is_said(tmp_path) -> None:
-    """The same on a file system that has no room left."""
+    """The same on a file system without room, by its name; where room is made, it goes on.
+
+    The group that could not be written is written then, as it is, and its numbers have no gap.
+    """
     disk = tmp_path / "disk"
     disk.mkdir()
     mounted = subprocess.run(
@@ -206,13 +223,22 @@ def test_a_full_file_system_is_said(tmp_path) -> None:
             answered.append(number)
 
     try:
+        (disk / "filler").write_bytes(bytes(100_000))
         journal = SqliteJournal(disk / "journal.sqlite")
-        with pytest.raises(JournalError, match="disk is full: make room"):
-            fill_up(journal)
+        free = rf"the disk is full \(the file system {disk} has \d.* free of 400.0 KiB\): make room"
+        for _ in range(3):
+            with pytest.raises(JournalBlocked, match=free):
+                fill_up(journal)
+        count = len(answered)
         assert journal.intents("a") == {"b": {"n": answered[-1]}}
+        assert journal.last_sequence == count
+        (disk / "filler").unlink()
+        journal.write([Record("at last")], [Intent("a", "b", {"n": -1})], 0.0)
+        assert journal.intents("a") == {"b": {"n": -1}}
+        assert [one.sequence for one in journal.records(newest=10**6)] == [*range(1, count + 2)]
         journal._database.close()
     finally:
-        subprocess.run(["umount", disk], check=True)
+        subprocess.run(["umount", "-l", disk], check=True)
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
@@ -244,6 +270,27 @@ def test_old_events_are_pruned(path) -> None:
     again = SqliteJournal(path, keep_events=50)
     assert again.last_sequence == 2500
     again.close()
+
+
+def test_damaged_facts_of_an_event_hide_no_other(path) -> None:
+    """They are for people, who are told."""
+    fill(path)
+    with sqlite3.connect(path) as database:
+        database.execute("UPDATE record SET facts = '{' WHERE sequence = 2")
+    journal = SqliteJournal(path)
+    assert [one.record.facts for one in journal.records()] == [{}, {"unreadable": "{"}, {}]
+    journal.close()
+
+
+def test_pruning_that_fails_fails_no_write(path) -> None:
+    """What was asked for is written; a second attempt at it would write it twice."""
+    journal = SqliteJournal(path, keep_events=0)
+    journal._database.execute(
+        "CREATE TRIGGER t BEFORE DELETE ON record BEGIN SELECT raise(ABORT, 'disk is full'); END"
+    )
+    stored = journal.write([Record("n")] * 1000, [], 0.0)
+    assert len(stored) == len(journal.records(newest=10**6)) == 1000
+    journal.close()
 
 
 def test_the_folder_is_private(path) -> None:

@@ -1,0 +1,162 @@
+"""What can still be read of a damaged journal goes into a new one; the damaged one is kept aside.
+
+A page that is damaged takes the intents and events on it with it, so the new journal is one that
+has lost a part: what ran by a lost intent is stopped as its slave registers. What a lost intent
+could make run twice is put right here: hosts that processes are on, and the numbers of instances.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import shutil
+import sqlite3
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from rosrm.errors import JournalError
+from rosrm.journal import SqliteJournal
+from rosrm.ports import Intent, Record
+
+_FILES: Final = ("", "-wal", "-shm")
+#: From both ends, as a damaged page hides all that is behind it.
+_INTENTS: Final = (
+    "SELECT tbl, key, value FROM intent ORDER BY tbl, key",
+    "SELECT tbl, key, value FROM intent ORDER BY tbl DESC, key DESC",
+)
+_EVENTS: Final = (
+    "SELECT * FROM record WHERE facts IS NOT NULL ORDER BY sequence",
+    "SELECT * FROM record WHERE facts IS NOT NULL ORDER BY sequence DESC",
+)
+#: Numbers left free above the largest that is known.
+_FREE: Final = 1000
+
+
+@dataclass(slots=True)
+class _Found:
+    """What could be read: intents by table and key, events by sequence, as they are stored."""
+
+    intents: dict[tuple[str, str], dict[str, Any]] = field(default_factory=dict)
+    events: dict[int, tuple[Any, ...]] = field(default_factory=dict)
+    whole: bool = True
+
+
+def recover(path: Path, wall: Callable[[], float] = time.time) -> str:
+    """Make a new journal of what is left of a damaged one.
+
+    Args:
+        path: of the journal; no master may have it open.
+        wall: unix time, seconds.
+
+    Returns:
+        What was found and where the damaged file is now, for people.
+
+    Raises:
+        JournalError: it is not damaged, or nothing can be read of it.
+    """
+    _check_damaged(path)
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix="recovery-") as place:
+        found = _salvage(path, Path(place))
+        new = Path(place) / "new.sqlite"
+        aside = path.with_name(f"{path.name}.damaged-{int(wall())}")
+        _write(new, found, aside)
+        for suffix in _FILES:
+            with contextlib.suppress(FileNotFoundError):
+                Path(f"{path}{suffix}").rename(f"{aside}{suffix}")
+        new.rename(path)
+    return _summary(found, aside)
+
+
+def _check_damaged(path: Path) -> None:
+    if not path.is_file():
+        raise JournalError(f"there is no journal to recover: {path} is no file")
+    try:
+        journal = SqliteJournal(path)
+        for table in ("cluster", "host", "process", "migration", "learned"):
+            journal.intents(table)
+        journal.close()
+    except JournalError as fault:
+        if "damaged" not in str(fault):
+            raise
+    else:
+        raise JournalError(f"the journal {path} is not damaged: start without `--recover`")
+
+
+def _salvage(path: Path, place: Path) -> _Found:
+    """Read a copy, as reading would write to the original (`-shm`, a checkpoint)."""
+    copy = place / "damaged.sqlite"
+    for suffix in _FILES[:2]:
+        with contextlib.suppress(FileNotFoundError):
+            shutil.copyfile(f"{path}{suffix}", f"{copy}{suffix}")
+    found = _Found()
+    with contextlib.closing(sqlite3.connect(copy)) as database:
+        database.text_factory = lambda raw: raw.decode(errors="replace")
+        for query in _INTENTS:
+            for table, key, text in _rows(database, query, found):
+                with contextlib.suppress(ValueError, TypeError):
+                    found.intents.setdefault((str(table), str(key)), dict(json.loads(text)))
+        for query in _EVENTS:
+            found.events.update((int(row[0]), row) for row in _rows(database, query, found))
+    if not found.intents:
+        raise JournalError(
+            f"nothing can be read of the journal {path}: restore it from a backup, or move it away "
+            f"to start with an empty one"
+        )
+    return found
+
+
+def _rows(database: sqlite3.Connection, query: str, found: _Found) -> Iterator[tuple[Any, ...]]:
+    """Rows up to the first that cannot be read."""
+    try:
+        yield from database.execute(query)
+    except sqlite3.Error:
+        found.whole = False
+
+
+def _write(path: Path, found: _Found, aside: Path) -> None:
+    _put_right(found)
+    SqliteJournal(path).close()
+    with contextlib.closing(sqlite3.connect(path)) as database, database:
+        database.executemany(
+            f"INSERT INTO record VALUES ({', '.join('?' * 8)})",  # noqa: S608 - fixed words
+            [found.events[sequence] for sequence in sorted(found.events)],
+        )
+    journal = SqliteJournal(path)
+    intents = [Intent(table, key, value) for (table, key), value in found.intents.items()]
+    journal.write([Record("journal_recovered", message=_summary(found, aside))], intents, 0.0)
+    journal.close()
+
+
+def _put_right(found: _Found) -> None:
+    """What the intents that are left presume of those that may be lost."""
+    hosts = {key for table, key in found.intents if table == "host"}
+    ids = [int(found.intents["host", name].get("host_id", 0)) for name in hosts]
+    largest = 0
+    for (table, _), process in list(found.intents.items()):
+        if table != "process":
+            continue
+        for number, host in process.get("instances", {}).items():
+            largest = max(largest, int(number))
+            if host not in hosts:
+                hosts.add(host)
+                ids.append(max(ids, default=0) + 1)
+                known = {"host_id": ids[-1], "cordoned": False, "draining": False}
+                found.intents["host", host] = known
+    found.intents.setdefault(("cluster", "instances"), {"next": largest + _FREE})
+    epoch = found.intents.setdefault(("cluster", "epoch"), {"epoch": 0})
+    epoch["boot"] = "recovered"  # as after a fall: all hosts are heard before work is given
+
+
+def _summary(found: _Found, aside: Path) -> str:
+    processes = sum(table == "process" for table, _ in found.intents)
+    hosts = sum(table == "host" for table, _ in found.intents)
+    part = "all that was" if found.whole else "what could still be read:"
+    return (
+        f"the journal was recovered from a damaged one, {part} {processes} processes, {hosts} "
+        f"hosts and {len(found.events)} events; the damaged file is {aside}. Look at `rosrm ps` "
+        f"for what is missing, and submit it again: it is stopped where it still runs"
+    )

@@ -1,0 +1,127 @@
+"""What is left of a damaged journal: kept, put right, and the damaged file is not thrown away."""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+
+import pytest
+
+from rosrm.errors import JournalError
+from rosrm.journal import SqliteJournal
+from rosrm.journal_recovery import recover
+from rosrm.ports import Intent, Record
+
+PAGE = 4096
+COUNT = 300
+
+
+@pytest.fixture
+def path(tmp_path):
+    path = tmp_path / "state" / "journal.sqlite"
+    journal = SqliteJournal(path)
+    journal.write([], [Intent("host", f"h{n}", {"host_id": n + 1}) for n in range(3)], 0.0)
+    journal.write([], [Intent("cluster", "instances", {"next": 2001})], 0.0)
+    journal.write([], [Intent("cluster", "epoch", {"epoch": 4, "boot": "this"})], 0.0)
+    for number in range(COUNT):
+        name, on = f"p{number:03}", {str(number): f"h{number % 3}"}
+        process = {"order": number, "instances": on, "spec": "x" * 200}
+        journal.write([Record("assigned", name)], [Intent("process", name, process)], 0.0)
+    journal.close()
+    return path
+
+
+def pages_of(path, name: str) -> list[int]:
+    """Leaf pages of a table, as far as they can be told: those that hold rows of it."""
+    marks = {"intent": b'{"order": ', "record": b"assigned"}
+    raw = path.read_bytes()
+    return [
+        at
+        for at in range(PAGE, len(raw), PAGE)
+        if marks[name] in raw[at : at + PAGE] and raw[at] in (10, 13)
+    ]
+
+
+def spoil(path, at: int) -> None:
+    raw = bytearray(path.read_bytes())
+    raw[at : at + PAGE] = os.urandom(PAGE)
+    path.write_bytes(raw)
+
+
+@pytest.mark.parametrize("which", [0, 1, -1])
+def test_what_can_be_read_goes_on(path, which) -> None:
+    """One page of intents is damaged: the others are there, in both directions from it."""
+    spoil(path, pages_of(path, "intent")[which])
+    damaged = path.read_bytes()
+    with pytest.raises(JournalError, match="--recover"):
+        SqliteJournal(path)
+
+    said = recover(path, wall=lambda: 1700.0)
+
+    aside = path.with_name("journal.sqlite.damaged-1700")
+    assert aside.read_bytes() == damaged
+    assert str(aside) in said
+    journal = SqliteJournal(path)
+    processes = journal.intents("process")
+    assert COUNT - 40 < len(processes) < COUNT
+    assert all(value["order"] == int(name[1:]) for name, value in processes.items())
+    assert f"{len(processes)} processes" in said
+    assert journal.records(newest=1)[0].record.kind == "journal_recovered"
+    assert journal.last_sequence == COUNT + 1
+    journal.close()
+
+
+def test_damaged_events_cost_no_intent(path) -> None:
+    """They are for people."""
+    spoil(path, pages_of(path, "record")[1])
+    recover(path)
+    journal = SqliteJournal(path)
+    assert len(journal.intents("process")) == COUNT
+    assert journal.intents("cluster")["instances"] == {"next": 2001}
+    assert COUNT / 2 < len(journal.records(newest=10**6)) <= COUNT
+    journal.close()
+
+
+def test_what_is_left_is_put_right(path) -> None:
+    """Hosts that processes are on are expected, and no number is given twice."""
+    with sqlite3.connect(path) as database:
+        database.execute("DELETE FROM intent WHERE tbl IN ('host', 'cluster')")
+    spoil(path, pages_of(path, "record")[0])
+    recover(path)
+    journal = SqliteJournal(path)
+    hosts = journal.intents("host")
+    assert set(hosts) == {"h0", "h1", "h2"}
+    assert len({host["host_id"] for host in hosts.values()}) == 3
+    assert journal.intents("cluster")["instances"]["next"] >= COUNT
+    journal.close()
+
+
+def test_all_hosts_are_heard_before_work_is_given(path) -> None:
+    """A recovered journal counts as one whose machine fell: its `boot` is none."""
+    spoil(path, pages_of(path, "intent")[1])
+    recover(path)
+    journal = SqliteJournal(path)
+    assert journal.intents("cluster")["epoch"] == {"epoch": 4, "boot": "recovered"}
+    journal.close()
+
+
+def test_a_whole_journal_is_left_alone(path) -> None:
+    """Somebody put `--recover` into a start script."""
+    before = path.read_bytes()
+    with pytest.raises(JournalError, match="is not damaged: start without"):
+        recover(path)
+    assert path.read_bytes() == before
+
+
+def test_where_nothing_can_be_read_nothing_is_changed(path) -> None:
+    """The damaged file stays where it was."""
+    path.write_bytes(b"this is no database at all, but text" * 1000)
+    with pytest.raises(JournalError, match="nothing can be read"):
+        recover(path)
+    assert [one.name for one in path.parent.iterdir()] == ["journal.sqlite"]
+
+
+def test_no_journal_is_said(tmp_path) -> None:
+    """With the path."""
+    with pytest.raises(JournalError, match=str(tmp_path / "journal.sqlite")):
+        recover(tmp_path / "journal.sqlite")
