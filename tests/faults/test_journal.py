@@ -1,0 +1,275 @@
+"""A journal that fails a real master: its tail is lost, it is damaged, its disk is full."""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import os
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+
+from rosrm.config.settings import LivenessSettings
+from rosrm.errors import NoMaster, Refused
+from rosrm.journal_recovery import recover
+from tests.ros.clusters import PATIENCE, alive, clusters, host, job, service, wait_gone, wait_until
+
+_CLONE_NEWNS = 0x00020000
+#: Short, so that a test may wait for it to pass; a busy machine needs some room for suspect.
+LIVENESS = LivenessSettings(suspect=2.0, lease=5.0)
+
+
+def kill(part) -> None:
+    part.process.send_signal(signal.SIGKILL)
+    part.process.wait(PATIENCE)
+
+
+def files_of(cluster) -> list[Path]:
+    return sorted((cluster.directory / "master").glob("journal.sqlite*"))
+
+
+# --- a lost tail -------------------------------------------------------------------------------
+
+
+def test_a_lost_tail_is_said_and_starts_nothing_twice(make_cluster) -> None:
+    """As after a power failure: what was decided last is gone, and hosts have heard of it.
+
+    One of them was started again since. What was started in the lost part is stopped, what was
+    queued before it is started anew, once that has ended; all else goes on untouched.
+    """
+    cluster = make_cluster(host("h0"), host("h1"), liveness=LIVENESS)
+    cluster.submit(service("before"))
+    pid = cluster.wait("before", "running").pid
+    for name in ("h0", "h1"):
+        cluster.client.set_host_state(name, "cordon")
+    cluster.submit(service("queued"))
+    kill(cluster.master)
+    kept = {path: path.read_bytes() for path in files_of(cluster)}
+    cluster.reconnect()
+    cluster.start_master()
+    up = {"h0", "h1"}
+    cluster.wait_until(
+        "both up", lambda v: {r.description.name for r in v.hosts if r.state == "up"} == up
+    )
+    cluster.client.set_host_state("h1", "uncordon")
+    lost = cluster.wait("queued", "running").pid
+    cluster.submit(service("after"))
+    stranger = cluster.wait("after", "running").pid
+    for _ in range(20):
+        cluster.client.list()  # beats tell every host of the newest record meanwhile
+        time.sleep(0.02)
+
+    kill(cluster.master)
+    for path in files_of(cluster):
+        path.unlink()
+    for path, content in kept.items():
+        path.write_bytes(content)
+    for name in ("h0", "h1"):
+        kill(cluster.slaves[name])
+        cluster.start_slave(next(one for one in cluster.hosts if one.host == name))
+    cluster.reconnect()
+    cluster.start_master()
+    told = cluster.wait_for_event("journal_behind")
+    assert told.facts["lost"] == told.facts["seen"] - told.facts["newest"] > 0
+    for name in ("h0", "h1"):
+        cluster.client.set_host_state(name, "uncordon")
+    wait_gone(lost)
+    wait_gone(stranger)
+    row = cluster.wait("queued", "running")
+    assert row.pid != lost
+    assert cluster.wait("before", "running").pid == pid
+    assert [one.name for one in cluster.client.list(processes=True).processes] == [
+        "before", "queued",
+    ]  # fmt: skip
+    assert len(cluster.events("journal_behind")) == 1
+
+
+# --- a damaged file ----------------------------------------------------------------------------
+
+
+def test_a_damaged_journal_is_refused_and_recovered(make_cluster) -> None:
+    """The master says what to do and stops nothing; recovered, it knows what it can still read."""
+    cluster = make_cluster(host("h0"), liveness=LIVENESS)
+    cluster.submit(service("p"))
+    pid = cluster.wait("p", "running").pid
+    cluster.submit(*(job(f"j{n:03}", "true") for n in range(200)))
+    cluster.ended("j199")
+    cluster.master.end()
+    cluster.master.process.wait(PATIENCE)
+    journal = cluster.directory / "master" / "journal.sqlite"
+    raw = bytearray(journal.read_bytes())
+    leaves = [at for at in range(4096, len(raw), 4096) if b'"j100"' in raw[at : at + 4096]]
+    for at in leaves:
+        raw[at : at + 4096] = os.urandom(4096)
+    journal.write_bytes(raw)
+
+    cluster.reconnect()
+    assert cluster.start_master().process.wait(PATIENCE) == 1
+    said = cluster.log_of("master")
+    assert f"rosrm master: the journal {journal} cannot be used" in said
+    assert "`--recover`" in said
+    assert "Traceback" not in said
+    assert alive(pid)
+
+    recover(journal)
+    cluster.start_master()
+    cluster.wait_for_hosts()
+    assert cluster.events("journal_recovered")
+    assert cluster.wait("p", "running").pid == pid
+    assert cluster.run(job("new", "true"))[0].state == "finished"
+
+
+# --- a full disk -------------------------------------------------------------------------------
+
+
+class Disk:
+    """A small file system for the master's state."""
+
+    def __init__(self, place: Path) -> None:
+        self.place = place
+        self._filler = place / "filler"
+
+    def fill(self) -> None:
+        """Until not a byte fits."""
+        with self._filler.open("ab", buffering=0) as filler:
+            for size in (65536, 4096, 1):
+                while self._fits(filler, size):
+                    pass
+
+    @staticmethod
+    def _fits(filler, size: int) -> bool:
+        try:
+            return filler.write(bytes(size)) == size
+        except OSError as error:
+            assert error.errno == errno.ENOSPC
+            return False
+
+    def make_room(self) -> None:
+        self._filler.unlink()
+
+
+@pytest.fixture
+def disk(tmp_path):
+    """Seen by this test and what it starts alone; gone with them in any case."""
+    place = tmp_path / "c" / "master"
+    place.mkdir(parents=True)
+    if os.geteuid() != 0 or ctypes.CDLL(None).unshare(_CLONE_NEWNS) != 0:
+        pytest.skip("only root may mount a small file system")
+    subprocess.run(["mount", "--make-rprivate", "/"], check=True)
+    options = ["-o", "size=1m,mode=700"]
+    subprocess.run(["mount", "-t", "tmpfs", *options, "tmpfs", place], check=True)
+    yield Disk(place)
+    subprocess.run(["umount", "-l", place], check=True)
+
+
+@pytest.fixture
+def cluster(disk, tmp_path):
+    with clusters(lambda: tmp_path / "c") as make:
+        yield make(host("h0", max_processes=3), host("h1", max_processes=1), liveness=LIVENESS)
+
+
+def blocked(cluster) -> str:
+    """Why the master takes no new work, once it does not."""
+    wait_until(lambda: cluster.client.list().trouble, "the master noticing its full disk")
+    return cluster.client.list().trouble
+
+
+def test_a_full_disk_stops_new_work_and_keeps_what_runs(cluster, disk) -> None:
+    """Requests are refused with the file system's name; nothing is lost, nothing runs twice.
+
+    It lasts for longer than the lease: no host is lost by it. What had been decided, and could not
+    be written, is carried out when there is room, in order; a slave that was started again
+    meanwhile is taken in with its process.
+    """
+    ran = cluster.directory / "ran"
+    cluster.submit(service("s0"), service("ends"), service("s1"), service("s2"))
+    pids = {name: cluster.wait(name, "running").pid for name in ("s0", "ends", "s1", "s2")}
+    cluster.submit(*(job(f"q{n}", "sh", "-c", f"echo q{n} >> {ran}") for n in range(5)))
+    where = {row.name: row.host for row in cluster.client.list(processes=True).processes}
+    disk.fill()
+    os.kill(pids["ends"], signal.SIGKILL)  # the master must decide something: its place is free
+    reason = blocked(cluster)
+    for part in (str(disk.place), "free of 1.0 MiB", "make room", "What runs goes on"):
+        assert part in reason
+    for request in (
+        lambda: cluster.submit(job("late", "true")),
+        lambda: cluster.client.cancel(["s0"]),
+        lambda: cluster.client.migrate("s0"),
+        lambda: cluster.client.set_host_state("h0", "drain"),
+    ):
+        with pytest.raises(Refused, match="disk is full") as refusal:
+            request()
+        assert refusal.value.code == "journal"
+    kill(cluster.slaves["h1"])
+    cluster.start_slave(cluster.hosts[1])
+    until = time.monotonic() + LIVENESS.lease + 1.0
+    while time.monotonic() < until:
+        assert cluster.client.list().trouble
+        cluster.client.spin(0.1)
+    assert not ran.exists()
+    assert all(alive(pid) for name, pid in pids.items() if name != "ends")
+
+    disk.make_room()
+    cluster.wait_for_event("journal_back", "disk is full")
+    for n in range(5):
+        assert cluster.ended(f"q{n}").state == "finished"
+    assert ran.read_text().split() == ["q0", "q1", "q2", "q3", "q4"]
+    assert cluster.process("ends").state == "failed"
+    for name in ("s0", "s1", "s2"):
+        row = cluster.wait(name, "running")
+        assert (row.pid, row.host) == (pids[name], where[name])
+    assert not cluster.events("host_lost")
+    assert cluster.run(job("late", "true"))[0].state == "finished"
+    assert cluster.log_of("master").count("nothing new is taken in until then") == 1
+
+
+def test_a_master_is_killed_while_its_disk_is_full(cluster, disk) -> None:
+    """What it had decided and not written was never done; it comes up when there is room."""
+    cluster.submit(service("s0"), service("ends"))
+    pids = {name: cluster.wait(name, "running").pid for name in ("s0", "ends")}
+    disk.fill()
+    os.kill(pids["ends"], signal.SIGKILL)
+    blocked(cluster)
+    kill(cluster.master)
+    cluster.reconnect()
+    assert cluster.start_master().process.wait(PATIENCE) == 1
+    said = cluster.log_of("master")
+    assert "disk is full" in said
+    assert "Traceback" not in said
+    disk.make_room()
+    cluster.start_master()
+    cluster.wait_for_hosts()
+    assert cluster.ended("ends").state == "failed"
+    assert cluster.wait("s0", "running").pid == pids["s0"]
+
+
+def test_a_master_is_stopped_while_its_disk_is_full(cluster, disk) -> None:
+    """It ends in good order."""
+    cluster.submit(service("ends"))
+    pid = cluster.wait("ends", "running").pid
+    disk.fill()
+    os.kill(pid, signal.SIGKILL)
+    blocked(cluster)
+    cluster.master.end()
+    assert cluster.master.process.wait(PATIENCE) == 0
+    assert "Traceback" not in cluster.log_of("master")
+    disk.make_room()
+    cluster.reconnect()
+    cluster.start_master()
+    assert cluster.ended("ends").state == "failed"
+
+
+def test_whoever_asked_as_the_disk_became_full_is_told(cluster, disk) -> None:
+    """The answer waits for the journal; without one in time, the reason is said."""
+    disk.fill()
+    cluster.client._timeout = 1.0
+    with pytest.raises(NoMaster, match=r"did not answer .*disk is full.* may still be carried out"):
+        cluster.submit(job("first", "true"))
+    with pytest.raises(Refused, match="disk is full"):
+        cluster.submit(job("second", "true"))
+    disk.make_room()
+    assert cluster.ended("first").state == "finished"
+    assert [row.name for row in cluster.client.list(processes=True).processes] == ["first"]
