@@ -163,7 +163,8 @@ class Keeping:
         self._budget_at = now
         if now >= self._next_scan:
             self._next_scan = now + _SCAN_EVERY
-            self._in_thread(self._store.scan, self._scanned)
+            if self._kept or self._store.is_used():
+                self._in_thread(self._store.scan, self._scanned)
         for shipment in list(self._shipments.values()):
             self._begin_due(shipment, now)
         for transfer in list(self._transfers.values()):

@@ -51,6 +51,10 @@ class KeptStore:
         """Where the state of a process is kept."""
         return self._root / token(process)
 
+    def is_used(self) -> bool:
+        """Whether anything was ever kept here."""
+        return self._root.exists()
+
     def scan(self) -> tuple[KeptState, ...]:
         """The newest state of each process."""
         try:
