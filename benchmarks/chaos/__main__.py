@@ -111,6 +111,7 @@ def _report(options: argparse.Namespace, tally: Tally, seconds: float) -> None:
             "violations_by_kind": dict(violations), "by_kind": dict(sorted(tally.by_kind.items())),
             "recovery_s": _spread(tally.recovery), "whole_s": _spread(tally.whole),
             "parted_s": _spread({"owner": tally.parted} if tally.parted else {}),
+            "load": _spread({"average": tally.loads} if tally.loads else {}),
             "allowed": dict(tally.allowed), "missed": dict(tally.missed), "left_out": left_out,
             "services": len(list(work.services())) + 1, "hosts": len(HOSTS), "lease_s": LEASE_S,
         },

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -52,6 +53,7 @@ class Tally:
         recovery: seconds from the undoing of the last fault of a round until all was well, by kind
             of the fault, or "burst" for rounds of several kinds.
         whole: the same, from the first fault on.
+        loads: load average of the machine at the end of each round.
     """
 
     by_kind: Counter[str] = field(default_factory=Counter)
@@ -61,6 +63,7 @@ class Tally:
     parted: list[float] = field(default_factory=list)
     recovery: dict[str, list[float]] = field(default_factory=dict)
     whole: dict[str, list[float]] = field(default_factory=dict)
+    loads: list[float] = field(default_factory=list)
     rounds: int = 0
 
     @property
@@ -140,6 +143,7 @@ class Trial:
         # A move goes on after its round.
         recent = time.monotonic() - _MOVE
         self._harms = [harm for harm in self._harms if harm.kind in MOVES and harm.begun > recent]
+        self._tally.loads.append(os.getloadavg()[0])
         self._tally.allowed += judged.allowed
         self._tally.parted += judged.parted
         if judged.violations:
