@@ -21,7 +21,7 @@ from rosrm.core.model import (
     StandbyPolicy,
 )
 from tests.faults.watching import Watcher, instances
-from tests.ros.clusters import PATIENCE, QUICK, Cluster, alive, host, service, wait_gone, wait_until
+from tests.ros.clusters import QUICK, Cluster, alive, host, service, wait_until
 
 ROOT = Path(__file__).resolve().parents[2]
 SOON = {
@@ -29,33 +29,6 @@ SOON = {
     "control": ControlSettings(beat_period=0.1),
 }
 ELSEWHERE = HostLossPolicy("elsewhere")
-
-
-def switch_off(cluster: Cluster, name: str) -> None:
-    """As a loss of power: slave, supervisor and processes of a host end at the same moment."""
-    slave = cluster.slaves.pop(name).process
-    state = str(cluster.directory / "hosts" / name)
-    others = [pid for pid in _pids() if _belongs(pid, state)]
-    for pid in (slave.pid, *others):
-        os.kill(pid, signal.SIGSTOP)
-    for pid in (slave.pid, *others):
-        os.kill(pid, signal.SIGKILL)
-    slave.wait(PATIENCE)
-    for pid in others:
-        wait_gone(pid)
-
-
-def _pids() -> list[int]:
-    return [int(entry.name) for entry in Path("/proc").iterdir() if entry.name.isdigit()]
-
-
-def _belongs(pid: int, state: str) -> bool:
-    """A supervisor of this host, or what it has started."""
-    with contextlib.suppress(OSError):
-        entry = Path(f"/proc/{pid}")
-        words = (entry / "cmdline").read_bytes() + b"\0" + (entry / "environ").read_bytes()
-        return pid != os.getpid() and f"{state}/supervisor".encode() in words
-    return False
 
 
 def counter(name: str, **options) -> ProcessSpec:
@@ -117,7 +90,7 @@ def test_a_lost_host_comes_back_with_nothing(make_cluster) -> None:
     cluster.submit(service("waits", restart=again), service("goes", host_loss=ELSEWHERE))
     first = cluster.wait("waits", "running"), cluster.wait("goes", "running")
     cluster.add(host("h1"))
-    switch_off(cluster, "h0")
+    cluster.switch_off("h0")
     assert cluster.wait("waits", "unreachable").host == "h0"
     wait_until(
         lambda: cluster.client.list() and cluster.wait("goes", "running").host == "h1",
@@ -143,7 +116,7 @@ def test_a_standby_goes_on_from_the_last_state(make_cluster, how: str) -> None:
         if how == "process":
             os.kill(primary.pid, signal.SIGKILL)
         else:
-            switch_off(cluster, primary.host)
+            cluster.switch_off(primary.host)
         cluster.wait_for_event("failed_over", process="moving")
         row = cluster.wait("moving", "running")
         assert (row.number != primary.number, row.host != primary.host) == (True, True)

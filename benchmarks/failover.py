@@ -1,0 +1,256 @@
+"""How soon a lost host is noticed, and how soon its processes go on elsewhere.
+
+Four hosts on one machine, in a network of their own. In each round one is switched off: its slave,
+its supervisor and its processes get SIGKILL at one moment, where all times begin. `detect`: until
+the master has it for lost. `standby`: until an outside observer hears the standby of a stateful
+process. `restart`: until it hears the instance that was started anew, from its kept state, of a
+process without a standby. Then a load on all cores, for minutes: how many hosts are taken for lost
+that were not?
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import itertools
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from benchmarks.handoff import Observer, Output
+from benchmarks.machine import percentile, print_report, say
+from rosrm.config.settings import ClusterConfig, ControlSettings, HostConfig, LivenessSettings
+from rosrm.core.model import HostLossPolicy, MigrationPolicy, ProcessSpec, StandbyPolicy, StopPolicy
+from rosrm.local_cluster import LocalCluster
+from rosrm.loopback import enter_private_network
+
+_ROOT = Path(__file__).resolve().parents[1]
+_HOSTS = ("h0", "h1", "h2", "h3")
+_PATIENCE = 60.0
+_NS = 1e9
+#: A lease below a second wants a beat to match.
+_SHORT = (
+    LivenessSettings(suspect=0.3, lease=0.8),
+    ControlSettings(beat_period=0.1),
+)
+_GUARDED, _KEPT = "guarded", "kept"
+
+
+@dataclass
+class Outcome:
+    """What came of the rounds; seconds from the fault.
+
+    Attributes:
+        detect: until the host was lost.
+        standby, restart: until the successor was heard.
+        standby_behind, restart_behind: cycles that the successor did once more than it had to.
+    """
+
+    detect: list[float] = field(default_factory=list)
+    standby: list[float] = field(default_factory=list)
+    restart: list[float] = field(default_factory=list)
+    standby_behind: list[int] = field(default_factory=list)
+    restart_behind: list[int] = field(default_factory=list)
+
+
+def _process(name: str, rate: float, **fields: object) -> ProcessSpec:
+    return ProcessSpec(
+        name, module="benchmarks.handoff_nodes", arguments=("count", "--rate", str(rate)),
+        environment={"PYTHONPATH": str(_ROOT)}, ros=True, stop=StopPolicy(0.5, 0.5),
+        migration=MigrationPolicy("handoff"), host_loss=HostLossPolicy("elsewhere"),
+        **fields,  # type: ignore[arg-type]
+    )  # fmt: skip
+
+
+def _hosts() -> list[HostConfig]:
+    limits = {"memory": 0.98, "cpu": 1.0, "disk": 1.0}
+    return [HostConfig(host=name, limits=limits) for name in _HOSTS]
+
+
+@contextlib.contextmanager
+def _cluster(liveness: LivenessSettings, control: ControlSettings) -> Iterator[LocalCluster]:
+    with tempfile.TemporaryDirectory(prefix="rosrm-failover-") as folder:
+        settings = ClusterConfig(liveness=liveness, control=control)
+        with LocalCluster(Path(folder), cluster=settings, hosts=_hosts()) as cluster:
+            yield cluster
+
+
+# --- rounds -----------------------------------------------------------------------------------
+
+
+def measure(rounds: int, rate: float) -> Outcome:
+    """Switch hosts off, one a round, in turn that of the one process and of the other.
+
+    Raises:
+        TimeoutError: something did not come about; the message says what.
+    """
+    outcome = Outcome()
+    with contextlib.ExitStack() as stack:
+        cluster = stack.enter_context(_cluster(*_SHORT))
+        observer = Observer(cluster.domain or 0)
+        stack.callback(observer.close)
+        cluster.client.submit(
+            [
+                _process(_GUARDED, rate, standby=StandbyPolicy(wanted=True)),
+                _process(_KEPT, rate),
+            ]
+        )
+        for number, name in zip(range(rounds), itertools.cycle((_GUARDED, _KEPT)), strict=False):
+            _round(cluster, observer, name, outcome)
+            if (number + 1) % 10 == 0:
+                say(f"{number + 1}/{rounds} hosts switched off")
+    return outcome
+
+
+def _round(cluster: LocalCluster, observer: Observer, name: str, outcome: Outcome) -> None:
+    _wait_until_calm(cluster)
+    before = {one: cluster.process(one) for one in (_GUARDED, _KEPT)}
+    host = before[name].host
+    last_event = cluster.client.list(events=True, newest=1).events[-1].sequence
+    observer.outputs.clear()
+    observer.wait_for(20)
+    fault = cluster.switch_off(host)
+    for one, row in before.items():
+        if row.host != host:
+            continue
+        after = _wait_for_successor(observer, row.number, _of(cluster, one, row.number))
+        behind = max(0, _last_of(observer.outputs, row.number).sequence - after.sequence)
+        seconds = after.received / _NS - fault
+        if one == _GUARDED:
+            outcome.standby.append(seconds)
+            outcome.standby_behind.append(behind)
+        else:
+            outcome.restart.append(seconds)
+            outcome.restart_behind.append(behind)
+    outcome.detect.append(_lost_at(cluster, host, last_event) - fault)
+    cluster.start_slave(next(one for one in _hosts() if one.host == host))
+
+
+def _wait_until_calm(cluster: LocalCluster) -> None:
+    """Both run, on hosts that are there, the standby is ready, and a state is kept."""
+
+    def calm(view: object) -> bool:
+        rows = {row.name: row for row in view.processes}  # type: ignore[attr-defined]
+        running = all(rows[one].state == "running" for one in (_GUARDED, _KEPT))
+        return running and "standby is ready" in rows[_GUARDED].reason
+
+    cluster.wait_for_hosts(_PATIENCE)
+    cluster.wait_until("two processes and a standby", calm, _PATIENCE)
+    until = time.monotonic() + 3.0  # a kept state travels every second
+    while time.monotonic() < until:
+        cluster.client.spin(0.1)
+
+
+def _of(cluster: LocalCluster, name: str, former: int) -> int:
+    """The number of the instance that follows another one."""
+
+    def followed(view: object) -> bool:
+        rows = view.processes  # type: ignore[attr-defined]
+        return any(row.name == name and row.number not in (0, former) for row in rows)
+
+    cluster.wait_until(f"a successor of {name}#{former}", followed, _PATIENCE)
+    return int(cluster.process(name).number)
+
+
+def _wait_for_successor(observer: Observer, former: int, number: int) -> Output:
+    deadline = time.monotonic() + _PATIENCE
+    while time.monotonic() < deadline:
+        for output in list(observer.outputs):
+            if output.instance == number:
+                return output
+        time.sleep(0.005)
+    raise TimeoutError(f"#{number}, which follows #{former}, was not heard in {_PATIENCE:g} s")
+
+
+def _last_of(outputs: Sequence[Output], number: int) -> Output:
+    return [output for output in outputs if output.instance == number][-1]
+
+
+def _lost_at(cluster: LocalCluster, host: str, after: int) -> float:
+    """When the master took a host for lost, unix time."""
+    deadline = time.monotonic() + _PATIENCE
+    while time.monotonic() < deadline:
+        events = cluster.client.list(events=True, host=host, after=after).events
+        for event in events:
+            if event.kind == "host_lost":
+                return float(event.wall_time)
+        cluster.client.spin(0.05)
+    raise TimeoutError(f"{host} was not lost within {_PATIENCE:g} s")
+
+
+# --- load -------------------------------------------------------------------------------------
+
+
+def false_losses(minutes: float, liveness: LivenessSettings, control: ControlSettings) -> int:
+    """How many hosts are taken for lost while every core is busy with something else."""
+    with _cluster(liveness, control) as cluster, _load():
+        until = time.monotonic() + 60.0 * minutes
+        while time.monotonic() < until:
+            cluster.client.spin(0.5)
+        events = cluster.client.list(events=True).events
+        return sum(event.kind == "host_lost" for event in events)
+
+
+@contextlib.contextmanager
+def _load() -> Iterator[None]:
+    """One process a core that does nothing but count."""
+    counting = "while True: pass"
+    burners = [
+        subprocess.Popen([sys.executable, "-c", counting])
+        for _ in range(len(os.sched_getaffinity(0)))
+    ]
+    try:
+        yield
+    finally:
+        for burner in burners:
+            burner.kill()
+            burner.wait()
+
+
+def main() -> None:
+    """Measure and print one JSON object."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--rounds", type=int, default=40, help="hosts that are switched off")
+    parser.add_argument("--rate", type=float, default=50.0, help="Hz, of the nodes")
+    parser.add_argument("--minutes", type=float, default=10.0, help="of load, for each lease")
+    chosen = parser.parse_args()
+    alone = enter_private_network()
+    outcome = measure(chosen.rounds, chosen.rate)
+    losses = {
+        "0.8 s": false_losses(chosen.minutes, *_SHORT),
+        "default": false_losses(chosen.minutes, LivenessSettings(), ControlSettings()),
+    }
+    print_report(
+        "failover",
+        {
+            "lease_s": _SHORT[0].lease, "rate_hz": chosen.rate,
+            **_quantiles("detect", outcome.detect), **_quantiles("standby", outcome.standby),
+            **_quantiles("restart", outcome.restart),
+            "state_lost": sum(outcome.standby_behind),
+            "standby_behind_most": max(outcome.standby_behind, default=None),
+            "restart_behind_most": max(outcome.restart_behind, default=None),
+            "standbys": len(outcome.standby), "restarts": len(outcome.restart),
+            "false_losses": sum(losses.values()), "false_losses_by_lease": losses,
+            "load_minutes": chosen.minutes,
+            "transports": "UDPv4, in a network namespace" if alone else "default, LOCALHOST",
+        },
+        runs=chosen.rounds,
+    )  # fmt: skip
+
+
+def _quantiles(name: str, seconds: Sequence[float]) -> dict[str, float | None]:
+    return {
+        f"{name}_p{percent}_s": round(percentile(list(seconds), percent / 100), 3)
+        if seconds
+        else None
+        for percent in (50, 99)
+    }
+
+
+if __name__ == "__main__":
+    main()
