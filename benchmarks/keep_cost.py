@@ -1,9 +1,9 @@
 """What keeping its state costs a node, in each cycle: `python -m benchmarks.keep_cost`.
 
-A node with a timer of 10 ms and a state of a given size that changes in every cycle, in a
-process of its own, with and without a directory for its state; interleaved, and the median of the
-rounds. `mean_us`, `p50_us`, `p99_us`: from the author's callback until the node is ready for the next
-one; `cpu_us`: processor time of the whole process, its executor and its writer included, a cycle.
+A node with a timer of 10 ms and a state of a given size that changes in every cycle, in a process
+of its own, with and without a directory for its state; interleaved, and the median of the rounds.
+`mean_us`, `p50_us`, `p99_us`: from the author's callback until the node is ready for the next one;
+`cpu_us`: processor time of the whole process, its executor and its writer included, a cycle.
 """
 
 from __future__ import annotations

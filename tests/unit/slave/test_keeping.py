@@ -256,6 +256,7 @@ def test_parts_out_of_order_begin_anew(net):
 def test_a_slow_disk_holds_up_no_loop(net, monkeypatch):
     """The loop only asks the thread."""
     slave = net.add("a")
+    net.write("a", 1)
     blocked, free = threading.Event(), threading.Event()
 
     def scan():
