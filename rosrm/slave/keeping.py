@@ -199,6 +199,11 @@ class Keeping:
                 return
 
     def _begin(self, transfer: _Transfer, found: tuple[Head, bytes, int] | None) -> None:
+        shipment = transfer.shipment
+        if found is not None and found[0].instance > shipment.instance.number:
+            # Its successor runs elsewhere, and what came here came from there.
+            self._shipments.pop(shipment.instance.process, None)
+            found = None
         if found is None:
             self._end(transfer)
             return

@@ -218,6 +218,21 @@ def test_a_newer_state_there_is_left_alone(net):
     assert net.said["a"] == []
 
 
+def test_the_state_of_a_successor_is_not_sent_back(net):
+    """The process has moved to b, whose slave ships its state to here."""
+    net.add("a").keep(P7, ["b"], 1.0)
+    net.add("b")
+    net.write("a", 1)
+    net.until(lambda: net.age("b") == (7, 1), "the first copy")
+    given = len(net.wires["a"].given)
+    net.write("b", 2, number=8)
+    net.slaves["b"].keep(InstanceId("p", 8), ["a"], 1.0)
+    net.until(lambda: net.age("a") == (8, 2), "the copy of the successor's state")
+    for _ in range(50):
+        net.pass_time(0.1)
+    assert len(net.wires["a"].given) == given
+
+
 def test_room_is_bounded(net):
     """By the copies of all processes together; what is there already stays."""
     net.add("a").keep(P7, ["b"], 1.0)
