@@ -238,8 +238,10 @@ def _conclude(state: MasterState, run: Run, now: float) -> None:
     process = state.processes[run.process]
     moved = run.undo is None
     process.moved_at = now
+    standby = state.standbys.get(run.process)
+    kept = {process.owner, standby.destination.number if standby else 0}
     for instance in state.instances_of(process):
-        if instance.id.number != process.owner and not instance.stopping:
+        if instance.id.number not in kept and not instance.stopping:
             if instance.state is None and instance.id.number not in run.launched:
                 state.drop_instance(instance)  # it was counted, and never started
             else:

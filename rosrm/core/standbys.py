@@ -7,7 +7,8 @@ runs, has none          one is started on another host that has room, as a shado
 has one that runs       source and standby are told of each other, until it says READY
 has one that gave up    it is stopped; another one is started after a while, ever longer
 waits for its restart   it is stopped for good: its end hands over to the standby
-moves, or is over       the standby is stopped
+moves                   it is kept until the move is committed: a move may fail
+is over                 the standby is stopped
 ======================  =====================================================================
 
 `failover` says what follows when the primary has ended.
@@ -131,8 +132,11 @@ def _order_start(state: MasterState, run: Run, now: float) -> None:
 
 def _review(state: MasterState, run: Run, now: float) -> None:
     process, instance = state.processes[run.process], state.instances.get(run.destination.number)
-    if process.wanted is Wanted.CANCEL or process.phase.over or process.name in state.runs:
+    move = state.runs.get(run.process)
+    if process.wanted is Wanted.CANCEL or process.phase.over or (move and move.committed):
         end_standby(state, process, now)
+    elif move is not None:
+        return
     elif instance is None:
         how = run.how_ended(run.destination)
         _lost(state, process, run, f"{run.destination} ended: {how}", now)

@@ -187,3 +187,30 @@ def test_a_restart_on_order_costs_the_standby_and_brings_a_new_one() -> None:
     cluster.wait(1.0)
     assert not cluster.told("failed_over")
     assert cluster.active() == ["a"]
+
+
+def test_a_move_that_fails_leaves_the_standby() -> None:
+    """The same one, and as ready as before."""
+    cluster = with_standby("b", "c")
+    (other,) = [name for name in ("b", "c") if name not in cluster.where("p")]
+    cluster.machines[other].quirks["p"].add("never ready")
+    cluster.migrate("p", other)
+    cluster.wait(15.0)
+    assert len(cluster.told("stayed")) == 1
+    assert len(cluster.told("standby_begun")) == 1
+    assert len(cluster.where("p")) == 2
+    lose(cluster, "a")
+    assert len(cluster.told("failed_over")) == 1
+
+
+def test_a_source_that_is_lost_in_its_move_is_followed_by_its_standby() -> None:
+    """The destination had no state yet: the move is undone, and the standby takes over."""
+    cluster = with_standby("b", "c")
+    (standby,) = [name for name in cluster.where("p") if name != "a"]
+    (other,) = [name for name in ("b", "c") if name != standby]
+    cluster.machines[other].quirks["p"].add("never ready")
+    cluster.migrate("p", other)
+    cluster.machines["a"].connected = False
+    cluster.wait(25.0)
+    assert cluster.phase("p") == "running"
+    assert cluster.state.instances[cluster["p"].owner].host.name == standby
