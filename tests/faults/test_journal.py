@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import ctypes
-import errno
 import os
 import signal
-import subprocess
 import time
 from pathlib import Path
 
@@ -15,9 +12,9 @@ import pytest
 from rosrm.config.settings import LivenessSettings
 from rosrm.errors import NoMaster, Refused
 from rosrm.journal_recovery import recover
+from tests.faults.disks import small_disk
 from tests.ros.clusters import PATIENCE, alive, clusters, host, job, service, wait_gone, wait_until
 
-_CLONE_NEWNS = 0x00020000
 #: Short, so that a test may wait for it to pass; a busy machine needs some room for suspect.
 LIVENESS = LivenessSettings(suspect=2.0, lease=5.0)
 
@@ -125,45 +122,11 @@ def test_a_damaged_journal_is_refused_and_recovered(make_cluster) -> None:
 # --- a full disk -------------------------------------------------------------------------------
 
 
-class Disk:
-    """A small file system for the master's state."""
-
-    def __init__(self, place: Path) -> None:
-        self.place = place
-        self._filler = place / "filler"
-
-    def fill(self) -> None:
-        """Until not a byte fits."""
-        with self._filler.open("ab", buffering=0) as filler:
-            for size in (65536, 4096, 1):
-                while self._fits(filler, size):
-                    pass
-
-    @staticmethod
-    def _fits(filler, size: int) -> bool:
-        try:
-            return filler.write(bytes(size)) == size
-        except OSError as error:
-            if error.errno != errno.ENOSPC:
-                raise
-            return False
-
-    def make_room(self) -> None:
-        self._filler.unlink()
-
-
 @pytest.fixture
 def disk(tmp_path):
-    """Seen by this test and what it starts alone; gone with them in any case."""
-    place = tmp_path / "c" / "master"
-    place.mkdir(parents=True)
-    if os.geteuid() != 0 or ctypes.CDLL(None).unshare(_CLONE_NEWNS) != 0:
-        pytest.skip("only root may mount a small file system")
-    subprocess.run(["mount", "--make-rprivate", "/"], check=True)
-    options = ["-o", "size=1m,mode=700"]
-    subprocess.run(["mount", "-t", "tmpfs", *options, "tmpfs", place], check=True)
-    yield Disk(place)
-    subprocess.run(["umount", "-l", place], check=True)
+    """Where the master keeps its state."""
+    with small_disk(tmp_path / "c" / "master") as disk:
+        yield disk
 
 
 @pytest.fixture

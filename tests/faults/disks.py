@@ -1,0 +1,61 @@
+"""A small file system of a test's own, which can be filled to its last byte."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import errno
+import os
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+_CLONE_NEWNS = 0x00020000
+
+
+class Disk:
+    """A file system of 1 MiB.
+
+    Attributes:
+        place: where it is mounted.
+    """
+
+    def __init__(self, place: Path) -> None:
+        self.place = place
+        self._filler = place / "filler"
+
+    def fill(self) -> None:
+        """Until not a byte fits."""
+        with self._filler.open("ab", buffering=0) as filler:
+            for size in (65536, 4096, 1):
+                while self._fits(filler, size):
+                    pass
+
+    @staticmethod
+    def _fits(filler, size: int) -> bool:
+        try:
+            return filler.write(bytes(size)) == size
+        except OSError as error:
+            if error.errno != errno.ENOSPC:
+                raise
+            return False
+
+    def make_room(self) -> None:
+        self._filler.unlink()
+
+
+@contextlib.contextmanager
+def small_disk(place: Path) -> Iterator[Disk]:
+    """Seen by this test and what it starts alone; gone with them in any case."""
+    place.mkdir(parents=True)
+    if os.geteuid() != 0 or ctypes.CDLL(None).unshare(_CLONE_NEWNS) != 0:
+        pytest.skip("only root may mount a small file system")
+    subprocess.run(["mount", "--make-rprivate", "/"], check=True)
+    options = ["-o", "size=1m,mode=700"]
+    subprocess.run(["mount", "-t", "tmpfs", *options, "tmpfs", place], check=True)
+    try:
+        yield Disk(place)
+    finally:
+        subprocess.run(["umount", "-l", place], check=True)

@@ -1,0 +1,111 @@
+"""While nothing can be made durable: what is noted, turned away, kept for later, and let go."""
+
+from __future__ import annotations
+
+from typing import get_args
+
+import numpy as np
+import pytest
+
+from rosrm.core import events as happened
+from rosrm.core.commands import Record
+from rosrm.core.model import InstanceId
+from rosrm.master import standstill
+from rosrm.master.standstill import Standstill
+from tests.unit.core.cluster import Cluster, process
+
+REFUSED = {
+    happened.HostRegistered, happened.SubmissionReceived, happened.CancelRequested,
+    happened.RestartRequested, happened.MigrationRequested, happened.HostStateRequested,
+}  # fmt: skip
+KEPT = {
+    happened.HostLeft, happened.StatusesReceived, happened.OrderAnswered,
+    happened.HandoffReported, happened.AssignmentWithdrawn,
+}  # fmt: skip
+NEWEST = {happened.ProcessRequested, happened.KeptStatesReceived}
+DROPPED = {happened.TimePassed, happened.UsagesReceived, happened.PeerRefused}
+
+
+def still(now: float = 100.0) -> Standstill:
+    return Standstill([Record("n")], "the disk is full", since=5.0, core_now=now, tried=5.0)
+
+
+def take(held: Standstill, *events: happened.Event, cluster: Cluster | None = None) -> list:
+    replies: list = []
+    held.take((cluster or Cluster()).state, events, replies.append)
+    return replies
+
+
+def statuses(sequence: int) -> happened.StatusesReceived:
+    return happened.StatusesReceived(1, 2, sequence, False, ())
+
+
+def test_every_event_has_its_place() -> None:
+    """A new kind of event must be thought of here."""
+    known = REFUSED | KEPT | NEWEST | DROPPED | {happened.ReadingsReceived}
+    assert known == set(get_args(happened.Event))
+
+
+def test_requests_are_turned_away_with_the_reason() -> None:
+    """Under a code of their own, by which a slave knows that it may ask again."""
+    held = still()
+    (reply,) = take(held, happened.CancelRequested(7, ("p",)))
+    assert (reply.request, reply.accepted, reply.code) == (7, False, "journal")
+    assert "the disk is full" in reply.message
+    assert held.waiting() == []
+
+
+def test_what_happened_is_kept_in_order_and_of_requests_for_work_the_newest() -> None:
+    """An end that was heard is not lost; a slave that asks again asks once."""
+    held = still()
+    left = happened.HostLeft(9, 3, 4)
+    events = [
+        statuses(1), happened.ProcessRequested(1, 5, 6), left, happened.TimePassed(),
+        happened.AssignmentWithdrawn(InstanceId("p", 1)), happened.ProcessRequested(2, 5, 6),
+    ]  # fmt: skip
+    assert take(held, *events) == []
+    assert held.waiting() == [events[0], left, events[4], events[5]]
+
+
+def test_what_is_kept_is_bounded(monkeypatch) -> None:
+    """Slaves are asked again for statuses that were let go."""
+    monkeypatch.setattr(standstill, "_MOST_STATUSES", 3)
+    held = still()
+    take(held, *(statuses(n) for n in range(10)))
+    assert held.waiting() == [statuses(n) for n in range(3)]
+
+
+def test_no_host_falls_silent_by_it() -> None:
+    """Readings are noted; a minute later no deadline has passed, and what is lost is asked for."""
+    cluster = Cluster("a", "b", lease=10.0, suspect=1.0)
+    cluster.submit(process("p"), process("q"))
+    held = still(cluster.now)
+    machine = cluster.machines["a"]
+    machine.batches += 1  # a status batch that was let go
+    machine.busy["memory"] = 0.7
+    take(held, cluster.readings(list(cluster.machines.values())), cluster=cluster)
+    column = cluster.state.hosts.by_name["a"].column
+    assert cluster.state.hosts.usage[0, column] == pytest.approx(0.7)
+    assert np.all(cluster.state.hosts.heard == cluster.now)
+    cluster.tell(happened.TimePassed())
+    cluster.wait(3.0)
+    assert not [one for one in cluster.records if one.kind in ("host_suspect", "host_lost")]
+    assert cluster.state.hosts.status_sequence[column] == machine.batches
+
+
+def test_a_suspect_host_that_is_heard_is_so_no_more() -> None:
+    """Beats say so: else what runs there alone would have to stop. A lost one stays lost."""
+    cluster = Cluster("a", "b", "c", lease=10.0, suspect=1.0)
+    cluster.machines["b"].connected = False
+    cluster.wait(12.0)
+    cluster.machines["a"].connected = False
+    cluster.wait(2.0)
+    a, b, _ = (cluster.state.hosts.by_name[name].host_id for name in "abc")
+    assert cluster.state.hosts.unheard() == [a, b]
+    held = still(cluster.now)
+    for machine in cluster.machines.values():
+        machine.connected = True
+    take(held, cluster.readings(list(cluster.machines.values())), cluster=cluster)
+    assert cluster.state.hosts.unheard() == [b]
+    cluster.wait(1.0)
+    assert cluster.state.hosts.unheard() == []
