@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -71,12 +72,18 @@ def wait_until(participant: Participant, done: Callable[[], bool], deadline: flo
 
 @dataclass(slots=True)
 class _Answers:
-    """The first answer to a request that may have been sent more than once."""
+    """The first answer to a request, and how often that was sent."""
 
     first: tuple[Any, ...] = ()
+    sent: int = 0
 
     def take(self, future: Any) -> None:
         self.first = self.first or (future.result(),)
+
+    @property
+    def answer(self) -> Any:
+        """None: there is none."""
+        return self.first[0] if self.first else None
 
 
 def find_master(
@@ -101,15 +108,15 @@ def find_master(
         request = srv.Handshake.Request(
             protocol_version=PROTOCOL_VERSION, software_version=__version__, role=role, name=name
         )
-        return _ask_until_answered(participant, client, request, deadline, _GREET_AGAIN)
+        return _ask_until_answered(participant, client, request, deadline, _GREET_AGAIN).answer
     finally:
         participant.node.destroy_client(client)
 
 
 def _ask_until_answered(
     participant: Participant, client: Any, request: Any, deadline: float, again: float
-) -> Any:
-    """The first answer to a request that is repeated; None when `deadline` has passed.
+) -> _Answers:
+    """The first answer to a request that is repeated until `deadline`.
 
     A server answers nobody whose reader of answers it has not found yet, and a new client's request
     may be there before.
@@ -118,10 +125,11 @@ def _ask_until_answered(
     while not answers.first:
         now = time.monotonic()
         if now >= deadline:
-            return None
+            return answers
+        answers.sent += 1
         client.call_async(request).add_done_callback(answers.take)
         wait_until(participant, lambda: bool(answers.first), min(deadline, now + again))
-    return answers.first[0]
+    return answers
 
 
 def _greet(participant: Participant, name: str, timeout: float) -> srv.Handshake.Response:
@@ -276,8 +284,15 @@ class MasterClient:
         return self._control.envelope(self._master.beat, self._master.epoch)
 
     def _ask(self, kind: Any, name: str, request: Any) -> Any:
-        request.envelope = self._envelope()
-        return self._call(kind, self._names(name), request, "the master")
+        for greeted_anew in (False, True):
+            request.envelope = self._envelope()
+            try:
+                return self._call(kind, self._names(name), request, "the master")
+            except Refused as refusal:
+                if greeted_anew or refusal.code != "stale":
+                    raise
+                self._heard = -math.inf  # another run of the master than the one that greeted us
+        raise AssertionError("the second time it is answered or raised")
 
     def _client(self, kind: Any, name: str) -> Any:
         path = name if name.startswith("/") else self._names(name)
@@ -296,11 +311,18 @@ class MasterClient:
         """
         client = self._client(kind, path)
         deadline = time.monotonic() + self._timeout
-        response = _ask_until_answered(self._participant, client, request, deadline, _AGAIN)
+        answers = _ask_until_answered(self._participant, client, request, deadline, _AGAIN)
+        response = answers.answer
         if response is None:
             raise NoMaster(
                 f"{who} did not answer {path} within {self._timeout:g} s "
                 f"({self._participant.settings.describe()}){self._trouble(kind)}"
+            )
+        if response.answer.code == "stale" and answers.sent > 1:
+            raise Refused(
+                f"{who} was silent when it was asked first, and has forgotten it since: it is not "
+                f"known whether it was done. Look at `rosrm ps`, and ask again if need be",
+                "unsure",
             )
         check_answer(response.answer, who)
         return response
@@ -311,7 +333,8 @@ class MasterClient:
             return ""
         request = srv.List.Request(protocol_version=PROTOCOL_VERSION)
         client, deadline = self._client(srv.List, names.LIST), time.monotonic() + _AGAIN
-        answer = _ask_until_answered(self._participant, client, request, deadline, _GREET_AGAIN)
+        answers = _ask_until_answered(self._participant, client, request, deadline, _GREET_AGAIN)
+        answer = answers.answer
         trouble = answer.trouble if answer is not None else ""
         return f": {trouble}. What was asked for may still be carried out then" if trouble else ""
 

@@ -1,0 +1,55 @@
+"""A client whose master is killed while it asks."""
+
+from __future__ import annotations
+
+import signal
+import threading
+
+from rosrm.errors import Refused
+from rosrm.ros.client import MasterClient
+from tests.ros.clusters import PATIENCE, host, service
+
+
+def test_what_a_killed_master_may_have_taken_is_not_called_undone(make_cluster) -> None:
+    """The next run of the master knows nothing of the request: nobody can tell."""
+    cluster = make_cluster(host("h0"))
+    cluster.client.list()
+    client = MasterClient.connect(cluster.ros, name="other", timeout=PATIENCE)
+    said: list[str] = []
+
+    def submit() -> None:
+        try:
+            client.submit([service("p")])
+        except Refused as refusal:
+            said.append(refusal.code)
+
+    try:
+        client.list()
+        master = cluster.master.process
+        master.send_signal(signal.SIGSTOP)  # the request reaches it, and nobody answers
+        asking = threading.Thread(target=submit)
+        asking.start()
+        asking.join(1.0)
+        master.send_signal(signal.SIGKILL)
+        master.wait(PATIENCE)
+        cluster.reconnect()
+        cluster.start_master()
+        asking.join(PATIENCE)
+    finally:
+        client.close()
+    assert said == ["unsure"]
+
+
+def test_a_request_to_another_run_of_the_master_is_made_anew(make_cluster) -> None:
+    """It was not sent to the former one: a client that greeted that goes on by itself."""
+    cluster = make_cluster(host("h0"))
+    with MasterClient.connect(cluster.ros, name="other", timeout=PATIENCE) as client:
+        client.list()
+        cluster.master.process.send_signal(signal.SIGKILL)
+        cluster.master.process.wait(PATIENCE)
+        cluster.reconnect()
+        cluster.start_master()
+        cluster.wait_for_hosts()
+        client._heard += 1000.0  # it greeted the former one just now
+        client.submit([service("p")])
+        cluster.wait("p", "running")
