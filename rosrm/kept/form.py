@@ -137,16 +137,24 @@ def decoded_head(data: bytes) -> tuple[Head, int]:
     return Head(name, instance, sequence, blocks, size), start
 
 
-def decoded(data: bytes, path: Path = Path()) -> Kept:
-    """A whole file; raises `Damaged`."""
-    head, at = decoded_head(data)
+def checked(data: bytes) -> tuple[Head, int]:
+    """As `decoded_head`, of a file that is whole; raises `Damaged` for any other."""
+    head, start = decoded_head(data)
     if len(data) < head.size:
         raise Damaged(f"it ends after {len(data)} of {head.size} bytes")
-    blocks = []
+    at, view = start, memoryview(data)  # no copies: it may have hundreds of megabytes
     for size, digest in head.blocks:
-        block = data[at : at + size]
-        if zlib.crc32(block) != digest:
+        if zlib.crc32(view[at : at + size]) != digest:
             raise Damaged("its content does not match its checksum")
-        blocks.append(block)
+        at += size
+    return head, start
+
+
+def decoded(data: bytes, path: Path = Path()) -> Kept:
+    """A whole file; raises `Damaged`."""
+    head, at = checked(data)
+    blocks = []
+    for size, _ in head.blocks:
+        blocks.append(data[at : at + size])
         at += size
     return Kept(head, tuple(blocks), path)

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
-from rosrm.kept.form import LARGEST, Damaged, Head, Kept, decoded, decoded_head
+from rosrm.kept.form import LARGEST, Damaged, Head, Kept, checked, decoded, decoded_head
 
 #: Written by the node, in turn.
 SLOTS: Final = ("state.0", "state.1")
@@ -53,14 +53,15 @@ def newest_head(directory: Path) -> Head | None:
 
 def read(path: Path) -> Kept:
     """A whole state; raises `Damaged`."""
-    return decoded(_content(path), path)
+    return decoded(content_of(path), path)
 
 
-def _content(path: Path) -> bytes:
+def content_of(path: Path) -> bytes:
+    """All bytes of a file; raises `Damaged`."""
     try:
         descriptor = os.open(path, os.O_RDONLY | OPEN)
         with os.fdopen(descriptor, "rb") as file:
-            return file.read(LARGEST + 1)
+            return file.read(min(os.fstat(descriptor).st_size, LARGEST))
     except OSError as error:
         raise Damaged(f"it cannot be read: {error.strerror}") from None
 
@@ -92,7 +93,7 @@ def newest_content(directory: Path) -> tuple[Head, bytes] | None:
     """The newest whole state as it lies in its file; None: there is none."""
     for path, _ in files(directory):
         with contextlib.suppress(Damaged):
-            data = _content(path)
-            head = decoded(data, path).head
+            data = content_of(path)
+            head, _ = checked(data)
             return head, data[: head.size]
     return None

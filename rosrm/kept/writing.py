@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from rosrm.kept.form import Block, Damaged, Head, decoded_head, encoded_head
-from rosrm.kept.reading import COPY, HEAD_ROOM, OPEN, SLOTS, paths_of, peek, read
+from rosrm.kept.form import Block, Damaged, Head, checked, decoded_head, encoded_head
+from rosrm.kept.reading import COPY, HEAD_ROOM, OPEN, SLOTS, content_of, paths_of, peek
 
 
 class SlotWriter:
@@ -81,7 +81,7 @@ class SlotWriter:
 
 def _age_if_whole(path: Path) -> tuple[int, int]:
     try:
-        return read(path).head.age
+        return checked(content_of(path))[0].age
     except Damaged:
         return (0, 0)
 
@@ -132,7 +132,7 @@ class CopyWriter:
             OSError: it cannot be kept.
         """
         try:
-            head = read(self._begun).head
+            head, _ = checked(content_of(self._begun))
             self._begun.replace(self._directory / COPY)
         except (Damaged, OSError):
             self.abandon()
