@@ -110,8 +110,8 @@ def _report(options: argparse.Namespace, tally: Tally, seconds: float) -> None:
             "seed": options.seed, "minutes": round(seconds / 60.0, 1),
             "violations_by_kind": dict(violations), "by_kind": dict(sorted(tally.by_kind.items())),
             "recovery_s": _spread(tally.recovery), "whole_s": _spread(tally.whole),
-            "parted_s": _spread({"owner": tally.parted} if tally.parted else {}),
-            "load": _spread({"average": tally.loads} if tally.loads else {}),
+            "parted_s": _spread({"owner": tally.parted}), "overloaded": tally.overloaded,
+            "load": _spread({"average": tally.loads}),
             "allowed": dict(tally.allowed), "missed": dict(tally.missed), "left_out": left_out,
             "services": len(list(work.services())) + 1, "hosts": len(HOSTS), "lease_s": LEASE_S,
         },
@@ -127,6 +127,7 @@ def _spread(seconds: Mapping[str, Sequence[float]]) -> dict[str, Any]:
             "p99": round(percentile(values, 0.99), 2), "max": round(max(values), 2),
         }
         for kind, values in sorted(seconds.items())
+        if values
     }  # fmt: skip
 
 

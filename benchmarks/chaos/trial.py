@@ -32,6 +32,8 @@ _LOOK_AT_ALL: Final = 0.3
 _STEADY: Final = 2
 #: Seconds within which a move that was asked for has ended.
 _MOVE: Final = 30.0
+#: Load average for each core from which on the machine does not keep to its times.
+_OVERLOAD: Final = 3.0
 #: Seconds that a job takes which only shows that its host takes work.
 _CANARY: Final = 0.1
 
@@ -54,6 +56,7 @@ class Tally:
             of the fault, or "burst" for rounds of several kinds.
         whole: the same, from the first fault on.
         loads: load average of the machine at the end of each round.
+        overloaded: rounds in which so much else ran that hosts may have been lost by it.
     """
 
     by_kind: Counter[str] = field(default_factory=Counter)
@@ -64,6 +67,7 @@ class Tally:
     recovery: dict[str, list[float]] = field(default_factory=dict)
     whole: dict[str, list[float]] = field(default_factory=dict)
     loads: list[float] = field(default_factory=list)
+    overloaded: int = 0
     rounds: int = 0
 
     @property
@@ -139,11 +143,11 @@ class Trial:
         healed = time.monotonic()
         well = self._await_well(number, f"fault {number} was undone", SETTLE_S)
         self._harms += self._harmer.take_done()
+        self._note_load(begun)
         judged = self._oracle.history(self._harms)
         # A move goes on after its round.
         recent = time.monotonic() - _MOVE
         self._harms = [harm for harm in self._harms if harm.kind in MOVES and harm.begun > recent]
-        self._tally.loads.append(os.getloadavg()[0])
         self._tally.allowed += judged.allowed
         self._tally.parted += judged.parted
         if judged.violations:
@@ -155,6 +159,17 @@ class Trial:
             self._tally.whole.setdefault(word, []).append(well - begun)
             say(
                 f"{self._tally.faults} faults; {', '.join(kinds)}: well after {well - healed:.1f} s"
+            )
+
+    def _note_load(self, begun: float) -> None:
+        """A machine that is overloaded by others does what a cut does; it is counted."""
+        load = os.getloadavg()[0]
+        self._tally.loads.append(load)
+        if load > _OVERLOAD * len(os.sched_getaffinity(0)):
+            self._tally.overloaded += 1
+            everywhere = frozenset({"*"})
+            self._harms.append(
+                Harm("overload", begun, time.monotonic(), everywhere, hides=True, deafens=True)
             )
 
     def _do(self, drawn: Round, begun: float) -> list[Fault]:
