@@ -178,7 +178,7 @@ class Record:
         self._size += written
         if written < len(text):
             self._waiting = [text[written:]]
-            self._fail("the disk took only a part")
+            self._fail("No space left on device, after a part of it")
             return False
         self._waiting.clear()
         self.trouble = ""
