@@ -3,41 +3,42 @@
 from __future__ import annotations
 
 import os
-import select
 import socket
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from rosrm.core.model import (
-    Fence,
     InstanceId,
-    InstanceState,
     InstanceStatus,
     RestartPolicy,
-    StopPolicy,
 )
 from rosrm.core.supervision import (
     AmendOrdered,
     FailOrdered,
     FenceOrdered,
-    FenceRule,
     Forgotten,
     Heard,
     RestartOrdered,
-    RestartRule,
     ShutdownOrdered,
     StopOrdered,
-    StopRule,
 )
 from rosrm.errors import SupervisorError
-from rosrm.supervisor import endpoint, lines, paths, protocol
+from rosrm.supervisor import lines, paths, protocol
 from rosrm.supervisor.logs import LogLimits
+from rosrm.supervisor.starting import connect_or_start, readable, writable
+from rosrm.supervisor.values import (
+    Amended,
+    LaunchOrder,
+    Told,
+    fence_rule,
+    key_of,
+    restart_rule,
+    status_from,
+    stop_rule,
+)
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -49,6 +50,7 @@ __all__ = [
     "SupervisorClient",
     "SupervisorEnded",
     "SupervisorGone",
+    "Told",
     "log_path",
     "newest_log",
 ]
@@ -65,42 +67,6 @@ class SupervisorGone(SupervisorError):
 
 class SupervisorEnded(SupervisorError):
     """The shutdown that was asked for is complete: nothing runs any more."""
-
-
-@dataclass(frozen=True, slots=True)
-class LaunchOrder:
-    """What is to be started.
-
-    Attributes:
-        argv: the command line; its first word is looked up in the PATH of `environment`.
-        environment: the whole of it, nothing is inherited.
-        working_directory: None: one of its own, below the state directory.
-        memo: kept by the supervisor for a later run of the client; see `SupervisorClient.memos`.
-        fence: when the supervisor ends it by itself; None: never.
-        heard: when the master last heard this host, monotonic; 0.0: just now.
-    """
-
-    instance: InstanceId
-    argv: tuple[str, ...]
-    environment: Mapping[str, str]
-    working_directory: str | None = None
-    restart: RestartPolicy = field(default_factory=RestartPolicy)
-    stop: StopPolicy = field(default_factory=StopPolicy)
-    memo: str = ""
-    fence: Fence | None = None
-    heard: float = 0.0
-
-
-@dataclass(frozen=True, slots=True)
-class Amended:
-    """The supervisor has recorded that an instance has this restart policy from now on."""
-
-    instance: InstanceId
-    restart: RestartPolicy
-
-
-#: What the supervisor tells of an instance.
-Told = InstanceStatus | Amended
 
 
 def log_path(state_directory: Path, instance: InstanceId) -> Path:
@@ -164,7 +130,7 @@ class SupervisorClient:
         state = Path(os.path.abspath(state_directory))
         deadline = time.monotonic() + timeout
         while True:
-            client = cls(_connect_or_start(state, start, log, deadline), state)
+            client = cls(connect_or_start(state, start, log, deadline), state)
             try:
                 client._introduce(log, deadline)
             except SupervisorGone:
@@ -189,11 +155,11 @@ class SupervisorClient:
 
     def stop(self, instance: InstanceId) -> None:
         """SIGINT, SIGTERM, SIGKILL to all of it; never heard of: it will never be started."""
-        self._order(StopOrdered(_key(instance)))
+        self._order(StopOrdered(key_of(instance)))
 
     def fence(self, instance: InstanceId) -> None:
         """SIGKILL to all of it, and no restart; never heard of: it will never be started."""
-        self._order(FenceOrdered(_key(instance)))
+        self._order(FenceOrdered(key_of(instance)))
 
     def heard(self, at: float, alive: float) -> None:
         """Fences wait: the master is known to have heard this host, and this slave was at work.
@@ -203,12 +169,12 @@ class SupervisorClient:
 
         Left out while the supervisor does not read (it is stopped): a newer one will follow.
         """
-        if _writable(self._peer, 0.0):
+        if writable(self._peer, 0.0):
             self._order(Heard(at, alive))
 
     def restart(self, instance: InstanceId) -> None:
         """Stop it, then start it again; the restart policy does not count this."""
-        self._order(RestartOrdered(_key(instance)))
+        self._order(RestartOrdered(key_of(instance)))
 
     def fail(self, instance: InstanceId, pid: int, reason: str, *, kill: bool) -> None:
         """A run of it counts as failed: stop it, then do as its restart policy says.
@@ -218,7 +184,7 @@ class SupervisorClient:
             reason: for people.
             kill: SIGKILL at once; otherwise it is asked first.
         """
-        self._order(FailOrdered(_key(instance), pid, reason, kill))
+        self._order(FailOrdered(key_of(instance), pid, reason, kill))
 
     def amend(
         self, instance: InstanceId, restart: RestartPolicy, changes: Mapping[str, str | None]
@@ -228,16 +194,16 @@ class SupervisorClient:
         Args:
             changes: of its environment when it starts again; None: without this variable.
         """
-        order = AmendOrdered(_key(instance), _rule(restart))
+        order = AmendOrdered(key_of(instance), restart_rule(restart))
         self._order(protocol.Amend(order, changes))
 
     def remember(self, instance: InstanceId, memo: str) -> None:
         """Keep another text for a later run of the client."""
-        self._order(protocol.Remember(_key(instance), memo))
+        self._order(protocol.Remember(key_of(instance), memo))
 
     def forget(self, instances: Iterable[InstanceId]) -> None:
         """Their final statuses are kept elsewhere now: the supervisor need not."""
-        forgotten = tuple(Forgotten(_key(instance)) for instance in instances)
+        forgotten = tuple(Forgotten(key_of(instance)) for instance in instances)
         if forgotten:
             self._order(protocol.Forget(forgotten))
 
@@ -264,7 +230,7 @@ class SupervisorClient:
             if self._failure is not None:
                 raise self._failure
             wait = None if deadline is None else max(0.0, deadline - time.monotonic())
-            if not _readable(self._peer, wait):
+            if not readable(self._peer, wait):
                 return []
             self._read()
         received, self._received = self._received, []
@@ -291,15 +257,15 @@ class SupervisorClient:
         }
         changes.update((name, None) for name in base if name not in order.environment)
         return protocol.Launch(
-            _key(order.instance),
+            key_of(order.instance),
             order.argv,
             self._base_id,
             changes,
             order.working_directory,
-            _rule(order.restart),
-            StopRule(*(getattr(order.stop, name) for name in StopRule._fields)),
+            restart_rule(order.restart),
+            stop_rule(order.stop),
             order.memo,
-            _fence_rule(order.fence),
+            fence_rule(order.fence),
             order.heard,
         )
 
@@ -320,7 +286,7 @@ class SupervisorClient:
             try:
                 view = view[self._peer.send(view, socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL) :]
             except BlockingIOError:
-                if not _writable(self._peer, max(0.0, deadline - time.monotonic())):
+                if not writable(self._peer, max(0.0, deadline - time.monotonic())):
                     message = f"{self._name()} took no order within {SEND_TIMEOUT:g} s"
                     raise SupervisorError(message) from None
             except OSError as error:
@@ -333,7 +299,7 @@ class SupervisorClient:
         while not self.pid:
             if self._failure is not None:
                 raise self._failure
-            if not _readable(self._peer, max(0.0, deadline - time.monotonic())):
+            if not readable(self._peer, max(0.0, deadline - time.monotonic())):
                 raise SupervisorError(f"{self._name()} did not answer in time")
             self._read()
 
@@ -358,7 +324,7 @@ class SupervisorClient:
     def _take(self, fields: Mapping[str, object]) -> None:
         told = fields["tell"]
         if told == "status":
-            self._received.append(_status(fields["status"]))
+            self._received.append(status_from(fields["status"]))
         elif told == "amended":
             instance = InstanceId(*protocol.read_key(fields["instance"]))
             rule = protocol.read_restart(fields["restart"])  # type: ignore[arg-type]
@@ -385,7 +351,7 @@ class SupervisorClient:
         assert isinstance(fenced, list)
         self.pid = pid
         self.notes = tuple(str(note) for note in notes)
-        self.instances = tuple(_status(value) for value in instances)
+        self.instances = tuple(status_from(value) for value in instances)
         self.fenced = frozenset(InstanceId(*protocol.read_key(key)) for key in fenced)
         self.memos = {InstanceId(*protocol.read_key(key)): str(memo) for key, memo in memos}
 
@@ -397,88 +363,3 @@ class SupervisorClient:
     def _name(self) -> str:
         pid = f" (pid {self.pid})" if self.pid else ""
         return f"the supervisor{pid} of {self._state}"
-
-
-# --- starting one -----------------------------------------------------------------------------
-
-
-def _connect_or_start(state: Path, start: bool, log: LogLimits, deadline: float) -> socket.socket:
-    while True:
-        try:
-            return endpoint.connect(str(state))
-        except (FileNotFoundError, ConnectionRefusedError):
-            if not start:
-                raise SupervisorError(f"no supervisor serves {state}") from None
-        except OSError as error:
-            raise SupervisorError(f"{state} cannot be used: {error.strerror}") from None
-        problem = _start(state, log, deadline)
-        if problem and time.monotonic() > deadline:
-            raise SupervisorError(f"the supervisor of {state} did not start: {problem}")
-        if problem and "another supervisor" not in problem:
-            raise SupervisorError(f"the supervisor of {state} did not start: {problem}")
-        if problem:
-            # Somebody else's is about to listen or about to end: neither can be awaited from here.
-            time.sleep(0.02)
-
-
-def _start(state: Path, log: LogLimits, deadline: float) -> str:
-    """Start a supervisor and wait for its first line; "" when it is ready, else what is wrong."""
-    main = Path(__file__).with_name("__main__.py")
-    names = ("--log-max-bytes", "--log-keep", "--log-instances", "--log-processes")
-    limits = [f"{name}={value}" for name, value in zip(names, log, strict=True)]
-    command = [sys.executable, "-I", "-S", str(main), "--state", str(state), *limits]
-    process = subprocess.Popen(
-        command,
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        start_new_session=True,
-    )
-    assert process.stdout is not None
-    with process.stdout as output:
-        said = b""
-        while not said.startswith(b"ready\n"):
-            if not _readable(output, max(0.0, deadline - time.monotonic())):
-                said += b"it was not ready in time"
-                break
-            part = os.read(output.fileno(), _CHUNK)
-            if not part:
-                break
-            said += part
-    process.wait()
-    return "" if said == b"ready\n" else said.decode(errors="replace").strip() or "it said nothing"
-
-
-def _readable(file: socket.socket | object, timeout: float | None) -> bool:
-    return _poll(file, select.POLLIN, timeout)
-
-
-def _writable(file: socket.socket, timeout: float) -> bool:
-    return _poll(file, select.POLLOUT, timeout)
-
-
-def _poll(file: object, event: int, timeout: float | None) -> bool:
-    poll = select.poll()
-    poll.register(file, event)  # type: ignore[arg-type]
-    return bool(poll.poll(None if timeout is None else timeout * 1000.0))
-
-
-# --- values -----------------------------------------------------------------------------------
-
-
-def _key(instance: InstanceId) -> tuple[str, int]:
-    return (instance.process, instance.number)
-
-
-def _fence_rule(fence: Fence | None) -> FenceRule | None:
-    return None if fence is None else FenceRule(fence.after, fence.grace, fence.alive)
-
-
-def _rule(restart: RestartPolicy) -> RestartRule:
-    return RestartRule(*(getattr(restart, name) for name in RestartRule._fields))
-
-
-def _status(value: object) -> InstanceStatus:
-    assert isinstance(value, list)
-    status = protocol.read_status(value)
-    return InstanceStatus(InstanceId(*status.instance), InstanceState(status.state), *status[2:])

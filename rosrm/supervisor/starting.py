@@ -1,0 +1,82 @@
+"""Finding the supervisor of a state directory, or starting one."""
+
+from __future__ import annotations
+
+import os
+import select
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Final
+
+from rosrm.errors import SupervisorError
+from rosrm.supervisor import endpoint
+from rosrm.supervisor.logs import LogLimits
+
+_CHUNK: Final = 1 << 16
+
+
+def connect_or_start(state: Path, start: bool, log: LogLimits, deadline: float) -> socket.socket:
+    """A connection to the one that serves a state directory; raises `SupervisorError`."""
+    while True:
+        try:
+            return endpoint.connect(str(state))
+        except (FileNotFoundError, ConnectionRefusedError):
+            if not start:
+                raise SupervisorError(f"no supervisor serves {state}") from None
+        except OSError as error:
+            raise SupervisorError(f"{state} cannot be used: {error.strerror}") from None
+        problem = _start(state, log, deadline)
+        if problem and time.monotonic() > deadline:
+            raise SupervisorError(f"the supervisor of {state} did not start: {problem}")
+        if problem and "another supervisor" not in problem:
+            raise SupervisorError(f"the supervisor of {state} did not start: {problem}")
+        if problem:
+            # Somebody else's is about to listen or about to end: neither can be awaited from here.
+            time.sleep(0.02)
+
+
+def _start(state: Path, log: LogLimits, deadline: float) -> str:
+    """Start a supervisor and wait for its first line; "" when it is ready, else what is wrong."""
+    main = Path(__file__).with_name("__main__.py")
+    names = ("--log-max-bytes", "--log-keep", "--log-instances", "--log-processes")
+    limits = [f"{name}={value}" for name, value in zip(names, log, strict=True)]
+    command = [sys.executable, "-I", "-S", str(main), "--state", str(state), *limits]
+    process = subprocess.Popen(
+        command,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        start_new_session=True,
+    )
+    assert process.stdout is not None
+    with process.stdout as output:
+        said = b""
+        while not said.startswith(b"ready\n"):
+            if not readable(output, max(0.0, deadline - time.monotonic())):
+                said += b"it was not ready in time"
+                break
+            part = os.read(output.fileno(), _CHUNK)
+            if not part:
+                break
+            said += part
+    process.wait()
+    return "" if said == b"ready\n" else said.decode(errors="replace").strip() or "it said nothing"
+
+
+def readable(file: socket.socket | object, timeout: float | None) -> bool:
+    """Whether there is something to read, within so many seconds; None: however long."""
+    return _poll(file, select.POLLIN, timeout)
+
+
+def writable(file: socket.socket, timeout: float) -> bool:
+    """Whether there is room to write, within so many seconds."""
+    return _poll(file, select.POLLOUT, timeout)
+
+
+def _poll(file: object, event: int, timeout: float | None) -> bool:
+    poll = select.poll()
+    poll.register(file, event)  # type: ignore[arg-type]
+    return bool(poll.poll(None if timeout is None else timeout * 1000.0))
