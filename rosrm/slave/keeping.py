@@ -276,7 +276,10 @@ class Keeping:
             True: it may start now; else `done` is called when the state has come, or does not come
             in time.
         """
-        if not assignment.spec.keeps_state or assignment.shadow:
+        if not assignment.spec.keeps_state:
+            return True
+        self._store.make()  # its node makes its own directory below it
+        if assignment.shadow:
             return True
         directory = self._store.directory(assignment.spec.name)
         if any(head.instance < assignment.kept_from for _, head in kept.files(directory)):

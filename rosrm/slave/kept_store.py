@@ -51,6 +51,11 @@ class KeptStore:
         """Where the state of a process is kept."""
         return self._root / token(process)
 
+    def make(self) -> None:
+        """Make the directory of all states, for the owner alone; that it fails is said later."""
+        with contextlib.suppress(OSError):
+            self._root.mkdir(mode=0o700, parents=True, exist_ok=True)
+
     def is_used(self) -> bool:
         """Whether anything was ever kept here."""
         return self._root.exists()
@@ -121,6 +126,7 @@ class KeptStore:
             return "full", f"it has {part.total} bytes; at most {kept.LARGEST} are kept"
         if bounded and not self._has_room(part):
             return "full", f"with it there were more than {self._max_bytes} bytes (keep.max_bytes)"
+        self.make()
         try:
             writer = kept.CopyWriter(directory)
         except OSError as error:

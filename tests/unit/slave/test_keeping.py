@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import queue
+import stat
 import threading
 import time
 import zlib
@@ -379,6 +381,22 @@ def test_what_is_here_and_as_new_is_not_fetched(net):
     net.write("b", 41)
     prepare(net, "a", assignment("b"))
     assert net.age("a") == (7, 42)
+
+
+def test_all_that_is_kept_is_the_owners_alone(net):
+    """Whatever the umask, and whoever makes the directory first: a node that starts, or a copy."""
+    before = os.umask(0)
+    try:
+        net.add("a").keep(P7, ["b"], 1.0)
+        net.add("b")
+        net.slaves["a"].prepare(assignment(), pytest.fail)
+        net.write("a", 1)
+        net.until(lambda: net.age("b") == (7, 1), "the copy")
+    finally:
+        os.umask(before)
+    for host in "ab":
+        assert stat.S_IMODE((net.root / host).stat().st_mode) == 0o700
+        assert stat.S_IMODE(net.directory(host).stat().st_mode) == 0o700
 
 
 def test_the_host_that_is_named_first_starts_at_once(net):
