@@ -197,6 +197,7 @@ class SlaveRuntime:
             if now >= next_usage:
                 next_usage = now + _USAGE_PERIOD
                 self._usage.look(now)
+                self.take(core.TimePassed())  # cycles may be far between, and fences wait for us
             awaited = self._state.awaited_in_graph()
             if awaited and now >= next_graph:
                 next_graph = now + _LOOK_AT_GRAPH
