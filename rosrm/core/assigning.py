@@ -62,7 +62,12 @@ def decide_now(state: MasterState, process: Process) -> Decision:
 
 def place_waiting(state: MasterState, now: float) -> None:
     """Assign from the queue until its head fits nowhere (with `backfill`, until nobody fits)."""
-    if not len(state.queue) or state.placed_at == _versions(state) or why_no_work(state, now):
+    head = state.queue.head()
+    if head is None or state.placed_at == _versions(state):
+        return
+    why = why_no_work(state, now)
+    if why:
+        state.processes[head].reason = why
         return
     if state.settings.backfill:
         _place_any(state, now)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sqlite3
 import time
 from pathlib import Path
 
@@ -82,6 +83,22 @@ def test_a_lost_tail_is_said_and_starts_nothing_twice(make_cluster) -> None:
         "before", "queued",
     ]  # fmt: skip
     assert len(cluster.events("journal_behind")) == 1
+
+
+def test_after_a_fall_of_its_machine_the_master_hears_all_hosts_first(make_cluster) -> None:
+    """Its journal may have lost what nobody else has heard of: a host that is away may run it."""
+    cluster = make_cluster(host("h0"), host("h1"), liveness=LIVENESS)
+    kill(cluster.master)
+    kill(cluster.slaves.pop("h1"))
+    with sqlite3.connect(files_of(cluster)[0]) as database:
+        database.execute(
+            "UPDATE intent SET value = json_set(value, '$.boot', 'another') WHERE key = 'epoch'"
+        )
+    cluster.reconnect()
+    cluster.start_master()
+    assert cluster.run(job("p", "true"))[0].state == "finished"
+    kinds = [(event.kind, event.process or event.host) for event in cluster.events()]
+    assert kinds.index(("assigned", "p")) > kinds.index(("host_lost", "h1"))
 
 
 # --- a damaged file ----------------------------------------------------------------------------

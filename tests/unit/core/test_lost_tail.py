@@ -97,6 +97,7 @@ def test_what_was_started_in_what_is_lost_is_never_there_twice(cluster) -> None:
     for _ in range(20):
         cluster.wait(0.1)
         assert cluster.where("p") == ["b"]
+        assert "all hosts must be heard first" in cluster["p"].reason
     loss.come_back("b", loss.seen)
     for _ in range(20):
         assert len(cluster.where("p")) <= 1
@@ -120,6 +121,7 @@ def test_after_a_fall_of_the_machine_all_known_hosts_are_heard_first(cluster, th
     cluster.set_host("a", "uncordon")
     cluster.wait(2.0)
     assert cluster.where("p") == ["b"]
+    assert "all hosts must be heard first" in cluster["p"].reason
     cluster.machines["b"].connected = there
     if there:
         loss.come_back("b", 0)
