@@ -163,6 +163,7 @@ class ParametersPart(Part):
     def __init__(self, topic: str, node: Any) -> None:
         super().__init__(topic, ParameterEvent, self._all, self._take_over)
         self._node = node
+        self._name = node.get_fully_qualified_name()  # at the end ROS may not know it any more
         self._changed = True
         self._count = 0
         node.add_post_set_parameters_callback(self._note)
@@ -176,7 +177,7 @@ class ParametersPart(Part):
             return None
         self._changed, self._count = False, len(known)
         return ParameterEvent(
-            node=self._node.get_fully_qualified_name(),
+            node=self._name,
             changed_parameters=[one.to_parameter_msg() for one in known.values()],
         )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
@@ -16,6 +17,9 @@ from rosrm.node.steady import steady_timer
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs.msg import StateMark
 
+#: Seconds in which the author's constructor names all parts, should it spin before; between looks.
+_PATIENCE: Final = 10.0
+_LOOK: Final = 0.02
 _REMEDY: Final = (
     "This node does not start, so that what is kept stays as it is. To begin from nothing, cancel "
     "the process and submit it again"
@@ -32,7 +36,8 @@ def kept_state(identity: Identity) -> tuple[Kept | None, list[str]]:
 class Revival:
     """Restores a kept state in the executor's first round; until then the node is like a shadow.
 
-    The author's constructor is over by then, and no callback of the author has run.
+    The author's constructor is over by then (or has named all parts), and no callback of the author
+    has run.
 
     Args:
         member: the node, at rest.
@@ -48,11 +53,16 @@ class Revival:
         self._parts = parts
         self._kept = kept
         self._done = done
+        self._give_up = time.monotonic() + _PATIENCE
         self._timer = steady_timer(member.plain, 0.0, self._restore)
 
     def _restore(self) -> None:
         with self._member.turn:
-            self._member.plain.destroy_timer(self._timer)
+            plain = self._member.plain
+            plain.destroy_timer(self._timer)
+            if self._is_incomplete() and time.monotonic() < self._give_up:
+                self._timer = steady_timer(plain, _LOOK, self._restore)
+                return
             try:
                 mark = self._restored()
             except StateError as fault:
@@ -60,6 +70,10 @@ class Revival:
                 self._member.node.get_logger().error(f"{message}. {_REMEDY}")
                 raise StateError(message) from fault
             self._go_on(mark)
+
+    def _is_incomplete(self) -> bool:
+        """The author's constructor spins, and has not named all parts yet."""
+        return len(self._parts) < len(self._kept.blocks) - 1
 
     def _restored(self) -> StateMark:
         try:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 
 import pytest
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Int64
@@ -173,3 +174,36 @@ def test_what_is_not_kept_at_once_is_kept_though_no_cycle_follows(stage, tmp_pat
     writes = node._rosrm._source._keeper
     assert writes._kept < node._rosrm.member.sequence
     stage.spin_until(lambda: kept_up_to(tmp_path, 5), "the last state")
+
+
+class Asking(Counter):
+    """Spins in its constructor, before it has named its state."""
+
+    def __init__(self, **named) -> None:
+        self._held_back: list = []
+        super().__init__(**named)
+        executor = SingleThreadedExecutor(context=self.context)
+        executor.add_node(self)
+        for _ in range(20):
+            executor.spin_once(timeout_sec=0.01)
+        executor.remove_node(self)
+        held_back, self._held_back = self._held_back, None
+        for part in held_back:
+            self.keep_state(*part)
+
+    def keep_state(self, *part) -> None:
+        if self._held_back is None:
+            super().keep_state(*part)
+        else:
+            self._held_back.append(part)
+
+
+def test_a_constructor_that_spins_is_waited_for(stage, tmp_path):
+    """Nothing is restored before all parts are named, and no cycle runs."""
+    first = stage.instance(Counter, 1, keep=tmp_path)
+    stage.spin_until(lambda: first.count >= 10, "ten counts")
+    stage.remove(first)
+    second = stage.instance(Asking, 1, keep=tmp_path)
+    assert second.count == 0
+    stage.spin_until(lambda: second.count > 0, "a count")
+    assert second.count >= first.count
