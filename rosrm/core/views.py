@@ -129,8 +129,8 @@ class Snapshot:
     master: str
     uptime: float
     last_sequence: int
-    trouble: str = ""
     hosts: Sequence[HostRow] = ()
     processes: Sequence[ProcessRow] = ()
     plugins: Sequence[PluginRow] = ()
     events: Sequence[EventRow] = ()
+    trouble: str = ""
