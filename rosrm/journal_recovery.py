@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import shutil
 import sqlite3
 import tempfile
@@ -23,15 +24,19 @@ from rosrm.journal import SqliteJournal
 from rosrm.ports import Intent, Record
 
 _FILES: Final = ("", "-wal", "-shm")
-#: From both ends, as a damaged page hides all that is behind it.
+#: A damaged page hides all that is behind it in a scan. So events are read by a few, and from the
+#: end; intents from both ends, then one by one by the names that the events know.
+_EVENTS: Final = "SELECT * FROM record WHERE sequence BETWEEN ? AND ? AND facts IS NOT NULL"
+_NEWEST_EVENTS: Final = "SELECT * FROM record WHERE facts IS NOT NULL ORDER BY sequence DESC"
+_FEW: Final = 50
+_MOST_EVENTS: Final = 2_000_000
 _INTENTS: Final = (
     "SELECT tbl, key, value FROM intent ORDER BY tbl, key",
     "SELECT tbl, key, value FROM intent ORDER BY tbl DESC, key DESC",
 )
-_EVENTS: Final = (
-    "SELECT * FROM record WHERE facts IS NOT NULL ORDER BY sequence",
-    "SELECT * FROM record WHERE facts IS NOT NULL ORDER BY sequence DESC",
-)
+_INTENT: Final = "SELECT tbl, key, value FROM intent WHERE tbl = ? AND key = ?"
+#: Bytes, at most, by which a file that was cut short is filled up (sparsely).
+_MOST_EMPTY: Final = 2**30
 #: Numbers left free above the largest that is known.
 _FREE: Final = 1000
 
@@ -92,15 +97,12 @@ def _salvage(path: Path, place: Path) -> _Found:
     for suffix in _FILES[:2]:
         with contextlib.suppress(FileNotFoundError):
             shutil.copyfile(f"{path}{suffix}", f"{copy}{suffix}")
+    _fill_up(copy)
     found = _Found()
     with contextlib.closing(sqlite3.connect(copy)) as database:
         database.text_factory = lambda raw: raw.decode(errors="replace")
-        for query in _INTENTS:
-            for table, key, text in _rows(database, query, found):
-                with contextlib.suppress(ValueError, TypeError):
-                    found.intents.setdefault((str(table), str(key)), dict(json.loads(text)))
-        for query in _EVENTS:
-            found.events.update((int(row[0]), row) for row in _rows(database, query, found))
+        _read_events(database, found)
+        _read_intents(database, found)
     if not found.intents:
         raise JournalError(
             f"nothing can be read of the journal {path}: restore it from a backup, or move it away "
@@ -109,10 +111,43 @@ def _salvage(path: Path, place: Path) -> _Found:
     return found
 
 
-def _rows(database: sqlite3.Connection, query: str, found: _Found) -> Iterator[tuple[Any, ...]]:
+def _fill_up(copy: Path) -> None:
+    """SQLite reads nothing of a file that is shorter than its head says: add empty pages."""
+    head = copy.read_bytes()[:32]
+    page, count = int.from_bytes(head[16:18], "big"), int.from_bytes(head[28:32], "big")
+    size = copy.stat().st_size
+    if head.startswith(b"SQLite format 3\0") and size < page * count < _MOST_EMPTY + size:
+        os.truncate(copy, page * count)
+
+
+def _read_events(database: sqlite3.Connection, found: _Found) -> None:
+    for row in _rows(database, found, _NEWEST_EVENTS):
+        found.events[int(row[0])] = row
+    newest = max(found.events, default=_MOST_EVENTS)
+    for first in range(max(0, newest - _MOST_EVENTS), newest, _FEW):
+        for row in _rows(database, found, _EVENTS, first, first + _FEW - 1):
+            found.events[int(row[0])] = row
+
+
+def _read_intents(database: sqlite3.Connection, found: _Found) -> None:
+    processes = sorted({str(event[4]) for event in found.events.values() if event[4]})
+    hosts = sorted({str(event[5]) for event in found.events.values() if event[5]})
+    known = [("cluster", "epoch"), ("cluster", "instances")]
+    known += [("host", name) for name in hosts]
+    known += [(table, name) for name in processes for table in ("process", "migration")]
+    rows = [row for query in _INTENTS for row in _rows(database, found, query)]
+    rows += [row for at in known for row in _rows(database, found, _INTENT, *at)]
+    for table, key, text in rows:
+        with contextlib.suppress(ValueError, TypeError):
+            found.intents[str(table), str(key)] = dict(json.loads(text))
+
+
+def _rows(
+    database: sqlite3.Connection, found: _Found, query: str, *values: object
+) -> Iterator[tuple[Any, ...]]:
     """Rows up to the first that cannot be read."""
     try:
-        yield from database.execute(query)
+        yield from database.execute(query, values)
     except sqlite3.Error:
         found.whole = False
 

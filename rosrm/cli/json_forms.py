@@ -37,6 +37,7 @@ def status_form(snapshot: Snapshot) -> dict[str, Any]:
         "master": snapshot.master,
         "uptime": snapshot.uptime,
         "last_sequence": snapshot.last_sequence,
+        "trouble": snapshot.trouble,
         "hosts": _counts(row.state for row in snapshot.hosts),
         "processes": _counts(row.state for row in snapshot.processes),
     }

@@ -71,6 +71,16 @@ def test_what_can_be_read_goes_on(path, which) -> None:
     journal.close()
 
 
+def test_of_a_file_that_was_cut_short_the_rest_goes_on(path) -> None:
+    """SQLite alone would read nothing of it; how much there is depends on which pages are left."""
+    raw = path.read_bytes()
+    path.write_bytes(raw[: len(raw) * 3 // 4])
+    recover(path)
+    journal = SqliteJournal(path)
+    assert 0 < len(journal.intents("process")) < COUNT
+    journal.close()
+
+
 def test_damaged_events_cost_no_intent(path) -> None:
     """They are for people."""
     spoil(path, pages_of(path, "record")[1])

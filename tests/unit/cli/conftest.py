@@ -97,6 +97,7 @@ class FakeClient:
     processes: list = field(default_factory=lambda: list(PROCESSES))
     plugins: list = field(default_factory=lambda: list(PLUGINS))
     events: list = field(default_factory=lambda: list(EVENTS))
+    trouble: str = ""
     asked: list = field(default_factory=list)
     fails: BaseException | None = None
     settings: object = None
@@ -148,6 +149,7 @@ class FakeClient:
         return Snapshot(
             master="lab",
             uptime=125.0,
+            trouble=self.trouble,
             last_sequence=max((row.sequence for row in self.events), default=0),
             hosts=self.hosts if hosts else (),
             processes=self.processes if processes else (),

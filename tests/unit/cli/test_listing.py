@@ -28,9 +28,22 @@ def test_status_json_counts_states(rosrm, client):
         "master": "lab",
         "uptime": 125.0,
         "last_sequence": 2,
+        "trouble": "",
         "hosts": {"up": 2, "suspect": 1},
         "processes": {"running": 1, "queued": 1, "failed": 1, "finished": 1},
     }
+
+
+@pytest.mark.parametrize("command", ["status", "ps", "hosts", "events"])
+@pytest.mark.parametrize("json_too", [(), ("--json",)])
+def test_a_master_that_takes_no_work_is_told_beside_the_listing(rosrm, client, command, json_too):
+    whole = rosrm(command, *json_too)
+    client.trouble = "nothing new is taken in just now: the disk is full"
+    result = rosrm(command, *json_too)
+    assert result.code == 0
+    assert result.err == "rosrm: nothing new is taken in just now: the disk is full\n"
+    if not json_too:
+        assert result.out == whole.out
 
 
 def test_status_of_an_empty_cluster(rosrm, client):

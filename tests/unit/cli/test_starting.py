@@ -12,7 +12,8 @@ from rosrm.config import ClusterConfig, HostConfig
 from rosrm.handover import take_over
 from rosrm.hookspecs import hookimpl
 from rosrm.installed import installed_plugins
-from rosrm.ports import MigrationOffer, ProbeOffer, ScoringOffer
+from rosrm.journal import SqliteJournal
+from rosrm.ports import Intent, MigrationOffer, ProbeOffer, ScoringOffer
 from rosrm.registry import Registry
 
 
@@ -103,3 +104,29 @@ def test_the_runtime_inherits_the_settings_and_where_the_plugins_are(monkeypatch
     assert seen["words"][-4:-1] == ["-m", "rosrm.slave.run", "--settings-fd"]
     assert (seen["inherited"], seen["handover"].settings) == (True, '{"host": "h"}')
     assert list(seen["handover"].plugins) == installed_plugins()
+
+
+def test_a_damaged_journal_is_recovered_before_the_master_starts(rosrm, becomes, tmp_path):
+    (tmp_path / "c.yaml").write_text("name: lab\nstate: s\n", encoding="utf-8")
+    path = tmp_path / "s" / "journal.sqlite"
+    command = ("master", "--config", tmp_path / "c.yaml", "--recover")
+
+    none = rosrm(*command)
+    assert (none.code, becomes) == (1, [])
+    assert f"there is no journal to recover: {path}" in none.err
+
+    journal = SqliteJournal(path)
+    for number in range(100):
+        journal.write([], [Intent("process", f"p{number}", {"x": "y" * 500})], 0.0)
+    journal.close()
+    whole = rosrm(*command)
+    assert (whole.code, becomes) == (1, [])
+    assert "is not damaged: start without" in whole.err
+
+    raw = path.read_bytes()
+    path.write_bytes(raw[: len(raw) - 2 * 4096])
+    result = rosrm(*command)
+    assert result.code == 0
+    assert "the journal was recovered" in result.err
+    assert [module for module, _ in becomes] == ["rosrm.master.run"]
+    SqliteJournal(path).close()
