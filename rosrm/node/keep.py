@@ -103,7 +103,6 @@ class Keeper:
 
     def _blocks(self) -> list[Block]:
         for part in self._parts:
-            part.retained = True
             part.refresh(LARGEST_PART)
         mark = bytes(serialize_message(self._mark()))
         blocks = [Block(mark, zlib.crc32(mark)), *(part.block() for part in self._parts)]

@@ -53,6 +53,7 @@ class Source:
         self._marks = plain.create_publisher(StateMark, mark_topic, topics.MARK)
         for part in parts:
             part.publisher = plain.create_publisher(part.message_type, part.topic, topics.STATE)
+            part.retained = bool(member.identity.keep)
         self._keeper = Keeper(member, parts, self._run) if member.identity.keep else None
         member.on_cycle = self._after_cycle
         member.on_overflow = self._overflowed
@@ -62,6 +63,7 @@ class Source:
         part.publisher = self._member.plain.create_publisher(
             part.message_type, part.topic, topics.STATE
         )
+        part.retained = self._keeper is not None
 
     # --- the state -------------------------------------------------------------------------
 

@@ -12,7 +12,8 @@ from std_msgs.msg import Int64
 from std_srvs.srv import Trigger
 
 from rosrm import kept
-from rosrm_msgs.msg import HandoffReport
+from rosrm.node.channel import MARK
+from rosrm_msgs.msg import HandoffReport, StateMark
 from tests.ros.nodes import RELIABLE, Conductor, Counter
 
 LATCHED = QoSProfile(
@@ -207,3 +208,12 @@ def test_a_constructor_that_spins_is_waited_for(stage, tmp_path):
     assert second.count == 0
     stage.spin_until(lambda: second.count > 0, "a count")
     assert second.count >= first.count
+
+
+def test_who_is_followed_from_the_first_cycle_on_keeps_its_state_too(stage, tmp_path):
+    """What has been published and does not change, as the parameters, is still there to be kept."""
+    marks = stage.listen(StateMark, "/counter/_rosrm/mark", MARK)
+    first = stage.instance(Counter, 1, keep=tmp_path)
+    stage.spin_until(lambda: marks and first.count >= 5, "five counts that somebody follows")
+    at = first._rosrm.member.sequence
+    stage.spin_until(lambda: kept_up_to(tmp_path, at), "a kept state")
