@@ -12,7 +12,7 @@ signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 import sys
 
-from rosrm.config.settings import ClusterConfig
+from rosrm.config.settings import CheckpointChoice, ClusterConfig
 from rosrm.entry import run
 from rosrm.handover import Handover
 from rosrm.master.fallback import fallback_of
@@ -28,10 +28,17 @@ def serve(handover: Handover) -> int:
     name = config.scoring.policy
     policy = GuardedPolicy(name, registry.scoring(name, config.scoring.options))
     strategies = registry.migrations(config.migration.strategies)
-    checkpoint = registry.checkpoint(config.checkpoint.policy, config.checkpoint.options)
+    checkpoint = registry.checkpoint(_installed_policy(config, registry), config.checkpoint.options)
     rows = registry.rows("scoring", "migration", "checkpoint")
     fallback = fallback_of(registry, name)
     return MasterRuntime(config, policy, strategies, rows, fallback, checkpoint).run()
+
+
+def _installed_policy(config: ClusterConfig, registry: Registry) -> str | None:
+    """What the file names was checked; settings without a file have a default, here or not."""
+    policy = config.checkpoint.policy
+    is_default = policy == CheckpointChoice().policy
+    return None if is_default and policy not in registry.names("checkpoint") else policy
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ from rosrm.config.process import ProcessInFile
 from rosrm.core import migration, views
 from rosrm.core.model import HostDescription
 from rosrm.loading import HOOKS
+from rosrm_checkpoint.other_host import OtherHostOptions
 from rosrm_migration.handoff import HandoffOptions
 from rosrm_migration.relaunch import RelaunchOptions
 
@@ -69,6 +70,12 @@ def test_every_setting_is_documented_and_nothing_else(heading, kind):
     ros = {key for key in wanted if key.startswith("ros.")}
     assert rows(section(text, heading)) == wanted - ros | {"ros"}
     assert rows(section(text, "The section `ros`")) == ros
+
+
+def test_every_option_of_the_checkpoint_policy_is_documented():
+    text = section(page("configuration.md"), "Options of the checkpoint policy")
+    named = set(re.findall(r"^\| `(\w+)` \|", text, re.MULTILINE))
+    assert named == {field.name for field in fields(OtherHostOptions)}
 
 
 @pytest.mark.parametrize("options", [RelaunchOptions, HandoffOptions])
