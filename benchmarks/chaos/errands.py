@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 _PAUSE: Final = 0.3
 #: In the master's answer to a submission that it had taken already.
 _KNOWN: Final = "in use already"
-#: In its answer to a request that was on its way for too long.
-_STALE: Final = "old by this side's clock"
+#: In what a client is told whose request a master may have taken before it was killed.
+_UNKNOWN: Final = ("it is not known whether", "old by this side's clock")
 
 
 @dataclass
@@ -140,7 +140,8 @@ class Errands:
 
 def _may_have_been_taken(answer: Mapping[str, Any]) -> bool:
     """An answer may have been lost: the client asks again by itself, and that may come too late."""
-    return "no_master" in answer or _STALE in answer.get("refused", "")
+    refusal = answer.get("refused", "")
+    return "no_master" in answer or any(words in refusal for words in _UNKNOWN)
 
 
 def _accepted(errand: Errand) -> bool:

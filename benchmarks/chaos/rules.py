@@ -237,7 +237,9 @@ def _most_behind(
     second = asked or _is_struck_twice(name, promise, harms)
     if promise.standby and not (second and promise.copied):
         return _LAST_CYCLES + _unseen(one, harms, one.host)
-    return promise.copied + _unseen(one, harms) if promise.copied else 0.0
+    # A young one's copy may be of the one that it followed, as young or on its way then.
+    young = _RATE * 2 * _YOUNG if one.last - one.first < _YOUNG else 0.0
+    return promise.copied + young + _unseen(one, harms) if promise.copied else 0.0
 
 
 def _is_struck_twice(name: str, promise: Promise, harms: Sequence[Harm]) -> bool:

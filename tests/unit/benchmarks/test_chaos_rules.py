@@ -147,7 +147,9 @@ def test_a_state_that_came_to_no_other_host_in_time_is_lost():
     assert kinds(copied, [FIRST, anew], [OFF])[0] == ["state"]
     assert kinds(copied, [FIRST, anew], [OFF, other]) == ([], {"state_from_nothing": 1})
     young = run(first=17.0, numbers=(1, 31))
-    assert kinds(copied, [young, anew], [OFF]) == ([], {"state_from_nothing": 1})
+    assert kinds(copied, [young, anew], [OFF]) == ([], {"state_seconds_repeated": 1})
+    young_and_far = run(first=17.0, numbers=(501, 531))
+    assert kinds(copied, [young_and_far, anew], [OFF]) == ([], {"state_from_nothing": 1})
 
 
 def test_a_standby_bears_one_fault_and_the_copy_another():
