@@ -136,6 +136,28 @@ def test_a_damaged_journal_is_refused_and_recovered(make_cluster) -> None:
     assert cluster.run(job("new", "true"))[0].state == "finished"
 
 
+# --- one that cannot be written ---------------------------------------------------------------
+
+
+def test_a_journal_that_somebody_else_holds_holds_new_work_up(make_cluster) -> None:
+    """A person looks at it with another program, and forgets it: the master goes on afterwards."""
+    cluster = make_cluster(host("h0"), liveness=LIVENESS)
+    cluster.submit(service("stays"), service("ends"))
+    pids = {name: cluster.wait(name, "running").pid for name in ("stays", "ends")}
+    holder = sqlite3.connect(files_of(cluster)[0], isolation_level=None)
+    holder.execute("BEGIN IMMEDIATE")
+    os.kill(pids["ends"], signal.SIGKILL)
+    assert "another program holds it" in blocked(cluster)
+    with pytest.raises(Refused, match="another program holds it"):
+        cluster.submit(job("new", "true"))
+    holder.close()
+    cluster.wait_for_event("journal_back", "another program holds it")
+    assert cluster.ended("ends").state == "failed"
+    assert cluster.run(job("new", "true"))[0].state == "finished"
+    assert cluster.wait("stays", "running").pid == pids["stays"]
+    assert not cluster.events("host_lost")
+
+
 # --- a full disk -------------------------------------------------------------------------------
 
 

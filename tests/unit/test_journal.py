@@ -141,6 +141,50 @@ def test_a_damaged_file_is_refused(path, spoil) -> None:
     assert path.read_bytes() == before
 
 
+def test_a_damaged_log_costs_what_is_behind_the_damage(path) -> None:
+    """SQLite says nothing of it: the number of the newest record tells, to whoever knew it."""
+    writer = run(WRITER, path)
+    for _ in range(20):
+        answered = int(writer.stdout.readline())
+    writer.kill()
+    writer.wait(30)
+    writer.stdout.close()
+    log = path.with_name("journal.sqlite-wal")
+    raw = bytearray(log.read_bytes())
+    raw[len(raw) // 2 :] = os.urandom(len(raw) - len(raw) // 2)
+    log.write_bytes(raw)
+
+    journal = SqliteJournal(path)
+    last = journal.intents("process")["p"]["n"]
+    assert 0 < last < answered
+    assert journal.last_sequence == 2 * last
+    journal.close()
+
+
+def test_a_log_that_can_be_none_is_said(path) -> None:
+    """Something else lies in its place: where to look is in the message."""
+    fill(path)
+    path.with_name("journal.sqlite-wal").mkdir()
+    with pytest.raises(JournalError, match="-wal"):
+        SqliteJournal(path)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root may mount a file system")
+def test_a_file_system_that_is_read_only_is_said(tmp_path) -> None:
+    """With what to look at; it is no damage."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    if subprocess.run(["mount", "-t", "tmpfs", "tmpfs", disk], check=False).returncode:
+        pytest.skip("cannot mount here")
+    try:
+        fill(disk / "journal.sqlite")
+        subprocess.run(["mount", "-o", "remount,ro", disk], check=True)
+        with pytest.raises(JournalBlocked, match="look at the owner and permissions"):
+            SqliteJournal(disk / "journal.sqlite").write([Record("a")], [], 0.0)
+    finally:
+        subprocess.run(["umount", "-l", disk], check=True)
+
+
 def test_another_version_is_refused(path) -> None:
     """A file of a later rosrm is not misread."""
     fill(path)
