@@ -323,3 +323,23 @@ def test_a_node_goes_on_where_nothing_can_be_kept(make_cluster):
     wait_for_count(cluster, 200)
     log = cluster.log("counter")
     assert log.count("its state is not kept: Not a directory") == 1, log
+
+
+def test_a_master_that_was_started_again_knows_where_states_lie(make_cluster):
+    """The slaves tell it anew, and it tells them; nothing of it is in its journal."""
+    cluster = make_cluster(host("h0"), host("h1"), liveness=QUICK_LEASE)
+    cluster.submit(counter(host_loss=ELSEWHERE))
+    row = cluster.wait("counter", "running")
+    keeper = wait_for_copy(cluster, 50)
+    cluster.master.process.kill()
+    cluster.master.process.wait(PATIENCE)
+    cluster.reconnect()
+    cluster.start_master()
+    cluster.wait_for_hosts()
+    cluster.wait("counter", "running")
+    at = copies(cluster)[keeper]
+    before = copies(cluster)[wait_for_copy(cluster, at + 100)]
+    kill_host(cluster, row.host)
+    cluster.wait_for_event("given_up", process="counter")
+    assert cluster.wait("counter", "running").host == keeper
+    assert wait_for_count(cluster, before)[0][0] > before
