@@ -30,6 +30,8 @@ _LAST_SECOND: Final = 12
 _YOUNG: Final = 6.0
 #: What is asked for, and ends or silences nobody by force.
 MOVES: Final = ("move", "overlap")
+#: The kind of the harm that other programs on the machine do.
+OVERLOAD: Final = "overload"
 #: Cycles a second.
 _RATE: Final = 10.0
 
@@ -185,6 +187,8 @@ def _judge_overlap(
         for harm in harms
         if harm.hides and (harm.concerns(one.host) or harm.concerns(other.host))
     ]
+    # What was done explains it, or else the machine itself, which may be busy to the end.
+    parting = [harm for harm in parting if harm.kind != OVERLOAD] or parting
     until = [harm.ended + _OVERLAP + (_STARTING if harm.restarts else _MEETING) for harm in parting]
     # On a busy machine a part that was started again comes up late: what it took shows that it has.
     until += [reached[host] + _OVERLAP for host in (one.host, other.host) if host in reached]

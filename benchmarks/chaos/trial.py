@@ -17,7 +17,7 @@ from benchmarks.chaos.errands import Errand, Errands
 from benchmarks.chaos.faults import Fault, Move, Round
 from benchmarks.chaos.harm import Harmer
 from benchmarks.chaos.oracle import Amiss, Oracle, Wanted
-from benchmarks.chaos.rules import MOVES, Harm, Promise, Violation
+from benchmarks.chaos.rules import MOVES, OVERLOAD, Harm, Promise, Violation
 from benchmarks.chaos.story import Story
 from benchmarks.machine import say
 
@@ -169,7 +169,7 @@ class Trial:
             self._tally.overloaded += 1
             everywhere = frozenset({"*"})
             self._harms.append(
-                Harm("overload", begun, time.monotonic(), everywhere, hides=True, deafens=True)
+                Harm(OVERLOAD, begun, time.monotonic(), everywhere, hides=True, deafens=True)
             )
 
     def _do(self, drawn: Round, begun: float) -> list[Fault]:

@@ -10,6 +10,7 @@ import pytest
 import benchmarks.chaos
 from benchmarks.chaos.outputs import Outputs, Run
 from benchmarks.chaos.rules import (
+    OVERLOAD,
     Harm,
     Judgement,
     Promise,
@@ -86,6 +87,15 @@ def test_a_host_that_comes_up_late_is_given_its_second_from_then_on():
     elsewhere = Promise(elsewhere=True)
     assert judge_service("a", elsewhere, [late, beside], [CUT]).violations != []
     assert judge_service("a", elsewhere, [late, beside], [CUT], {"host1": 40.0}).violations == []
+
+
+def test_an_overloaded_machine_explains_what_nothing_else_does():
+    """It does not make a host that was cut off later than it was."""
+    late, beside = run(last=29.0), run("a#2", "host2", 16.0, 30.0)
+    overload = Harm(OVERLOAD, 10.0, 30.0, frozenset({"*"}), hides=True)
+    elsewhere = Promise(elsewhere=True)
+    assert kinds(elsewhere, [late, beside], [overload]) == ([], {"partitioned": 1})
+    assert kinds(elsewhere, [late, beside], [overload, CUT])[0] == ["doubled"]
 
 
 def test_who_comes_back_for_a_moment_does_not_end_the_owner():
