@@ -163,7 +163,7 @@ class MasterRuntime:
         except (AttributeError, KeyError, TypeError, ValueError) as fault:
             raise unreadable(self._config.state / "journal.sqlite", fault) from fault
         lost_tail.begin(state, newest, now, fell=fell)
-        self._record_from(now)
+        self._record_from(state, now)
         return state
 
     def _last_run(self) -> tuple[int, bool, int]:
@@ -174,14 +174,17 @@ class MasterRuntime:
         fell = not stopped and known.get("boot", _boot()) != _boot()
         return self._journal.last_sequence, fell, int(known["epoch"])
 
-    def _record_from(self, now: float) -> None:
+    def _record_from(self, state: MasterState, now: float) -> None:
         """Begin the record of this run, if one is wanted, with what the state was restored from."""
         wanted, config = self._config.record, self._config
         if wanted.directory == Path():
             return
         intents = {table: self._journal.intents(table) for table in TABLES}
-        epoch = int(intents["cluster"]["epoch"]["epoch"])
-        header = Header(__version__, config.name, json.loads(config.to_json()), epoch, now, intents)
+        tail = {"newest": state.tail.newest, "fell": state.tail.fell}
+        intents["cluster"] = {**intents["cluster"], "tail": tail}
+        header = Header(
+            __version__, config.name, json.loads(config.to_json()), state.epoch, now, intents
+        )
         self._recorder = Recorder(wanted.directory, header, wanted.max_size, wanted.keep)
         _log.info("recording into %s", self._recorder.path)
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from math import inf
 from typing import Final
 
+from rosrm.core import lost_tail
 from rosrm.core.commands import Command
 from rosrm.core.master import step
 from rosrm.core.placement import NamedPolicy
@@ -81,6 +82,9 @@ def replay(
     header = recording.header
     state = MasterState(settings, policy[0], policy[1], strategies, header.epoch)
     restore(state, lambda table: header.intents.get(table, {}), header.started)
+    tail = header.intents.get("cluster", {}).get("tail")
+    if tail is not None:
+        lost_tail.begin(state, int(tail["newest"]), header.started, fell=bool(tail["fell"]))
     end = header.started + min(until, recording.length)
     meter = Meter(end)
     meter.begin(state, header.started)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -65,6 +67,21 @@ def test_any_run_is_replayed_to_the_same_decisions(loads, growth, backfill):
     made = simulation([host("a", 500), host("b", 500)], plans, until=40.0, backfill=backfill)
     again = replay(read(recorded(made)), CoreSettings(backfill=backfill), EQ1, STRATEGIES)
     assert again.different == 0
+
+
+def test_where_the_journal_had_lost_its_end_the_replay_gives_no_work_either(record):
+    """It knows where the journal ended, and which host had seen more of it."""
+    told = [
+        replace(one, event=replace(one.event, journal_seen=9))
+        if isinstance(one.event, happened.HostRegistered)
+        else one
+        for one in record.events
+    ]
+    for newest, held_up in ((9, False), (3, True)):
+        intents = {"cluster": {"tail": {"newest": newest, "fell": False}}}
+        header = replace(record.header, intents=intents)
+        again = replay(replace(record, header=header, events=told), CoreSettings(), EQ1, STRATEGIES)
+        assert (again.different > 0) is held_up
 
 
 def test_other_weights_decide_otherwise_and_the_first_difference_is_told(record):
