@@ -201,6 +201,7 @@ class HostLinks:
                 srv.RequestProcess.Response(
                     answer=accepted(epoch=self._epoch),
                     journal=journal,
+                    slave_beat=int(self.ledger.beat[link.host_id]),
                     assignments=[convert.assignment_to_msg(one) for one in batch],
                 )
             )

@@ -308,7 +308,8 @@ class SlaveEndpoint:
         except Refused as refusal:
             self._host.say(f"an assignment that makes no sense was refused: {refusal}")
             return
-        self._host.take(core.AssignmentsReceived(work))
+        given_at = response.slave_beat / 1e9 if response.slave_beat else None
+        self._host.take(core.AssignmentsReceived(work, given_at))
 
     # --- what is said --------------------------------------------------------------------
 

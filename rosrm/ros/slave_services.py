@@ -151,7 +151,10 @@ def _ordered(request: srv.ControlHost.Request) -> core.Event:
     """What an order means for the core; raises `Refused`."""
     kind = srv.ControlHost.Request
     if request.action == kind.START:
-        return core.AssignmentsReceived((convert.assignment_from_msg(request.assignment),))
+        given_at = request.envelope.receiver_beat / 1e9
+        return core.AssignmentsReceived(
+            (convert.assignment_from_msg(request.assignment),), given_at
+        )
     instance = convert.instance_from_msg(request.instance)
     orders: dict[int, core.Event] = {
         kind.STOP: core.StopOrdered(instance),

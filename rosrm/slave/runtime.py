@@ -93,8 +93,9 @@ class SlaveRuntime:
         self._left = False
         self._shutting_down = False
         self._accepting = False
+        max_age = max(config.control.max_age, _BEATS_MISSED * config.period)
         self._state = core.SlaveState(
-            max_processes=config.max_processes, max_starting=config.max_starting
+            max_processes=config.max_processes, max_starting=config.max_starting, max_age=max_age
         )
         self._events: deque[core.Event] = deque()
         self._from_threads: deque[Callable[[], None]] = deque()
@@ -135,7 +136,7 @@ class SlaveRuntime:
                 self._participant,
                 self,
                 self._description(probes.absent),
-                max(config.control.max_age, _BEATS_MISSED * config.period),
+                max_age,
                 JournalSeen(config.state / "journal_seen"),
             )
             self._keeping = Keeping(

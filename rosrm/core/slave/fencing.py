@@ -46,6 +46,17 @@ def too_late(state: SlaveState, assignment: Assignment, now: float) -> str:
     )
 
 
+def too_old(state: SlaveState, assignment: Assignment, age: float) -> str:
+    """Why an assignment that has been on its way for so long is not taken up; "": it is."""
+    fence = assignment.fence
+    most = state.max_age
+    if fence is not None and not fence.alive:
+        most = min(most, fence.after)
+    if age < most:
+        return ""
+    return f"given {age:.1f} s ago: it may run elsewhere by now"
+
+
 def late(state: SlaveState, now: float) -> dict[InstanceId, str]:
     """Those that wait for their start and must not be started any more, and why."""
     return {

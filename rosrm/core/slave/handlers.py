@@ -77,9 +77,8 @@ def _assigned(state: SlaveState, event: AssignmentsReceived, now: float) -> _Com
         instance = assignment.instance
         if instance in state.held:
             continue  # the order came twice
-        refusal = _why_not(state, assignment)
-        if refusal:
-            status = InstanceStatus(instance, InstanceState.REFUSED, message=refusal)
+        status = _refused(state, assignment, event.given_at, now)
+        if status is not None:
             state.held[instance] = Held(status, ended_at=now)
             _bury(state, instance)
             refusals.append(status)
@@ -92,6 +91,20 @@ def _assigned(state: SlaveState, event: AssignmentsReceived, now: float) -> _Com
         one.status = replace(one.status, message=state.why_wait())
     reports = refusals + [one.status for one in held]
     return [*launches, Report(tuple(reports))] if reports else launches
+
+
+def _refused(
+    state: SlaveState, assignment: Assignment, given_at: float | None, now: float
+) -> InstanceStatus | None:
+    """What is said of an assignment that is not taken up; None: it is."""
+    reason = _why_not(state, assignment)
+    if reason:
+        return InstanceStatus(assignment.instance, InstanceState.REFUSED, message=reason)
+    age = 0.0 if given_at is None else now - given_at
+    late = fencing.too_old(state, assignment, age)
+    if late:
+        return InstanceStatus(assignment.instance, InstanceState.FENCED, message=late)
+    return None
 
 
 def _waiting(assignment: Assignment) -> Held:
@@ -121,7 +134,7 @@ def _refuse_late(state: SlaveState, now: float) -> _Commands:
     late = fencing.late(state, now)
     for instance, why in late.items():
         del state.waiting[instance]
-        status = InstanceStatus(instance, InstanceState.REFUSED, message=why)
+        status = InstanceStatus(instance, InstanceState.FENCED, message=why)
         state.held[instance] = Held(status, ended_at=now)
         _bury(state, instance)
     return [Report(tuple(state.held[one].status for one in late))] if late else []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from math import inf
 from typing import Final
 
 import numpy as np
@@ -71,6 +72,7 @@ class SlaveState:
     Attributes:
         max_processes: most that run at a time; 0: no bound.
         max_starting: most that are started at a time, until they are ready; 0: no bound.
+        max_age: seconds after which an assignment that was on its way is not taken up.
         waiting: assignments that are started as soon as they may be, in order.
         unheard: something was reported while no master had this host: perhaps after its
             registration was sent.
@@ -80,6 +82,7 @@ class SlaveState:
 
     max_processes: int = 0
     max_starting: int = 0
+    max_age: float = inf
     epoch: int = 0
     registered: bool = False
     unheard: bool = False

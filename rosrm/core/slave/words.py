@@ -94,9 +94,14 @@ class MasterLost:
 
 @dataclass(frozen=True, slots=True)
 class AssignmentsReceived:
-    """The master assigned instances to this host."""
+    """The master assigned instances to this host.
+
+    Attributes:
+        given_at: when it did so at the earliest, by the slave's clock; None: just now.
+    """
 
     assignments: tuple[Assignment, ...]
+    given_at: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -50,7 +50,8 @@ class Slave:
 
 def refusals(commands) -> list[str]:
     reported = [one for c in commands if isinstance(c, slave.Report) for one in c.statuses]
-    return [one.message for one in reported if one.state is InstanceState.REFUSED]
+    states = (InstanceState.REFUSED, InstanceState.FENCED)
+    return [one.message for one in reported if one.state in states]
 
 
 def test_the_supervisor_hears_it_while_there_is_a_fence() -> None:
@@ -92,6 +93,25 @@ def test_what_is_given_out_too_late_is_not_started() -> None:
     (message,) = refusals(one.assign(after=2.0))
     assert message.startswith("fenced before it was started: for 2 s")
     assert refusals(one.assign(number=2, after=0.0, fence=Fence(2.5, 0.0))) == []
+
+
+def test_an_answer_that_was_long_on_its_way_starts_nothing() -> None:
+    """DDS delivers it when a cut is over, and beats have come meanwhile."""
+    one = Slave(max_age=5.0)
+    spec = ProcessSpec("p", command=("true",))
+    for number, (fence, age, taken) in enumerate(
+        [
+            (FENCE, 1.9, True),
+            (FENCE, 2.0, False),
+            (Fence(2.0, 0.0, alive=True), 4.9, True),
+            (None, 4.9, True),
+            (None, 5.0, False),
+        ]
+    ):
+        given = Assignment(InstanceId("p", number), spec, 1, "p", fence=fence)
+        commands = one.step(slave.AssignmentsReceived((given,), one.now - age))
+        assert any(isinstance(c, slave.Launch) for c in commands) is taken, number
+        assert len(refusals(commands)) == (not taken), number
 
 
 def test_what_waits_for_its_start_is_fenced_too() -> None:
