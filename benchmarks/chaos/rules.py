@@ -165,7 +165,7 @@ def _may_end(name: str, promise: Promise, run: Run, harms: Sequence[Harm]) -> bo
         harm.process == name
         or (harm.kills and harm.concerns(run.host))
         or ((promise.elsewhere or promise.isolated) and harm.hides and harm.concerns(run.host))
-        or (promise.isolated and harm.deafens and harm.concerns(run.host))
+        or ((promise.elsewhere or promise.isolated) and harm.deafens and harm.concerns(run.host))
         for harm in harms
     )
 
