@@ -238,6 +238,7 @@ def _end(
         and status.state is InstanceState.EXITED
         and before is not InstanceState.STOPPING
         and status.exit_code == 0 and status.exit_signal == 0
+        and status.run_time > 0.0  # else it was stopped before it was started
     )  # fmt: skip
     told = instance.stopping or instance.recalled or process.wanted is Wanted.REQUEUE
     return End(status, ordered=told and not completed, completed=completed)

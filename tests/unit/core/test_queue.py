@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rosrm.core import events as happened
-from rosrm.core.model import InstanceId
+from rosrm.core.model import InstanceId, InstanceState, InstanceStatus
 from rosrm.ports import Record
 from tests.unit.core.cluster import MIB, Cluster, Machine, job, process
 
@@ -193,3 +193,23 @@ def test_an_assignment_given_twice_and_withdrawn_never_starts() -> None:
     cluster.carry_out([*given, *again])
     cluster.wait(1.0)
     assert list(machine.programs) == [InstanceId("p", 2)]
+
+
+def test_a_job_that_was_taken_back_before_it_ran_has_not_completed() -> None:
+    """Its late assignment and the order to stop it met: it ended with code 0, and never ran."""
+    machine = Machine("a")
+    cluster = Cluster(machine, order_retry=50.0, delivery_timeout=5.0)
+    cluster.decide(happened.SubmissionReceived(1, (job("p"),)))  # the answer is late
+    machine.connected = False
+    cluster.wait(5.5)
+    assert machine.ordered.pop().action == "stop"
+    machine.connected = True
+    never_ran = InstanceStatus(InstanceId("p", 1), InstanceState.EXITED, message="stopped")
+    machine.batches += 1
+    cluster.tell(
+        happened.StatusesReceived(
+            machine.host_id, machine.incarnation, machine.batches, False, (never_ran,)
+        )
+    )
+    cluster.wait(1.0)
+    assert (cluster.phase("p"), cluster["p"].owner) == ("running", 2)
