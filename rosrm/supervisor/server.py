@@ -73,17 +73,23 @@ class Server:
             self._round()
             if self._leaving:
                 break
-            for key, _ in self._selector.select(self._timeout()):
-                call: Callable[[], None] = key.data
-                call()
+            self._take_in(self._timeout())
         self._leave()
+
+    def _take_in(self, timeout: float | None) -> None:
+        """Whatever comes first within so many seconds; None: however long."""
+        for key, _ in self._selector.select(timeout):
+            call: Callable[[], None] = key.data
+            call()
 
     def _round(self) -> None:
         """Everything that is due without waiting."""
-        now = time.monotonic()
-        deadline = self._core.deadline()
-        if deadline is not None and deadline <= now:
+        if self._is_due():
+            # This process may have been stopped meanwhile: what was said in time counts first.
+            self._take_in(0.0)
+        if self._is_due():
             self._happened(supervision.TimePassed())
+        now = time.monotonic()
         self._logs.look(now)
         self._spawn_some()
         if self._record.is_large():
@@ -92,6 +98,10 @@ class Server:
         self._tell()
         if self._served and self._client is None and self._core.idle:
             self._leaving = True
+
+    def _is_due(self) -> bool:
+        deadline = self._core.deadline()
+        return deadline is not None and deadline <= time.monotonic()
 
     def _timeout(self) -> float | None:
         if self._spawns:

@@ -236,3 +236,23 @@ def test_a_record_without_fences_is_taken_over(host, client):
     assert client.notes == ()
     assert client.fenced == frozenset()
     assert (of_one(client).state, of_one(client).pid) == (InstanceState.RUNNING, pid)
+
+
+def test_a_supervisor_that_was_stopped_hears_first_what_was_said_in_time(host, client):
+    """Its client was at work all the while, and the fence has passed by its clock."""
+    client.start([host.order("one", *SLEEPS, fence=Fence(1.0, 0.0, alive=True))])
+    pid = host.running(client, "one").pid
+    os.kill(client.pid, signal.SIGSTOP)
+    try:
+        until = time.monotonic() + 2.5
+        while time.monotonic() < until:
+            client.heard(0.0, time.monotonic())
+            time.sleep(0.05)
+    finally:
+        client.heard(0.0, time.monotonic())
+        os.kill(client.pid, signal.SIGCONT)
+    until = time.monotonic() + 0.7
+    while time.monotonic() < until:
+        client.heard(0.0, time.monotonic())
+        assert not any(status.state.ended for status in client.receive(0.05))
+    os.kill(pid, 0)
