@@ -6,6 +6,8 @@ those the one with the largest relief goes. When no host has room nothing moves.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from rosrm.core.assigning import demand_to_move, ranking_of
 from rosrm.core.begin import begin_move, moves_under_way, why_immovable
 from rosrm.core.hosts import Host
@@ -114,7 +116,7 @@ def try_move(
     if refusal:
         return refusal
     source = state.instances[process.owner]
-    demand = demand_to_move(state, process, source.seen, source.host.name, headroom)
+    demand = demand_to_move(state, process, _measured(source), source.host.name, headroom)
     ranking = ranking_of(state, demand)
     column = ranking.best() if host is None else host.column
     if column < 0:
@@ -128,6 +130,12 @@ def try_move(
     if not reason:
         state.note_decision(process, decision, "migrated", now)
     return reason
+
+
+def _measured(source: Instance) -> Mapping[str, float]:
+    """What it was seen to use of what its host has a probe for: of the rest nobody has asked."""
+    probed = {resource.name for resource in source.host.description.resources}
+    return {name: amount for name, amount in source.seen.items() if name in probed}
 
 
 def _drain(state: MasterState, host: Host, now: float) -> None:

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from rosrm.core.model import ResourceDescription
 from tests.unit.core.cluster import GIB, MIB, Cluster, Machine, movable, process
 
 
@@ -216,3 +217,14 @@ def test_what_leaves_is_counted_as_it_was_seen(resource: str) -> None:
     cluster.machines["a"].busy[resource] = 0.6
     cluster.wait(3.0)
     assert (cluster.where("p"), cluster.where("q")) == (["b"], ["a"])
+
+
+def test_what_no_host_has_a_probe_for_keeps_nobody_where_it_is() -> None:
+    """Slaves say what each process uses of the CPU, also where no probe reads it."""
+    memory = (ResourceDescription("memory", "B", 16 * GIB),)
+    cluster = Cluster(*(Machine(name, resources=memory) for name in ("a", "b")))
+    for machine in cluster.machines.values():
+        machine.shown["p"] = {"memory": 50 * MIB, "cpu": 0.5}
+    cluster.submit(movable("p"))
+    cluster.wait(2.0)
+    assert cluster.migrate("p").accepted
