@@ -115,12 +115,10 @@ def _assign(
     state: MasterState, process: Process, ranking: Ranking, column: int, now: float
 ) -> None:
     decision = decide(ranking, chosen=column)
-    host, demand = state.hosts.hosts[column], ranking.demand
+    host = state.hosts.hosts[column]
     instance = state.new_instance_id(process)
     state.queue.remove(process.name)
-    state.charge_instance(
-        instance, host, now, demand.amounts, demand.estimated, ranking.need[:, column]
-    )
+    state.charge_ranked(instance, host, now, ranking)
     ranking.took()
     process.owner, process.left_behind = instance.number, None
     state.set_phase(process, ProcessPhase.ASSIGNED, now)

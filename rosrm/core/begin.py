@@ -29,11 +29,7 @@ def begin_move(
         state.record(now, "plugin_failed", run, process=process.name)
         return run
     state.runs[process.name] = run
-    demand = ranking.demand
-    state.charge_instance(
-        run.destination, destination, now, demand.amounts, demand.estimated,
-        ranking.need[:, destination.column],
-    )  # fmt: skip
+    state.charge_ranked(run.destination, destination, now, ranking)
     state.set_phase(process, ProcessPhase.MIGRATING, now, f"to {destination.name}: {cause}")
     state.record(
         now, "migration_begun",

@@ -11,7 +11,6 @@ from collections.abc import Mapping, Sequence
 from typing import Final
 
 from rosrm.core.migration import Configure, HandoffPhase, ReportPhase, Step
-from rosrm.core.model import InstanceState
 from rosrm.core.processes import Process, ProcessPhase, Wanted
 from rosrm.core.runs import End, Run
 from rosrm.core.state import MasterState
@@ -68,6 +67,4 @@ def take_over(state: MasterState, process: Process, end: End, now: float) -> boo
 
 
 def _succeeded(end: End) -> bool:
-    status = end.status
-    done = status.state is InstanceState.EXITED and not (status.exit_code or status.exit_signal)
-    return done and not end.ordered and not end.gone
+    return end.status.succeeded and not end.ordered and not end.gone

@@ -19,6 +19,8 @@ the master that was cut off, and its hosts come back one by one.
 
 from __future__ import annotations
 
+import numpy as np
+
 from rosrm.core import coming_back, failover, handoffs, lifecycle
 from rosrm.core.hosts import Host, HostCondition
 from rosrm.core.processes import LeftBehind
@@ -56,9 +58,8 @@ def regain_sight(state: MasterState, host: Host, now: float) -> None:
 
 def review_lost_hosts(state: MasterState, now: float) -> None:
     """Give up what is due on every lost host."""
-    for host in state.hosts.hosts:
-        if host.instances and state.hosts.condition_of(host) is HostCondition.LOST:
-            _review(state, host, now)
+    for column in np.flatnonzero(state.hosts.condition == HostCondition.LOST):
+        _review(state, state.hosts.hosts[column], now)
 
 
 def _review(state: MasterState, host: Host, now: float) -> None:

@@ -235,9 +235,8 @@ def _end(
     """How it ended: by itself, or because it was told to."""
     completed = (
         process.spec.kind is Kind.JOB
-        and status.state is InstanceState.EXITED
+        and status.succeeded
         and before is not InstanceState.STOPPING
-        and status.exit_code == 0 and status.exit_signal == 0
         and status.run_time > 0.0  # else it was stopped before it was started
     )  # fmt: skip
     told = instance.stopping or instance.recalled or process.wanted is Wanted.REQUEUE
@@ -263,7 +262,7 @@ def conclude(state: MasterState, process: Process, end: End, host: Host, now: fl
     elif status.state is InstanceState.REFUSED:
         exclude(process, host, status)
         _requeue(state, process, host, now, f"{host.name} cannot run it: {status.message}")
-    elif status.state is InstanceState.EXITED and process.exit_code == 0:
+    elif status.succeeded:
         _finish(state, process, ProcessPhase.FINISHED, host, now, status.message)
     else:
         reason = status.message or f"exit code {process.exit_code}"

@@ -22,8 +22,6 @@ PROVED_LONG: Final = 4 * SHORT
 #: Weight of the newest run in the mean.
 _NEWEST: Final = 0.3
 
-_RUNS: Final = frozenset({InstanceState.RUNNING, InstanceState.READY})
-
 
 def learn_run_time(state: MasterState, spec: ProcessSpec, status: InstanceStatus) -> None:
     """Remember how long a job ran."""
@@ -40,7 +38,7 @@ def review_slots(state: MasterState, host: Host, now: float) -> None:
     running = [
         instance
         for instance in (state.instances[number] for number in host.instances)
-        if instance.state in _RUNS
+        if instance.runs
     ]
     ahead = len(running) >= most and all(_ends_soon(state, one, now) for one in running)
     state.hosts.set_bound(host, most + ahead)

@@ -327,6 +327,11 @@ class InstanceStatus:
     run_time: float = 0.0
     message: str = ""
 
+    @property
+    def succeeded(self) -> bool:
+        """It has exited, with 0 and on no signal."""
+        return self.state is InstanceState.EXITED and not (self.exit_code or self.exit_signal)
+
 
 @dataclass(frozen=True, slots=True)
 class KeptState:

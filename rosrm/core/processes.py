@@ -95,6 +95,14 @@ class Instance:
     node_name: str = ""
     ready_at: float = inf
 
+    @property
+    def runs(self) -> bool:
+        """Its slave says that it runs, ready or not."""
+        return self.state in _RUNS
+
+
+_RUNS: Final = frozenset({InstanceState.RUNNING, InstanceState.READY})
+
 
 @dataclass(frozen=True, slots=True)
 class LeftBehind:

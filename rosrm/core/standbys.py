@@ -23,7 +23,6 @@ from rosrm.core.assigning import demand_of, ranking_of
 from rosrm.core.begin import plan_move
 from rosrm.core.hosts import Host
 from rosrm.core.migration import HandoffPhase, ReportPhase, Start
-from rosrm.core.model import InstanceState
 from rosrm.core.placement import Demand
 from rosrm.core.processes import Process, ProcessPhase, Wanted
 from rosrm.core.runs import Run
@@ -35,7 +34,6 @@ _FIRST_WAIT: Final = 2.0
 _LONGEST_WAIT: Final = 60.0
 #: Most standbys that are begun in one review.
 _AT_A_TIME: Final = 2
-_RUNS: Final = frozenset({InstanceState.RUNNING, InstanceState.READY})
 
 
 def review_standbys(state: MasterState, now: float) -> None:
@@ -72,10 +70,7 @@ def _begin(state: MasterState, process: Process, now: float) -> bool:
         _wait(state, process, f"it can have no standby: {why}", now)
         return False
     state.standbys[process.name] = run
-    demand = ranking.demand
-    state.charge_instance(
-        run.destination, host, now, demand.amounts, demand.estimated, ranking.need[:, column]
-    )
+    state.charge_ranked(run.destination, host, now, ranking)
     state.record(
         now, "standby_begun", f"the standby of {process.name} starts on {host.name}",
         process=process.name, host=host.name, facts={"number": run.destination.number},
@@ -144,7 +139,7 @@ def _review(state: MasterState, run: Run, now: float) -> None:
         end_standby(state, process, now)
     elif instance.host.draining:
         _lost(state, process, run, f"{instance.host.name} is being drained", now)
-    elif instance.state not in _RUNS:
+    elif not instance.runs:
         _see_it_start(state, process, run, now)
     else:
         _see_it_follow(state, process, run, now)

@@ -313,6 +313,15 @@ class MasterState:
         self.hosts.charge(host, charged, processes=1)
         return added
 
+    def charge_ranked(
+        self, instance: InstanceId, host: Host, now: float, ranking: Ranking
+    ) -> Instance:
+        """As `charge_instance`, by the ranking that has chosen the host."""
+        demand = ranking.demand
+        return self.charge_instance(
+            instance, host, now, demand.amounts, demand.estimated, ranking.need[:, host.column]
+        )
+
     def drop_instance(self, instance: Instance) -> None:
         """An instance has ended: it counts no more."""
         del self.instances[instance.id.number]

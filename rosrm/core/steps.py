@@ -29,7 +29,6 @@ __all__ = ["DONE", "give_order", "give_order_again", "outcome_of", "timed_out", 
 _WORDS: Final = {
     Start: "start", AwaitReady: "await ready", AwaitReleased: "await released", Stop: "stop",
 }  # fmt: skip
-_RUNS: Final = frozenset({InstanceState.RUNNING, InstanceState.READY})
 
 
 def give_order(state: MasterState, run: Run, step: Step, now: float) -> None:
@@ -136,7 +135,7 @@ def _(step: Start, state: MasterState, run: Run, now: float) -> str | None:
         return None  # what is in its way has to end first
     if run.answer is not None and not run.answer[0]:
         return f"{step.host} refused to start {step.instance}: {run.answer[1]}"
-    return DONE if instance.state in _RUNS else None
+    return DONE if instance.runs else None
 
 
 @outcome_of.register
