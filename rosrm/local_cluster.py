@@ -20,6 +20,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Final
 
+import psutil
+
 from rosrm.config.settings import ClusterConfig, HostConfig
 from rosrm.core.views import HostRow, ProcessRow, Snapshot
 from rosrm.errors import NoMaster, RosrmError
@@ -145,8 +147,8 @@ class LocalCluster:
             When that was, unix time.
         """
         slave = self.slaves.pop(name).process
-        mark = str(self.directory / "hosts" / name / "supervisor").encode()
-        pids = [slave.pid, *(pid for pid in _all_pids() if pid != os.getpid() and _has(pid, mark))]
+        mark = str(self.directory / "hosts" / name / "supervisor")
+        pids = [slave.pid, *(pid for pid in _processes_with(mark) if pid != os.getpid())]
         at = time.time()
         for number in (signal.SIGSTOP, signal.SIGKILL):
             for pid in pids:
@@ -250,17 +252,18 @@ class LocalCluster:
         self.close()
 
 
-def _all_pids() -> list[int]:
-    return [int(entry.name) for entry in Path("/proc").iterdir() if entry.name.isdigit()]
-
-
-def _has(pid: int, mark: bytes) -> bool:
-    """Its command line or its environment names this."""
-    try:
-        entry = Path(f"/proc/{pid}")
-        return mark in (entry / "cmdline").read_bytes() + b"\0" + (entry / "environ").read_bytes()
-    except OSError:  # it has ended, or is another user's
-        return False
+def _processes_with(mark: str) -> list[int]:
+    """Pids of those whose command line or environment names this; of other users none."""
+    return [
+        process.pid
+        for process in psutil.process_iter(["cmdline", "environ"])
+        if any(
+            mark in word
+            for word in (
+                *(process.info["cmdline"] or ()), *(process.info["environ"] or {}).values()
+            )
+        )
+    ]  # fmt: skip
 
 
 def _end_all(parts: Sequence[Part]) -> None:
