@@ -10,7 +10,8 @@ RosrmError                  what a user reads: no traceback is shown for it
 │   └── JournalBlocked      not just now: it may pass by itself
 ├── RecordError             the record of a master's run cannot be read
 ├── SupervisorError         the supervisor cannot be started or reached
-└── LabError                a virtual host or its network cannot be made, or is not there
+├── LabError                a virtual host or its network cannot be made, or is not there
+└── CriuError               there is no CRIU that works here, or it could not dump or restore
 
 SkipPlugin                  not an error: a plugin says that it is absent here, and why
 """
@@ -77,6 +78,10 @@ class SupervisorError(RosrmError):
 
 class LabError(RosrmError):
     """A virtual host or its network cannot be made, changed or found."""
+
+
+class CriuError(RosrmError):
+    """There is no CRIU that works here, or it could not dump or restore, and why."""
 
 
 class SkipPlugin(Exception):

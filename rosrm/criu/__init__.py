@@ -1,0 +1,1 @@
+"""CRIU: a process as files, and a process again. Optional: without it everything else works."""
