@@ -7,7 +7,8 @@ is looked at about once a second.
 ==========================================  =====================================================
 what is seen                                what is ordered
 ==========================================  =====================================================
-it runs, and the policy chooses hosts       `keep`: its slave ships the state to them from now on
+it runs, and the policy chooses hosts       `keep`: its slave ships the state to them from now on,
+                                            beginning with the first that this instance has
 its slave was told something else before    `keep`: the new choice
 it is cancelled, or has finished            `drop_kept` wherever something is kept of it
 it was submitted anew                       `drop_kept` of what is kept of its former life
@@ -103,10 +104,8 @@ def review(state: MasterState, now: float) -> None:
 def _review(state: MasterState, process: Process, now: float) -> None:
     holdings = state.keeping.holdings.of(process.name)
     owner = state.instances.get(process.owner)
-    if owner is not None and process.phase is ProcessPhase.RUNNING:
-        own = holdings.get(owner.host.name)
-        if own is not None and own.number == owner.id.number:
-            _choose(state, process, owner.host, holdings, now)
+    if owner is not None and owner.runs and process.phase is ProcessPhase.RUNNING:
+        _choose(state, process, owner.host, holdings, now)
     for name, holding in holdings.items():
         if _is_stale(state, process, name, holding, holdings):
             _drop(state, process, name, holding, now)
@@ -162,7 +161,7 @@ def _choice(
     since = max((holdings[name].since for name in others), default=None)
     view = CheckpointView(
         process.spec, host.name, None if since is None else now - since,
-        holdings[host.name].size, others, hosts,
+        max(holdings.values(), key=lambda one: one.age).size, others, hosts,
     )  # fmt: skip
     try:
         choice = keeping.policy.choose(view)

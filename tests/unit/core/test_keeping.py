@@ -194,6 +194,24 @@ def test_after_the_loss_of_its_host_the_start_is_told_where_the_state_lies():
     assert one not in assignment.kept_on
 
 
+def test_a_restarted_one_is_kept_elsewhere_from_its_first_state_on():
+    """Its slave is told before it has said that it keeps anything: a second loss may come soon."""
+    policy = Asked()
+    cluster = running(policy)
+    lost, (keeper, _) = where(cluster), others(cluster)
+    keep(cluster, keeper, ("p", cluster["p"].owner, 4))
+    cluster.machines[lost].connected = False
+    cluster.wait(6.0)
+    now_on = next(host for host in cluster.where("p") if host != lost)
+    policy.answer = CheckpointChoice(
+        tuple(name for name in cluster.machines if name not in (lost, now_on))
+    )
+    cluster.wait(1.2)
+    newest = cluster.orders("keep")[-1]
+    assert newest.instance == InstanceId("p", cluster["p"].owner)
+    assert newest.host_id == cluster.machines[now_on].host_id
+
+
 def test_a_failed_process_that_is_restarted_goes_on_from_its_state():
     """It was not asked to begin anew."""
     cluster = running(Asked())
