@@ -95,7 +95,8 @@ class Keeping:
         self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._shipments: dict[str, _Shipment] = {}
         self._transfers: dict[str, _Transfer] = {}
-        self._fetches: dict[InstanceId, Fetch] = {}
+        #: Instances that wait for a state; None: it is being looked for here.
+        self._preparing: dict[InstanceId, Fetch | None] = {}
         self._kept: tuple[KeptState, ...] = ()
         self._told: tuple[KeptState, ...] | None = None
         self._told_at = 0.0
@@ -169,8 +170,9 @@ class Keeping:
             self._begin_due(shipment, now)
         for transfer in list(self._transfers.values()):
             self._go_on(transfer, now)
-        for fetch in list(self._fetches.values()):
-            fetch.go_on(now)
+        for fetch in list(self._preparing.values()):
+            if fetch is not None:
+                fetch.go_on(now)
 
     def _scanned(self, states: tuple[KeptState, ...]) -> None:
         self._kept = states
@@ -273,42 +275,61 @@ class Keeping:
         """See to it that the newest state is here before an instance starts.
 
         Returns:
-            True: it may start now; else `done` is called when the state has come, or does not come
+            True: it may start now; else `done` is called when the state is here, or does not come
             in time.
         """
         if not assignment.spec.keeps_state:
             return True
+        self._preparing[assignment.instance] = None
+        self._in_thread(
+            partial(self._look_for, assignment),
+            lambda here: self._looked(assignment, here, done),
+        )
+        return False
+
+    def _look_for(self, assignment: Assignment) -> Head | None:
+        """Runs in the thread: the newest state that is here and of use."""
         self._store.make()  # its node makes its own directory below it
-        if assignment.shadow:
-            return True
         directory = self._store.directory(assignment.spec.name)
-        if any(head.instance < assignment.kept_from for _, head in kept.files(directory)):
+        if not assignment.shadow and any(
+            head.instance < assignment.kept_from for _, head in kept.files(directory)
+        ):
             kept.drop(directory, assignment.kept_from - 1)
-        hosts = assignment.kept_on
-        if not hosts or hosts[0] == self._host:
-            return True
-        instance = assignment.instance
+        return kept.newest_head(directory)
+
+    def _looked(
+        self, assignment: Assignment, here: Head | None, done: Callable[[Assignment], None]
+    ) -> None:
+        """Fetch what another host has newer, if anything."""
+        instance, hosts = assignment.instance, assignment.kept_on
+        if instance not in self._preparing:
+            return
+        if assignment.shadow or not hosts or hosts[0] == self._host:
+            del self._preparing[instance]
+            done(assignment)
+            return
 
         def ended(message: str) -> None:
-            if self._fetches.pop(instance, None) is not None:
+            if self.forget(instance):
                 self._say(message)
                 done(assignment)
 
-        fetch = Fetch(
+        fetch = self._preparing[instance] = Fetch(
             assignment, tuple(name for name in hosts if name != self._host), self._endpoint,
-            here=kept.newest_head(directory), take=self._take_fetched, ended=ended,
+            here=here, take=self._take_fetched, ended=ended,
         )  # fmt: skip
-        self._fetches[instance] = fetch
         fetch.go_on(time.monotonic())
-        return False
 
     def _take_fetched(self, part: Part, then: Callable[[tuple[str, str]], None]) -> None:
         self._in_thread(partial(self._store.take, part, bounded=False), then)
 
     def is_preparing(self, instance: InstanceId) -> bool:
         """Its start waits for a state."""
-        return instance in self._fetches
+        return instance in self._preparing
 
     def forget(self, instance: InstanceId) -> bool:
         """It is not to start any more; False: nothing was prepared for it."""
-        return self._fetches.pop(instance, None) is not None
+        if instance not in self._preparing:
+            return False
+        del self._preparing[instance]
+        return True

@@ -8,12 +8,10 @@ import os
 import signal
 import socket
 import sys
-import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -30,7 +28,7 @@ from rosrm.core.model import (
     RestartPolicy,
     StopPolicy,
 )
-from rosrm.errors import LaunchError, Refused, SupervisorError
+from rosrm.errors import LaunchError, Refused
 from rosrm.ports import ProbeContext
 from rosrm.registry import Registry
 from rosrm.ros.graph import GraphWatch
@@ -38,25 +36,19 @@ from rosrm.ros.journal_seen import JournalSeen
 from rosrm.ros.kept_endpoint import KeptEndpoint
 from rosrm.ros.names import STATE_CONFIG, Names, token
 from rosrm.ros.participant import Participant
-from rosrm.ros.slave_endpoint import Link, LogSlice, SlaveEndpoint, result_json
-from rosrm.slave.environment import SHADOW, Whereabouts
+from rosrm.ros.slave_endpoint import Link, LogSlice, SlaveEndpoint
+from rosrm.slave.environment import Whereabouts
+from rosrm.slave.executing import Done, execute
 from rosrm.slave.health import HealthWatch
 from rosrm.slave.keeping import Keeping
 from rosrm.slave.launch import launch_order
 from rosrm.slave.log_reading import NOTHING_YET, newest_instance, read_log
-from rosrm.slave.memos import from_memo, to_memo
+from rosrm.slave.memos import to_memo
 from rosrm.slave.sampling import Sampler
 from rosrm.slave.sessions import SessionTable
+from rosrm.slave.supervisor_link import SupervisorLink
 from rosrm.slave.usage import UsageWatch
 from rosrm.state_directory import only_one
-from rosrm.supervisor.client import (
-    Amended,
-    LogLimits,
-    SupervisorClient,
-    SupervisorEnded,
-    SupervisorGone,
-    Told,
-)
 from rosrm.version import __version__
 
 _log = logging.getLogger("rosrm.slave")
@@ -70,7 +62,6 @@ _PATIENCE_TOLD: Final = 10.0
 #: At slow rates a request is still meant after so many of our own beats.
 _BEATS_MISSED: Final = 3
 
-Executor = Callable[[Mapping[str, Any]], Mapping[str, Any]]
 #: Told of the outcome of an order: why it was refused; "": it is done.
 Settled = Callable[[str], None]
 
@@ -101,8 +92,7 @@ class SlaveRuntime:
         self._from_threads: deque[Callable[[], None]] = deque()
         self._graph_before: dict[InstanceId, frozenset[bytes]] = {}
         self._unsettled: dict[tuple[InstanceId, RestartPolicy], list[Settled]] = {}
-        self._executors: Mapping[str, Executor] = registry.executors()
-        self._supervisor_state = config.state / "supervisor"
+        self._executors = registry.executors()
         self._kept = config.state / "kept"
         self._closing = contextlib.ExitStack()
         with contextlib.ExitStack() as opened:
@@ -122,8 +112,11 @@ class SlaveRuntime:
             # From here on Ctrl-C ends what was begun in good order; before, it ends us at once.
             for number in (signal.SIGINT, signal.SIGTERM):
                 signal.signal(number, self._stop)
-            self._supervisor = self._connect()
-            opened.callback(self._close_supervisor)
+            self._supervisor = SupervisorLink(
+                config.state / "supervisor", config.logs, post=self._post, take=self.take,
+                follow=self._follow_session, say=self.say, ended=self._supervisor_ended,
+            )  # fmt: skip
+            opened.callback(self._supervisor.close)
             self._participant = Participant(
                 config.ros, f"rosrm_slave_{token(config.host)}", pace="steady"
             )
@@ -147,15 +140,6 @@ class SlaveRuntime:
             self._closing = opened.pop_all()
         self._adopt()
 
-    def _connect(self) -> SupervisorClient:
-        logs = self._config.logs
-        return SupervisorClient.connect(
-            self._supervisor_state, log=LogLimits(logs.max_bytes, logs.keep)
-        )
-
-    def _close_supervisor(self) -> None:
-        self._supervisor.close()  # the one that is connected by then
-
     def _limits(self) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
         limit = np.ones(RESOURCE_SLOTS, np.float32)
         for slot, resource in enumerate(self._sampler.resources):
@@ -173,16 +157,16 @@ class SlaveRuntime:
 
     def _adopt(self) -> None:
         """Take over what a former run of this slave left with the supervisor."""
-        if self._supervisor.instances:
-            self.say(f"{len(self._supervisor.instances)} processes were found with the supervisor")
-        self._take_over()
+        held = self._supervisor.take_over()
+        if held:
+            self.say(f"{held} processes were found with the supervisor")
         self._work(time.monotonic())
 
     # --- the loop ------------------------------------------------------------------------
 
     def run(self) -> int:
         """Serve until SIGINT or SIGTERM; returns the exit code."""
-        self._listen()
+        self._supervisor.listen()
         with self._closing:
             self._serve(lambda: not self._stopping and not self._endpoint.failure)
             return self._end()
@@ -279,33 +263,26 @@ class SlaveRuntime:
                 if isinstance(command, core.Report) and not command.complete:
                     reported += command.statuses
                 else:
-                    # One that was killed takes no order; its reader says so, and it is replaced.
-                    with contextlib.suppress(SupervisorGone):
-                        self._carry_out(command)
+                    self._carry_out(command)
             if reported:
                 self._endpoint.publish_statuses(reported, complete=False)
 
     def _carry_out(self, command: core.Command) -> None:
         if isinstance(command, core.Launch):
             self._launch(command.assignments)
-        elif isinstance(command, core.Stop | core.Fence | core.Restart):
-            self._interfere(command)
-        elif isinstance(command, core.Renew):
-            self._supervisor.heard(command.at, command.alive)
-        elif isinstance(command, core.Fail):
-            self.say(f"{command.instance} is {command.reason}")
-            self._supervisor.fail(command.instance, command.pid, command.reason, kill=command.kill)
-        elif isinstance(command, core.Amend):
-            self._supervisor.amend(command.instance, command.restart, {SHADOW: None})
+        elif isinstance(command, core.Report):
+            self._endpoint.publish_statuses(command.statuses, complete=command.complete)
         elif isinstance(command, core.Settle):
             for settled in self._unsettled.pop((command.instance, command.restart), []):
                 settled(command.refusal)
-        elif isinstance(command, core.Remember):
-            self._supervisor.remember(command.instance, to_memo(command.memo))
-        elif isinstance(command, core.Forget):
-            self._supervisor.forget(command.instances)
+        elif isinstance(
+            command, core.Stop | core.Fence | core.Restart
+        ) and self._keeping.is_preparing(command.instance):
+            self._do_not_begin(command)
         else:
-            self._endpoint.publish_statuses(command.statuses, complete=command.complete)
+            if isinstance(command, core.Fail):
+                self.say(f"{command.instance} is {command.reason}")
+            self._supervisor.carry_out(command)
 
     def _launch(self, assignments: Sequence[Assignment]) -> None:
         """Start them, each as soon as its kept state is here."""
@@ -323,19 +300,12 @@ class SlaveRuntime:
         if wanted and not self._shutting_down:
             self._start([assignment])
 
-    def _interfere(self, command: core.Stop | core.Fence | core.Restart) -> None:
-        """End an instance, or restart it; one that is being prepared has not begun."""
-        instance = command.instance
-        if self._keeping.is_preparing(instance):
-            if not isinstance(command, core.Restart):
-                self._keeping.forget(instance)
-                self.take(core.LaunchRefused(instance, "it was stopped before it was started"))
-        elif isinstance(command, core.Stop):
-            self._supervisor.stop(instance)
-        elif isinstance(command, core.Fence):
-            self._supervisor.fence(instance)
-        else:
-            self._supervisor.restart(instance)
+    def _do_not_begin(self, command: core.Stop | core.Fence | core.Restart) -> None:
+        """It is still being prepared: what it waits for comes with its start."""
+        if not isinstance(command, core.Restart):
+            self._keeping.forget(command.instance)
+            refusal = "it was stopped before it was started"
+            self.take(core.LaunchRefused(command.instance, refusal))
 
     def _start(self, assignments: Sequence[Assignment]) -> None:
         orders = []
@@ -355,7 +325,7 @@ class SlaveRuntime:
             try:
                 order = launch_order(
                     assignment, self._environment, sys.executable, where=where,
-                    state_directory=self._supervisor_state, heard=self._state.heard_at,
+                    state_directory=self._supervisor.state, heard=self._state.heard_at,
                 )  # fmt: skip
                 orders.append(replace(order, memo=to_memo(held.memo)))
             except LaunchError as error:
@@ -364,62 +334,14 @@ class SlaveRuntime:
         if orders:
             self._supervisor.start(orders)
 
-    def _listen(self) -> None:
-        threading.Thread(target=self._read_supervisor, name="supervisor", daemon=True).start()
-
-    def _read_supervisor(self) -> None:
-        """Runs in a thread of its own: the supervisor's words, into the loop."""
-        while True:
-            try:
-                told = self._supervisor.receive(None)
-            except SupervisorError as error:
-                self._from_threads.append(partial(self._supervisor_gone, error))
-                self._wake()
-                return
-            self._from_threads.append(partial(self._take_told, told))
-            self._wake()
-
     def _wake(self) -> None:
         # The participant may be closed already, when the last words come.
         with contextlib.suppress(Exception):
             self._participant.wake()
 
-    def _supervisor_gone(self, error: SupervisorError) -> None:
-        """It has ended as it was told to; or it was killed, and another one takes over."""
-        if isinstance(error, SupervisorGone) and not self._shutting_down:
-            self.say(f"{error}; starting another one")
-            try:
-                self._supervisor.close()
-                self._supervisor = self._connect()
-            except SupervisorError as failure:
-                error = failure
-            else:
-                self._listen()
-                self._take_over()
-                return
+    def _supervisor_ended(self, failure: str) -> None:
         self._left = True
-        if not isinstance(error, SupervisorEnded):
-            self._endpoint.failure = f"the supervisor of this host is gone: {error}"
-
-    def _take_over(self) -> None:
-        """Take over what the supervisor knows; what it does not know does not run."""
-        for note in self._supervisor.notes:
-            self.say(note)
-        for status in self._supervisor.instances:
-            self._follow_session(status)
-        found = {one: from_memo(memo) for one, memo in self._supervisor.memos.items()}
-        memos = {one: memo for one, memo in found.items() if memo is not None}
-        supervisor = self._supervisor
-        self.take(core.SupervisorReplaced(supervisor.instances, memos, supervisor.fenced))
-
-    def _take_told(self, told: Sequence[Told]) -> None:
-        statuses = tuple(one for one in told if isinstance(one, InstanceStatus))
-        for status in statuses:
-            self._follow_session(status)
-        self.take(core.SupervisorReported(statuses))
-        for one in told:
-            if isinstance(one, Amended):
-                self.take(core.RestartPolicyRecorded(one.instance, one.restart))
+        self._endpoint.failure = self._endpoint.failure or failure
 
     def _follow_session(self, status: InstanceStatus) -> None:
         self._usage.follow(status)
@@ -460,7 +382,7 @@ class SlaveRuntime:
         held = self._state.held.get(instance)
         ended = held is None or held.status.state.ended
         try:
-            return read_log(self._supervisor_state, instance, offset, max_bytes, ended=ended)
+            return read_log(self._supervisor.state, instance, offset, max_bytes, ended=ended)
         except Refused:
             if ended:
                 raise
@@ -470,26 +392,14 @@ class SlaveRuntime:
         held = [one.number for one in self._state.held if one.process == process]
         if held:
             return InstanceId(process, max(held))
-        return newest_instance(self._supervisor_state, process)
+        return newest_instance(self._supervisor.state, process)
 
-    def execute(
-        self, executor: str, arguments: dict[str, Any], done: Callable[[bool, str, str], None]
-    ) -> None:
-        """Run an executor in a thread of its own."""
-        function = self._executors.get(executor)
-        if function is None:
-            there = ", ".join(sorted(self._executors)) or "none"
-            raise Refused(f"no executor {executor!r} on {self._config.host}; there are: {there}")
-
-        def work() -> None:
-            try:
-                result = result_json(function(arguments))
-                outcome = (True, "", result)
-            except Exception as error:  # noqa: BLE001 - a third party's code: anything may come
-                outcome = (False, f"{executor} raised {type(error).__name__}: {error}", "")
-            self._post(partial(done, *outcome))
-
-        threading.Thread(target=work, name=f"executor {executor}", daemon=True).start()
+    def execute(self, executor: str, arguments: dict[str, Any], done: Done) -> None:
+        """Run an executor in a thread of its own; raises `Refused`."""
+        execute(
+            self._executors, executor, arguments,
+            host=self._config.host, post=self._post, done=done,
+        )  # fmt: skip
 
     # --- the end -------------------------------------------------------------------------
 
@@ -507,14 +417,10 @@ class SlaveRuntime:
         if live:
             self.say(f"stopping {live} processes ({self._stopping or 'refused'})")
         self._shutting_down = True
-        self._endpoint.leave(self._shut_down)
+        self._endpoint.leave(self._supervisor.shut_down)
         deadline = time.monotonic() + self._longest_stop()
         self._serve(lambda: not self._left and time.monotonic() < deadline)
         return self._ended(failure)
-
-    def _shut_down(self) -> None:
-        with contextlib.suppress(SupervisorGone):  # its reader says so
-            self._supervisor.shutdown()
 
     def _ended(self, failure: str) -> int:
         if not self._left:
