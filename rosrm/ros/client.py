@@ -32,6 +32,8 @@ _REQUEST: Final = 10.0
 _AGAIN: Final = 2.0
 #: The same for a greeting, which costs the master nothing.
 _GREET_AGAIN: Final = 0.5
+#: In an answer that does not say which run of the master gave it.
+_UNKNOWN_EPOCH: Final = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,6 +86,19 @@ class _Answers:
     def answer(self) -> Any:
         """None: there is none."""
         return self.first[0] if self.first else None
+
+
+def is_unsure(answer: Any, epoch: int) -> bool:
+    """Whether who was asked first may have done what a repeated request is turned down for.
+
+    Args:
+        answer: to the repeated request: another run's "in use already" may be the doing of the
+            first one.
+        epoch: of the run that was asked first.
+    """
+    if answer.accepted:
+        return False
+    return answer.code == "stale" or answer.epoch not in (_UNKNOWN_EPOCH, epoch)
 
 
 def find_master(
@@ -318,7 +333,7 @@ class MasterClient:
                 f"{who} did not answer {path} within {self._timeout:g} s "
                 f"({self._participant.settings.describe()}){self._trouble(kind)}"
             )
-        if response.answer.code == "stale" and answers.sent > 1:
+        if answers.sent > 1 and is_unsure(response.answer, self._master.epoch):
             raise Refused(
                 f"{who} was silent when it was asked first, and has forgotten it since: it is not "
                 f"known whether it was done. Look at `rosrm ps`, and ask again if need be",

@@ -5,8 +5,11 @@ from __future__ import annotations
 import signal
 import threading
 
+import pytest
+
 from rosrm.errors import Refused
-from rosrm.ros.client import MasterClient
+from rosrm.ros.client import MasterClient, is_unsure
+from rosrm.ros.control import accepted, refused
 from tests.ros.clusters import PATIENCE, host, service
 
 
@@ -56,3 +59,20 @@ def test_a_request_to_another_run_of_the_master_is_made_anew(make_cluster) -> No
         client._heard += 1000.0  # it greeted the former one just now
         client.submit([service("p")])
         cluster.wait("p", "running")
+
+
+@pytest.mark.parametrize(
+    ("answer", "unsure"),
+    [
+        (accepted(epoch=2), False),  # done, whoever did it
+        (refused("exists", "p is in use already", 1), False),  # by the run that was asked first
+        (refused("exists", "p is in use already", 2), True),  # perhaps by its own first asking
+        (refused("stale", "too old"), True),
+        (refused("invalid", "no such field"), False),  # says nothing of a run: of the request alone
+    ],
+)
+def test_a_refusal_by_another_run_of_the_master_leaves_it_open_what_was_done(
+    answer, unsure
+) -> None:
+    """A repeated request may be turned down for what the former run has done of it."""
+    assert is_unsure(answer, 1) is unsure
