@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from rosrm.criu.log_reading import causes
+from rosrm.criu.log_reading import causes, first_words
 from rosrm.errors import CriuError
 
 #: Names the program itself; nothing else is looked at then.
@@ -32,6 +32,7 @@ OLDEST: Final = (4, 2)
 
 #: Seconds for `criu --version`.
 _ANSWER: Final = 10.0
+_CAP_SYS_ADMIN: Final = 21  # linux/capability.h
 #: An ordinary user's PATH leaves out where Debian has it.
 _PLACES: Final = "/usr/local/sbin:/usr/sbin:/sbin"
 
@@ -61,7 +62,7 @@ class Criu:
         log: Path,
         pass_fds: Sequence[int] = (),
     ) -> None:
-        """Run CRIU and wait for its end. Without root it runs with `--unprivileged`.
+        """Run CRIU and wait for its end; with `--unprivileged`, unless we may do all.
 
         It has a session of its own: a Ctrl-C that is meant for us does not cut a dump in two.
 
@@ -74,7 +75,7 @@ class Criu:
         Raises:
             CriuError: it failed, with the lines of its log that say why; or its time passed.
         """
-        unprivileged = () if os.geteuid() == 0 else ("--unprivileged",)
+        unprivileged = () if may_do_all() else ("--unprivileged",)
         log.unlink(missing_ok=True)  # an older one would be taken for the cause
         words = [*self.command, *arguments, *unprivileged, "--log-file", str(log)]
         with tempfile.TemporaryFile("w+", errors="replace") as said:
@@ -149,7 +150,10 @@ def opened(program: Path) -> Criu:
             check=False,
         )
     except OSError as error:
-        raise CriuError(f"{program} cannot be started: {error.strerror}") from None
+        why = error.strerror
+        if isinstance(error, FileNotFoundError) and program.exists():
+            why = "the C library that it names is missing; if it was moved, install it anew"
+        raise CriuError(f"{program} cannot be started: {why}") from None
     except subprocess.TimeoutExpired:
         raise CriuError(f"{program} --version did not answer within {_ANSWER:g} s") from None
     version = re.search(r"^Version:\s*v?(\d+(?:\.\d+)+)", answer.stdout, re.MULTILINE)
@@ -160,6 +164,13 @@ def opened(program: Path) -> Criu:
             f"and said {said!r}"
         )
     return Criu((str(program),), version[1])
+
+
+def may_do_all() -> bool:
+    """Whether this process has CAP_SYS_ADMIN: root does, but not in every container."""
+    status = Path("/proc/self/status").read_text(encoding="ascii", errors="replace")
+    effective = re.search(r"^CapEff:\s*([0-9a-f]+)", status, re.MULTILINE)
+    return effective is not None and bool(int(effective[1], 16) >> _CAP_SYS_ADMIN & 1)
 
 
 def default_prefix() -> Path:
@@ -193,5 +204,4 @@ def _why(log: Path, output: str) -> str:
         written = log.read_text(errors="replace")
     except OSError:
         written = ""
-    lines = causes(written) or causes(output) or tuple(output.strip().splitlines()[-1:])
-    return "; ".join(lines)
+    return "; ".join(causes(written) or causes(output) or first_words(output))
