@@ -199,6 +199,22 @@ class SpecChecking(Protocol):
         """What is wrong with it, its own `migration.options` included; "": nothing. Pure."""
 
 
+@runtime_checkable
+class HostChecking(Protocol):
+    """A migration strategy that does not work on every host, or not between all of them."""
+
+    @property
+    def ability(self) -> str:
+        """The executor that says of a host whether the strategy works there.
+
+        It is asked once after each registration of a host, without arguments, and answers with
+        what must match on another host, text to text. Where it does not work it raises.
+        """
+
+    def host_fault(self, source: Mapping[str, str], destination: Mapping[str, str]) -> str:
+        """Why nothing can be moved so between two hosts of these answers; "": it can. Pure."""
+
+
 @dataclass(frozen=True)
 class MigrationOffer:
     """Registers a migration strategy; the fields are as in `ProbeOffer`.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from rosrm.core import abilities
 from rosrm.core.commands import Assign
 from rosrm.core.lost_tail import why_no_work
 from rosrm.core.model import EMPTY
@@ -36,8 +37,18 @@ def demand_to_move(
     estimate = state.learned.estimate(process.spec, state.settings.default_needs)
     amounts = larger(estimate.amounts, seen)
     guessed = {name for name in estimate.estimated if amounts[name] > seen.get(name, 0.0)}
-    excluded = {**process.excluded, source: "it is there already"}
+    excluded = {
+        **process.excluded, **_unable(state, process, source), source: "it is there already",
+    }  # fmt: skip
     return Demand(process.spec, amounts, frozenset(guessed), excluded, headroom)
+
+
+def _unable(state: MasterState, process: Process, source: str) -> dict[str, str]:
+    """Hosts to which its strategy cannot move it, with the reason."""
+    strategy = process.spec.migration.strategy or ""
+    here = state.hosts.by_name[source]
+    faults = {host.name: abilities.fault(state, strategy, here, host) for host in state.hosts.hosts}
+    return {name: fault for name, fault in faults.items() if fault}
 
 
 def ranking_of(state: MasterState, demand: Demand) -> Ranking:

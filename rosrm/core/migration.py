@@ -75,7 +75,9 @@ class Start:
     """Start an instance on a host; done when the slave says that it runs.
 
     A shadow is the destination of a handoff: it has an alias, stays silent, and is not restarted.
-    `remappings` come beside those of the process's spec.
+    One that is restored goes on from an image of the source, which earlier steps have brought to
+    the host while the source stands still; nor is it restarted. `remappings` come beside those of
+    the process's spec.
     """
 
     instance: InstanceId
@@ -85,6 +87,7 @@ class Start:
     undo: Step | None = None
     shadow: bool = False
     remappings: Mapping[str, str] = field(default_factory=dict)
+    restored: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,7 +159,11 @@ class Commit:
 
 @dataclass(frozen=True, slots=True)
 class Execute:
-    """The open step: run an executor that the strategy's plugin registered on a slave."""
+    """The open step: run an executor that the strategy's plugin registered on a slave.
+
+    The executor is given the arguments and, as `results`, what the executors of earlier steps of
+    the same run have answered, by their names.
+    """
 
     executor: str
     host: str
@@ -219,6 +226,8 @@ def _step_fault(step: Step, move: Move) -> str:
     numbered = (move.source, move.destination, move.fallback)
     if not isinstance(step, Execute) and step.instance not in numbered:
         return f"names the instance {step.instance}, which is not of this move"
+    if isinstance(step, Start) and step.restored and step.instance != move.destination:
+        return "restores an instance that is not the destination"
     if isinstance(step, Start) and step.shadow:
         return _shadow_fault(step, move)
     return ""

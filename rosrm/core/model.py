@@ -264,6 +264,8 @@ class Assignment:
         fence: when its host stops it, if it and the master do not hear each other; None: never.
         kept_on: hosts that keep a state of the process, the newest first.
         kept_from: states of instances with a lower number are of a former life of the name.
+        restored: it starts from an image of a former instance that lies on the host, and is not
+            restarted until its slave is told otherwise.
     """
 
     instance: InstanceId
@@ -274,6 +276,12 @@ class Assignment:
     fence: Fence | None = None
     kept_on: tuple[str, ...] = ()
     kept_from: int = 0
+    restored: bool = False
+
+    @property
+    def on_trial(self) -> bool:
+        """It is the destination of a move that may still fail."""
+        return self.shadow or self.restored
 
 
 class InstanceState(str, Enum):

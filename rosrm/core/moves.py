@@ -20,14 +20,22 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from rosrm.core import abilities, handoffs, keeping, lifecycle
 from rosrm.core import events as happened
-from rosrm.core import handoffs, keeping, lifecycle
 from rosrm.core.hosts import HostCondition
 from rosrm.core.migration import AwaitReady, Commit, Configure, Start, Step, Stop
 from rosrm.core.model import InstanceId, InstanceState
 from rosrm.core.runs import End
 from rosrm.core.state import MasterState, Process, ProcessPhase, Run, Wanted
-from rosrm.core.steps import DONE, give_order, give_order_again, outcome_of, timed_out, title
+from rosrm.core.steps import (
+    DONE,
+    give_order,
+    give_order_again,
+    note_result,
+    outcome_of,
+    timed_out,
+    title,
+)
 
 # --- go on ------------------------------------------------------------------------------------
 
@@ -41,11 +49,14 @@ def advance_all(state: MasterState, now: float) -> None:
 
 def order_answered(state: MasterState, event: happened.OrderAnswered, now: float) -> None:
     """A slave took an order, refused it, or did not answer in time."""
-    keeping.order_answered(state, event)
+    if keeping.order_answered(state, event) or abilities.order_answered(state, event, now):
+        return
     name = state.runs_by_order.pop(event.order, None)
     run = state.runs.get(name) if name is not None else None
     if run is not None and run.order == event.order and event.code != "timeout":
         run.answer = (event.accepted, event.message or event.code)
+        if event.accepted and event.result:
+            note_result(run, event.result)
 
 
 def _advance(state: MasterState, run: Run, now: float) -> bool:

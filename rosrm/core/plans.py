@@ -152,6 +152,7 @@ _READ: Final[Mapping[str, Callable[[Any], Any]]] = {
     "settle": _number,
     "node_name": _text,
     "shadow": _truth,
+    "restored": _truth,
     "phase": _phase,
     "awaited": _truth,
     "restart": _restart,

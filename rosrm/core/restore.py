@@ -164,6 +164,7 @@ def _run_of(state: MasterState, process: Process, move: Mapping[str, Any], now: 
         move["destination_node"], wall, index=int(move["index"]), turned_at=int(move["turned_at"]),
         committed=bool(move["committed"]), failure=move["failure"],
         launched=set(move["launched"]), suspended=set(move["suspended"]),
+        results=dict(move.get("results", {})),  # older journals have none
     )  # fmt: skip
     if move["back"]:
         run.undo = way_back(plan, run.turned_at)

@@ -79,6 +79,7 @@ class Run:
         ended: how its instances ended, by number.
         heard: what they said of a handoff, by number.
         taking_over: the destination was told to go on without its source.
+        results: what executors have answered, by their names.
     """
 
     process: str
@@ -110,6 +111,7 @@ class Run:
     ended: dict[int, End] = field(default_factory=dict)
     heard: dict[int, Heard] = field(default_factory=dict)
     taking_over: bool = False
+    results: dict[str, Mapping[str, Any]] = field(default_factory=dict)
     plain_plan: PlainPlan = field(init=False)
 
     def __post_init__(self) -> None:
@@ -185,6 +187,7 @@ def run_to_dict(run: Run, stopping: Sequence[int]) -> dict[str, Any]:
         "committed": run.committed, "failure": run.failure, "launched": sorted(run.launched),
         "suspended": sorted(run.suspended), "stopping": list(stopping),
         "ended": {str(number): _end_to_dict(end) for number, end in run.ended.items()},
+        "results": {name: dict(result) for name, result in run.results.items()},
     }  # fmt: skip
 
 

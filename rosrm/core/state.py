@@ -9,6 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from rosrm.core.abilities import Abilities
 from rosrm.core.columns import FloatArray
 from rosrm.core.commands import Command
 from rosrm.core.fencing import fence_of
@@ -106,6 +107,7 @@ class MasterState:
         self.rankings_version = 0
         self.placed_at: tuple[int, ...] = ()
         self.keeping = Keeping()
+        self.abilities = Abilities()
         self.next_order = 1
         self.next_instance = 1
         self.reserved_instances = 1
@@ -334,17 +336,18 @@ class MasterState:
 
     def assignment(
         self, instance: InstanceId, spec: ProcessSpec, node_name: str = "", *,
-        shadow: bool = False,
+        shadow: bool = False, restored: bool = False,
     ) -> Assignment:  # fmt: skip
         """The order for a slave to run an instance."""
         fence = fence_of(spec, self.settings)
         kept_on: tuple[str, ...] = ()
         born = self.processes[spec.name].born if spec.name in self.processes else 0
-        if spec.keeps_state and not shadow:
+        if spec.keeps_state and not shadow and not restored:
             kept_on = self.keeping.in_reach(spec.name, born, self.hosts)
         return Assignment(
-            instance, spec, self.epoch, node_name or spec.name, shadow, fence, kept_on, born
-        )
+            instance, spec, self.epoch, node_name or spec.name, shadow, fence, kept_on, born,
+            restored,
+        )  # fmt: skip
 
     def note_decision(self, process: Process, decision: Decision, kind: str, now: float) -> None:
         """Remember the newest decision about a process, for `explain`."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import singledispatch
 from typing import Any, Final
@@ -48,13 +49,24 @@ def give_order(state: MasterState, run: Run, step: Step, now: float) -> None:
         state.emit(
             Order(
                 run.order, host.host_id, "execute", executor=step.executor,
-                arguments=step.arguments, timeout=step.timeout,
+                arguments=_arguments(run, step), timeout=step.timeout,
             )
         )  # fmt: skip
     elif isinstance(step, SetRestart):
         _order_restart_policy(state, run, step, host)
     else:
         _order_start(state, run, step, host, now)
+
+
+def _arguments(run: Run, step: Execute) -> Mapping[str, Any]:
+    return {**step.arguments, "results": run.results} if run.results else step.arguments
+
+
+def note_result(run: Run, result: Mapping[str, Any]) -> None:
+    """What an executor has answered is for those of later steps."""
+    step = run.step_in_hand
+    if isinstance(step, Execute):
+        run.results[step.executor] = result
 
 
 def _order_restart_policy(state: MasterState, run: Run, step: SetRestart, host: Host) -> None:
@@ -70,7 +82,7 @@ def _order_start(state: MasterState, run: Run, step: Start, host: Host, now: flo
     if _in_the_way(state, run, step, now):
         return
     run.launched.add(number)
-    if step.shadow:
+    if step.shadow or step.restored:
         run.suspended.add(number)
     state.save_run(run)
     if number not in state.instances and number not in run.ended:
@@ -81,18 +93,22 @@ def _order_start(state: MasterState, run: Run, step: Start, host: Host, now: flo
         instance.node_name = step.node_name
         state.save(process)
     remapped = replace(spec, remappings={**spec.remappings, **step.remappings})
-    assignment = state.assignment(step.instance, remapped, step.node_name, shadow=step.shadow)
+    assignment = state.assignment(
+        step.instance, remapped, step.node_name, shadow=step.shadow, restored=step.restored
+    )
     state.emit(Order(run.order, host.host_id, "start", step.instance, assignment))
 
 
 def _in_the_way(state: MasterState, run: Run, step: Start, now: float) -> bool:
     """Another instance of the name may still run, and the plan does not allow two at a time.
 
+    A source of which there is an image stands still.
     On the way back it is stopped, whatever the plan says: the step that did not stop it failed.
     """
     process = state.processes[run.process]
     back = run.undo is not None
-    if not back and (run.plan.overlap > 0.0 or step.node_name not in ("", process.name)):
+    aliased = step.node_name not in ("", process.name)
+    if not back and (run.plan.overlap > 0.0 or aliased or step.restored):
         return False
     others = [one for one in state.instances_of(process) if one.id != step.instance]
     for other in others:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Final
 
+from rosrm.core import abilities, keeping
 from rosrm.core import events as happened
-from rosrm.core import keeping
 from rosrm.core.assigning import reconsider_set_aside
 from rosrm.core.charges import settle_charge
 from rosrm.core.commands import Order, Redeliver, Withdraw
@@ -34,6 +34,7 @@ def time_passed(state: MasterState, event: happened.TimePassed, now: float) -> N
     review_lost_hosts(state, now)
     review_standbys(state, now)
     _ask_for_missing_statuses(state, now)
+    abilities.ask_hosts(state, now)
     relieve_hosts(state, now)
     keeping.review(state, now)
     reconsider_set_aside(state, now)

@@ -49,8 +49,8 @@ def launch_order(
         argv=(*command, *arguments),
         environment=environment,
         working_directory=_working_directory(spec),
-        # A shadow that has ended is never started again: the source is active all the while.
-        restart=RestartPolicy("never") if assignment.shadow else spec.restart,
+        # One that ended in a move is never started again: the source is there, and may go on.
+        restart=RestartPolicy("never") if assignment.on_trial else spec.restart,
         stop=spec.stop,
         fence=assignment.fence,
         heard=heard,

@@ -110,7 +110,7 @@ def _refused(
 def _waiting(assignment: Assignment) -> Held:
     spec = assignment.spec
     awaited = None
-    if awaits_graph(spec):
+    if awaits_graph(spec) and not assignment.restored:  # that one joins the graph when it may
         name = qualified_name(spec.namespace, assignment.node_name)
         awaited = Awaited(name, spec.readiness.timeout)
     status = InstanceStatus(assignment.instance, InstanceState.HELD)

@@ -259,14 +259,11 @@ class Machine:
     def obey(self, order: Order, now: float) -> happened.OrderAnswered:
         """The slave takes an order."""
         if order.action == "execute":
-            accepted, message = True, ""
             try:
-                self.executors[order.executor](order.arguments)
+                result = self.executors[order.executor](order.arguments)
             except Exception as error:  # noqa: BLE001 - what a test's executor does
-                accepted, message = False, str(error)
-            return happened.OrderAnswered(
-                order.order, accepted, "" if accepted else "failed", message
-            )
+                return happened.OrderAnswered(order.order, False, "failed", str(error))
+            return happened.OrderAnswered(order.order, True, result=result)
         if order.action == "set_restart":
             return self._set_restart(order, now)
         if order.action in ("keep", "drop_kept"):

@@ -1,0 +1,152 @@
+"""Where a migration strategy works: each host is asked, by an executor of the strategy's plugin.
+
+=============================  ==============================================================
+of a host                      what is done
+=============================  ==============================================================
+it is up, and was not asked    `execute` of the strategy's executor
+it has answered                its answer holds until it registers anew
+it did not answer              it is asked again after a while
+=============================  ==============================================================
+
+Nothing of it is durable, and until a host has answered nothing is moved to or from it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from math import inf
+from typing import TYPE_CHECKING, Final
+
+from rosrm.core import events as happened
+from rosrm.core.commands import Order
+from rosrm.core.hosts import Host, HostCondition
+from rosrm.ports import HostChecking
+
+if TYPE_CHECKING:
+    from rosrm.core.state import MasterState
+
+#: Seconds for an answer, and until a host that gave none is asked again.
+_PATIENCE: Final = 30.0
+_ASK_AGAIN: Final = 10.0
+#: Numbers of the orders are apart from those of all else: a record that is replayed without a
+#: strategy must not number its orders otherwise.
+_BEFORE_FIRST: Final = 1 << 41
+
+
+@dataclass(slots=True)
+class Answer:
+    """What one host says of one strategy.
+
+    Attributes:
+        incarnation: of the slave that was asked.
+        order: by which it was asked.
+        facts: None: it has not answered, or the strategy does not work there.
+        reason: why it does not.
+        ask_at: when it is asked again; inf: there is no need.
+    """
+
+    incarnation: int
+    order: int
+    facts: Mapping[str, str] | None = None
+    reason: str = ""
+    ask_at: float = inf
+
+
+@dataclass(slots=True)
+class Abilities:
+    """What all hosts say of all strategies that are not for every host.
+
+    Attributes:
+        answers: by strategy and host.
+        last_order: by which a host was asked.
+    """
+
+    answers: dict[tuple[str, str], Answer] = field(default_factory=dict)
+    last_order: int = _BEFORE_FIRST
+
+
+def ask_hosts(state: MasterState, now: float) -> None:
+    """Ask every host that is up and has not been asked, or did not answer."""
+    for name, strategy in _checking(state):
+        for host in state.hosts.hosts:
+            if state.hosts.condition_of(host) is HostCondition.UP:
+                _ask(state, name, strategy, host, now)
+
+
+def _checking(state: MasterState) -> Iterator[tuple[str, HostChecking]]:
+    for name, strategy in state.strategies.items():
+        if isinstance(strategy, HostChecking):
+            yield name, strategy
+
+
+def _ask(state: MasterState, name: str, strategy: HostChecking, host: Host, now: float) -> None:
+    known = state.abilities.answers.get((name, host.name))
+    incarnation = host.description.incarnation
+    if known is not None and known.incarnation == incarnation and now < known.ask_at:
+        return
+    if strategy.ability not in host.description.executors:
+        reason = f"the plugin of {name!r} is not installed there"
+        state.abilities.answers[name, host.name] = Answer(incarnation, 0, reason=reason)
+        return
+    state.abilities.last_order += 1
+    order = state.abilities.last_order
+    state.abilities.answers[name, host.name] = Answer(
+        incarnation, order, ask_at=now + _PATIENCE + _ASK_AGAIN
+    )
+    state.emit(Order(order, host.host_id, "execute", executor=strategy.ability, timeout=_PATIENCE))
+
+
+def order_answered(state: MasterState, event: happened.OrderAnswered, now: float) -> bool:
+    """Whether the answer was to a question of this module; it is noted then."""
+    if event.order <= _BEFORE_FIRST:
+        return False
+    for (strategy, host), answer in state.abilities.answers.items():
+        if answer.order == event.order:
+            _note(state, strategy, host, answer, event, now)
+            return True
+    return False
+
+
+def _note(
+    state: MasterState,
+    strategy: str,
+    host: str,
+    answer: Answer,
+    event: happened.OrderAnswered,
+    now: float,
+) -> None:
+    if event.accepted:
+        answer.facts = {key: str(value) for key, value in (event.result or {}).items()}
+        answer.reason, answer.ask_at = "", inf
+    elif event.code == "timeout":
+        answer.ask_at = now + _ASK_AGAIN
+    else:
+        answer.reason, answer.ask_at = event.message or event.code, inf
+        state.record(
+            now, "strategy_absent", f"{strategy} does not work on {host}: {answer.reason}",
+            host=host, facts={"strategy": strategy},
+        )  # fmt: skip
+
+
+def fault(state: MasterState, strategy: str, source: Host, destination: Host) -> str:
+    """Why a strategy cannot move anything from one host to another; "": it can, by what is known.
+
+    Args:
+        strategy: its name; one that works everywhere has no fault.
+    """
+    checking: object = state.strategies.get(strategy)
+    if not isinstance(checking, HostChecking):
+        return ""
+    facts = []
+    for host in (source, destination):
+        answer = state.abilities.answers.get((strategy, host.name))
+        if answer is None or (answer.facts is None and not answer.reason):
+            return f"it is not known yet whether {strategy} works on {host.name}"
+        if answer.facts is None:
+            return f"{strategy} does not work on {host.name}: {answer.reason}"
+        facts.append(answer.facts)
+    try:
+        return str(checking.host_fault(*facts))
+    except Exception as error:  # noqa: BLE001 - a third party's code: anything may come
+        return f"{strategy} cannot say whether it can go there: {type(error).__name__}: {error}"

@@ -1,0 +1,154 @@
+"""Strategies that do not work on every host: who is asked, what follows, what executors answer."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from rosrm.core.commands import Order
+from rosrm.core.migration import Commit, Execute, Move, Plan, SetRestart, Start, Stop
+from rosrm.core.model import MigrationPolicy, RestartPolicy
+from tests.unit.core.cluster import Cluster, process
+from tests.unit.core.machine import Machine
+
+
+class Freezing:
+    """Takes an image of the source, and goes on from it: as `criu` does."""
+
+    ability = "can_freeze"
+
+    def host_fault(self, source: Mapping[str, str], destination: Mapping[str, str]) -> str:
+        same = source["version"] == destination["version"]
+        return "" if same else f"it has version {destination['version']}"
+
+    def propose(self, move: Move) -> Plan:
+        here, there, policy = move.source_host, move.destination_host, move.spec.restart
+        give_back = SetRestart(move.source, here, policy, 5.0)
+        stop_there = Stop(move.destination, there, 5.0)
+        return Plan(
+            (
+                SetRestart(move.source, here, RestartPolicy("never"), 5.0, undo=give_back),
+                Execute("freeze", here, {"of": move.source.number}, 5.0),
+                Execute("fetch", there, {"for": move.destination.number}, 5.0),
+                Start(move.destination, there, 5.0, undo=stop_there, restored=True),
+                Commit(),
+                SetRestart(move.destination, there, policy, 5.0),
+                Stop(move.source, here, 5.0),
+            )
+        )
+
+
+class Host:
+    """A machine with the executors of `Freezing`, which remembers what they were asked."""
+
+    def __init__(self, name: str, version: str = "4.2", **fields: Any) -> None:
+        self.asked: list[tuple[str, Mapping[str, Any]]] = []
+        self.ability: Any = {"version": version}
+        self.machine = Machine(
+            name,
+            executors={"can_freeze": self._say, "freeze": self._freeze, "fetch": self._fetch},
+            **fields,
+        )
+
+    def _say(self, arguments: Mapping[str, Any]) -> Any:
+        self.asked.append(("can_freeze", arguments))
+        if isinstance(self.ability, Exception):
+            raise self.ability
+        return self.ability
+
+    def _freeze(self, arguments: Mapping[str, Any]) -> Any:
+        self.asked.append(("freeze", arguments))
+        return {"port": 4242}
+
+    def _fetch(self, arguments: Mapping[str, Any]) -> Any:
+        self.asked.append(("fetch", arguments))
+        return {}
+
+
+def frozen(*hosts: Host | Machine) -> Cluster:
+    """A process that moves by `Freezing`, on the first of these hosts."""
+    machines = [host.machine if isinstance(host, Host) else host for host in hosts]
+    cluster = Cluster(*machines, strategies={"freezing": Freezing()})
+    cluster.submit(process("p", migration=MigrationPolicy("freezing")))
+    cluster.wait(1.0)
+    assert cluster.where("p") == ["a"]
+    return cluster
+
+
+def busy(name: str, version: str = "4.2") -> Host:
+    return Host(name, version, busy={"memory": 0.5})
+
+
+def test_each_host_is_asked_once_after_its_registration():
+    """And again when its slave is another one."""
+    host = Host("a")
+    cluster = frozen(host)
+    cluster.wait(60.0)
+    assert host.asked == [("can_freeze", {})]
+    host.machine.incarnation += 100
+    host.machine.connected = False
+    cluster.wait(1.5)
+    host.machine.connected = True
+    cluster.register(host.machine)
+    cluster.wait(2.0)
+    assert [name for name, _ in host.asked] == ["can_freeze", "can_freeze"]
+
+
+def test_a_process_moves_to_a_host_of_the_same_ability():
+    """The image's place is told to who fetches it, and the new instance starts from the image."""
+    here, there = Host("a"), busy("b")
+    cluster = frozen(here, there)
+    number = cluster["p"].owner
+    assert cluster.migrate("p").accepted
+    cluster.wait(2.0)
+    assert (cluster.phase("p"), cluster.where("p")) == ("running", ["b"])
+    assert here.asked[-1] == ("freeze", {"of": number})
+    fetched = there.asked[-1][1]
+    assert fetched["results"] == {"freeze": {"port": 4242}}
+    (start,) = (one for one in cluster.carried if isinstance(one, Order) and one.action == "start")
+    assert start.assignment is not None
+    assert start.assignment.restored
+
+
+def test_where_it_does_not_work_nothing_goes():
+    """With the host's own reason, in the answer to who asked."""
+    there = busy("b")
+    there.ability = RuntimeError("CRIU 3.17 is too old")
+    cluster = frozen(Host("a"), there)
+    reply = cluster.migrate("p", "b")
+    assert not reply.accepted
+    assert "freezing does not work on b: CRIU 3.17 is too old" in reply.message
+    assert "freezing does not work on b" in " ".join(cluster.told("strategy_absent"))
+
+
+def test_hosts_that_do_not_match_are_no_destination():
+    """By the strategy's own comparison."""
+    cluster = frozen(Host("a"), busy("b", "4.1"), busy("c"))
+    reply = cluster.migrate("p", "b")
+    assert "it has version 4.1" in reply.message
+    assert cluster.migrate("p").accepted
+    cluster.wait(2.0)
+    assert cluster.where("p") == ["c"]
+
+
+def test_a_host_without_the_plugin_is_no_destination():
+    """It is not even asked."""
+    cluster = frozen(Host("a"), Machine("b", busy={"memory": 0.5}))
+    assert "is not installed there" in cluster.migrate("p", "b").message
+
+
+def test_what_an_executor_answered_outlives_the_master():
+    """A later step needs it, whichever run of the master gives that."""
+    here, there = Host("a"), busy("b")
+    cluster = frozen(here, there)
+    there.machine.connected = False
+    cluster.migrate("p", "b")
+    cluster.wait(0.5)
+    assert here.asked[-1][0] == "freeze"
+    cluster.kill_master()
+    there.machine.connected = True
+    cluster.restart_master()
+    cluster.wait(5.0)
+    fetches = [arguments for name, arguments in there.asked if name == "fetch"]
+    assert fetches[-1]["results"] == {"freeze": {"port": 4242}}
+    assert cluster.where("p") == ["b"]
