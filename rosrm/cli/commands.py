@@ -21,6 +21,7 @@ from typer.core import TyperGroup
 
 from rosrm.cli import acting, checking, following, listing, simulate, starting
 from rosrm.cli.app import INTERRUPTED
+from rosrm.cli.criu import criu
 from rosrm.cli.lab import lab
 from rosrm.cli.options import Common, Domain
 from rosrm.errors import RosrmError
@@ -86,3 +87,4 @@ for module in (starting, acting, listing, following, simulate):
         app.command()(function)
 app.add_typer(checking.config, name="config")
 app.add_typer(lab, name="lab")
+app.add_typer(criu, name="criu")

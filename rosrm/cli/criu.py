@@ -1,0 +1,154 @@
+"""`rosrm criu`: the program that dumps and restores processes, for the strategy `criu`."""
+
+# Each command imports what it needs when it runs, so that `rosrm --help` is quick.
+# ruff: noqa: PLC0415
+
+from __future__ import annotations
+
+import os
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from rosrm.cli.options import AsJson
+
+if TYPE_CHECKING:
+    from rosrm.criu.probe import Ability
+    from rosrm.criu.program import Criu
+
+criu = typer.Typer(
+    no_args_is_help=True,
+    help="CRIU, which moves a process with its whole memory: install it, or see what it can do.",
+)
+
+Prefix = Annotated[
+    Path | None,
+    typer.Option(
+        "--prefix",
+        metavar="FOLDER",
+        help="Where it is, or goes; default: ROSRM_CRIU_PREFIX, or below the user's data.",
+    ),
+]
+
+
+@criu.callback()
+def _group() -> None:
+    """CRIU, which moves a process with its whole memory."""
+
+
+@criu.command()
+def install(
+    prefix: Prefix = None,
+    given: Annotated[
+        Path | None,
+        typer.Option(
+            "--from",
+            metavar="PATH",
+            help="Packages (*.deb) that are there already: a folder of them, or a file.",
+        ),
+    ] = None,
+    mirror: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--mirror",
+            metavar="URL",
+            help="Of the distribution's archive, instead of what apt's sources say.",
+        ),
+    ] = None,
+) -> None:
+    """Bring a CRIU that works into a folder of its own. The system is not touched.
+
+    Needs no root. Nothing is done where one works already.
+    """
+    from rosrm.criu import installing
+    from rosrm.criu.probe import probe
+    from rosrm.criu.program import PREFIX_VARIABLE, PROGRAM_VARIABLE, default_prefix
+
+    where = (prefix or default_prefix()).absolute()
+    if given is None:
+        found, able = _tried(where)
+        if found and able.works:
+            typer.echo(f"CRIU {found.version} works here: {found.command[0]}; nothing to install")
+            return
+    new = installing.install(where, _say, given=given, mirrors=mirror or ())
+    typer.echo(f"CRIU {new.version} is installed: {new.command[0]}")
+    if where != default_prefix():
+        typer.echo(f"rosrm finds it there with {PREFIX_VARIABLE}={where}")
+    if os.environ.get(PROGRAM_VARIABLE):
+        _note(f"{PROGRAM_VARIABLE} is set, so that rosrm uses that program instead")
+    able = probe(new)
+    if able.works:
+        typer.echo("it works: a process was dumped and restored")
+    else:
+        _note(f"it does not work yet: {able.reason}")
+
+
+@criu.command()
+def check(prefix: Prefix = None, as_json: AsJson = False) -> None:
+    """Try it here: dump and restore a process, and say what works and what does not.
+
+    The exit code is 0 only if it works.
+    """
+    from rosrm.cli import json_forms
+    from rosrm.criu.program import default_prefix
+
+    found, able = _tried((prefix or default_prefix()).absolute())
+    if as_json:
+        json_forms.show({"program": found.command[0] if found else None, **asdict(able)})
+    else:
+        for good, what, said in _lines(found, able):
+            typer.echo(f"{'ok' if good else 'NO':4}{what:18}{said}")
+    if not able.works:
+        raise typer.Exit(1)
+
+
+# --- inner parts ------------------------------------------------------------------------------
+
+
+def _tried(prefix: Path) -> tuple[Criu | None, Ability]:
+    """The CRIU to use here, if there is one, and what it can do."""
+    from rosrm.criu.probe import Ability, probe
+    from rosrm.criu.program import find
+    from rosrm.errors import CriuError
+
+    try:
+        found = find(prefix)
+    except CriuError as error:
+        return None, Ability(False, str(error), {})
+    return found, probe(found)
+
+
+def _lines(found: Criu | None, able: Ability) -> list[tuple[bool, str, str]]:
+    """Line by line: whether it is well, what is looked at, what is said."""
+    if found is None:
+        return [(False, "program", able.reason)]
+    from rosrm.criu.program import OLDEST
+
+    facts = able.facts
+    whose = "every user" if facts["all_users"] == "yes" else f"the user {facts['uid']} alone"
+    enough = found.number >= OLDEST
+    wanted = "" if enough else f" ({'.'.join(map(str, OLDEST))} or newer is meant)"
+    said = "a process with a UDP socket was dumped, restored and went on" if able.works else ""
+    python = f"{facts['python']} ({facts['python_version']}), {facts['libc']}"
+    return [
+        (True, "program", found.command[0]),
+        (enough, "version", found.version + wanted),
+        (True, "processes", f"of {whose}"),
+        (able.works, "dump and restore", said or able.reason),
+        (True, "kernel", f"{facts['kernel']} on {facts['machine']}"),
+        (
+            True,
+            "same elsewhere",
+            f"Python {python}, {len(facts['cpu'].split())} processor features",
+        ),
+    ]
+
+
+def _say(step: str) -> None:
+    typer.echo(f"  {step}")
+
+
+def _note(text: str) -> None:
+    typer.echo(f"rosrm: note: {text}", err=True)
