@@ -10,7 +10,9 @@ RosrmError                  what a user reads: no traceback is shown for it
 │   └── JournalBlocked      not just now: it may pass by itself
 ├── RecordError             the record of a master's run cannot be read
 ├── SupervisorError         the supervisor cannot be started or reached
+├── TransferError           a directory cannot be moved to another host
 ├── LabError                a virtual host or its network cannot be made, or is not there
+├── PortableError           a node that cannot leave the ROS graph, or join it again, and why
 └── CriuError               there is no CRIU that works here, or it could not dump or restore
 
 SkipPlugin                  not an error: a plugin says that it is absent here, and why
@@ -76,12 +78,20 @@ class SupervisorError(RosrmError):
     """The supervisor of this host cannot be started or reached."""
 
 
+class TransferError(RosrmError):
+    """A directory cannot be offered to another host, or fetched from one; nothing is left of it."""
+
+
 class LabError(RosrmError):
     """A virtual host or its network cannot be made, changed or found."""
 
 
 class CriuError(RosrmError):
     """There is no CRIU that works here, or it could not dump or restore, and why."""
+
+
+class PortableError(RosrmError):
+    """A node that cannot be asked to leave the ROS graph or to join it again, or does not do it."""
 
 
 class SkipPlugin(Exception):

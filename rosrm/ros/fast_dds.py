@@ -20,30 +20,36 @@ Pace = Literal["eager", "steady", "movable"]
 _OF_PARTS: Final = ("eager", "steady")
 
 
-def announcements(environment: Mapping[str, str], pace: Pace) -> dict[str, str]:
+def announcements(
+    environment: Mapping[str, str], pace: Pace, *, udp: bool = False
+) -> dict[str, str]:
     """Variables that Fast DDS makes a participant by; none where a user set a profile.
 
     Args:
         environment: that a user may have set a profile, or transports, in.
         pace: the profile.
+        udp: over UDP alone, also where it is no part of rosrm.
     """
     if any(variable in environment for variable in _VARIABLES):
         return {}
     variables = {_VARIABLES[0]: str(_PROFILES / f"{pace}.xml")}
-    if pace in _OF_PARTS and _TRANSPORTS not in environment:
+    if (udp or pace in _OF_PARTS) and _TRANSPORTS not in environment:
         variables[_TRANSPORTS] = "UDPv4"
     return variables
 
 
 @contextlib.contextmanager
-def announcing(environment: MutableMapping[str, str], pace: Pace) -> Iterator[None]:
+def announcing(
+    environment: MutableMapping[str, str], pace: Pace, *, udp: bool = False
+) -> Iterator[None]:
     """Give Fast DDS a profile while a participant is made, unless the user has given one.
 
     Args:
         environment: of this process; it is as it was afterwards, for who is started by it.
         pace: the profile.
+        udp: over UDP alone, also where it is no part of rosrm.
     """
-    added = announcements(environment, pace)
+    added = announcements(environment, pace, udp=udp)
     environment.update(added)
     try:
         yield

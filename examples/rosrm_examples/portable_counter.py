@@ -1,0 +1,84 @@
+"""A counter whose whole memory moves with it, by CRIU: nothing of it is on a topic.
+
+    python -m rosrm_examples.portable_counter --mb 100 --period 0.02
+
+It holds MB of memory and publishes on `count` (std_msgs/Int64MultiArray) the count, 1, 2, 3, ...;
+how often it has read all its memory; and the CRC-32 of what it found there the last time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import random
+import sys
+import zlib
+from collections.abc import Sequence
+
+from std_msgs.msg import Int64MultiArray
+
+from rosrm.node import PortableNode, run_portable
+
+#: Bytes that are read at each count, so that no count takes long.
+SLICE = 4_000_000
+
+
+class PortableCounter(PortableNode):
+    """Counts, and reads its memory over and over.
+
+    Args:
+        mb: of memory, 1 MB = 10^6 bytes; the content is the same in each run.
+        period: seconds between two counts.
+    """
+
+    def __init__(self, mb: float = 1.0, period: float = 0.1) -> None:
+        super().__init__("portable_counter")
+        self.memory = random.Random(0).randbytes(int(mb * 1e6))  # noqa: S311 - no secret
+        self.period = period
+        self.count = self.passes = self.checksum = 0
+        self.at = self.checksum_so_far = 0
+
+    def join(self) -> None:
+        """Makes its part in the ROS graph, anew after each move."""
+        self.output = self.create_publisher(Int64MultiArray, "count", 100)
+        self.create_timer(self.period, self.tick)
+
+    def tick(self) -> None:
+        """Counts on."""
+        self.read_on()
+        self.count += 1
+        self.output.publish(Int64MultiArray(data=[self.count, self.passes, self.checksum]))
+
+    def read_on(self) -> None:
+        """Reads the next slice of the memory."""
+        part = memoryview(self.memory)[self.at : self.at + SLICE]
+        self.checksum_so_far = zlib.crc32(part, self.checksum_so_far)
+        self.at += SLICE
+        if self.at >= len(self.memory):
+            self.passes, self.checksum = self.passes + 1, self.checksum_so_far
+            self.at = self.checksum_so_far = 0
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Counts until told to stop."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    at = given.index("--ros-args") if "--ros-args" in given else len(given)
+    parser = argparse.ArgumentParser(prog="python -m rosrm_examples.portable_counter")
+    parser.add_argument("--mb", type=_positive, default=1.0, help="MB of memory")
+    parser.add_argument("--period", type=_positive, default=0.1, help="seconds between two counts")
+    options = parser.parse_args(given[:at])
+    run_portable(lambda: PortableCounter(options.mb, options.period), args=given[at:])
+
+
+def _positive(text: str) -> float:
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not 0 < number < math.inf:
+        raise argparse.ArgumentTypeError(f"{text} is not a number above 0")
+    return number
+
+
+if __name__ == "__main__":
+    main()

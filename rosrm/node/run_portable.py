@@ -1,0 +1,319 @@
+"""`run_portable`: runs a portable node, and has it leave and join again when rosrm asks for it."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import os
+import queue
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+import rclpy
+from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
+from rclpy.signals import uninstall_signal_handlers
+
+from rosrm.errors import PortableError
+from rosrm.node.absence import Absence
+from rosrm.node.left import what_is_left
+from rosrm.node.portable import PortableNode
+from rosrm.portable import SIGNAL, VARIABLE, Request, State, Status, Want
+from rosrm.portable.listening import Listener
+from rosrm.ros import fast_dds_place
+
+#: Seconds between two looks at what is asked, where the signal is lost: while it runs, while it is
+#: away. An idle node is woken as often; one that works notices the signal after its callback.
+_LOOK: Final = 0.25
+_LOOK_AWAY: Final = 0.05
+#: Seconds within which what the callbacks have begun (threads, coroutines) has to end.
+_REST: Final = 5.0
+
+
+def run_portable(
+    make: Callable[[], PortableNode],
+    *,
+    args: Sequence[str] | None = None,
+    executor: Callable[[], Executor] = SingleThreadedExecutor,
+    patience: float = 1.0,
+) -> None:
+    """Run a node until the process is told to end; call it last, in the main thread.
+
+    Started by hand, it is `rclpy.init`, the node, `rclpy.spin`. Under rosrm it leaves the ROS graph
+    between two callbacks when it is asked to, and joins again when it is asked to.
+
+    Args:
+        make: returns the node, a `PortableNode`; called once.
+        args: command line; None: the process's own.
+        executor: makes what runs the callbacks, anew after each move.
+        patience: seconds that a node waits after a move, before its callbacks go on, until it has
+            found as many readers and writers of its topics as it had before.
+
+    Raises:
+        PortableError: it cannot join again, or its control directory cannot be used.
+        TypeError: the node makes in its constructor what belongs into `join`.
+        Exception: what a callback raised.
+    """
+    given = list(sys.argv if args is None else args)
+    directory = os.environ.get(VARIABLE, "")
+    run = _Run(given, executor, patience, Path(directory) if directory else None)
+    try:
+        run.begin(make)
+        run.until_the_end()
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except BaseException as error:
+        run.say_failed(error)
+        raise
+    finally:
+        run.end()
+
+
+class _Ended(Exception):
+    """The process was told to end while its node was away."""
+
+
+class _Run:
+    """One portable node in its process."""
+
+    def __init__(
+        self,
+        args: list[str],
+        make_executor: Callable[[], Executor],
+        patience: float,
+        directory: Path | None,
+    ) -> None:
+        self._args = args
+        self._make_executor = make_executor
+        self._patience = patience
+        self._listener = None if directory is None else Listener(directory)
+        # Filled by a signal handler: of all queues only this one may be (it is reentrant).
+        self._woken: queue.SimpleQueue[None] = queue.SimpleQueue()
+        self._looked = 0.0
+        self._node: Any = None
+        self._executor: Any = None
+        if self._listener is not None:
+            signal.signal(SIGNAL, lambda *_: self._woken.put(None))
+
+    # --- the course of a life --------------------------------------------------------------
+
+    def begin(self, make: Callable[[], PortableNode]) -> None:
+        """Join for the first time."""
+        rclpy.init(args=self._args)
+        self._node = make()
+        self._node._portable_join_first()  # noqa: SLF001 - the other half of one thing
+        self._add_executor()
+        if self._listener is not None:
+            self._listener.say(Status(State.RUNNING))
+
+    def until_the_end(self) -> None:
+        """Run, leave, wait and join again, until the context is shut down."""
+        with contextlib.suppress(_Ended):
+            while (request := self._spin()) is not None:
+                absence, fault = self._leave(request)
+                if not fault:
+                    request = self._wait_away()
+                self._join(request, absence, fault)
+
+    def end(self) -> None:
+        """The process ends; the log says why, where it is not in good order."""
+        if self._node is not None and rclpy.ok():
+            self._node.destroy_node()
+        if self._executor is not None:
+            self._executor.shutdown()
+        rclpy.try_shutdown()
+        if self._listener is not None and self._listener.status.state is not State.FAILED:
+            self._listener.close()
+
+    def say_failed(self, error: BaseException) -> None:
+        """Tell whoever waits; the traceback is in the log."""
+        if self._listener is not None:
+            said = str(error) if isinstance(error, PortableError) else _said(error)
+            self._listener.say(Status(State.FAILED, self._listener.status.request, said))
+
+    # --- running ---------------------------------------------------------------------------
+
+    def _add_executor(self) -> None:
+        self._executor = self._make_executor()
+        self._executor.add_node(self._node)
+
+    def _spin(self) -> Request | None:
+        """Run callbacks until the node shall leave; None: it is over."""
+        timeout = None if self._listener is None else _LOOK
+        while self._executor.context.ok():
+            self._executor.spin_once(timeout_sec=timeout)
+            request = self._asked()
+            if request is not None:
+                return request
+        return None
+
+    def _asked(self) -> Request | None:
+        now = time.monotonic()
+        if self._listener is None or (self._woken.empty() and now < self._looked + _LOOK):
+            return None
+        self._looked = now
+        self._clear()
+        return self._listener.asked()
+
+    def _clear(self) -> None:
+        with contextlib.suppress(queue.Empty):
+            while True:
+                self._woken.get_nowait()
+
+    # --- leaving ---------------------------------------------------------------------------
+
+    def _leave(self, request: Request) -> tuple[Absence | None, str]:
+        """Leave the graph: how the node was, and why it cannot stay away ("": it can).
+
+        Nothing was done (and no absence is returned) where that is known beforehand.
+        """
+        began = time.monotonic()
+        listener = self._its_listener()
+        listener.say(Status(State.LEAVING, request.id))
+        try:
+            fast_dds_place.check()
+            self._come_to_rest()
+        except PortableError as error:
+            return None, str(error)
+        absence, fault = self._depart()
+        fault = fault or _not_clean()
+        if not fault:
+            seconds = {"leave": round(time.monotonic() - began, 6)}
+            listener.say(Status(State.LEFT, request.id, seconds=seconds))
+        return absence, fault
+
+    def _come_to_rest(self) -> None:
+        """Wait for what the callbacks have begun: none is cut in half."""
+        deadline = time.monotonic() + _REST
+        while unfinished := _unfinished(self._executor):
+            if time.monotonic() > deadline:
+                raise PortableError(
+                    f"{len(unfinished)} callbacks have begun and not ended in {_REST:g} s (async "
+                    f"functions that wait, or goals that are executed); the node goes on as it was"
+                )
+            if any(one.executing() for one in unfinished):
+                time.sleep(0.001)  # another thread's: rclpy has nothing to wait on
+            else:
+                self._executor.spin_once(timeout_sec=0.01)
+
+    def _depart(self) -> tuple[Absence | None, str]:
+        node = self._node
+        absence, fault = node._portable_leave()  # noqa: SLF001 - the other half of one thing
+        ended = not self._executor.context.ok()  # by a signal; ROS answers it up to here
+        self._executor.shutdown()
+        self._executor = None
+        rclpy.try_shutdown()
+        if ended:
+            raise _Ended
+        uninstall_signal_handlers()  # they need a context; in between there are ours
+        return absence, fault
+
+    # --- away ------------------------------------------------------------------------------
+
+    def _wait_away(self) -> Request:
+        """Nothing of ROS is here, until the node shall join again."""
+        listener = self._its_listener()
+        with _ends_by_signal():
+            while True:
+                request = listener.asked()
+                if request is not None and request.want is Want.JOIN:
+                    return request
+                with contextlib.suppress(queue.Empty):
+                    self._woken.get(timeout=_LOOK_AWAY)
+
+    # --- joining ---------------------------------------------------------------------------
+
+    def _join(self, request: Request, absence: Absence | None, fault: str) -> None:
+        """Join again: because it is asked for, or because the node cannot leave.
+
+        Args:
+            request: that is answered by it.
+            absence: what the node was; None: it never left.
+            fault: why it cannot leave; "": it had left.
+        """
+        listener = self._its_listener()
+        missing: tuple[str, ...] = ()
+        if absence is not None:
+            missing = self._arrive(request, absence)
+        if fault:
+            self._node.get_logger().error(f"rosrm asked this node to leave; it stays: {fault}")
+        seconds = listener.status.seconds
+        listener.done(Status(State.RUNNING, request.id, fault, seconds, missing))
+
+    def _arrive(self, request: Request, absence: Absence) -> tuple[str, ...]:
+        listener = self._its_listener()
+        began = time.monotonic()
+        listener.enter(State.JOINING, request.id)
+        guids_are_new = fast_dds_place.look_again()
+        rclpy.init(args=without_parameter_files(self._args))
+        self._node._portable_join_again(absence)  # noqa: SLF001 - the other half of one thing
+        self._add_executor()
+        joined = time.monotonic()
+        missing: tuple[str, ...] = self._node._portable_go_on(absence, self._patience)  # noqa: SLF001
+        found = time.monotonic()
+        times = {"join": round(joined - began, 6), "peers": round(found - joined, 6)}
+        status = listener.status
+        listener.status = replace(status, seconds={**status.seconds, **times})
+        if not guids_are_new:
+            self._node.get_logger().warning("Fast DDS keeps its GUIDs: restore an image only once")
+        if missing:
+            self._node.get_logger().warning(
+                f"goes on without peers that it had: {', '.join(missing)}"
+            )
+        return missing
+
+    def _its_listener(self) -> Listener:
+        assert self._listener is not None  # nobody else asks
+        return self._listener
+
+
+def _unfinished(executor: Any) -> list[Any]:
+    """What an executor of rclpy has begun; rclpy has no public way to ask."""
+    return [task for task, *_ in getattr(executor, "_tasks", ()) if not task.done()]
+
+
+def _not_clean() -> str:
+    """What would keep this process from being dumped; "": nothing."""
+    if not what_is_left():
+        return ""
+    gc.collect()  # an entity in a cycle of references
+    return what_is_left()
+
+
+@contextlib.contextmanager
+def _ends_by_signal() -> Any:
+    """Without ROS a signal to end is ours to take: in good order."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def end(*_: Any) -> None:
+        raise _Ended
+
+    before = {one: signal.signal(one, end) for one in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for one, handler in before.items():
+            signal.signal(one, handler)
+
+
+def without_parameter_files(args: Sequence[str]) -> list[str]:
+    """A command line without `--params-file FILE`: at another host the file may be missing."""
+    kept: list[str] = []
+    words = iter(args)
+    for word in words:
+        if word == "--params-file":
+            next(words, None)
+        else:
+            kept.append(word)
+    return kept
+
+
+def _said(error: BaseException) -> str:
+    return f"{type(error).__name__}: {error}"

@@ -1,0 +1,35 @@
+"""How a running node is asked to leave the ROS graph and to join it again, through small files.
+
+A process that is to be dumped by CRIU may hold no socket and no pipe to the outside, so it is
+spoken to by two files in a directory of its own and a signal that wakes it: `form` has the files,
+`control` is for who asks, `listening` for the node. Nothing here needs ROS.
+"""
+
+from rosrm.portable.control import (
+    ask_prepare,
+    ask_resume,
+    await_joined,
+    await_left,
+    control_directory,
+    make_directory,
+    remove_directory,
+    status_of,
+)
+from rosrm.portable.form import SIGNAL, VARIABLE, Request, State, Status, Want
+
+__all__ = [
+    "SIGNAL",
+    "VARIABLE",
+    "Request",
+    "State",
+    "Status",
+    "Want",
+    "ask_prepare",
+    "ask_resume",
+    "await_joined",
+    "await_left",
+    "control_directory",
+    "make_directory",
+    "remove_directory",
+    "status_of",
+]

@@ -1,0 +1,173 @@
+"""The two files of a control directory: `request`, what a node is asked; `status`, how it stands.
+
+    RUNNING -> LEAVING -> LEFT -> JOINING -> RUNNING
+                  |                  |
+                  +-> (refused)      +-> FAILED
+                      RUNNING
+
+Each is one JSON object, at most 64 KiB, and is replaced as a whole. Standard library alone.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+from pathlib import Path
+from typing import Any, Final
+
+from rosrm.errors import PortableError
+
+#: Names the control directory in the environment of a process.
+VARIABLE: Final = "ROSRM_PORTABLE"
+
+#: Wakes a node that was asked something. A real-time signal: SIGUSR1 and SIGUSR2 belong to authors
+#: and their libraries (faulthandler, loggers). Its default is to end a process, so it goes only to
+#: one that catches it. The first real-time signals are debuggers' and libraries' favourites.
+SIGNAL: Final = int(signal.SIGRTMIN) + 5
+
+FORMAT: Final = 1
+_REQUEST: Final = "request"
+_STATUS: Final = "status"
+_LARGEST: Final = 1 << 16
+
+
+class Want(Enum):
+    """What a node is asked for."""
+
+    LEAVE = "leave"
+    JOIN = "join"
+
+
+class State(Enum):
+    """Where a node stands."""
+
+    RUNNING = "running"
+    LEAVING = "leaving"
+    LEFT = "left"
+    JOINING = "joining"
+    FAILED = "failed"
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """What a node is asked.
+
+    Attributes:
+        id: of one absence: the same for leaving and for joining again, and never used anew.
+        want: of the two.
+    """
+
+    id: str
+    want: Want
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """How a node stands.
+
+    Attributes:
+        state: of its part in the ROS graph.
+        request: id of the newest request that it has taken up; "": none yet.
+        fault: why that was refused, or why it has failed; "": neither.
+        seconds: how long the steps of the last absence took: "leave", "join", "peers".
+        missing: peers that it had before it left, and did not find again in time.
+    """
+
+    state: State
+    request: str = ""
+    fault: str = ""
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    missing: tuple[str, ...] = ()
+
+
+def write_request(directory: Path, request: Request) -> None:
+    """Ask; raises `OSError`."""
+    _write(directory / _REQUEST, {"id": request.id, "want": request.want.value})
+
+
+def read_request(directory: Path) -> Request | None:
+    """What is asked; None: nothing.
+
+    Raises:
+        PortableError: what lies there is no request.
+    """
+    found = _read(directory / _REQUEST)
+    if found is None:
+        return None
+    try:
+        return Request(_text(found["id"]), Want(found["want"]))
+    except (KeyError, TypeError, ValueError) as error:
+        raise PortableError(f"{directory / _REQUEST} is no request: {error!r}") from None
+
+
+def write_status(directory: Path, status: Status) -> None:
+    """Say how a node stands; raises `OSError`."""
+    content = {
+        "state": status.state.value,
+        "request": status.request,
+        "fault": status.fault,
+        "seconds": dict(status.seconds),
+        "missing": list(status.missing),
+    }
+    _write(directory / _STATUS, content)
+
+
+def read_status(directory: Path) -> Status | None:
+    """How the node stands; None: there is none that says so.
+
+    Raises:
+        PortableError: what lies there is no status.
+    """
+    found = _read(directory / _STATUS)
+    if found is None:
+        return None
+    try:
+        seconds = {_text(name): float(value) for name, value in found["seconds"].items()}
+        return Status(
+            State(found["state"]), _text(found["request"]), _text(found["fault"]), seconds,
+            tuple(_text(one) for one in found["missing"]),
+        )  # fmt: skip
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise PortableError(f"{directory / _STATUS} is no status: {error!r}") from None
+
+
+def remove_status(directory: Path) -> None:
+    """No node stands here any more."""
+    with contextlib.suppress(OSError):
+        (directory / _STATUS).unlink()
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str):
+        raise TypeError(f"{value!r} is no text")
+    return value
+
+
+def _write(path: Path, content: Mapping[str, Any]) -> None:
+    """Replace a file as a whole: who reads it finds the old one or the new one."""
+    beside = path.with_name(f".{path.name}.new")
+    beside.write_text(json.dumps({"format": FORMAT, **content}), encoding="utf-8")
+    beside.replace(path)
+
+
+def _read(path: Path) -> dict[str, Any] | None:
+    try:
+        # Whatever somebody put there, it neither blocks nor fills the memory.
+        with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
+            data = file.read(_LARGEST + 1)
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except OSError as error:
+        raise PortableError(f"{path} cannot be read: {error.strerror}") from None
+    try:
+        found = json.loads(data)
+    except ValueError:
+        raise PortableError(f"{path} holds no JSON") from None
+    if not isinstance(found, dict) or found.get("format") != FORMAT:
+        raise PortableError(f"{path} is not of format {FORMAT}, which this rosrm speaks")
+    return found
