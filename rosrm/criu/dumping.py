@@ -1,0 +1,172 @@
+"""Dumps the process tree of an instance into an image; it stands still meanwhile.
+
+Options of CRIU, and why: `--tcp-close`: TCP connections come back closed, for their other ends do
+not wait (listening and UDP sockets come back as they were); `--file-locks`: what is locked is
+locked again; `--manage-cgroups=ignore`: it comes back in the cgroup of its new instance.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import signal
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Final, Literal
+
+from rosrm.criu import held_files, image, ties, tree, troubles
+from rosrm.criu.image import Manifest
+from rosrm.criu.program import Criu
+from rosrm.errors import CriuError
+
+#: What both CRIU's dump and its restore are told.
+COMMON: Final = ("--tcp-close", "--file-locks", "--manage-cgroups=ignore")
+
+#: Seconds for CRIU to stop all threads; nothing was changed when they have passed.
+_FREEZE: Final = 10
+#: Seconds that a signal may take to stop a process or let it go on.
+_SIGNAL: Final = 5.0
+
+#: What becomes of the process after the dump.
+Leave = Literal["stopped", "running", "killed"]
+
+
+def dump(
+    criu: Criu,
+    pid: int,
+    directory: Path,
+    *,
+    leave: Leave,
+    timeout: float,
+    process: str = "",
+    instance: int = 0,
+) -> Manifest:
+    """Dump the tree of a process, and say what is in the image.
+
+    It may take its time: no loop should wait for it. Whatever fails, the process runs on.
+
+    Args:
+        criu: to use.
+        pid: of the instance's leader, which may be a hold: then what it holds is dumped.
+        directory: of the image; an absolute path, empty or not there.
+        leave: what becomes of the process: "stopped" until `resume` or a SIGKILL, "running" or
+            "killed".
+        timeout: seconds. CRIU is killed when they have passed, which can harm the process; give it
+            many times what it needs (half a second for each GiB, and the time to write that).
+        process: its name, for the manifest.
+        instance: its number, likewise.
+
+    Raises:
+        CriuError: what cannot be dumped, or what failed; the process runs as before.
+    """
+    root = tree.root_of(pid)
+    if not tree.is_alive(root):
+        raise CriuError(f"{process or 'the process'} (pid {pid}) has ended")
+    was_stopped = tree.is_stopped(root)
+    pids = tree.tree(root)
+    tie = ties.outward(pids)
+    if tie:
+        raise CriuError(f"{process or f'pid {pid}'} cannot be dumped: {tie}")
+    image.create(directory)
+    image.check_room(directory, tree.memory_of(pids))
+    try:
+        _run(criu, root, directory, timeout, process)
+        manifest = _describe(root, directory, Manifest(
+            process, instance, platform.node(), time.time(), criu.version, platform.release(),
+            platform.machine(), tree.inner_pid(root), (), (), "", "",
+        ))  # fmt: skip
+        image.write(directory, manifest)
+    except (CriuError, OSError) as error:
+        image.remove(directory, logs=False)
+        why = str(error) if isinstance(error, CriuError) else _disk_trouble(directory, error)
+        raise CriuError(why + _go_on(root, was_stopped)) from None
+    if leave == "killed":
+        kill(pid)
+    elif leave == "running" and not was_stopped:
+        resume(pid)
+    return manifest
+
+
+def resume(pid: int) -> None:
+    """Let go on what a dump has left stopped.
+
+    Args:
+        pid: of the instance's leader.
+    """
+    tree.send(tree.tree(tree.root_of(pid)), signal.SIGCONT)
+
+
+def kill(pid: int) -> None:
+    """End what was dumped, at once; its parent has to reap it before it is restored here.
+
+    Args:
+        pid: of the instance's leader; a hold ends by itself then.
+    """
+    tree.send(reversed(tree.tree(tree.root_of(pid))), signal.SIGKILL)
+
+
+def _run(criu: Criu, root: int, directory: Path, timeout: float, process: str) -> None:
+    arguments = (
+        "dump", "--tree", str(tree.inner_pid(root)), "--images-dir", str(directory / image.PAGES),
+        "--leave-stopped", *COMMON, "--timeout", str(_FREEZE),
+        "--ghost-limit", str(held_files.MOST),
+    )  # fmt: skip
+    inside = replace(criu, command=(*tree.entering(root), *criu.command))
+    log = directory / image.DUMP_LOG
+    try:
+        inside.run(arguments, timeout=timeout, log=log)
+    except CriuError as error:
+        meaning = _meaning(root, str(error))
+        if not meaning:
+            raise
+        raise CriuError(f"{process or f'pid {root}'} cannot be dumped: {meaning}") from None
+    if not tree.wait_until_stopped(tree.tree(root), _SIGNAL):
+        raise CriuError(f"{process or f'pid {root}'} did not stop for its dump")
+
+
+def _meaning(root: int, message: str) -> str:
+    """What kept CRIU from it; the process is still there, so its descriptors tell what they are."""
+    for one, kind in ties.odd_descriptors(tree.tree(root)):
+        return f"its file descriptor {one.number} is {kind}, which cannot be dumped"
+    return troubles.of_dump(message)
+
+
+def _describe(root: int, directory: Path, manifest: Manifest) -> Manifest:
+    """Complete the manifest; the processes stand still."""
+    pids = tree.tree(root)
+    logs = held_files.logs(root)
+    working_directory = _link(root, "cwd")
+    return replace(
+        manifest,
+        ids=tuple(sorted(number for pid in pids for number in tree.inner_ids(pid))),
+        logs=logs,
+        working_directory=working_directory,
+        interpreter=_link(root, "exe"),
+        files=held_files.open_files(pids, logs, working_directory, directory),
+        mapped=held_files.mapped_files(pids),
+        sizes=image.file_sizes(directory),
+    )
+
+
+def _link(pid: int, name: str) -> str:
+    return os.readlink(f"/proc/{pid}/{name}")  # noqa: PTH115 - as /proc says it
+
+
+def _disk_trouble(directory: Path, error: OSError) -> str:
+    return f"the image in {directory} cannot be written: {error.strerror}"
+
+
+def _go_on(root: int, was_stopped: bool) -> str:
+    """After a failure the process is to run as before; what is to be said where it does not."""
+    pids = tree.tree(root)
+    if not was_stopped:
+        tree.send([pid for pid in pids if tree.is_stopped(pid)], signal.SIGCONT)
+    if not tree.is_alive(root):
+        return f". The process (pid {root}) has ended meanwhile"
+    end = time.monotonic() + _SIGNAL
+    while not was_stopped and any(map(tree.is_stopped, pids)):
+        if time.monotonic() > end:
+            return f". The process (pid {root}) is still stopped"
+        time.sleep(0.001)
+    return ""

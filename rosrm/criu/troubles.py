@@ -1,0 +1,72 @@
+"""What CRIU's messages mean, one clear sentence each.
+
+Gathered by dumping and restoring such processes with CRIU 4.2.1. A message that is not in the table
+is passed on as CRIU said it.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Final
+
+#: A message of CRIU's, and what it means; `\\1` stands for its first group.
+_DUMP: Final = (
+    (r"Can't dump file (\d+) of that type \[\w+\] \(\w+ (\d+:\d+)\)",
+     r"its file descriptor \1 is the device \2, which cannot be dumped"),
+    (r"Can't dump file (\d+) of that type \[\w+\] \(anon anon_inode:\[?(\w+)\]?\)",
+     r"its file descriptor \1 is of the kind \2, which cannot be dumped"),
+    (r"External socket is used", "it has a Unix socket that is connected to a process outside"),
+    (r"with SysVIPC shmem map", "it uses System V shared memory, which belongs to the whole host"),
+    (r"Unknown socket collected \(family (\d+)\)",
+     r"it has a socket of address family \1, which cannot be dumped"),
+    (r"pidfd pid (\d+) is not a part of process tree",
+     r"it has a pidfd of the process \1, which is outside"),
+    (r"Can't dump nested (\w+) namespace",
+     r"a child of it lives in a \1 namespace of its own"),
+    (r"Can't dump ghost file (\S+) of (\d+) size",
+     r"it holds the deleted file \1 of \2 bytes open, which is too large to go along"),
+    (r"[Dd]angling tty|tty: .*sid", "it has a terminal"),
+    (r"(?:Unable to|Can't) seize|seize.*Operation not permitted",
+     "it cannot be stopped: a debugger holds it, or it belongs to somebody else"),
+    (r"Can't lookup mount=\d+ for fd=(-?\d+) path=(\S+)",
+     r"the file \2 lies on a mount that cannot be seen from here"),
+    (r"Timeout reached", "not all of its threads could be stopped in time"),
+    (r"No space left on device", "the file system of the image is full"),
+)  # fmt: skip
+_RESTORE: Final = (
+    (r"Can't bind inet socket.*Cannot assign requested address",
+     "a socket of it is bound to a network address that this host does not have"),
+    (r"Can't bind inet socket.*Address already in use",
+     "the port of a socket of it is in use here, or by a listening socket of its own"),
+    (r"Can't fork for (\d+): File exists|Pid (\d+) do not match expected",
+     r"its pid \1 is in use here"),
+    (r"Can't open file (\S+) on restore: (.*)", r"the file /\1 cannot be opened here: \2"),
+    (r"File (\S+) has bad size (\d+) \(expect (\d+)\)",
+     r"the file /\1 has \2 bytes here; the process knows it with \3"),
+    (r"unix: .*Peer \d+ unresolved",
+     "it had a Unix socket that was connected to a process outside"),
+    (r"CPU .*(?:capabilit|feature|instruction)|cpu: .*(?:not support|mismatch|do not match)",
+     "this host's processor lacks something that the process found where it was dumped"),
+    (r"No space left on device", "a file system is full here"),
+    (r"Cannot allocate memory", "there is not enough memory here"),
+    (r"[Uu]nexpected EOF|[Bb]ad magic|[Ii]mage format|Magic doesn't match",
+     "the image is damaged"),
+)  # fmt: skip
+
+
+def of_dump(message: str) -> str:
+    """What kept CRIU from dumping, from its message; "" where the table does not know it."""
+    return _meaning(message, _DUMP)
+
+
+def of_restore(message: str) -> str:
+    """What kept CRIU from restoring, likewise."""
+    return _meaning(message, _RESTORE)
+
+
+def _meaning(message: str, table: tuple[tuple[str, str], ...]) -> str:
+    for pattern, meaning in table:
+        match = re.search(pattern, message)
+        if match is not None:
+            return match.expand(meaning)
+    return ""
