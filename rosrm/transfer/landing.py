@@ -1,0 +1,102 @@
+"""Where a directory is put together before it appears, whole, under its name.
+
+A hidden directory beside the target, locked while its fetch lives: what a killed one has left has
+no lock and is removed by the next fetch beside it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+from rosrm.disk_space import room_for
+from rosrm.errors import TransferError
+
+_PREFIX: Final = ".rosrm-fetch-"
+
+
+class Landing:
+    """A new directory beside the target; it is removed at the end, unless it became the target.
+
+    Args:
+        target: a path where nothing is; its parent is made where it does not exist.
+
+    Attributes:
+        path: to write to; for its owner alone.
+
+    Raises:
+        TransferError: there is something, or nothing can be made there.
+    """
+
+    def __init__(self, target: Path) -> None:
+        self._target = target
+        self._lock = -1
+        parent = target.parent
+        if os.path.lexists(target):
+            raise TransferError(f"{target} exists already: nothing is fetched over it")
+        try:
+            parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            with _locked(parent):
+                _remove_stale(parent)
+                self.path = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=parent))
+                self._lock = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY)
+                fcntl.flock(self._lock, fcntl.LOCK_EX)
+        except OSError as error:
+            raise TransferError(f"nothing can be made in {parent}: {error.strerror}") from None
+
+    def require(self, size: int, reserve: int) -> None:
+        """Raise `TransferError` unless so many bytes fit, with the reserve still free then."""
+        usage = os.statvfs(self.path)
+        free = usage.f_bavail * usage.f_frsize
+        if size + reserve > free:
+            raise TransferError(
+                f"{size} bytes do not fit beside {self._target}: {reserve} are to stay free, and "
+                f"{room_for(self._target) or f'{free} are free'}"
+            )
+
+    def become_target(self) -> None:
+        """Put it in its place at once; raises `TransferError`."""
+        try:
+            self.path.rename(self._target)
+        except OSError as error:
+            raise TransferError(
+                f"{self._target} cannot be put in its place: {error.strerror}"
+            ) from None
+
+    def close(self) -> None:
+        """Remove it, unless it became the target."""
+        shutil.rmtree(self.path, ignore_errors=True)
+        os.close(self._lock)
+
+
+@contextlib.contextmanager
+def _locked(directory: Path) -> Iterator[None]:
+    """One at a time: else a new directory could be taken for a stale one before it is locked."""
+    descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _remove_stale(parent: Path) -> None:
+    for path in parent.glob(f"{_PREFIX}*"):
+        try:
+            descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+        except OSError:
+            continue  # not ours
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            continue  # its fetch lives
+        else:
+            shutil.rmtree(path, ignore_errors=True)
+        finally:
+            os.close(descriptor)

@@ -1,0 +1,67 @@
+"""Fetches what a source offers: reads it, checks it, puts it in its place; or leaves nothing."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+from rosrm.disk_space import room_for
+from rosrm.errors import TransferError
+from rosrm.transfer.form import Fetched, Offer
+from rosrm.transfer.landing import Landing
+from rosrm.transfer.stream import Stream
+from rosrm.transfer.unpacking import unpack
+
+#: Bytes that a file may take beyond its content, rounded up.
+_ROUNDING: Final = 4096
+
+
+def receive(
+    offer: Offer, target: Path, *, timeout: float, max_rate: float, reserve: int,
+    before_placing: Callable[[], None],
+) -> Fetched:  # fmt: skip
+    """Fetch a directory.
+
+    Args:
+        offer: of the source.
+        target: where it shall be; nothing may be there.
+        timeout: seconds for all of it.
+        max_rate: bytes a second that are read, as compressed; 0: there is no bound.
+        reserve: bytes that stay free on the file system.
+        before_placing: called when all is here and whole, before the target appears.
+
+    Raises:
+        TransferError: it cannot be had, or not whole; nothing of it is left.
+    """
+    began = time.monotonic()
+    with contextlib.closing(Landing(target)) as landing:
+        landing.require(offer.length + offer.files * _ROUNDING, reserve)
+        stream = Stream(offer, timeout=timeout, max_rate=max_rate)
+        with contextlib.closing(stream):
+            try:
+                files = unpack(stream, landing.path)
+            except OSError as error:
+                raise TransferError(_unwritable(target, error)) from None
+            checksum = stream.check()
+            if files != offer.files:
+                raise TransferError(f"{files} files came, {offer.files} were offered")
+            before_placing()
+            landing.become_target()
+            stream.say_taken()
+    return Fetched(
+        address=stream.address,
+        size=offer.size,
+        files=files,
+        received=stream.received,
+        resumed=stream.resumed,
+        seconds=time.monotonic() - began,
+        checksum=checksum,
+    )
+
+
+def _unwritable(target: Path, error: OSError) -> str:
+    room = room_for(target)
+    return f"{target} cannot be written: {error.strerror}" + (f"; {room}" if room else "")

@@ -1,0 +1,177 @@
+"""Serves one directory to one reader, over HTTPS, until it was taken or its time is over.
+
+    GET /archive?from=N   archive and checksum from byte N on, compressed
+    POST /taken           the reader has all of it, and it is whole: the end
+
+Both with `Authorization: Bearer TOKEN` and a number that the reader has drawn (`Rosrm-Reader`). The
+first reader that brings the token is the only one: it may go on where its connection broke, and
+nobody else begins again.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hmac
+import secrets
+import socket
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+from aiohttp import web
+
+from rosrm.errors import TransferError
+from rosrm.transfer.addresses import own_addresses
+from rosrm.transfer.archive import Archive
+from rosrm.transfer.certificate import new_certificate
+from rosrm.transfer.form import DIGEST_SIZE, READER_HEADER, Offer, Sent
+from rosrm.transfer.rate import Pace
+from rosrm.transfer.zstd import compressed
+
+_LOOPBACK: Final = "127.0.0.1"
+#: Seconds for the answer to the last request to go out.
+_FAREWELL: Final = 2.0
+
+
+class _Refusal(Exception):
+    """Why a request is turned down, as the reader is told."""
+
+    def __init__(self, status: int, why: str) -> None:
+        super().__init__(why)
+        self.status = status
+
+
+class _Desk:
+    """Hands the archive out.
+
+    Attributes:
+        taken: set once the reader has it.
+        sent: bytes that went out.
+    """
+
+    def __init__(self, archive: Archive, token: str, max_rate: float) -> None:
+        self._archive = archive
+        self._token = token
+        self._pace = Pace(max_rate)
+        self._reader = ""
+        self._sending: asyncio.Task[object] | None = None
+        self._fault = ""
+        self.taken = asyncio.Event()
+        self.sent = 0
+
+    async def archive(self, request: web.Request) -> web.StreamResponse:
+        """Send the archive, from where the reader wants it."""
+        try:
+            start = self._start(request)
+        except _Refusal as refusal:
+            return web.Response(status=refusal.status, text=str(refusal))
+        if self._sending is not None:
+            self._sending.cancel()  # the reader has given that connection up
+        self._sending = asyncio.current_task()
+        response = web.StreamResponse(headers={"Content-Type": "application/zstd"})
+        with contextlib.suppress(ConnectionError):  # the reader may come again
+            await response.prepare(request)
+            try:
+                await self._send(response, start)
+            except TransferError as error:
+                self._fault = str(error)  # the reader hears it when it comes again
+                if request.transport is not None:
+                    request.transport.abort()
+        return response
+
+    async def take(self, request: web.Request) -> web.Response:
+        """The reader has all."""
+        try:
+            self._admit(request)
+        except _Refusal as refusal:
+            return web.Response(status=refusal.status, text=str(refusal))
+        self.taken.set()
+        return web.Response(status=204)
+
+    def _start(self, request: web.Request) -> int:
+        self._admit(request)
+        if self._fault:
+            raise _Refusal(410, self._fault)
+        text = request.query.get("from", "0")
+        if not (text.isascii() and text.isdigit() and len(text) < 20):
+            raise _Refusal(400, "'from' is no number of bytes")
+        start = int(text)
+        if start >= self._archive.length + DIGEST_SIZE:
+            raise _Refusal(416, "there is nothing from there on")
+        return start
+
+    def _admit(self, request: web.Request) -> None:
+        brought = _bytes(request.headers.get("Authorization", ""))
+        if not hmac.compare_digest(brought, f"Bearer {self._token}".encode()):
+            raise _Refusal(401, "the token is not the one of this offer")
+        reader = request.headers.get(READER_HEADER, "")
+        if not reader:
+            raise _Refusal(400, f"the request has no {READER_HEADER}")
+        self._reader = self._reader or reader
+        if not hmac.compare_digest(_bytes(reader), _bytes(self._reader)):
+            raise _Refusal(403, "somebody has begun to fetch it already, and an offer stands once")
+
+    async def _send(self, response: web.StreamResponse, start: int) -> None:
+        for piece in compressed(self._archive.pieces(start)):
+            await response.write(piece)
+            self.sent += len(piece)
+            await asyncio.sleep(self._pace.wait(len(piece), time.monotonic()))
+        await response.write_eof()
+
+
+def _bytes(header: str) -> bytes:
+    """As they came."""
+    return header.encode("utf-8", "surrogateescape")
+
+
+async def serve(
+    directory: Path, *, seconds: float, max_rate: float, loopback: bool,
+    announce: Callable[[Offer], None], withdrawn: asyncio.Event,
+) -> Sent:  # fmt: skip
+    """Offer a directory, and wait until that is over.
+
+    Args:
+        directory: all of it is offered, as it is now.
+        seconds: after which the offer ends.
+        max_rate: bytes a second that go out, as compressed; 0: there is no bound.
+        loopback: listen for this host alone.
+        announce: told of the offer once it can be fetched.
+        withdrawn: set to end it.
+
+    Raises:
+        TransferError: the directory cannot be offered.
+    """
+    archive = Archive(directory)
+    context, fingerprint = new_certificate()
+    desk = _Desk(archive, token := secrets.token_urlsafe(32), max_rate)
+    application = web.Application()
+    application.add_routes([web.get("/archive", desk.archive), web.post("/taken", desk.take)])
+    # No access log: nobody needs one, and what is not written keeps its secrets.
+    runner = web.AppRunner(application, access_log=None, shutdown_timeout=_FAREWELL)
+    await runner.setup()
+    try:
+        listener = socket.create_server((_LOOPBACK if loopback else "", 0))
+        await web.SockSite(runner, listener, ssl_context=context).start()
+        announce(
+            Offer(
+                addresses=(_LOOPBACK,) if loopback else own_addresses() or (_LOOPBACK,),
+                port=listener.getsockname()[1],
+                fingerprint=fingerprint,
+                token=token,
+                size=archive.size,
+                files=archive.files,
+                length=archive.length,
+                seconds=seconds,
+            )
+        )
+        over = [asyncio.create_task(one.wait()) for one in (desk.taken, withdrawn)]
+        await asyncio.wait(over, timeout=seconds, return_when=asyncio.FIRST_COMPLETED)
+        for task in over:
+            task.cancel()
+    finally:
+        await runner.cleanup()
+    if desk.taken.is_set():
+        return Sent("taken", desk.sent)
+    return Sent("withdrawn" if withdrawn.is_set() else "expired", desk.sent)
