@@ -88,7 +88,7 @@ def _take(recorded: Recorded, fields: Mapping[str, Any]) -> None:
     elif kind == "spawning":
         recorded.spawning.update(protocol.read_key(key) for key in fields["instances"])
     elif kind == "environment":
-        recorded.environments[fields["id"]] = fields["variables"]
+        recorded.environments[fields["id"]] = dict(fields["variables"])
     elif kind == "dead":
         recorded.dead[fields["process"]] = int(fields["number"])
         for key in [key for key in recorded.instances if _dead(key, fields)]:
@@ -195,7 +195,12 @@ class Record:
         environments: Mapping[str, Mapping[str, str]],
         birth: Callable[[Key], int],
     ) -> None:
-        """Replace the record by one that holds only what counts now, if the disk has room."""
+        """Replace the record by one that holds only what counts now, if the disk has room.
+
+        Args:
+            environments: all that launches refer to now or may later; one may be missing, where a
+                line was damaged.
+        """
         waiting = self._waiting
         self._waiting = []
         self._add({"record": "header", "version": VERSION, "boot": members.boot_id()})
@@ -203,8 +208,8 @@ class Record:
             self._add(
                 {"record": "dead", "key": [process, -1], "process": process, "number": number}
             )
-        for identity in {launch.environment for launch in launches.values()}:
-            self.environment(identity, environments[identity])
+        for identity, variables in environments.items():
+            self.environment(identity, variables)
         for launch in launches.values():
             self.launch(launch)
         for instance in supervision.instances.values():

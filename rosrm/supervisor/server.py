@@ -202,7 +202,13 @@ class Server:
             os.close(log)
 
     def _environment(self, launch: protocol.Launch) -> dict[str, str]:
-        environment = dict(self._environments[launch.environment])
+        base = self._environments.get(launch.environment)
+        if base is None:
+            raise children.SpawnError(
+                "its environment was lost with a damaged part of the record: it cannot be started "
+                "again by this order, only by a new one"
+            )
+        environment = dict(base)
         for name, value in launch.changes.items():
             if value is None:
                 environment.pop(name, None)
@@ -230,9 +236,10 @@ class Server:
 
     def _rewrite_record(self) -> None:
         used = {launch.environment for launch in self._launches.values()}
-        for identity in [identity for identity in self._environments if identity not in used]:
-            if self._client is None or identity != self._client.environment:
-                del self._environments[identity]
+        if self._client is not None:
+            used.add(self._client.environment)  # it is sent once: later launches refer to it
+        for identity in self._environments.keys() - used:
+            del self._environments[identity]
         self._record.rewrite(self._core, self._launches, self._environments, self._family.birth)
 
     # --- the client ---------------------------------------------------------------------------

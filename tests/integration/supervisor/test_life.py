@@ -17,7 +17,7 @@ import pytest
 import rosrm
 from rosrm.core.model import InstanceId, InstanceState, RestartPolicy
 from rosrm.errors import SupervisorError
-from rosrm.supervisor import members, protocol
+from rosrm.supervisor import members, protocol, record
 from rosrm.supervisor.client import SupervisorClient, SupervisorEnded
 
 from .conftest import Host, command_line, wait_gone, wait_until
@@ -254,6 +254,47 @@ def test_a_damaged_line_is_left_out_and_said(host):
     client = host.connect()
     assert client.instances[0].state is InstanceState.EXITED
     assert any("instances.jsonl:2" in note for note in client.notes)
+
+
+def test_what_starts_after_the_record_was_compacted_is_taken_over(host):
+    """Compacted while nothing ran: the environment that the client sent once is still there."""
+    client = host.connect()
+    large = "x" * (record.COMPACT_BYTES + 1)
+    host.run(client, host.order("large", "/no/such/program", memo=large))
+    always = RestartPolicy(when="always", delay=0.01)
+    code = "import os, time; print(os.environ.get('PATH'), flush=True); time.sleep(1000)"
+    client.start([host.python("later", code, restart=always)])
+    pid = host.running(client, "later").pid
+    assert (host.state / "instances.jsonl").stat().st_size < record.COMPACT_BYTES
+    host.kill_supervisor(client)
+    client = host.connect()
+    assert client.notes == ()
+    assert {status.pid for status in client.instances} == {0, pid}
+    os.kill(pid, signal.SIGKILL)
+    assert host.running(client, "later").pid != pid
+    wait_until(lambda: host.log("later").read_text().count(os.environ["PATH"]) == 2, "both runs")
+
+
+def test_without_its_environment_nothing_is_restarted(host):
+    """A damaged line takes it: what runs is taken over, and why it does not start again is said."""
+    client = host.connect()
+    always = RestartPolicy(when="always", delay=0.01)
+    client.start([host.order("one", "sleep", "1000", restart=always)])
+    pid = host.running(client, "one").pid
+    host.kill_supervisor(client)
+    path = host.state / "instances.jsonl"
+    lines = path.read_bytes().splitlines(keepends=True)
+    kept = [b"spoilt\n" if b'"variables"' in line else line for line in lines]
+    path.write_bytes(b"".join(kept))
+    client = host.connect()
+    (note,) = client.notes
+    assert "left out" in note
+    (status,) = client.instances
+    assert status.pid == pid
+    os.kill(pid, signal.SIGKILL)
+    ended = host.ended(client, "one")
+    assert ended.state is InstanceState.FAILED
+    assert "its environment was lost" in ended.message
 
 
 def test_a_second_supervisor_is_refused(host, client):

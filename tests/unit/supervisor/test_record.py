@@ -62,6 +62,22 @@ def test_an_amendment_counts_from_then_on(tmp_path, core, record):
         record.rewrite(core, {TALKER: amended}, {"base": {}}, lambda key: 55)
 
 
+def test_an_environment_that_is_known_is_kept(tmp_path, core, record):
+    """A client sends it once: launches that come after the record was compacted refer to it."""
+    record.rewrite(core, {}, {"base": {"A": "1"}}, lambda key: 55)
+    record.launch(LAUNCH)
+    record.flush()
+    assert rc.read(str(tmp_path)).environments == {"base": {"A": "1"}}
+
+
+def test_a_launch_without_its_environment_is_compacted(tmp_path, core, record):
+    """The line that held it was damaged."""
+    record.rewrite(core, {TALKER: LAUNCH}, {}, lambda key: 55)
+    recorded = rc.read(str(tmp_path))
+    assert recorded.launches == {TALKER: LAUNCH}
+    assert not recorded.environments
+
+
 def test_a_record_of_before_protocol_2_is_read(tmp_path, core):
     """Its launches had no memo, its instances no fault."""
     instance = core.instances[TALKER]
