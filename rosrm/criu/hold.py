@@ -241,13 +241,18 @@ def _hold_child(restore: _Restore) -> NoReturn:
 def _start_guard(root: int) -> int:
     """Beside us, to end the restored process with us; what is written here sends it away."""
     living, end_of_life = os.pipe()
+    hearing, saying = os.pipe()
     if os.fork() == 0:
         os.setsid()  # a SIGKILL to our group shall not reach it
         os.close(end_of_life)
+        os.close(saying)
         if not os.read(living, 16):
             tree.send(reversed(tree.tree(root)), signal.SIGKILL)
         os._exit(0)
     os.close(living)
+    os.close(saying)
+    os.read(hearing, 1)  # until it stands apart
+    os.close(hearing)
     return end_of_life
 
 

@@ -1,0 +1,480 @@
+"""Real processes are dumped into images, and restored below the program that holds them."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from rosrm.core.model import InstanceState
+from rosrm.criu import dumping, image, restoring, tree
+from rosrm.errors import CriuError
+from tests.criu_kit import TIMEOUT, eventually
+from tests.integration.supervisor.conftest import Host
+
+pytestmark = pytest.mark.timeout(240)
+
+#: Writes one number after the other; ends with 7 at SIGTERM, says so at SIGUSR1.
+COUNTER = """
+import signal, sys, time
+signal.signal(signal.SIGTERM, lambda *_: sys.exit(7))
+signal.signal(signal.SIGUSR1, lambda *_: print("usr1", flush=True))
+count = 0
+while True:
+    count += 1
+    print(count, flush=True)
+    time.sleep(0.01)
+"""
+
+
+@pytest.fixture
+def counter(theatre):
+    """A counter that counts."""
+    actor = theatre.start(COUNTER)
+    actor.counts()
+    return actor
+
+
+# --- what goes on -------------------------------------------------------------------------------
+
+
+def test_a_restored_process_goes_on_where_it_was_and_its_log_in_the_new_file(theatre, counter):
+    """No number is missing or written twice; the old log grows no more."""
+    directory = theatre.dump(counter)
+    before = counter.numbers()
+    restored = theatre.restore(directory)
+    restored.counts()
+    after = restored.numbers()
+    assert before + after == list(range(1, after[-1] + 1))
+    assert counter.numbers() == before
+
+
+def test_five_hops_in_a_row(theatre, counter):
+    """A restored process is dumped and restored again, and keeps the pid that it sees itself."""
+    actor, numbers, inner = counter, [], set()
+    for hop in range(5):
+        directory = theatre.dump(actor, f"hop{hop}")
+        numbers += actor.numbers()
+        actor = theatre.restore(directory, remove=True)
+        inner.add(actor.outcome.inner_pid)
+        actor.counts()
+    numbers += actor.numbers()
+    assert numbers == list(range(1, numbers[-1] + 1))
+    assert inner == {counter.pid}
+
+
+def test_a_udp_socket_is_the_same_after_the_restore(theatre):
+    """It answers at the same address, and knows how often it was asked."""
+    code = """
+import socket
+ours, count = socket.socket(socket.AF_INET, socket.SOCK_DGRAM), 0
+ours.bind(("127.0.0.1", 0))
+print(ours.getsockname()[1], flush=True)
+while True:
+    _, asker = ours.recvfrom(16)
+    count += 1
+    ours.sendto(b"%d" % count, asker)
+"""
+    actor = theatre.start(code)
+    eventually(actor.numbers, "its port")
+    address = ("127.0.0.1", actor.numbers()[0])
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ours:
+        ours.settimeout(TIMEOUT)
+        ours.sendto(b"?", address)
+        assert ours.recv(16) == b"1"
+        theatre.restore(theatre.dump(actor))
+        ours.sendto(b"?", address)
+        assert ours.recv(16) == b"2"
+
+
+def test_a_heap_of_numpy_with_its_threads_is_the_same(theatre):
+    """8 MB of chance numbers, three threads: the same sum, and the threads run."""
+    code = """
+import hashlib, threading, time, numpy
+heap = numpy.random.default_rng(1).random(1 << 20)
+def turn(name):
+    while True:
+        time.sleep(0.01)
+        print(name, hashlib.sha256(heap.tobytes()).hexdigest(), flush=True)
+for name in "ab":
+    threading.Thread(target=turn, args=name).start()
+turn("c")
+"""
+    actor = theatre.run([sys.executable, "-I", "-c", code])
+    eventually(lambda: {line[0] for line in actor.lines()} >= {*"abc"}, "its threads")
+    sums = {line.split()[1] for line in actor.lines()}
+    restored = theatre.restore(theatre.dump(actor))
+    eventually(lambda: {line[0] for line in restored.lines()} == {*"abc"}, "its threads again")
+    assert len(sums) == 1
+    assert {line.split()[1] for line in restored.lines()} == sums
+    assert theatre.manifest.size > 8 << 20
+
+
+def test_a_child_comes_along(theatre):
+    """The tree is dumped, pipes within it too: the child's numbers go on through its parent."""
+    code = f"""
+import subprocess, sys
+child = subprocess.Popen([sys.executable, "-I", "-S", "-c", {COUNTER!r}], stdout=subprocess.PIPE)
+for line in child.stdout:
+    print(line.decode(), end="", flush=True)
+"""
+    actor = theatre.start(code)
+    actor.counts()
+    directory = theatre.dump(actor)
+    restored = theatre.restore(directory)
+    restored.counts()
+    numbers = actor.numbers() + restored.numbers()
+    assert numbers == list(range(1, numbers[-1] + 1))
+
+
+def test_a_file_below_the_working_directory_follows(theatre):
+    """It is put back as it was when the process stood still, and written on at the same place."""
+    code = f"import sys; sys.stdout = open('count', 'w')\n{COUNTER}"
+    actor = theatre.start(code)
+    count = theatre.work / "count"
+    eventually(lambda: count.exists() and count.read_text().count("\n") > 2, "its file")
+    directory = theatre.dump(actor)
+    written = count.read_text()
+    count.unlink()  # as on another host
+    theatre.restore(directory)
+    eventually(lambda: count.exists() and len(count.read_text()) > len(written), "more in it")
+    numbers = [int(line) for line in count.read_text().splitlines(True) if line.endswith("\n")]
+    assert numbers == list(range(1, numbers[-1] + 1))
+
+
+# --- what becomes of the source -----------------------------------------------------------------
+
+
+def test_it_runs_on_after_a_dump_that_leaves_it_running(theatre, counter):
+    """A checkpoint costs it a moment, and no number."""
+    theatre.dump(counter, leave="running")
+    counter.counts()
+    assert counter.numbers() == list(range(1, counter.numbers()[-1] + 1))
+
+
+def test_it_stands_still_until_it_is_resumed(theatre, counter):
+    """Until the commit nothing is lost: who takes the move back resumes the source."""
+    theatre.dump(counter, leave="stopped")
+    seen = counter.numbers()
+    assert tree.is_stopped(counter.pid)
+    dumping.resume(counter.pid)
+    counter.counts()
+    assert counter.numbers()[: len(seen) + 1] == list(range(1, len(seen) + 2))
+
+
+def test_who_stood_still_before_is_not_set_going(theatre, counter):
+    """A process that somebody stopped stays stopped after its dump."""
+    counter.process.send_signal(signal.SIGSTOP)
+    assert tree.wait_until_stopped([counter.pid], TIMEOUT)
+    theatre.dump(counter, leave="running")
+    assert tree.is_stopped(counter.pid)
+
+
+def test_a_pipe_to_outside_is_named_and_the_source_runs_on(theatre):
+    """CRIU would dump it without a word; nobody would be at its other end."""
+    ours, theirs = os.pipe()
+    try:
+        actor = theatre.start(COUNTER, pass_fds=(theirs,))
+        actor.counts()
+        with pytest.raises(
+            CriuError, match=f"{theirs} of pid {actor.pid} .*a pipe .*{os.getpid()}"
+        ):
+            theatre.dump(actor)
+        actor.counts()
+    finally:
+        os.close(ours)
+        os.close(theirs)
+
+
+@pytest.mark.parametrize("kind", [socket.SOCK_STREAM, socket.SOCK_DGRAM])
+def test_a_unix_socket_to_outside_is_named_and_the_source_runs_on(theatre, kind):
+    """CRIU dumps a stream and fails to restore it; a datagram socket it refuses."""
+    ours, theirs = socket.socketpair(socket.AF_UNIX, kind)
+    with ours, theirs:
+        actor = theatre.start(COUNTER, pass_fds=(theirs.fileno(),))
+        theirs.close()
+        actor.counts()
+        with pytest.raises(CriuError, match=f"Unix socket that is connected to pid {os.getpid()}"):
+            theatre.dump(actor)
+        actor.counts()
+
+
+def test_a_socket_pair_within_the_process_is_no_tie(theatre):
+    """As an event loop holds one to wake itself."""
+    code = f"import socket; pair = socket.socketpair()\n{COUNTER}"
+    actor = theatre.start(code)
+    actor.counts()
+    theatre.restore(theatre.dump(actor)).counts()
+
+
+@pytest.mark.skipif(not os.access("/dev/fuse", os.W_OK), reason="/dev/fuse may not be opened")
+def test_a_device_is_named_and_the_source_runs_on(theatre):
+    """What CRIU itself refuses is said in words, and nothing but its log is left of the image."""
+    actor = theatre.start(f"device = open('/dev/fuse', 'rb+', buffering=0)\n{COUNTER}")
+    actor.counts()
+    with pytest.raises(CriuError, match=r"file descriptor \d+ is the device /dev/fuse"):
+        theatre.dump(actor)
+    actor.counts()
+    assert [path.name for path in (theatre.folder / "image").iterdir()] == ["dump.log"]
+
+
+def test_an_image_that_has_no_room_is_not_begun(tmp_path):
+    """The file system of the image keeps some space."""
+    with pytest.raises(CriuError, match=r"no room for the image .* MiB are free"):
+        image.check_room(tmp_path, 1 << 60)
+
+
+# --- below the hold -----------------------------------------------------------------------------
+
+
+def test_the_exit_code_comes_through_the_hold(theatre, counter):
+    """SIGTERM is passed on, and the process's own answer to it is the hold's end."""
+    restored = theatre.restore(theatre.dump(counter))
+    restored.process.terminate()
+    assert restored.process.wait(TIMEOUT) == 7
+
+
+def test_signals_come_through_the_hold(theatre, counter):
+    """What the process handles it handles; what kills it, the hold dies of too."""
+    restored = theatre.restore(theatre.dump(counter))
+    os.killpg(restored.pid, signal.SIGUSR1)
+    restored.says("usr1")
+    assert restored.lines().count("usr1\n") == 1
+    os.killpg(restored.pid, signal.SIGUSR2)
+    assert restored.process.wait(TIMEOUT) == -signal.SIGUSR2
+
+
+@pytest.mark.parametrize("group", [True, False])
+def test_sigkill_of_the_hold_ends_all_of_it(theatre, group):
+    """Also a daemon that has left group and session. It takes milliseconds; a second is wide."""
+    code = f"""
+import os, signal
+def become_two(*_):
+    if os.fork() == 0:
+        os.setsid()
+        if os.fork():
+            os._exit(0)
+        print("daemon", flush=True)
+signal.signal(signal.SIGHUP, become_two)
+{COUNTER}"""
+    actor = theatre.start(code)
+    actor.counts()
+    restored = theatre.restore(theatre.dump(actor))
+    os.killpg(restored.pid, signal.SIGHUP)
+    restored.says("daemon")
+    namespace = pid_namespace(restored.outcome.pid)
+    assert len(living_in(namespace)) == 3  # the init, the process, the daemon
+    if group:
+        os.killpg(restored.pid, signal.SIGKILL)
+    else:
+        restored.process.kill()
+    killed = time.monotonic()
+    eventually(lambda: not living_in(namespace), "the end of all in the namespace")
+    assert time.monotonic() - killed < 1.0
+    assert restored.process.wait(TIMEOUT) == -signal.SIGKILL
+
+
+def pid_namespace(pid: int) -> str:
+    return os.readlink(f"/proc/{pid}/ns/pid")  # noqa: PTH115 - it leads nowhere
+
+
+def living_in(namespace: str) -> list[int]:
+    """Processes of a pid namespace that are not just waiting to be reaped."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        try:
+            if entry.name.isdigit() and pid_namespace(int(entry.name)) == namespace:
+                found.append(int(entry.name))
+        except OSError:  # it has ended
+            continue
+    return [pid for pid in found if tree.is_alive(pid)]
+
+
+def test_what_the_process_leaves_behind_ends_with_it(theatre):
+    """Its end is the end of the namespace, before the hold's own is seen."""
+    code = f"""
+import os, signal
+def become_two(*_):
+    if os.fork() == 0:
+        os.setsid()
+        print("daemon", flush=True)
+signal.signal(signal.SIGHUP, become_two)
+{COUNTER}"""
+    actor = theatre.start(code)
+    actor.counts()
+    restored = theatre.restore(theatre.dump(actor))
+    os.killpg(restored.pid, signal.SIGHUP)
+    restored.says("daemon")
+    namespace = pid_namespace(restored.outcome.pid)
+    restored.process.terminate()
+    assert restored.process.wait(TIMEOUT) == 7
+    assert living_in(namespace) == []
+
+
+def test_marks_of_its_former_instance_are_gone(theatre):
+    """A supervisor that looks for leftovers of the old instance does not find the restored one."""
+    marks = {"ROSRM_INSTANCE": "actor#1", "ROSRM_SUPERVISOR": "/somewhere", "MORE": "kept"}
+    actor = theatre.start(COUNTER, environment=marks)
+    actor.counts()
+    restored = theatre.restore(theatre.dump(actor))
+    shown = Path(f"/proc/{restored.outcome.pid}/environ").read_bytes().split(b"\0")
+    assert {b"ROSRM_INSTANCE=", b"ROSRM_SUPERVISOR=", b"MORE=kept"} <= {*shown}
+
+
+def test_the_image_is_private_and_gone_when_it_was_told_so(theatre, counter):
+    """Memory of a process is nobody else's business; after the end nothing is left."""
+    directory = theatre.dump(counter)
+    modes = {path.stat().st_mode & 0o077 for path in [directory, *directory.rglob("*")]}
+    assert modes == {0}
+    restored = theatre.restore(directory, remove=True)
+    assert [path.name for path in directory.iterdir()] == ["hold.json"]
+    restored.process.terminate()
+    restored.process.wait(TIMEOUT)
+    assert not directory.exists()
+
+
+def test_below_a_supervisor(theatre, counter, tmp_path):
+    """The supervisor starts a hold like any process: it stops it, and sees its end."""
+    directory = theatre.dump(counter)
+    command = theatre.hold_command(directory)
+    host = Host(tmp_path / "host")
+    try:
+        client = host.connect()
+        client.start([host.order("actor", *command, number=2)])
+        running = host.wait(client, "actor", InstanceState.RUNNING, number=2)
+        log = host.log("actor", 2)
+        eventually(lambda: log.read_text().count("\n") > 2, "numbers in its log")
+        assert tree.root_of(running.pid) != running.pid
+        client.stop(running.instance)
+        ended = host.wait(client, "actor", InstanceState.EXITED, InstanceState.FAILED, number=2)
+        assert (ended.exit_code, ended.exit_signal) == (0, signal.SIGINT)
+    finally:
+        host.clean_up()
+
+
+# --- without a namespace ------------------------------------------------------------------------
+
+
+def test_without_a_namespace_it_is_held_all_the_same(theatre, counter):
+    """Where no namespace may be entered: same pid, signals and end come through."""
+    directory = theatre.dump(counter)
+    restored = theatre.restore(directory, "--no-namespace")
+    restored.counts()
+    assert not restored.outcome.namespace
+    assert restored.outcome.pid == restored.outcome.inner_pid == counter.pid
+    again = theatre.restore(theatre.dump(restored, "again"), "--no-namespace")
+    again.counts()
+    again.process.terminate()
+    assert again.process.wait(TIMEOUT) == 7
+
+
+def test_without_a_namespace_a_guard_ends_it_with_its_hold(theatre, counter):
+    """A SIGKILL of the hold's group reaches the restored process too."""
+    restored = theatre.restore(theatre.dump(counter), "--no-namespace")
+    os.killpg(restored.pid, signal.SIGKILL)
+    eventually(lambda: not tree.is_alive(restored.outcome.pid), "the end of the restored process")
+
+
+def test_without_a_namespace_a_pid_in_use_is_said(theatre, counter):
+    """The source still has it; it is not harmed."""
+    directory = theatre.dump(counter, leave="stopped")
+    with pytest.raises(CriuError, match=rf"its pid {counter.pid} is in use here"):
+        theatre.restore(directory, "--no-namespace")
+    dumping.resume(counter.pid)
+    counter.counts()
+
+
+# --- what cannot be restored --------------------------------------------------------------------
+
+
+def test_a_damaged_image_is_refused(theatre, counter):
+    """A file cut short is seen before CRIU begins, named, and said to who waits and in the log."""
+    directory = theatre.dump(counter)
+    pages = max((directory / "criu").iterdir(), key=lambda path: path.stat().st_size)
+    os.truncate(pages, 1000)
+    hold = theatre.hold(directory)
+    assert hold.process.wait(TIMEOUT) == 125
+    wanted = f"damaged: criu/{pages.name} has 1000 bytes instead of"
+    assert wanted in hold.log.read_text()
+    assert wanted in json.loads((directory / "hold.json").read_text())["reason"]
+
+
+def changed(directory: Path, **values: object) -> None:
+    """Another manifest."""
+    path = directory / "manifest.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **values}))
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({"working_directory": "/no/such"}, "the working directory /no/such .* is missing on"),
+        ({"interpreter": "/no/python"}, "the program /no/python .* is missing on"),
+        ({"machine": "vax"}, "made on vax"),
+        ({"mapped": [{"path": "/no/lib.so", "size": 1, "mode": 420}]}, "/no/lib.so, which"),
+        ({"mapped": [{"path": "/etc/hostname", "size": 1, "mode": 420}]}, "another one .* of 1"),
+        ({"format": 2}, "has format 2; this rosrm reads format 1"),
+        ({"pid": "one"}, "damaged: manifest.json: pid is 'one'"),
+        ({"sizes": {"../secret": 1}}, "'../secret' does not lie in the image"),
+    ],
+)  # fmt: skip
+def test_what_is_missing_here_is_named(theatre, counter, values, said):
+    """Before CRIU begins: the path, and the host."""
+    directory = theatre.dump(counter)
+    changed(directory, **values)
+    with pytest.raises(CriuError, match=said):
+        theatre.restore(directory)
+
+
+def test_a_file_that_it_reads_has_to_be_there(theatre):
+    """What it only reads does not follow."""
+    table = theatre.folder / "table"
+    table.write_text("rows")
+    actor = theatre.start(f"table = open({str(table)!r})\n{COUNTER}")
+    actor.counts()
+    directory = theatre.dump(actor)
+    table.unlink()
+    with pytest.raises(CriuError, match=f"the file {table}, which the process has open, cannot"):
+        theatre.restore(directory)
+
+
+def test_an_incomplete_image_is_refused(tmp_path):
+    """The manifest comes last: without it a dump or a transfer was cut off."""
+    image.create(tmp_path / "image")
+    with pytest.raises(CriuError, match=r"holds no complete image: there is no manifest\.json"):
+        image.read(tmp_path / "image")
+
+
+def test_an_image_that_others_may_read_is_refused(theatre, counter):
+    """Who can write to it can run what he likes as the process's user."""
+    directory = theatre.dump(counter)
+    directory.chmod(0o755)
+    with pytest.raises(CriuError, match="open to others"):
+        theatre.restore(directory)
+
+
+def test_what_tracing_maps_is_made_where_it_is_missing(theatre, counter):
+    """LTTng's shared memory, which every ROS process maps, has no content."""
+    directory = theatre.dump(counter)
+    path = Path(f"/dev/shm/lttng-ust-wait-rosrm-test-{os.getpid()}")
+    changed(directory, mapped=[{"path": str(path), "size": 4096, "mode": 0o640}])
+    try:
+        theatre.restore(directory)
+        status = path.stat()
+        assert (status.st_size, status.st_mode & 0o777) == (4096, 0o640)
+    finally:
+        path.unlink(missing_ok=True)
+
+
+def test_criu_takes_no_id_that_it_is_to_restore():
+    """In a fresh namespace ids begin small, where those of a container's processes are too."""
+    assert restoring.id_for_criu((), 32768) == 300
+    assert restoring.id_for_criu((12, 13, 310), 32768) == 310
+    assert restoring.id_for_criu(tuple(range(1, 32700, 100)), 32768) == 300
+    assert restoring.id_for_criu((301, 702, 1200), 2000) == 301
