@@ -17,6 +17,9 @@ unexport AMENT_PREFIX_PATH CMAKE_PREFIX_PATH COLCON_PREFIX_PATH ROS_DISTRO RMW_I
 # By default DDS multicasts on every interface: what runs from here stays on this machine.
 export ROS_AUTOMATIC_DISCOVERY_RANGE := LOCALHOST
 
+# Where `make setup` puts CRIU, if it can be had.
+export ROSRM_CRIU_PREFIX ?= $(CURDIR)/.venv/criu
+
 .DEFAULT_GOAL := help
 .PHONY: help setup test lint format demo demo-migration bench evaluation clean
 

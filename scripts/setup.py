@@ -28,6 +28,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 VENV = ROOT / ".venv"
 PYTHON = VENV / "bin" / "python"
+CRIU = VENV / "criu"  # tests/conftest.py and the Makefile name it too
 LOG = VENV / "setup.log"
 STAMP = VENV / "rosrm-setup.json"
 INTERFACES = ROOT / "rosrm_msgs"
@@ -91,7 +92,7 @@ def set_up(*, remake_other_version: bool) -> None:
         return
     check_machine()
     began = time.monotonic()
-    steps = Steps(total=3 if done.get("interfaces") == wanted["interfaces"] else 4)
+    steps = Steps(total=4 if done.get("interfaces") == wanted["interfaces"] else 5)
     steps.run("pip and the build backends", *pip("install", *BACKENDS))
     if done.get("interfaces") != wanted["interfaces"]:
         steps.run(
@@ -117,8 +118,20 @@ def set_up(*, remake_other_version: bool) -> None:
         "-c",
         "import rclpy, rosrm, rosrm_msgs.msg as m; m.ResourceInfo.__import_type_support__()",
     )
+    try_criu(steps)
     write_stamp(wanted)
     print(f"      .venv is ready ({time.monotonic() - began:.0f} s in all)", flush=True)
+
+
+def try_criu(steps: Steps) -> None:
+    """Bring CRIU into the environment, if one can be had; without it its tests are skipped."""
+    command = [PYTHON, "-m", "rosrm.cli", "criu", "install", "--prefix", CRIU]
+    try:
+        steps.run("CRIU, if there is one for this machine", *command)
+    except SetupError as error:
+        last = str(error).strip().splitlines()[-1].removeprefix("rosrm: ")
+        print(f"      without CRIU; what needs it is skipped in the tests. {last}")
+        print(f"      To try again: .venv/bin/rosrm criu install --prefix {CRIU.relative_to(ROOT)}")
 
 
 # ----------------------------------------------------------------------------- what is there

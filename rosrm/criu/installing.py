@@ -113,10 +113,12 @@ def bound(tree: Path) -> Path:
     program = tree / "usr/sbin/criu"
     if not program.is_file():
         raise CriuError("the package has no usr/sbin/criu in it: this is not Debian's `criu`")
-    loader = next(iter(sorted(tree.glob("usr/lib*/ld-linux*.so.*"))), None)
+    # Packages older than Debian 13 have libraries outside of /usr, too.
+    folders = [*tree.glob("usr/lib/*-linux-*"), *tree.glob("lib/*-linux-*")]
+    loader = next((file for folder in folders for file in folder.glob("ld-linux*.so.*")), None)
     if loader is None:
         return program
-    libraries = loader.resolve().parent
+    libraries = ":".join(map(str, folders))
     changer = tree / "usr/bin/patchelf"
     if not changer.is_file():
         raise CriuError("the packages bring a C library but no `patchelf` to use it with")

@@ -12,7 +12,7 @@ _ERROR: Final = re.compile(
 #: These stand beside every failure and say nothing of its cause.
 _EMPTY: Final = re.compile(
     r"(?:Pre-)?(?:Dumping|Restoring) FAILED\.?|"
-    r"\d+ (?:exited, status=\d+|killed by signal \d+.*|stopped by signal \d+.*)|"
+    r"(?:\d+ )?(?:exited, status=\d+|killed by signal \d+.*|stopped by signal \d+.*)|"
     r"Failed to restore .* task|Can't wait or bad status.*|"
     r"rlimit: Can't setup RLIMIT_NOFILE for self: .*"  # it goes on with fewer open files
 )
@@ -37,5 +37,5 @@ def first_words(output: str) -> tuple[str, ...]:
     Args:
         output: its standard output and error.
     """
-    lines = (line.strip() for line in output.splitlines())
+    lines = (line.strip(" :") for line in output.splitlines())
     return tuple(line for line in lines if line and not line.startswith(("Warn", "(")))[:1]

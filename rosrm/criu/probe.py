@@ -18,6 +18,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import uuid
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -34,9 +35,13 @@ TIMEOUT: Final = 20.0
 _NO_RIGHT: Final = "CAP_CHECKPOINT_RESTORE"
 _YAMA: Final = Path("/proc/sys/kernel/yama/ptrace_scope")
 
-#: The child. It counts what it is sent, and ends by itself where it is sent nothing for long.
+#: The child. It tells the clearer of itself, so that it is not missed; then it counts what it is
+#: sent, and ends by itself where it is sent nothing for long.
 _SUBJECT: Final = """
-import socket, sys
+import os, socket, sys
+clearer = int(sys.argv[3])
+os.write(clearer, b"%d\\n" % os.getpid())
+os.close(clearer)
 count = 0
 with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ours:
     ours.bind(("127.0.0.1", 0))
@@ -47,9 +52,11 @@ with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ours:
         ours.recv(1)
         count += 1
 """
-#: Reads the child's pid, and nothing when it is gone. At the end of its input, which comes when
-#: neither the probe nor a CRIU of it lives any more, it removes what they left.
+#: Makes the folder. Then it reads the child's pid, and nothing when that is gone. At the end of its
+#: input, which comes when neither the probe nor a CRIU of it lives any more, it removes all.
 _CLEARER: Final = """
+mkdir -m 700 -- "$0" || exit
+echo made
 while read -r word; do pid=$word; done
 if [ -n "$pid" ]; then kill -9 "$pid"; fi
 rm -rf -- "$0"
@@ -109,7 +116,7 @@ def _with_remedy(criu: Criu, reason: str) -> str:
     """A reason, and what to do where that is known."""
     if criu.number < OLDEST:
         least = ".".join(map(str, OLDEST))
-        return f"{reason}. CRIU {criu.version} is too old, {least} or newer is needed: {REMEDY}"
+        return f"CRIU {criu.version} is too old, {least} is needed: {REMEDY} (tried: {reason})"
     if _NO_RIGHT in reason:
         return (
             f"CRIU {criu.version} has no right to dump and restore as an ordinary user. "
@@ -185,16 +192,17 @@ def _heard(ours: socket.socket, trial: _Trial, count: str, after: str) -> tuple[
 @contextlib.contextmanager
 def _subject(port: int, trial: _Trial) -> Iterator[subprocess.Popen[bytes]]:
     """The child, and what it is restored as, for a time."""
+    words = (str(port), f"{max(1.0, trial.left):.0f}", str(trial.clearer))
     process = subprocess.Popen(
-        [INTERPRETER, "-I", "-S", "-c", _SUBJECT, str(port), f"{max(1.0, trial.left):.0f}"],
+        [INTERPRETER, "-I", "-S", "-c", _SUBJECT, *words],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
+        pass_fds=(trial.clearer,),
         start_new_session=True,
         cwd="/",
     )
     try:
-        os.write(trial.clearer, b"%d\n" % process.pid)
         yield process
     finally:
         if process.poll() is None:
@@ -211,21 +219,21 @@ def _subject(port: int, trial: _Trial) -> Iterator[subprocess.Popen[bytes]]:
 @contextlib.contextmanager
 def _folder() -> Iterator[tuple[Path, int]]:
     """A folder, and the pipe to the shell that removes it when all who hold the pipe are gone."""
-    folder = Path(tempfile.mkdtemp(prefix="rosrm-criu-"))
-    clearer = subprocess.Popen(
+    folder = Path(tempfile.gettempdir(), f"rosrm-criu-{uuid.uuid4().hex}")
+    with subprocess.Popen(
         ["/bin/sh", "-c", _CLEARER, str(folder)],
         stdin=subprocess.PIPE,
-        stdout=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
         start_new_session=True,
         cwd="/",
-    )
-    assert clearer.stdin is not None
-    try:
+    ) as clearer:
+        assert clearer.stdin is not None
+        assert clearer.stdout is not None
+        if not clearer.stdout.readline():
+            raise OSError(f"no folder can be made in {folder.parent}")
         yield folder, clearer.stdin.fileno()
-    finally:
-        clearer.stdin.close()
-        clearer.wait()
+        # Leaving closes the pipe and waits for the shell.
 
 
 def main() -> int:

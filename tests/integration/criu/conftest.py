@@ -1,0 +1,135 @@
+"""The CRIU of these tests, older ones beside it, and a user who may do nothing."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from rosrm.criu import installing, packages
+from rosrm.criu.probe import probe
+from rosrm.criu.program import Criu, default_prefix, find, opened
+from rosrm.errors import CriuError
+
+ROOT = Path(__file__).parents[3]
+#: Older ones are fetched once, beside the environment's own.
+OLDER = ROOT / ".venv" / "criu-older"
+
+#: A user who owns nothing.
+NOBODY = 65534
+
+
+@pytest.fixture(scope="session")
+def criu() -> Criu:
+    """The one of `make setup`, which works."""
+    try:
+        found = find()
+    except CriuError as error:
+        pytest.skip(str(error))
+    able = probe(found)
+    if not able.works:
+        pytest.skip(able.reason)
+    return found
+
+
+@pytest.fixture(scope="session")
+def cached() -> Path:
+    """The package files of `make setup`'s CRIU."""
+    folder = default_prefix() / "packages"
+    if not any(folder.glob("*.deb")):
+        pytest.skip(f"no packages of CRIU in {folder}: `make setup` had none to fetch")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def older() -> Callable[[str], Path]:
+    """The folder of a Debian release's own CRIU, in `tree`, and of its packages."""
+
+    def of(suite: str) -> Path:
+        place = OLDER / suite
+        if not (place / "tree").is_dir():
+            OLDER.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryDirectory(dir=OLDER) as new:
+                _fetch(suite, Path(new))
+                shutil.rmtree(place, ignore_errors=True)
+                Path(new, suite).rename(place)
+            installing.bound(place / "tree")
+        return place
+
+    return of
+
+
+def _fetch(suite: str, new: Path) -> None:
+    (new / "apt").mkdir()
+    (new / suite / "tree").mkdir(parents=True)
+    try:
+        archive = packages.archive_here()
+        if "debian" not in archive.keyring.name:
+            pytest.skip(f"only Debian has the release {suite}")
+        wanted = ("criu", "patchelf")
+        files = packages.fetch(wanted, replace(archive, suite=suite), new / "apt", print)
+    except CriuError as error:
+        pytest.skip(f"no CRIU of {suite} to be had: {error}")
+    packages.unpack(files, new / suite / "tree")
+    (new / suite / "packages").mkdir()
+    for file in files:
+        file.rename(new / suite / "packages" / file.name)
+
+
+@pytest.fixture(scope="session")
+def old(older) -> Callable[[str], Criu]:
+    """A Debian release's own CRIU: Debian 12 has 3.17, Debian 13 has 4.1."""
+    return lambda suite: opened(older(suite) / "tree/usr/sbin/criu")
+
+
+@pytest.fixture
+def public() -> Iterator[Path]:
+    """A folder in which every user may write."""
+    with tempfile.TemporaryDirectory(prefix="rosrm-test-") as folder:
+        Path(folder).chmod(0o777)
+        yield Path(folder)
+
+
+@pytest.fixture(scope="session")
+def as_nobody() -> Callable[..., subprocess.CompletedProcess]:
+    """Runs `python -m MODULE ...` as a user without any rights."""
+    if os.geteuid() != 0:
+        pytest.skip("only root may act as another user")
+    user = {"user": NOBODY, "group": NOBODY, "extra_groups": [], "cwd": "/"}
+    # The interpreter of the environment may lie where nobody else may look.
+    seen = subprocess.run(
+        ["/usr/bin/env", "-i", sys.executable, "-c", "import rosrm.criu.probe"],
+        capture_output=True,
+        check=False,
+        **user,
+    )
+    python = sys.executable if seen.returncode == 0 else shutil.which("python3", path="/usr/bin")
+    code = "import sys; assert sys.version_info >= (3, 10); import rosrm.criu.probe"
+    variables = {"PYTHONPATH": str(ROOT)}
+    if (
+        python is None
+        or subprocess.run([python, "-c", code], env=variables, check=False, **user).returncode
+    ):
+        pytest.skip("no Python and rosrm that every user can read")
+
+    def run(module: str, *words: object, home: Path, **environment: object):
+        variables = {"PYTHONPATH": ROOT, "PATH": "/usr/bin:/bin", "HOME": home, "TMPDIR": home}
+        variables |= {"PYTHONDONTWRITEBYTECODE": 1, **environment}
+        return subprocess.run(
+            [python, "-m", module, *map(str, words)],
+            env={name: str(value) for name, value in variables.items()},
+            capture_output=True,
+            text=True,
+            timeout=100,
+            check=False,
+            **user,
+        )
+
+    return run

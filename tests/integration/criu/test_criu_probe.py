@@ -1,0 +1,159 @@
+"""What the probe says of CRIUs that work, and of those that do not."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+
+from rosrm.criu.fitting import FACTS
+from rosrm.criu.probe import ability, probe
+from rosrm.criu.program import Criu
+
+
+def test_one_that_works(criu):
+    able = probe(criu)
+    assert (able.works, able.reason) == (True, "")
+    assert able.facts.keys() == FACTS.keys()
+    assert able.facts["version"] == criu.version
+
+
+def test_as_a_program_it_says_so_in_one_line(criu):
+    done = subprocess.run(
+        [sys.executable, "-m", "rosrm.criu.probe"], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.count("\n") == 1
+    assert json.loads(done.stdout).keys() == {"works", "reason", "facts"}
+    assert json.loads(done.stdout)["works"] is True
+
+
+@pytest.mark.parametrize(
+    ("suite", "version"), [("bookworm", "3.17"), ("trixie", "4.1")], ids=["3.17", "4.1"]
+)
+@pytest.mark.slow  # they are fetched once
+def test_too_old_ones_are_told_apart(old, suite, version):
+    """Debian 12's own fails on present kernels, Debian 13's only on a process with a socket."""
+    found = old(suite)
+    assert found.version.startswith(version)
+    able = probe(found)
+    if able.works:
+        pytest.skip(f"CRIU {found.version} works on this kernel")
+    assert able.reason.startswith(f"CRIU {found.version} is too old, 4.2 is needed: `rosrm criu ")
+    assert "could not dump: " in able.reason
+    assert able.facts["version"] == found.version
+
+
+def test_none_says_where_it_was_looked_for(tmp_path, monkeypatch):
+    monkeypatch.delenv("ROSRM_CRIU", raising=False)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr("rosrm.criu.program._PLACES", str(tmp_path))
+    able = ability(tmp_path)
+    assert (able.works, able.facts) == (False, {})
+    assert able.reason == (
+        f"there is no CRIU here (looked for: ROSRM_CRIU (not set), {tmp_path}/bin/criu, `criu` in "
+        "PATH). `rosrm criu install` brings one, without touching the system"
+    )
+
+
+def test_a_user_without_rights_reads_what_gives_them(criu, as_nobody, public):
+    program = reachable(criu, public)
+    done = as_nobody("rosrm.criu.probe", home=public, ROSRM_CRIU=program)
+    able = json.loads(done.stdout)
+    assert able["works"] is False
+    assert able["reason"].startswith(f"CRIU {criu.version} has no right to dump and restore")
+    assert "`sudo setcap cap_checkpoint_restore,cap_setpcap" in able["reason"]
+    assert f"+eip {program}`" in able["reason"]
+    assert left_in(public, program) == []
+
+
+def test_what_the_user_reads_gives_the_rights(criu, as_nobody, public):
+    program = reachable(criu, public)
+    asked = json.loads(as_nobody("rosrm.criu.probe", home=public, ROSRM_CRIU=program).stdout)
+    command = asked["reason"].split("`")[1].removeprefix("sudo ").split()
+    if shutil.which(command[0]) is None or subprocess.run(command, check=False).returncode != 0:
+        pytest.skip("no setcap, or no capabilities on this file system")
+    done = as_nobody("rosrm.criu.probe", home=public, ROSRM_CRIU=program)
+    able = json.loads(done.stdout)
+    assert (able["works"], able["reason"]) == (True, "")
+    assert (able["facts"]["uid"], able["facts"]["all_users"]) == ("65534", "no")
+    assert left_in(public, program) == []
+
+
+@pytest.mark.parametrize("moment", ["folder", "dump.log", "restore.log"])
+def test_a_killed_probe_leaves_nothing_behind(criu, tmp_path, moment):
+    """Killed as soon as it has its folder, in the dump, and in the restore."""
+    asking = subprocess.Popen(
+        [sys.executable, "-m", "rosrm.criu.probe"],
+        env={**os.environ, "TMPDIR": str(tmp_path)},
+        stdout=subprocess.DEVNULL,
+    )
+    try:
+        pattern = "rosrm-criu-*" if moment == "folder" else f"rosrm-criu-*/{moment}"
+        until = time.monotonic() + 60
+        while not any(tmp_path.glob(pattern)):
+            assert asking.poll() is None, f"it ended before there was a {moment}"
+            assert time.monotonic() < until, f"no {moment} within 60 s"
+    finally:
+        asking.kill()
+        asking.wait()
+    assert_all_gone(tmp_path)
+
+
+def test_one_that_hangs_is_given_up_in_time_and_leaves_nothing_behind(tmp_path, monkeypatch):
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr("tempfile.tempdir", None)
+    hanging = tmp_path / "criu"
+    hanging.write_text("#!/bin/sh\nexec sleep 1000\n")
+    hanging.chmod(0o755)
+    able = probe(Criu((str(hanging),), "4.2"), timeout=3.0)
+    assert able.works is False
+    assert able.reason.startswith("CRIU 4.2 could not dump: it was not done after ")
+    hanging.unlink()
+    assert_all_gone(tmp_path)
+
+
+def test_one_that_only_claims_to_have_restored_does_not_work(tmp_path):
+    """`criu check` would be content with it, and so would an exit code."""
+    lying = tmp_path / "criu"
+    lying.write_text('#!/bin/sh\nif [ "$1" = dump ]; then kill -9 "$3"; fi\n')
+    lying.chmod(0o755)
+    able = probe(Criu((str(lying),), "4.2"), timeout=5.0)
+    assert able.reason == "a child that was restored does not answer over UDP on loopback"
+
+
+def reachable(criu: Criu, public: Path) -> Path:
+    """A copy of the program in a folder that everybody can look into."""
+    copy = Path(shutil.copy(os.path.realpath(criu.command[0]), public / "criu"))
+    copy.chmod(0o755)
+    return copy
+
+
+def left_in(folder: Path, *expected: Path) -> list[str]:
+    return [path.name for path in folder.iterdir() if path not in expected]
+
+
+def assert_all_gone(folder: Path) -> None:
+    """No file in the folder, and no process that was started with it."""
+    until = time.monotonic() + 15  # less than the child lives by itself
+    while left_in(folder) or processes_of(folder):
+        told = f"{left_in(folder)}, {processes_of(folder)}"
+        assert time.monotonic() < until, f"15 s after its end there is still: {told}"
+        time.sleep(0.05)
+
+
+def processes_of(folder: Path) -> list[str]:
+    found = []
+    for process in psutil.process_iter():
+        try:
+            if process.pid != os.getpid() and process.environ().get("TMPDIR") == str(folder):
+                found.append(f"{process.pid} {' '.join(process.cmdline())[:60]}")
+        except psutil.Error:
+            continue
+    return found

@@ -1,0 +1,112 @@
+"""Whether an image of one host can be restored at another, by what the hosts tell."""
+
+from __future__ import annotations
+
+import pytest
+
+from rosrm.criu.facts import facts_of, features
+from rosrm.criu.fitting import FACTS, mismatch
+from rosrm.criu.program import Criu
+
+HERE = {
+    "version": "4.2.1",
+    "kernel": "6.18.44",
+    "machine": "x86_64",
+    "cpu": "avx avx2 sse2",
+    "uid": "1000",
+    "all_users": "no",
+    "python": "/usr/bin/python3.12",
+    "python_version": "3.12.3",
+    "libc": "glibc 2.39",
+}
+
+
+def test_a_host_like_the_source_takes_its_images():
+    assert mismatch(HERE, dict(HERE)) == ""
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"kernel": "5.15.0"},
+        {"version": "4.2.2"},
+        {"version": "4.10"},
+        {"cpu": "avx avx2 avx512f sse2"},
+        {"uid": "0", "all_users": "yes"},
+    ],
+    ids=str,
+)
+def test_another_kernel_and_more_of_everything_is_no_hindrance(change):
+    assert mismatch(HERE, {**HERE, **change}) == ""
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (
+            {"machine": "aarch64", "cpu": "fp asimd"},
+            "its machine is aarch64, the source's x86_64",
+        ),
+        (
+            {"version": "4.2"},
+            "its CRIU 4.2 is older than the source's 4.2.1, whose images it may not understand",
+        ),
+        (
+            {"cpu": "sse2"},
+            "its processor lacks what a program of the source may use already: avx, avx2",
+        ),
+        (
+            {"uid": "1001"},
+            (
+                "the process belongs to the user 1000, and its CRIU restores only those of the "
+                "user 1001"
+            ),
+        ),
+        (
+            {"python": "/opt/python"},
+            "its Python interpreter is /opt/python, the source's /usr/bin/python3.12",
+        ),
+        ({"python_version": "3.12.4"}, "its Python is 3.12.4, the source's 3.12.3"),
+        ({"libc": ""}, "its C library is none, the source's glibc 2.39"),
+    ],
+    ids=lambda value: str(value)[:30],
+)
+def test_what_differs_is_told_with_both_values(change, expected):
+    assert mismatch(HERE, {**HERE, **change}) == expected
+
+
+def test_many_missing_features_are_told_by_the_first_ones():
+    there = {**HERE, "cpu": ""}
+    source = {**HERE, "cpu": " ".join(f"f{n}" for n in range(9))}
+    assert mismatch(source, there).endswith(": f0, f1, f2, f3, f4, ...")
+
+
+@pytest.mark.parametrize("name", FACTS)
+def test_what_one_host_does_not_tell_makes_no_match(name):
+    part = {key: value for key, value in HERE.items() if key != name}
+    for one, other in ((part, HERE), (HERE, part)):
+        assert mismatch(one, other) == f"it is not known of both hosts what they have: {name}"
+
+
+def test_this_host_tells_every_fact_and_takes_its_own_images():
+    told = facts_of(Criu(("criu",), "4.2.1"))
+    assert told.keys() == FACTS.keys()
+    assert all(told.values())
+    assert mismatch(told, told) == ""
+
+
+def test_of_an_x86_processor_only_what_programs_use_is_told():
+    info = "processor : 0\nflags\t\t: fpu avx2 hypervisor constant_tsc sse4_2 amx_tile ibrs\n"
+    assert features(info) == "amx_tile avx2 fpu sse4_2"
+
+
+def test_of_an_arm_processor_all_features_are_told():
+    assert features("Features\t: fp asimd aes\nCPU part\t: 0xd0b\n") == "aes asimd fp"
+
+
+def test_cores_that_differ_have_in_common_what_all_of_them_have():
+    assert features("Features : fp sve aes\n\nFeatures : fp aes\n") == "aes fp"
+
+
+def test_a_processor_that_says_nothing_has_no_features():
+    assert features("") == ""
