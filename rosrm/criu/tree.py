@@ -100,7 +100,7 @@ def _namespace(pid: int, name: str) -> str:
 
 
 def _own(name: str) -> str:
-    return os.readlink(f"/proc/self/ns/{name}")  # noqa: PTH115
+    return os.readlink(f"/proc/thread-self/ns/{name}")  # noqa: PTH115
 
 
 def memory_of(pids: Iterable[int]) -> int:
