@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any, Final
 
 from rosrm.core import abilities
 from rosrm.core.commands import Assign
+from rosrm.core.hosts import HostCondition
+from rosrm.core.keeping import awaits_states
 from rosrm.core.lost_tail import why_no_work
 from rosrm.core.model import EMPTY
 from rosrm.core.placement import Demand, Ranking
 from rosrm.core.state import MasterState, Process, ProcessPhase, larger
 from rosrm.core.verdicts import Decision, decide, refused_everywhere, why_never
 
-_PLUGIN_TOLD_EVERY = 10.0
+_PLUGIN_TOLD_EVERY: Final = 10.0
+_STATE_MAY_COME: Final = "a host that may keep its state has not come back yet"
+_NOBODY: Final[frozenset[str]] = frozenset()
 
 
 def demand_of(state: MasterState, process: Process) -> Demand:
@@ -80,13 +85,36 @@ def place_waiting(state: MasterState, now: float) -> None:
     if why:
         state.processes[head].reason = why
         return
+    passed_over = _passed_over(state, now)
     if state.settings.backfill:
-        _place_any(state, now)
+        _place_any(state, passed_over, now)
     else:
-        while (name := state.queue.head()) is not None:
-            if not _place_or_set_aside(state, state.processes[name], now):
-                break
-    state.placed_at = _versions(state)
+        _place_in_order(state, passed_over, now)
+    if not passed_over:
+        state.placed_at = _versions(state)
+
+
+def _passed_over(state: MasterState, now: float) -> frozenset[str]:
+    """Who is not placed yet, and holds nobody up who is behind."""
+    if not (state.hosts.condition == HostCondition.EXPECTED).any():
+        return _NOBODY
+    names = (name for name in state.queue if awaits_states(state, state.processes[name]))
+    passed_over = frozenset(names)
+    for name in passed_over:
+        _tell_waits(state, state.processes[name], _STATE_MAY_COME, now)
+    return passed_over
+
+
+def _place_in_order(state: MasterState, passed_over: frozenset[str], now: float) -> None:
+    while (name := _next_in_line(state, passed_over)) is not None:
+        if not _place_or_set_aside(state, state.processes[name], now):
+            return
+
+
+def _next_in_line(state: MasterState, passed_over: frozenset[str]) -> str | None:
+    if not passed_over:
+        return state.queue.head()
+    return next((name for name in state.queue if name not in passed_over), None)
 
 
 def _versions(state: MasterState) -> tuple[int, ...]:
@@ -95,9 +123,11 @@ def _versions(state: MasterState) -> tuple[int, ...]:
     return (hosts.version, len(hosts.touched), state.queue.version, state.learned.version)
 
 
-def _place_any(state: MasterState, now: float) -> None:
+def _place_any(state: MasterState, passed_over: frozenset[str], now: float) -> None:
     fit_nowhere = set()
     for name in state.queue:
+        if name in passed_over:
+            continue
         process = state.processes[name]
         key = demand_of(state, process).key
         if key not in fit_nowhere and not _place_or_set_aside(state, process, now):
@@ -182,17 +212,25 @@ def reconsider_set_aside(state: MasterState, now: float) -> None:
 
 def _tell_waiting(state: MasterState, process: Process, now: float) -> None:
     """Say once that the head of the queue waits, and why."""
-    there = len(state.hosts) > 0
-    reason = "no host has room for it now" if there else "no host has registered yet"
-    if process.reason == reason:
+    if not len(state.hosts):
+        _tell_waits(state, process, "no host has registered yet", now)
         return
-    process.reason = reason
-    if there:
+    reason = "no host has room for it now"
+    if process.reason != reason:
         state.note_decision(process, decide_now(state, process), "waits", now)
-    state.record(
-        now, "waits", f"{process.name} waits: {reason}", process=process.name,
-        facts={"decision": process.decision} if there else EMPTY,
-    )  # fmt: skip
+        _tell_waits(state, process, reason, now, {"decision": process.decision})
+
+
+def _tell_waits(
+    state: MasterState, process: Process, reason: str, now: float,
+    facts: Mapping[str, Any] = EMPTY,
+) -> None:  # fmt: skip
+    """Say so once."""
+    if process.reason != reason:
+        process.reason = reason
+        state.record(
+            now, "waits", f"{process.name} waits: {reason}", process=process.name, facts=facts
+        )
 
 
 def _tell_failure(state: MasterState, ranking: Ranking, now: float) -> None:

@@ -20,12 +20,14 @@ class HostRegistered:
     Attributes:
         instances: what it holds already.
         journal_seen: newest record that a former run of this master has told it of; 0: none.
+        kept: all states that it keeps.
     """
 
     request: int
     description: HostDescription
     instances: tuple[InstanceStatus, ...] = ()
     journal_seen: int = 0
+    kept: tuple[KeptState, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rosrm.core import events as happened
-from rosrm.core import host_loss, lifecycle
+from rosrm.core import host_loss, keeping, lifecycle
 from rosrm.core.assigning import reconsider_set_aside
 from rosrm.core.charges import settle_charge
 from rosrm.core.commands import Order, Reply
@@ -48,6 +48,7 @@ def host_registered(state: MasterState, event: happened.HostRegistered, now: flo
         },
     )  # fmt: skip
     note_seen(state, host.name, event.journal_seen, now)
+    keeping.note_states(state, host, event.kept, now)  # it decides where what is queued goes on
     host_loss.regain_sight(state, host, now)
     lifecycle.reconcile(state, host, event.instances, now, registering=True)
     _forgive(state, host)
@@ -71,6 +72,7 @@ def _registered_again(
     asked for everything in order.
     """
     state.hosts.heard[host.column] = now
+    keeping.note_states(state, host, event.kept, now)
     condition = state.hosts.condition_of(host)
     if condition in (HostCondition.LOST, HostCondition.SUSPECT):
         welcome_back(state, host, now)

@@ -28,7 +28,7 @@ from rosrm.core import events as happened
 from rosrm.core.commands import Order
 from rosrm.core.holdings import Holding, Told
 from rosrm.core.hosts import Host, HostCondition
-from rosrm.core.model import InstanceId
+from rosrm.core.model import InstanceId, KeptState
 from rosrm.core.state import MasterState, Process, ProcessPhase
 from rosrm.ports import CheckpointChoice, CheckpointView
 
@@ -50,11 +50,25 @@ def kept_states_received(
 ) -> None:
     """Note all that a host keeps."""
     host = state.hosts.find(event.host_id, event.incarnation)
-    if host is None:
-        return
+    if host is not None:
+        note_states(state, host, event.states, now)
+
+
+def note_states(state: MasterState, host: Host, states: tuple[KeptState, ...], now: float) -> None:
+    """A host says all that it keeps."""
     # Of a journal that was lost: no instance may get a number that a kept state has already.
-    state.skip_numbers(max((one.instance.number for one in event.states), default=0))
-    state.keeping.holdings.replace(host.name, event.states, now)
+    state.skip_numbers(max((one.instance.number for one in states), default=0))
+    state.keeping.holdings.replace(host.name, states, now)
+
+
+def awaits_states(state: MasterState, process: Process) -> bool:
+    """Hosts that may keep a state of a process have not come back since the master started.
+
+    Started now it might begin from nothing beside its own state. Whoever has not come back when the
+    lease is over is lost.
+    """
+    expected = state.hosts.condition == HostCondition.EXPECTED
+    return process.spec.keeps_state and bool(expected.any())
 
 
 def order_answered(state: MasterState, event: happened.OrderAnswered) -> bool:
@@ -161,7 +175,7 @@ def _choice(
     since = max((holdings[name].since for name in others), default=None)
     view = CheckpointView(
         process.spec, host.name, None if since is None else now - since,
-        max(holdings.values(), key=lambda one: one.age).size, others, hosts,
+        _newest_size(holdings), others, hosts,
     )  # fmt: skip
     try:
         choice = keeping.policy.choose(view)
@@ -184,6 +198,10 @@ def _may_keep(state: MasterState, host: Host, keepers: tuple[str, ...]) -> bool:
     return condition is HostCondition.UP or (
         condition is HostCondition.SUSPECT and host.name in keepers
     )
+
+
+def _newest_size(holdings: Mapping[str, Holding]) -> int:
+    return max(((one.age, one.size) for one in holdings.values()), default=((0, 0), 0))[1]
 
 
 def _sound(choice: CheckpointChoice, view: CheckpointView) -> CheckpointChoice:

@@ -231,6 +231,7 @@ def assignment_to_msg(assignment: model.Assignment) -> msg.Assignment:
         fence_after=float(fence.after), fence_grace=float(fence.grace),
         fence_alive=fence.alive,
         kept_on=list(assignment.kept_on), kept_from=assignment.kept_from,
+        restored=assignment.restored,
         spec=spec_to_msg(assignment.spec),
     )  # fmt: skip
 
@@ -246,6 +247,7 @@ def assignment_from_msg(message: msg.Assignment) -> model.Assignment:
     return model.Assignment(
         instance_from_msg(message.instance), spec_from_msg(message.spec), message.epoch,
         message.node_name, message.shadow, fence, tuple(message.kept_on), message.kept_from,
+        message.restored,
     )  # fmt: skip
 
 

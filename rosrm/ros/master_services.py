@@ -156,6 +156,7 @@ class MasterServices:
         try:
             description = convert.host_from_msg(request.host)
             statuses = tuple(convert.status_from_msg(status) for status in request.instances)
+            kept = tuple(convert.kept_from_msg(state) for state in request.kept)
         except Refused as refusal:
             respond(srv.RegisterHost.Response(answer=refused(refusal.code, str(refusal))))
             return
@@ -167,8 +168,8 @@ class MasterServices:
                 self._links.renew(reply.host_id, description)
             respond(response)
 
-        token = self._keep(answer)
-        self._tell(happened.HostRegistered(token, description, statuses, int(request.journal_seen)))
+        token, seen = self._keep(answer), int(request.journal_seen)
+        self._tell(happened.HostRegistered(token, description, statuses, seen, kept))
 
     def _left(self, request: srv.Leave.Request, token: int) -> happened.Event:
         link = self._links.find(request.host_id, request.incarnation)

@@ -182,6 +182,7 @@ class SlaveEndpoint:
             envelope=self._control.envelope(self._master_beat, self._greeting.epoch),
             host=convert.host_to_msg(self._description),
             instances=[convert.status_to_msg(status) for status in self._host.statuses()],
+            kept=[convert.kept_to_msg(one) for one in self._host.kept_states()],
             journal_seen=self._seen.of_former_run(self.cluster, self._incarnation),
         )
         self._control.call(

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from rosrm.core import slave as core
-from rosrm.core.model import InstanceId, InstanceStatus, RestartPolicy
+from rosrm.core.model import InstanceId, InstanceStatus, KeptState, RestartPolicy
 from rosrm.errors import Refused
 from rosrm.ros import convert, names
 from rosrm.ros.control import ControlServer, Gate, accepted, refused, version_refusal
@@ -34,6 +34,9 @@ class Host(Protocol):
 
     def statuses(self) -> Sequence[InstanceStatus]:
         """All that this host holds."""
+
+    def kept_states(self) -> Sequence[KeptState]:
+        """All the states that this host keeps."""
 
     def read_log(self, process: str, number: int, offset: int, max_bytes: int) -> LogSlice:
         """A part of a log; raises `Refused`."""

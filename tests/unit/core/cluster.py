@@ -43,6 +43,7 @@ from rosrm.core.migration import (
 from rosrm.core.model import (
     EMPTY,
     RESOURCE_SLOTS,
+    KeptState,
     Kind,
     MigrationPolicy,
     ProcessSpec,
@@ -279,12 +280,13 @@ class Cluster:
         self.register(machine)
         return machine
 
-    def register(self, machine: Machine) -> Reply:
+    def register(self, machine: Machine, kept: tuple[KeptState, ...] = ()) -> Reply:
         """A slave registers; taken in, it sends a reading and asks for work."""
         machine.begin_to_register()
         reply = self.ask(
-            happened.HostRegistered, machine.description(), machine.slave.statuses(), settle=False
-        )
+            happened.HostRegistered, machine.description(), machine.slave.statuses(), 0, kept,
+            settle=False,
+        )  # fmt: skip
         if reply.accepted:
             machine.host_id, machine.fresh = reply.host_id, False
             machine.polled.clear()

@@ -314,3 +314,66 @@ def test_stateless_processes_and_strangers_are_left_alone():
     assert assigned(cluster).kept_on == ()
     cluster.submit(process("t"))
     assert assigned(cluster).instance.number > 70, "no number is used twice"
+
+
+def register(cluster: Cluster, host: str, *states: tuple[str, int, int]) -> None:
+    """A slave registers with the master, and says at once what it keeps."""
+    machine = cluster.machines[host]
+    kept = tuple(
+        KeptState(InstanceId(name, number), sequence, 100) for name, number, sequence in states
+    )
+    cluster.register(machine, kept)
+
+
+def test_a_master_that_starts_knows_what_a_host_keeps_as_soon_as_it_registers():
+    """A start that follows from the very registration goes on from that state."""
+    cluster = running(Asked(), "a", "b")
+    host, number = where(cluster), cluster["p"].owner
+    register(cluster, others(cluster)[0])
+    cluster.kill_master()
+    machine = cluster.machines[host]
+    machine.programs.clear()  # it ended, and was forgotten, while there was no master
+    machine.slave.held.clear()
+    register(cluster, others_of(cluster, host)[0])
+    register(cluster, host, ("p", number, 5))
+    cluster.wait(1.0)
+    assert assigned(cluster).instance.number > number
+    assert assigned(cluster).kept_on == (host,)
+
+
+def others_of(cluster: Cluster, host: str) -> list[str]:
+    return [name for name in cluster.machines if name != host]
+
+
+def test_after_a_start_of_the_master_its_state_may_lie_on_a_host_that_comes_back_later():
+    """It is not started from nothing meanwhile, nor waited for for ever; those behind it go on."""
+    cluster = running(Asked())
+    host, left = where(cluster), others(cluster)
+    for name in left:
+        cluster.machines[name].takes = False
+    cluster.machines[host].connected = False
+    cluster.wait(6.0)
+    assert cluster.queue() == ["p"]
+    cluster.kill_master()
+    for name in left:
+        cluster.machines[name].takes = True
+        register(cluster, name)
+    cluster.submit(process("behind"))
+    cluster.wait(1.0)
+    assert cluster.phase("behind") == "running"
+    assert cluster.queue() == ["p"]
+    assert "has not come back yet" in cluster["p"].reason
+    cluster.wait(4.0)  # the lease is over
+    assert cluster.phase("p") == "running"
+
+
+def test_the_last_copy_may_vanish_while_processes_are_looked_at():
+    """It was the one of a host that has been told to drop it."""
+    policy = Asked()
+    cluster = running(policy)
+    cluster.wait(3.0)
+    cluster.state.keeping.waiting = ["p"]
+    keep(cluster, where(cluster), ("another", cluster["p"].owner + 1, 5))
+    cluster.wait(3.0)
+    assert cluster.phase("p") == "running"
+    assert policy.views[-1].size == 0
