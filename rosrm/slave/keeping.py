@@ -27,10 +27,16 @@ from rosrm.slave.kept_store import KeptStore
 _SCAN_EVERY: Final = 1.0
 #: Seconds after which the master is told again, though nothing has changed.
 _SAY_EVERY: Final = 10.0
-#: Seconds for one part to be taken.
-_PART_TIMEOUT: Final = 3.0
-#: Seconds after which a host that did not take a state is tried again.
+#: Seconds for one part to be taken. A slave that was just found may not be able to answer yet.
+_PART_TIMEOUT: Final = 1.0
+#: Seconds after which a host that refuses a state is tried again.
 _AGAIN: Final = 3.0
+#: Why a part was not taken, where nothing but the wire is to blame.
+_LOST_WORDS: Final = frozenset({"timeout", "order"})
+
+
+#: What is answered where a part could not be taken for a reason that nobody thought of.
+_FAILED: Final = ("full", "the slave failed to take it; its log says why")
 
 
 @dataclass(slots=True)
@@ -97,7 +103,7 @@ class Keeping:
         self._transfers: dict[str, _Transfer] = {}
         #: Instances that wait for a state; None: it is being looked for here.
         self._preparing: dict[InstanceId, Fetch | None] = {}
-        self._kept: tuple[KeptState, ...] = ()
+        self._kept = self._store.scan()
         self._told: tuple[KeptState, ...] | None = None
         self._told_at = 0.0
         self._next_scan = 0.0
@@ -112,15 +118,23 @@ class Keeping:
         while (job := self._jobs.get()) is not None:
             job()
 
-    def _in_thread(self, work: Callable[[], Any], then: Callable[[Any], None]) -> None:
-        """Have something done by the thread; `then` is called in the loop with what it returned."""
+    def _in_thread(
+        self, work: Callable[[], Any], then: Callable[[Any], None], otherwise: Any = None
+    ) -> None:
+        """Have something done by the thread.
+
+        Args:
+            work: done there.
+            then: called in the loop with what it returned.
+            otherwise: what `then` is called with if the work raised; that is said.
+        """
 
         def job() -> None:
             try:
                 outcome = work()
             except Exception as error:  # noqa: BLE001 - the thread has to live on
                 self._post(partial(self._say, f"a kept state: {type(error).__name__}: {error}"))
-                return
+                outcome = otherwise
             self._post(partial(then, outcome))
 
         self._jobs.put(job)
@@ -174,9 +188,14 @@ class Keeping:
             if fetch is not None:
                 fetch.go_on(now)
 
-    def _scanned(self, states: tuple[KeptState, ...]) -> None:
-        self._kept = states
-        self._tell(time.monotonic())
+    def states(self) -> tuple[KeptState, ...]:
+        """What is kept here, as of the newest look."""
+        return self._kept
+
+    def _scanned(self, states: tuple[KeptState, ...] | None) -> None:
+        if states is not None:
+            self._kept = states
+            self._tell(time.monotonic())
 
     def _tell(self, now: float) -> None:
         quiet = not self._kept and not self._told
@@ -191,7 +210,8 @@ class Keeping:
         process = shipment.instance.process
         if process in self._transfers:
             return
-        for host in shipment.hosts:
+        # Who has waited longest goes first: one that does not answer holds up nobody.
+        for host in sorted(shipment.hosts, key=lambda name: shipment.due.get(name, 0.0)):
             if now >= shipment.due.get(host, 0.0) and self._endpoint.finds_keeper(host, now):
                 shipment.due[host] = now + shipment.every
                 transfer = self._transfers[process] = _Transfer(shipment, host)
@@ -232,12 +252,7 @@ class Keeping:
         shipment, head, host = transfer.shipment, transfer.head, transfer.host
         now = time.monotonic()
         if code and head is not None:
-            if code == "newer":
-                shipment.sent[host] = head.age
-            elif shipment.said.get(host) != code:
-                shipment.said[host] = code
-                self._say(f"{host} does not keep the state of {shipment.instance}: {message}")
-            shipment.due[host] = now + max(_AGAIN, shipment.every)
+            self._not_taken(shipment, host, head, now, code, message)
             self._end(transfer)
             return
         transfer.offset += size
@@ -249,6 +264,21 @@ class Keeping:
         else:
             self._go_on(transfer, now)
 
+    def _not_taken(
+        self, shipment: _Shipment, host: str, head: Head, now: float, code: str, message: str
+    ) -> None:
+        """Give it again, at once where only a word was lost."""
+        if code == "newer":  # the answer to the last part was lost, perhaps
+            shipment.sent[host] = head.age
+            return
+        if code in _LOST_WORDS:
+            shipment.due[host] = now
+        else:
+            shipment.due[host] = now + max(_AGAIN, shipment.every)
+        if shipment.said.get(host) != code:
+            shipment.said[host] = code
+            self._say(f"{host} does not keep the state of {shipment.instance}: {message}")
+
     def _end(self, transfer: _Transfer) -> None:
         process = transfer.shipment.instance.process
         if self._transfers.get(process) is transfer:
@@ -259,7 +289,7 @@ class Keeping:
     def take_part(self, part: Part, answer: Callable[[str, str], None]) -> None:
         """A part of a state came from another host."""
         take = partial(self._store.take, part, bounded=True)
-        self._in_thread(take, lambda outcome: answer(*outcome))
+        self._in_thread(take, lambda outcome: answer(*outcome), _FAILED)
 
     def read_part(
         self, process: str, age: tuple[int, int], offset: int, size: int,
@@ -321,7 +351,7 @@ class Keeping:
         fetch.go_on(time.monotonic())
 
     def _take_fetched(self, part: Part, then: Callable[[tuple[str, str]], None]) -> None:
-        self._in_thread(partial(self._store.take, part, bounded=False), then)
+        self._in_thread(partial(self._store.take, part, bounded=False), then, _FAILED)
 
     def is_preparing(self, instance: InstanceId) -> bool:
         """Its start waits for a state."""

@@ -25,6 +25,7 @@ from rosrm.core.model import (
     InstanceId,
     InstanceState,
     InstanceStatus,
+    KeptState,
     RestartPolicy,
     StopPolicy,
 )
@@ -286,11 +287,13 @@ class SlaveRuntime:
 
     def _launch(self, assignments: Sequence[Assignment]) -> None:
         """Start them, each as soon as its kept state is here."""
-        ready = [one for one in assignments if self._keeping.prepare(one, self._prepared)]
+        # Of several events at once the last may have been that its supervisor is gone.
+        wanted = [one for one in assignments if one.instance in self._state.held]
+        ready = [one for one in wanted if self._keeping.prepare(one, self._prepared)]
         if ready:
             self._start(ready)
         # Until it runs nobody else says so, and the master would take it back.
-        waiting = [self._state.held[one.instance].status for one in assignments if one not in ready]
+        waiting = [self._state.held[one.instance].status for one in wanted if one not in ready]
         if waiting:
             self._endpoint.publish_statuses(waiting, complete=False)
 
@@ -353,6 +356,10 @@ class SlaveRuntime:
     def statuses(self) -> Sequence[InstanceStatus]:
         """All that this host holds."""
         return self._state.statuses()
+
+    def kept_states(self) -> Sequence[KeptState]:
+        """All the states that this host keeps."""
+        return self._keeping.states()
 
     def set_restart(self, instance: InstanceId, restart: RestartPolicy, settled: Settled) -> None:
         """Give an instance another restart policy; `settled` when it is on record."""

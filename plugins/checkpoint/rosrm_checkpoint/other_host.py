@@ -27,6 +27,7 @@ class OtherHostOptions:
 class OtherHost:
     """Keeps to the hosts that have a state already, so that it seldom travels to a new one.
 
+    Those with the newest go first: a good copy is never left for one of a former instance.
     Which ones those are is settled by a digest of the names: different processes go to different
     hosts, and nothing that changes with time decides.
     """
@@ -40,11 +41,11 @@ class OtherHost:
         others.sort(key=lambda name: self._rank(name, process))
         return CheckpointChoice(tuple(others[: self._options.copies]), self._options.every)
 
-    def _rank(self, name: str, process: CheckpointView) -> tuple[bool, bool, int]:
+    def _rank(self, name: str, process: CheckpointView) -> tuple[bool, int, int]:
         """Lower goes first."""
-        near = self._is_near(name, process)
-        new = name not in process.kept_on
-        return near, new, zlib.crc32(f"{process.spec.name}\n{name}".encode())
+        near, kept_on = self._is_near(name, process), process.kept_on
+        place = kept_on.index(name) if name in kept_on else len(kept_on)
+        return near, place, zlib.crc32(f"{process.spec.name}\n{name}".encode())
 
     def _is_near(self, name: str, process: CheckpointView) -> bool:
         """Whether it may be lost together with the process's own host."""

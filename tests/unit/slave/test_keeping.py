@@ -389,7 +389,7 @@ def test_all_that_is_kept_is_the_owners_alone(net):
     try:
         net.add("a").keep(P7, ["b"], 1.0)
         net.add("b")
-        net.slaves["a"].prepare(assignment(), pytest.fail)
+        prepare(net, "a", assignment())
         net.write("a", 1)
         net.until(lambda: net.age("b") == (7, 1), "the copy")
     finally:
@@ -399,22 +399,38 @@ def test_all_that_is_kept_is_the_owners_alone(net):
         assert stat.S_IMODE(net.directory(host).stat().st_mode) == 0o700
 
 
-def test_the_host_that_is_named_first_starts_at_once(net):
-    """So does a shadow, which has a source to follow, and a process without a state."""
-    slave = net.add("a")
-    assert slave.prepare(assignment("a", "b"), pytest.fail)
-    assert slave.prepare(assignment(), pytest.fail)
-    assert slave.prepare(assignment("b", shadow=True), pytest.fail)
+@pytest.mark.parametrize(
+    "wanted", [assignment("a", "b"), assignment(), assignment("b", shadow=True)], ids=str
+)
+def test_what_needs_no_state_of_another_host_asks_none(net, wanted):
+    """The newest is here, or there is none, or it follows a source."""
+    net.add("a")
+    net.add("b")
+    net.write("b", 42)
+    prepare(net, "a", wanted)
+    assert net.age("a") is None
+
+
+def test_a_process_without_a_state_starts_at_once(net):
+    """Nothing is looked for."""
     stateless = Assignment(P7, ProcessSpec("p", command=("x",)), 1, "p", kept_on=("b",))
-    assert slave.prepare(stateless, pytest.fail)
+    assert net.add("a").prepare(stateless, pytest.fail)
 
 
 def test_states_of_a_former_life_are_deleted_before_a_start(net):
     """Wherever they came from."""
-    slave = net.add("a")
+    net.add("a")
     net.write("a", 42)
-    assert slave.prepare(assignment(kept_from=8), pytest.fail)
+    prepare(net, "a", assignment(kept_from=8))
     assert net.age("a") is None
+
+
+def test_a_start_goes_on_though_looking_for_its_state_failed(net, monkeypatch):
+    """Its slave says what went wrong."""
+    slave = net.add("a")
+    monkeypatch.setattr(slave, "_look_for", lambda _: 1 / 0)
+    prepare(net, "a", assignment())
+    assert "ZeroDivisionError" in net.said["a"][0]
 
 
 def test_a_start_that_is_called_off_does_not_happen(net):
