@@ -53,6 +53,12 @@ def _take_back(
 
 
 def has_successor(state: MasterState, status: InstanceStatus) -> bool:
-    """Another instance owns the name that this one ran under."""
+    """Another instance owns the name that this one ran under, or is about to.
+
+    It is where a plan goes on as if this one had ended.
+    """
     process = state.processes.get(status.instance.process)
-    return process is not None and process.owner not in (0, status.instance.number)
+    number, run = status.instance.number, state.runs.get(status.instance.process)
+    if run is not None and number in run.ended:
+        return True
+    return process is not None and process.owner not in (0, number)

@@ -149,7 +149,9 @@ def _why_not(state: SlaveState, assignment: Assignment) -> str:
 
 
 def _launch_refused(state: SlaveState, event: LaunchRefused, now: float) -> _Commands:
-    held = state.held[event.instance]
+    held = state.held.get(event.instance)
+    if held is None:  # it went with a supervisor that was killed
+        return []
     held.status = InstanceStatus(event.instance, InstanceState.REFUSED, message=event.reason)
     held.ready_by, held.ended_at = None, now
     _bury(state, event.instance)

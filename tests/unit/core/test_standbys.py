@@ -214,3 +214,16 @@ def test_a_source_that_is_lost_in_its_move_is_followed_by_its_standby() -> None:
     cluster.wait(25.0)
     assert cluster.phase("p") == "running"
     assert cluster.state.instances[cluster["p"].owner].host.name == standby
+
+
+def test_a_primary_that_is_heard_while_its_standby_takes_over_is_fenced() -> None:
+    """Before the commit too: its successor may be active at any moment."""
+    cluster = with_standby("b", "c")
+    cluster.machines["a"].connected = False
+    cluster.wait(9.5)
+    cluster.machines["b"].connected = False  # it does not hear that it is to take over
+    cluster.wait(0.8)
+    assert (cluster.phase("p"), cluster["p"].owner) == ("migrating", 1)
+    cluster.machines["a"].connected = True
+    cluster.wait(0.3)
+    assert [order.instance.number for order in cluster.orders("fence")] == [1]

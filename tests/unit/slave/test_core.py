@@ -58,6 +58,13 @@ def one() -> Slave:
     return Slave()
 
 
+def test_what_went_with_the_supervisor_cannot_be_refused_any_more(one):
+    """It was being started when its supervisor was killed: nobody holds it."""
+    one.step(assigned())
+    one.step(slave.SupervisorReplaced((), {}, frozenset()))
+    assert one.step(slave.LaunchRefused(InstanceId("p", 1), "no such package")) == []
+
+
 def awaited_names(one: Slave) -> list[str]:
     """Who is looked for in the graph."""
     return [h.awaited.node_name for h in one.state.awaited_in_graph().values()]
