@@ -113,7 +113,9 @@ def _report(options: argparse.Namespace, tally: Tally, seconds: float) -> None:
             "parted_s": _spread({"owner": tally.parted}), "overloaded": tally.overloaded,
             "load": _spread({"average": tally.loads}),
             "allowed": dict(tally.allowed), "missed": dict(tally.missed), "left_out": left_out,
-            "services": len(list(work.services())) + 1, "hosts": len(HOSTS), "lease_s": LEASE_S,
+            "services": len(list(work.services())) + 1,
+            "processes_p50": statistics.median(tally.counts) if tally.counts else None,
+            "hosts": len(HOSTS), "lease_s": LEASE_S,
         },
         runs=tally.rounds,
     )  # fmt: skip

@@ -13,9 +13,9 @@ from typing import Final
 
 from benchmarks.chaos import clocks
 from benchmarks.chaos.cluster import DESK, Cluster
+from benchmarks.chaos.excuses import Harm
 from benchmarks.chaos.faults import MASTER, Fault
 from benchmarks.chaos.reality import members
-from benchmarks.chaos.rules import Harm
 from rosrm.lab import Direction
 
 _ALL: Final = frozenset({"*"})
@@ -80,7 +80,9 @@ class Harmer:
             self._cluster.start(part)
             return True
 
-        return Harm(fault.kind, begun, begun, hosts, hides=True, restarts=True), start
+        deafens = part != MASTER  # what has a fence waits for a slave at work
+        harm = Harm(fault.kind, begun, begun, hosts, hides=True, restarts=True, deafens=deafens)
+        return harm, start
 
     def _master_stop(self, fault: Fault) -> tuple[Harm, Undo] | str:
         return self._stop_part(fault, MASTER, _ALL)
@@ -93,7 +95,8 @@ class Harmer:
         if not pid:
             return "it does not run"
         os.kill(pid, signal.SIGSTOP)
-        harm = Harm(fault.kind, time.monotonic(), 0.0, hosts, hides=True)
+        deafens = part != MASTER
+        harm = Harm(fault.kind, time.monotonic(), 0.0, hosts, hides=True, deafens=deafens)
         return harm, lambda: self._cluster.proceed(part)
 
     def _master_clock(self, fault: Fault) -> tuple[Harm, Undo] | str:
@@ -127,7 +130,9 @@ class Harmer:
         if isinstance(outcome, str):
             return outcome
         harm, undo = outcome
-        return replace(harm, forgets=number == signal.SIGKILL, deafens=True), undo
+        # After a kill the next one goes on from the last word that was heard, and ends nothing.
+        killed = number == signal.SIGKILL
+        return replace(harm, forgets=killed, deafens=not killed), undo
 
     def _process_kill(self, fault: Fault) -> tuple[Harm, Undo] | str:
         return self._signal_process(fault, signal.SIGKILL)
@@ -211,9 +216,10 @@ class Harmer:
         return self._fill(fault, fault.target), lambda: self._free(fault.target)
 
     def _master_disk_full(self, fault: Fault) -> tuple[Harm, Undo]:
-        """The master may end of it, and is started again."""
+        """The master may end of it, and is started again; states are kept elsewhere."""
         harm = self._fill(fault, DESK)
-        return replace(harm, hosts=_ALL, hides=True, restarts=True), lambda: self._free(DESK)
+        harm = replace(harm, hosts=_ALL, hides=True, restarts=True, fills=False)
+        return harm, lambda: self._free(DESK)
 
     def _fill(self, fault: Fault, host: str) -> Harm:
         begun = time.monotonic()

@@ -14,9 +14,10 @@ from pathlib import Path
 from typing import Final
 
 from benchmarks.chaos import rules
+from benchmarks.chaos.excuses import Harm, Promise
 from benchmarks.chaos.outputs import Outputs
 from benchmarks.chaos.reality import Member, members
-from benchmarks.chaos.rules import Harm, Judgement, Promise
+from benchmarks.chaos.rules import Judgement
 
 #: Seconds: who has said "active" within them is active, on a busy machine.
 FRESH: Final = 1.0
@@ -55,6 +56,9 @@ class Oracle:
         lab: its name.
         folder: of the lines.
         wanted: changed by whoever submits.
+
+    Attributes:
+        counts: live processes, at each look.
     """
 
     def __init__(self, lab: str, folder: Path, wanted: Wanted) -> None:
@@ -62,6 +66,13 @@ class Oracle:
         self._outputs = Outputs(folder)
         self._wanted = wanted
         self._done: set[str] = set()
+        self.counts: list[int] = []
+
+    def look(self) -> list[Member]:
+        """Every live process of the workload; they are counted."""
+        found = members(self._lab)
+        self.counts.append(len(found))
+        return found
 
     # --- at this moment -----------------------------------------------------------------------
 
@@ -69,7 +80,7 @@ class Oracle:
         """What is not as it should be; nothing: all is well."""
         now = time.monotonic()
         there: dict[str, list[Member]] = {}
-        for member in members(self._lab):
+        for member in self.look():
             there.setdefault(member.process, []).append(member)
         found: list[Amiss] = []
         for name, promise in self._wanted.services.items():

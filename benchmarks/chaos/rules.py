@@ -1,7 +1,4 @@
-"""What the runs of a process must be like, and which harm excuses what. Pure.
-
-Knows nothing of rosrm; what is promised for which fault stands here.
-"""
+"""What the runs of a process must be like, by what excuses what. Pure; knows nothing of rosrm."""
 
 from __future__ import annotations
 
@@ -12,85 +9,25 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Final
 
+from benchmarks.chaos.excuses import (
+    LAST_CYCLES,
+    MEETING,
+    OVERLOAD,
+    STARTING,
+    Harm,
+    Promise,
+    is_struck,
+    may_be_lost,
+    may_end,
+    most_behind,
+    unkept,
+)
 from benchmarks.chaos.outputs import Run
 
 #: Seconds after the hosts concerned reach the master again in which there may be two owners.
 _OVERLAP: Final = 1.0
-#: Seconds for the parts to hear each other once nothing keeps them from it: discovery, by DDS.
-_MEETING: Final = 3.0
-#: The same where a part was started again: it has to come up before.
-_STARTING: Final = 8.0
 #: Seconds by which lines of two processes may cross without both having been active at once.
 _CROSSING: Final = 0.05
-#: Cycles that are repeated by who follows one that was killed: the one under way, and one before.
-_LAST_CYCLES: Final = 2
-#: The same where the machine is busy: what is kept is a second behind at most, ten cycles.
-_LAST_SECOND: Final = 12
-#: Seconds after which a state has come to another host.
-_YOUNG: Final = 6.0
-#: What is asked for, and ends or silences nobody by force.
-MOVES: Final = ("move", "overlap")
-#: The kind of the harm that other programs on the machine do.
-OVERLOAD: Final = "overload"
-#: Cycles a second.
-_RATE: Final = 10.0
-
-
-@dataclass(frozen=True)
-class Promise:
-    """What holds of a service.
-
-    Attributes:
-        members: processes of one instance.
-        stateful: its numbers go on.
-        standby: it has a second instance, silent.
-        elsewhere: it goes to another host when its own is lost.
-        isolated: its host stops it when it is cut off.
-        kept: its state is kept on its own host, on the disk.
-        copied: cycles by which a copy of its state on another host may be behind; 0: there is none.
-    """
-
-    members: int = 1
-    stateful: bool = False
-    standby: bool = False
-    elsewhere: bool = False
-    isolated: bool = False
-    kept: bool = False
-    copied: int = 0
-
-
-@dataclass(frozen=True)
-class Harm:
-    """Something that was done to the lab, or asked for, and what it may explain.
-
-    Attributes:
-        kind: of the fault; or "move", "overlap" (a move during which both may be active).
-        hosts: that were concerned; "*": all of them.
-        process: that was struck or moved; "": none by itself.
-        begun, ended: monotonic time.
-        kills: what runs on the hosts ends.
-        hides: the hosts and the master do not hear each other.
-        restarts: a part had to be started again.
-        forgets: how a job ended there meanwhile is not known.
-        fills: nothing more could be kept on the disk there.
-        deafens: who fences there did not hear that the master hears the host.
-    """
-
-    kind: str
-    begun: float
-    ended: float
-    hosts: frozenset[str] = frozenset()
-    process: str = ""
-    kills: bool = False
-    hides: bool = False
-    restarts: bool = False
-    forgets: bool = False
-    fills: bool = False
-    deafens: bool = False
-
-    def concerns(self, host: str) -> bool:
-        """Whether it was done to a host."""
-        return host in self.hosts or "*" in self.hosts
 
 
 @dataclass(frozen=True)
@@ -152,22 +89,12 @@ def judge_service(
         for other in chained[index + 1 :]:
             if _overlap(one, other) > _CROSSING:
                 judged.add(_judge_overlap(name, promise, one, other, harms, reached))
-        if not _may_end(name, promise, one, harms):
+        if not may_end(name, promise, one, harms):
             text = f"{name}: {one} ended, and nothing was done to it; then came {following}"
             judged.violations.append(Violation("touched", name, text))
         if promise.stateful:
             judged.add(_judge_state(name, promise, one, following, harms))
     return judged
-
-
-def _may_end(name: str, promise: Promise, run: Run, harms: Sequence[Harm]) -> bool:
-    return any(
-        harm.process == name
-        or (harm.kills and harm.concerns(run.host))
-        or ((promise.elsewhere or promise.isolated) and harm.hides and harm.concerns(run.host))
-        or ((promise.elsewhere or promise.isolated) and harm.deafens and harm.concerns(run.host))
-        for harm in harms
-    )
 
 
 def _overlap(one: Run, other: Run) -> float:
@@ -189,7 +116,7 @@ def _judge_overlap(
     ]
     # What was done explains it, or else the machine itself, which may be busy to the end.
     parting = [harm for harm in parting if harm.kind != OVERLOAD] or parting
-    until = [harm.ended + _OVERLAP + (_STARTING if harm.restarts else _MEETING) for harm in parting]
+    until = [harm.ended + _OVERLAP + (STARTING if harm.restarts else MEETING) for harm in parting]
     # On a busy machine a part that was started again comes up late: what it took shows that it has.
     until += [reached[host] + _OVERLAP for host in (one.host, other.host) if host in reached]
     parted = promise.elsewhere and not promise.isolated
@@ -207,77 +134,17 @@ def _judge_state(
     behind = one.last_number + 1 - following.first_number
     if behind == 0:
         return Judgement()
-    if behind > 0 and _struck(name, promise, one, harms):
-        if behind <= _LAST_CYCLES:
+    if behind > 0 and is_struck(name, promise, one, harms):
+        if behind <= LAST_CYCLES:
             return Judgement(allowed=Counter(state_cycles_repeated=1))
-        if behind <= _most_behind(name, promise, one, following, harms):
+        if behind <= most_behind(name, promise, one, following, harms):
             return Judgement(allowed=Counter(state_seconds_repeated=1))
-        if following.first_number == 1 and _may_be_lost(name, promise, one, following, harms):
+        if following.first_number == 1 and may_be_lost(promise, one, following, harms):
             return Judgement(allowed=Counter(state_from_nothing=1))
-        if any(harm.fills for harm in harms):
+        if behind <= unkept(one, following, harms):
             return Judgement(allowed=Counter(state_older_disk_full=1))
     text = f"{name}: {following.first_number} after {one.last_number}: {one}, then {following}"
     return Judgement([Violation("state", name, text)])
-
-
-def _struck(name: str, promise: Promise, run: Run, harms: Sequence[Harm]) -> bool:
-    """Whether it ended by force, and not by a move."""
-    return any(
-        (harm.process == name and harm.kind not in MOVES)
-        or (harm.kills and harm.concerns(run.host))
-        or ((promise.elsewhere or promise.isolated) and harm.hides and harm.concerns(run.host))
-        for harm in harms
-    )
-
-
-def _most_behind(
-    name: str, promise: Promise, one: Run, following: Run, harms: Sequence[Harm]
-) -> float:
-    """Cycles that may be repeated by who follows one that was struck."""
-    if following.host == one.host and promise.kept:
-        return _LAST_SECOND
-    # For a move the standby makes room; where that fails, the copy is what is left.
-    asked = any(harm.kind in MOVES and harm.process == name for harm in harms)
-    second = asked or _is_struck_twice(name, promise, harms)
-    if promise.standby and not (second and promise.copied):
-        return _LAST_CYCLES + _unseen(one, harms, one.host)
-    # A young one's copy may be of the one that it followed, as young or on its way then.
-    young = _RATE * 2 * _YOUNG if one.last - one.first < _YOUNG else 0.0
-    return promise.copied + young + _unseen(one, harms) if promise.copied else 0.0
-
-
-def _is_struck_twice(name: str, promise: Promise, harms: Sequence[Harm]) -> bool:
-    """Whether who was to go on, or what it was to go on from, may have been struck as well."""
-    blows = [
-        harm
-        for harm in harms
-        if harm.hides or harm.kills or harm.deafens or harm.fills
-        or (harm.process == name and harm.kind not in MOVES)
-    ]  # fmt: skip
-    # What stops at once wherever the master is not heard, its standby included.
-    everywhere = promise.isolated and any("*" in harm.hosts for harm in blows)
-    return len(blows) > 1 or everywhere
-
-
-def _unseen(run: Run, harms: Sequence[Harm], host: str = "") -> float:
-    """Cycles of a run that nobody could see: one of them was cut off, and it went on.
-
-    Args:
-        host: that was cut off; "": any, for the copies lie on any.
-    """
-    since = [harm.begun for harm in harms if harm.hides and (not host or harm.concerns(host))]
-    return _RATE * max(0.0, run.last - min(since)) if since else 0.0
-
-
-def _may_be_lost(
-    name: str, promise: Promise, one: Run, following: Run, harms: Sequence[Harm]
-) -> bool:
-    """Whether there may be nothing to go on from: no copy, none yet, or none within reach."""
-    if following.host == one.host:
-        return not promise.kept
-    if _is_struck_twice(name, promise, harms) or one.last - one.first < _YOUNG:
-        return True
-    return not (promise.standby or promise.copied)
 
 
 def judge_job(name: str, accepted: float, runs: Sequence[Run], harms: Sequence[Harm]) -> Judgement:

@@ -14,10 +14,11 @@ from typing import Any, Final
 from benchmarks.chaos import work
 from benchmarks.chaos.cluster import HOSTS, Cluster
 from benchmarks.chaos.errands import Errand, Errands
+from benchmarks.chaos.excuses import MOVES, OVERLOAD, Harm, Promise
 from benchmarks.chaos.faults import Fault, Move, Round
 from benchmarks.chaos.harm import Harmer
 from benchmarks.chaos.oracle import Amiss, Oracle, Wanted
-from benchmarks.chaos.rules import MOVES, OVERLOAD, Harm, Promise, Violation
+from benchmarks.chaos.rules import Violation
 from benchmarks.chaos.story import Story
 from benchmarks.machine import say
 
@@ -56,6 +57,7 @@ class Tally:
             of the fault, or "burst" for rounds of several kinds.
         whole: the same, from the first fault on.
         loads: load average of the machine at the end of each round.
+        counts: live processes at each look, from the first round on.
         overloaded: rounds in which so much else ran that hosts may have been lost by it.
     """
 
@@ -67,6 +69,7 @@ class Tally:
     recovery: dict[str, list[float]] = field(default_factory=dict)
     whole: dict[str, list[float]] = field(default_factory=dict)
     loads: list[float] = field(default_factory=list)
+    counts: list[int] = field(default_factory=list)
     overloaded: int = 0
     rounds: int = 0
 
@@ -107,21 +110,22 @@ class Trial:
 
     def begin(self) -> None:
         """Submit the services, and wait until all is well."""
-        entries = [service.entry(self._lines) for service in self._services.values()]
+        entries = [one.entry(self._lines) for one in self._services.values()]
         promises = {name: promise_of(service) for name, service in self._services.items()}
         self._submit(entries, lambda _: self._wanted.services.update(promises))
         self._await_well(0, "the beginning", _BEGIN_S)
         self._oracle.history([])
+        self._oracle.counts = self._tally.counts
 
     def end(self) -> None:
         """Cancel everything, stop the slaves, and look for what is left."""
         names = list(self._wanted.services)
         self._wanted.services.clear()
+        self._oracle.counts = []
         self._errands.send(Errand({"do": "cancel", "names": names}))
         self._await_well(0, "everything was cancelled", SETTLE_S)
         self._cluster.shut_down()
-        left = self._oracle.left()
-        if left:
+        if left := self._oracle.left():
             self._violated(0, [Violation(one.kind, one.name, one.text) for one in left])
 
     # --- a round ------------------------------------------------------------------------------
@@ -133,11 +137,10 @@ class Trial:
             Stuck: something did not become well; it was told.
         """
         self._tally.rounds += 1
-        number = drawn.faults[-1].number
         self._submit_jobs(drawn)
         if drawn.renews:
             self._renew()
-        begun = time.monotonic()
+        number, begun = drawn.faults[-1].number, time.monotonic()
         done = self._do(drawn, begun)
         self._submit_canaries(drawn.number)
         healed = time.monotonic()
@@ -152,14 +155,12 @@ class Trial:
         self._tally.parted += judged.parted
         if judged.violations:
             self._violated(number, judged.violations)
-        kinds = sorted(fault.kind for fault in done)
-        if kinds:
+        if kinds := sorted(fault.kind for fault in done):
             word = kinds[0] if len(set(kinds)) == 1 else "burst"
             self._tally.recovery.setdefault(word, []).append(well - healed)
             self._tally.whole.setdefault(word, []).append(well - begun)
-            say(
-                f"{self._tally.faults} faults; {', '.join(kinds)}: well after {well - healed:.1f} s"
-            )
+            told = f"well after {well - healed:.1f} s"
+            say(f"{self._tally.faults} faults; {', '.join(kinds)}: {told}")
 
     def _note_load(self, begun: float) -> None:
         """A machine that is overloaded by others does what a cut does; it is counted."""
@@ -167,10 +168,8 @@ class Trial:
         self._tally.loads.append(load)
         if load > _OVERLOAD * len(os.sched_getaffinity(0)):
             self._tally.overloaded += 1
-            everywhere = frozenset({"*"})
-            self._harms.append(
-                Harm(OVERLOAD, begun, time.monotonic(), everywhere, hides=True, deafens=True)
-            )
+            times, everywhere = (begun, time.monotonic()), frozenset({"*"})
+            self._harms.append(Harm(OVERLOAD, *times, everywhere, hides=True, deafens=True))
 
     def _do(self, drawn: Round, begun: float) -> list[Fault]:
         """Everything of a round in its time; returns the faults that were done."""
@@ -192,7 +191,9 @@ class Trial:
             else:
                 due.append((time.monotonic() + _LOOK, lambda: end(fault)))
 
-        due: list[tuple[float, Callable[[], None]]] = [
+        until = max(fault.at + fault.lasts for fault in drawn.faults)
+        due: list[tuple[float, Callable[[], object]]] = [
+            *((begun + second, self._oracle.look) for second in range(int(until) + 1)),
             *((begun + one.at, lambda one=one: begin(one)) for one in drawn.faults),
             *((begun + one.at, lambda one=one: self._move(one)) for one in drawn.moves),
         ]

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import ast
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 import benchmarks.chaos
+from benchmarks.chaos.excuses import OVERLOAD, Harm, Promise
 from benchmarks.chaos.outputs import Outputs, Run
 from benchmarks.chaos.rules import (
-    OVERLOAD,
-    Harm,
     Judgement,
-    Promise,
     chain,
     judge_job,
     judge_line,
@@ -21,7 +20,7 @@ from benchmarks.chaos.rules import (
 )
 
 FOLDER = Path(benchmarks.chaos.__file__).parent
-JUDGES = ["oracle.py", "reality.py", "outputs.py", "rules.py"]
+JUDGES = ["oracle.py", "reality.py", "outputs.py", "rules.py", "excuses.py"]
 
 
 @pytest.mark.parametrize("name", JUDGES)
@@ -115,6 +114,44 @@ def test_a_move_loses_and_repeats_nothing():
         assert kinds(stateful, [FIRST, follower], [move])[0] == ["state"]
 
 
+SHORT = Harm("host_cut", 19.6, 19.9, frozenset({"host1"}), hides=True)
+
+
+def test_a_silence_too_short_to_lose_a_host_or_to_be_fenced_excuses_nothing():
+    """Two seconds may lose a host; for `isolation: stop`, 0.8 s: less than its fence may take."""
+    elsewhere, isolated = Promise(elsewhere=True), Promise(elsewhere=True, isolated=True)
+
+    def cut(seconds):
+        return Harm("host_cut", 20.0 - seconds, 20.0, frozenset({"host1"}), hides=True)
+
+    assert kinds(elsewhere, [FIRST, SECOND], [cut(1.9)])[0] == ["touched"]
+    assert kinds(elsewhere, [FIRST, SECOND], [cut(2.1)])[0] == []
+    assert kinds(isolated, [FIRST, SECOND], [cut(0.7)])[0] == ["touched"]
+    assert kinds(isolated, [FIRST, SECOND], [cut(0.9)])[0] == []
+
+
+def test_silences_add_up_and_a_part_that_starts_again_is_silent_until_it_is_up():
+    """Two that overlap count once, and what comes after the end of a run counts for nothing."""
+    elsewhere, everywhere = Promise(elsewhere=True), frozenset({"*"})
+    long = Harm("host_cut", 17.0, 18.8, frozenset({"host1"}), hides=True)
+    beside = replace(long, kind="master_stop", hosts=everywhere, ended=18.5)
+    killed = Harm("master_kill", 17.0, 17.2, everywhere, hides=True, restarts=True)
+    late = replace(long, begun=19.5, ended=25.0)
+    assert kinds(elsewhere, [FIRST, SECOND], [long])[0] == ["touched"]
+    assert kinds(elsewhere, [FIRST, SECOND], [long, SHORT])[0] == []
+    assert kinds(elsewhere, [FIRST, SECOND], [long, beside])[0] == ["touched"]
+    assert kinds(elsewhere, [FIRST, SECOND], [killed])[0] == []
+    assert kinds(elsewhere, [FIRST, SECOND], [late])[0] == ["touched"]
+
+
+def test_a_slave_that_is_stopped_lets_its_host_fence_sooner_than_the_host_is_lost():
+    """And a supervisor that was killed ends nothing."""
+    elsewhere = Promise(elsewhere=True)
+    slave = Harm("slave_stop", 18.5, 20.0, frozenset({"host1"}), hides=True, deafens=True)
+    assert kinds(elsewhere, [FIRST, SECOND], [slave])[0] == []
+    assert kinds(elsewhere, [FIRST, SECOND], [replace(slave, deafens=False)])[0] == ["touched"]
+
+
 def test_the_state_of_a_node_that_was_killed_goes_on_where_it_is_kept():
     """A second of it may be repeated; on another host it may begin anew, unless it is copied."""
     kept, copied = Promise(stateful=True, kept=True), Promise(stateful=True, kept=True, copied=5)
@@ -129,6 +166,12 @@ def test_the_state_of_a_node_that_was_killed_goes_on_where_it_is_kept():
     assert after(kept, 102, "host1")[0] == ["state"]
     assert after(kept, 1, "host1")[0] == ["state"]
     assert after(kept, 50, "host1", full) == ([], {"state_older_disk_full": 1})
+    assert after(kept, 50, "host1", replace(full, hosts=frozenset({"host3"})))[0] == ["state"]
+    assert after(kept, 50, "host1", replace(full, begun=18.0))[0] == ["state"]
+    assert after(copied, 80, "host2", replace(full, begun=18.0)) == (
+        [],
+        {"state_older_disk_full": 1},
+    )
     assert after(kept, 1, "host2") == ([], {"state_from_nothing": 1})
     assert after(kept, 50, "host2")[0] == ["state"]
     assert after(copied, 96, "host2") == ([], {"state_seconds_repeated": 1})
@@ -154,7 +197,17 @@ def test_a_state_that_came_to_no_other_host_in_time_is_lost():
     copied = Promise(stateful=True, kept=True, copied=5, elsewhere=True)
     anew = run("a#2", "host2", 23.0, 30.0, (1, 50))
     other = Harm("host_off", 19.0, 25.0, frozenset({"host3"}), kills=True, hides=True)
+    overload = Harm(OVERLOAD, 10.0, 30.0, frozenset({"*"}), hides=True, deafens=True)
     assert kinds(copied, [FIRST, anew], [OFF])[0] == ["state"]
+    for none in (
+        overload,
+        KILLED,
+        replace(other, hosts=OFF.hosts),
+        replace(SHORT, hosts=other.hosts),
+    ):
+        assert kinds(copied, [FIRST, anew], [OFF, none])[0] == ["state"]
+    unrelated = [replace(other, hosts=frozenset({host})) for host in ("host3", "host4")]
+    assert kinds(copied, [FIRST, anew], [KILLED, *unrelated])[0] == ["state"]
     assert kinds(copied, [FIRST, anew], [OFF, other]) == ([], {"state_from_nothing": 1})
     young = run(first=17.0, numbers=(1, 31))
     assert kinds(copied, [young, anew], [OFF]) == ([], {"state_seconds_repeated": 1})
@@ -168,7 +221,7 @@ def test_a_standby_bears_one_fault_and_the_copy_another():
     isolated = Promise(
         stateful=True, standby=True, elsewhere=True, isolated=True, kept=True, copied=5
     )
-    silent = Harm("master_stop", 20.0, 25.0, frozenset({"*"}), hides=True)
+    silent = Harm("master_stop", 18.0, 25.0, frozenset({"*"}), hides=True)
     other = Harm("slave_kill", 20.0, 22.0, frozenset({"host3"}), hides=True)
     behind = run("a#2", "host2", 23.0, 30.0, (97, 200))
     assert kinds(guarded, [FIRST, behind], [OFF])[0] == ["state"]
