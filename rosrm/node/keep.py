@@ -166,17 +166,21 @@ class _Writer:
         self._ending = False
         self._fault = ""
         self._changed = threading.Condition()
-        self._thread = threading.Thread(target=self._work, name="rosrm keeper", daemon=True)
-        self._thread.start()
+        self._thread: threading.Thread | None = None
 
     def put(self, sequence: int, blocks: Sequence[Block]) -> None:
         """Have a state written; returns at once."""
         with self._changed:
             self._waiting = sequence, blocks
             self._changed.notify()
+        if self._thread is None:  # not sooner: a successor has no time for it before it speaks
+            self._thread = threading.Thread(target=self._work, name="rosrm keeper", daemon=True)
+            self._thread.start()
 
     def close(self) -> None:
         """Write what waits, and end."""
+        if self._thread is None:
+            return
         with self._changed:
             self._ending = True
             self._changed.notify()
