@@ -55,6 +55,7 @@ with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ours:
 #: Makes the folder. Then it reads the child's pid, and nothing when that is gone. At the end of its
 #: input, which comes when neither the probe nor a CRIU of it lives any more, it removes all.
 _CLEARER: Final = """
+trap "" PIPE
 mkdir -m 700 -- "$0" || exit
 echo made
 while read -r word; do pid=$word; done

@@ -99,7 +99,7 @@ def public() -> Iterator[Path]:
 
 @pytest.fixture(scope="session")
 def as_nobody() -> Callable[..., subprocess.CompletedProcess]:
-    """Runs `python -m MODULE ...` as a user without any rights."""
+    """Runs `python ...` as a user without any rights, who has nothing but the standard library."""
     if os.geteuid() != 0:
         pytest.skip("only root may act as another user")
     user = {"user": NOBODY, "group": NOBODY, "extra_groups": [], "cwd": "/"}
@@ -119,11 +119,11 @@ def as_nobody() -> Callable[..., subprocess.CompletedProcess]:
     ):
         pytest.skip("no Python and rosrm that every user can read")
 
-    def run(module: str, *words: object, home: Path, **environment: object):
+    def run(*words: object, home: Path, **environment: object):
         variables = {"PYTHONPATH": ROOT, "PATH": "/usr/bin:/bin", "HOME": home, "TMPDIR": home}
         variables |= {"PYTHONDONTWRITEBYTECODE": 1, **environment}
         return subprocess.run(
-            [python, "-m", module, *map(str, words)],
+            [python, *map(str, words)],
             env={name: str(value) for name, value in variables.items()},
             capture_output=True,
             text=True,

@@ -64,7 +64,7 @@ def test_none_says_where_it_was_looked_for(tmp_path, monkeypatch):
 
 def test_a_user_without_rights_reads_what_gives_them(criu, as_nobody, public):
     program = reachable(criu, public)
-    done = as_nobody("rosrm.criu.probe", home=public, ROSRM_CRIU=program)
+    done = as_nobody("-m", "rosrm.criu.probe", home=public, ROSRM_CRIU=program)
     able = json.loads(done.stdout)
     assert able["works"] is False
     assert able["reason"].startswith(f"CRIU {criu.version} has no right to dump and restore")
@@ -75,11 +75,11 @@ def test_a_user_without_rights_reads_what_gives_them(criu, as_nobody, public):
 
 def test_what_the_user_reads_gives_the_rights(criu, as_nobody, public):
     program = reachable(criu, public)
-    asked = json.loads(as_nobody("rosrm.criu.probe", home=public, ROSRM_CRIU=program).stdout)
+    asked = json.loads(as_nobody("-m", "rosrm.criu.probe", home=public, ROSRM_CRIU=program).stdout)
     command = asked["reason"].split("`")[1].removeprefix("sudo ").split()
     if shutil.which(command[0]) is None or subprocess.run(command, check=False).returncode != 0:
         pytest.skip("no setcap, or no capabilities on this file system")
-    done = as_nobody("rosrm.criu.probe", home=public, ROSRM_CRIU=program)
+    done = as_nobody("-m", "rosrm.criu.probe", home=public, ROSRM_CRIU=program)
     able = json.loads(done.stdout)
     assert (able["works"], able["reason"]) == (True, "")
     assert (able["facts"]["uid"], able["facts"]["all_users"]) == ("65534", "no")
@@ -97,7 +97,7 @@ def test_a_killed_probe_leaves_nothing_behind(criu, tmp_path, moment):
     try:
         pattern = "rosrm-criu-*" if moment == "folder" else f"rosrm-criu-*/{moment}"
         until = time.monotonic() + 60
-        while not any(tmp_path.glob(pattern)):
+        while not any(tmp_path.glob(pattern)):  # without a pause: the moment is short
             assert asking.poll() is None, f"it ended before there was a {moment}"
             assert time.monotonic() < until, f"no {moment} within 60 s"
     finally:

@@ -1,0 +1,92 @@
+"""`rosrm criu check`: what it says line by line, as JSON, and by its exit code."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from rosrm.criu.probe import Ability
+from rosrm.criu.program import Criu
+from rosrm.errors import CriuError
+
+FACTS = {
+    "version": "4.2.1",
+    "kernel": "6.18.44",
+    "machine": "x86_64",
+    "cpu": "avx avx2 sse2",
+    "uid": "1000",
+    "all_users": "no",
+    "python": "/usr/bin/python3.12",
+    "python_version": "3.12.3",
+    "libc": "glibc 2.39",
+}
+
+
+@pytest.fixture
+def here(monkeypatch):
+    """Pretend that this is what is found here."""
+
+    def pretend(reason="", version="4.2.1", missing=""):
+        def find(prefix):
+            if missing:
+                raise CriuError(missing)
+            return Criu((f"{prefix}/bin/criu",), version)
+
+        able = Ability(not reason, reason, {**FACTS, "version": version})
+        monkeypatch.setattr("rosrm.criu.program.find", find)
+        monkeypatch.setattr("rosrm.criu.probe.probe", lambda criu: able)
+
+    return pretend
+
+
+def test_one_that_works_is_told_line_by_line(rosrm, here):
+    here()
+    result = rosrm("criu", "check", "--prefix", "/opt/criu")
+    assert result.code == 0
+    python = "Python /usr/bin/python3.12 (3.12.3), glibc 2.39"
+    assert result.out.splitlines() == [
+        "ok  program           /opt/criu/bin/criu",
+        "ok  version           4.2.1",
+        "ok  processes         of the user 1000 alone",
+        "ok  dump and restore  a process with a UDP socket was dumped, restored and went on",
+        "ok  kernel            6.18.44 on x86_64",
+        f"ok  same elsewhere    {python}, 3 processor features",
+    ]
+
+
+def test_one_that_does_not_is_told_with_what_to_do(rosrm, here):
+    here("it has no right. `sudo setcap ...` gives it", "4.1.1")
+    result = rosrm("criu", "check")
+    assert result.code == 1
+    assert [line for line in result.out.splitlines() if line.startswith("NO")] == [
+        "NO  version           4.1.1 (4.2 or newer is meant)",
+        "NO  dump and restore  it has no right. `sudo setcap ...` gives it",
+    ]
+
+
+def test_none_is_told_in_one_line(rosrm, here):
+    here(missing="there is no CRIU here. `rosrm criu install` brings one")
+    result = rosrm("criu", "check")
+    assert (result.code, result.err) == (1, "")
+    said = "there is no CRIU here. `rosrm criu install` brings one"
+    assert result.out == f"NO  program           {said}\n"
+
+
+def test_as_json_it_has_all_that_a_program_needs(rosrm, here):
+    here("no", "4.1.1")
+    result = rosrm("criu", "check", "--json", "--prefix", "/opt/criu")
+    assert result.code == 1
+    assert json.loads(result.out) == {
+        "program": "/opt/criu/bin/criu",
+        "works": False,
+        "reason": "no",
+        "facts": {**FACTS, "version": "4.1.1"},
+    }
+
+
+def test_as_json_there_is_no_program_where_there_is_none(rosrm, here):
+    here(missing="none")
+    result = rosrm("criu", "check", "--json")
+    expected = {"program": None, "works": False, "reason": "none", "facts": {}}
+    assert json.loads(result.out) == expected
