@@ -88,9 +88,9 @@ class Theatre:
         log = self.folder / f"{len(self._processes)}.log"
         with log.open("ab") as output:
             process = subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=output, stderr=output, cwd=self.work,
-                start_new_session=True, pass_fds=pass_fds,
-                env=os.environ if environment is None else environment,
+                command, stdin=subprocess.DEVNULL, stdout=output, stderr=output,
+                cwd=self.work if self.work.exists() else self.folder, start_new_session=True,
+                pass_fds=pass_fds, env=os.environ if environment is None else environment,
             )  # fmt: skip
         self._processes.append(process)
         return Actor(process, log)
@@ -106,9 +106,16 @@ class Theatre:
             actor.process.wait(TIMEOUT)
         return directory
 
-    def hold(self, directory: Path, *options: str, remove: bool = False) -> Actor:
+    def hold(
+        self,
+        directory: Path,
+        *options: str,
+        remove: bool = False,
+        environment: Mapping[str, str] | None = None,
+    ) -> Actor:
         """The program that restores an image, just started."""
-        return self.run([*self.hold_command(directory, remove=remove), *options])
+        command = [*self.hold_command(directory, remove=remove), *options]
+        return self.run(command, environment=environment)
 
     def hold_command(self, directory: Path, *, remove: bool = False) -> tuple[str, ...]:
         """Its command line."""
@@ -117,9 +124,9 @@ class Theatre:
             sys.executable, directory, criu=program, remove=remove, timeout=TIMEOUT
         )
 
-    def restore(self, directory: Path, *options: str, remove: bool = False) -> Actor:
+    def restore(self, directory: Path, *options: str, **named: Any) -> Actor:
         """The program that holds a restored process."""
-        actor = self.hold(directory, *options, remove=remove)
+        actor = self.hold(directory, *options, **named)
         actor.outcome = outcome.wait(
             directory, timeout=TIMEOUT, ended=lambda: actor.process.poll() is not None
         )

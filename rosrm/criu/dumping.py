@@ -19,6 +19,7 @@ from rosrm.criu import held_files, image, ties, tree, troubles
 from rosrm.criu.image import Manifest
 from rosrm.criu.program import Criu
 from rosrm.errors import CriuError
+from rosrm.supervisor import members, paths
 
 #: What both CRIU's dump and its restore are told.
 COMMON: Final = ("--tcp-close", "--file-locks", "--manage-cgroups=ignore")
@@ -74,7 +75,7 @@ def dump(
         _run(criu, root, directory, timeout, process)
         manifest = _describe(root, directory, Manifest(
             process, instance, platform.node(), time.time(), criu.version, platform.release(),
-            platform.machine(), tree.inner_pid(root), (), (), "", "",
+            platform.machine(), tree.inner_pid(root), (), (), "", _shelter(pid), "",
         ))  # fmt: skip
         image.write(directory, manifest)
     except (CriuError, OSError) as error:
@@ -147,6 +148,12 @@ def _describe(root: int, directory: Path, manifest: Manifest) -> Manifest:
         mapped=held_files.mapped_files(pids),
         sizes=image.file_sizes(directory),
     )
+
+
+def _shelter(leader: int) -> str:
+    """The directory of its supervisor for those that name none; "" where it has no supervisor."""
+    _, state = members.read_marks(leader)
+    return paths.work_directory(state) if state else ""
 
 
 def _link(pid: int, name: str) -> str:

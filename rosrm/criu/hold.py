@@ -67,7 +67,7 @@ def main() -> None:
     # What comes while it is restored waits for it; SIGKILL alone does not.
     signal.pthread_sigmask(signal.SIG_BLOCK, _PASSED_ON)
     try:
-        manifest = image.read(directory)
+        manifest = restoring.moved_here(image.read(directory))
         restoring.check(manifest)
         criu = opened(Path(options.criu))
     except CriuError as error:
@@ -105,7 +105,7 @@ class _Restore:
         log = _reopened_log()
         try:
             pid = restoring.restore(
-                self._criu, self.directory, self.manifest, log=log, timeout=self._timeout
+                self._criu, self.directory, self.manifest.shelter, log=log, timeout=self._timeout
             )
         finally:
             os.close(log)

@@ -38,7 +38,8 @@ class HeldFile:
         path: absolute, as the process knows it.
         size: bytes, when it was dumped.
         mode: its permissions.
-        grows: the process only appends to it, so it may have another size at the restore.
+        grows: the process only appends to it, so it may have another size at the restore, and is
+            made anew where it is missing.
         copy: its copy below the image, which is put back; "": it has to lie there.
     """
 
@@ -80,6 +81,7 @@ class Manifest:
         ids: of all its processes and threads there.
         logs: files that were its standard output and error.
         working_directory: of the root.
+        shelter: where the supervisor runs those that name no working directory; "": not known.
         interpreter: the program that the root runs.
         files: that were open.
         mapped: files that were mapped.
@@ -97,6 +99,7 @@ class Manifest:
     ids: tuple[int, ...]
     logs: tuple[str, ...]
     working_directory: str
+    shelter: str
     interpreter: str
     files: tuple[HeldFile, ...] = ()
     mapped: tuple[MappedFile, ...] = ()

@@ -11,14 +11,17 @@ import platform
 import shutil
 import stat
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from rosrm.criu import image, troubles
+from rosrm.criu import image, relocation, troubles
 from rosrm.criu.dumping import COMMON
 from rosrm.criu.image import HeldFile, Manifest, MappedFile
 from rosrm.criu.program import Criu
 from rosrm.errors import CriuError
+from rosrm.supervisor import paths
+from rosrm.supervisor.members import SUPERVISOR_MARK
 
 #: CRIU writes the pid of the restored root here.
 _PID_FILE: Final = "restored.pid"
@@ -26,6 +29,23 @@ _PID_FILE: Final = "restored.pid"
 _TRACING: Final = "/dev/shm/lttng-ust-wait-"  # noqa: S108 - LTTng's own
 #: Ids that CRIU and its children may take while they restore.
 _IDS_OF_CRIU: Final = 400
+
+
+def moved_here(manifest: Manifest) -> Manifest:
+    """As it is on this host: whose supervisor has another directory for those that name none."""
+    state = os.environ.get(SUPERVISOR_MARK, "")
+    new = paths.work_directory(state) if state else ""
+
+    def here(path: str) -> str:
+        return relocation.moved(path, manifest.shelter, new)
+
+    return replace(
+        manifest,
+        shelter=new,
+        working_directory=here(manifest.working_directory),
+        files=tuple(replace(held, path=here(held.path)) for held in manifest.files),
+        mapped=tuple(replace(mapped, path=here(mapped.path)) for mapped in manifest.mapped),
+    )
 
 
 def check(manifest: Manifest) -> None:
@@ -41,14 +61,14 @@ def check(manifest: Manifest) -> None:
     if not Path(manifest.interpreter).is_file():
         raise CriuError(f"the program {manifest.interpreter} of the process is missing on {here}")
     for held in manifest.files:
-        if not held.copy:
-            _check_file(held, here, any_size=held.grows, holds="has open")
+        if not held.copy and not held.grows:
+            _check_file(held, here, "has open")
     for mapped in manifest.mapped:
         if not mapped.path.startswith(_TRACING):
-            _check_file(mapped, here, any_size=False, holds="has mapped")
+            _check_file(mapped, here, "has mapped")
 
 
-def _check_file(file: HeldFile | MappedFile, here: str, *, any_size: bool, holds: str) -> None:
+def _check_file(file: HeldFile | MappedFile, here: str, holds: str) -> None:
     try:
         status = os.stat(file.path)  # noqa: PTH116 - hundreds of them
     except OSError as error:
@@ -58,7 +78,7 @@ def _check_file(file: HeldFile | MappedFile, here: str, *, any_size: bool, holds
         ) from None
     if not stat.S_ISREG(status.st_mode):
         raise CriuError(f"{file.path}, which the process {holds}, is no file on {here}")
-    if status.st_size != file.size and not any_size:
+    if status.st_size != file.size:
         raise CriuError(
             f"the file {file.path}, which the process {holds}, is another one on {here}: "
             f"{status.st_size} bytes instead of {file.size}"
@@ -66,22 +86,30 @@ def _check_file(file: HeldFile | MappedFile, here: str, *, any_size: bool, holds
 
 
 def prepare(directory: Path, manifest: Manifest) -> None:
-    """Put back the files that follow, and make LTTng's; raises CriuError."""
+    """Put back the files that follow, make those that only grow, and LTTng's; raises CriuError."""
     for mapped in manifest.mapped:
         if mapped.path.startswith(_TRACING) and not Path(mapped.path).exists():
             _make_tracing_file(mapped)
     for held in manifest.files:
-        if held.copy:
-            try:
-                target = Path(held.path)
-                target.parent.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(directory / held.copy, target)
-                target.chmod(held.mode)
-            except OSError as error:
-                raise CriuError(
-                    f"the file {held.path}, which follows the process, cannot be put back on "
-                    f"{platform.node()}: {error.strerror}"
-                ) from None
+        try:
+            _put_back(directory, held)
+        except OSError as error:
+            raise CriuError(
+                f"the file {held.path}, which the process has open, cannot be put back on "
+                f"{platform.node()}: {error.strerror}"
+            ) from None
+
+
+def _put_back(directory: Path, held: HeldFile) -> None:
+    target = Path(held.path)
+    if not held.copy and (not held.grows or target.exists()):
+        return
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if held.copy:
+        shutil.copyfile(directory / held.copy, target)
+        target.chmod(held.mode)
+    else:
+        target.touch(mode=held.mode)
 
 
 def _make_tracing_file(mapped: MappedFile) -> None:
@@ -98,41 +126,42 @@ def _make_tracing_file(mapped: MappedFile) -> None:
         os.unlink(new)  # noqa: PTH108
 
 
-def restore(criu: Criu, directory: Path, manifest: Manifest, *, log: int, timeout: float) -> int:
+def restore(criu: Criu, directory: Path, shelter: str, *, log: int, timeout: float) -> int:
     """Restore the process, as a descendant of the caller; returns its pid.
 
     CRIU's children end, so the nearest subreaper or init above the caller becomes its parent.
 
     Args:
         criu: to use.
-        directory: of the image.
-        manifest: of the image, checked and prepared for.
+        directory: of the image, checked and prepared for.
+        shelter: takes the place of the image's.
         log: descriptor that becomes its standard output and error.
         timeout: seconds; CRIU is killed when they have passed.
 
     Raises:
         CriuError: what failed.
     """
+    manifest = image.read(directory)
     pid_file = directory / _PID_FILE
     pid_file.unlink(missing_ok=True)
-    joined = [
-        word for path in manifest.logs for word in ("--inherit-fd", f"fd[{log}]:{path.lstrip('/')}")
-    ]
-    arguments = (
-        "restore", "--images-dir", str(directory / image.PAGES), "--restore-detached",
-        "--pidfile", str(pid_file), *COMMON, *joined,
-    )  # fmt: skip
-    try:
-        criu.run(arguments, timeout=timeout, log=directory / image.RESTORE_LOG, pass_fds=(log,))
-    except CriuError as error:
-        name = manifest.process or "the process"
-        meaning = troubles.of_restore(str(error))
-        if not meaning:
-            raise
-        raise CriuError(
-            f"{name} cannot be restored on {platform.node()}: {meaning} "
-            f"(log: {directory / image.RESTORE_LOG})"
-        ) from None
+    logs = [relocation.moved(path, manifest.shelter, shelter) for path in manifest.logs]
+    joined = [word for path in logs for word in ("--inherit-fd", f"fd[{log}]:{path.lstrip('/')}")]
+    log_file = directory / image.RESTORE_LOG
+    with relocation.images(directory / image.PAGES, manifest.shelter, shelter) as images:
+        arguments = (
+            "restore", "--images-dir", str(images), "--restore-detached",
+            "--pidfile", str(pid_file), *COMMON, *joined,
+        )  # fmt: skip
+        try:
+            criu.run(arguments, timeout=timeout, log=log_file, pass_fds=(log,))
+        except CriuError as error:
+            name = manifest.process or "the process"
+            meaning = troubles.of_restore(str(error))
+            if not meaning:
+                raise
+            raise CriuError(
+                f"{name} cannot be restored on {platform.node()}: {meaning} (log: {log_file})"
+            ) from None
     pid = int(pid_file.read_text())
     pid_file.unlink()
     return pid

@@ -148,6 +148,53 @@ def test_a_file_below_the_working_directory_follows(theatre):
     assert numbers == list(range(1, numbers[-1] + 1))
 
 
+def test_a_log_of_its_own_is_made_anew_where_it_is_missing(theatre):
+    """As rcl's in ~/.ros/log: what is only appended to stays behind, and goes on empty."""
+    own = theatre.folder / "logs/own.log"
+    own.parent.mkdir()
+    actor = theatre.start(f"import sys; sys.stdout = open({str(own)!r}, 'a')\n{COUNTER}")
+    eventually(lambda: own.exists() and own.read_text().count("\n") > 2, "its log")
+    directory = theatre.dump(actor)
+    own.unlink()
+    own.parent.rmdir()
+    theatre.restore(directory)
+    eventually(lambda: own.exists() and own.read_text().count("\n") > 2, "its log again")
+
+
+def test_who_runs_in_its_supervisors_directory_does_so_on_another_host(theatre):
+    """There it has another path: working directory and files below it move along, hop by hop."""
+
+    def state(number: int) -> dict[str, str]:
+        return {"ROSRM_SUPERVISOR": str(theatre.folder / f"host{number}")}
+
+    def shelter(number: int) -> Path:
+        return theatre.folder / f"host{number}/work"
+
+    code = f"import os, sys; sys.stdout, there = open('count', 'w'), os.open('.', 0)\n{COUNTER}"
+    for number in range(3):
+        shelter(number).mkdir(parents=True)
+    theatre.work = shelter(0)
+    actor = theatre.start(code, environment=state(0))
+    for number in range(1, 3):
+        before = shelter(number - 1) / "count"
+        eventually(lambda: before.exists() and before.read_text().count("\n") > 2, "numbers")  # noqa: B023
+        directory = theatre.dump(actor, f"hop{number}")
+        before.unlink()
+        shelter(number - 1).rmdir()
+        actor = theatre.restore(directory, environment=state(number))
+        assert working_directory(actor.outcome.pid) == str(shelter(number))
+        image.read(directory)  # nothing was changed in the image itself
+        size = theatre.manifest.files[0].size
+        here = shelter(number) / "count"
+        eventually(lambda: here.stat().st_size > size, "more numbers")  # noqa: B023
+    numbers = [int(line) for line in here.read_text().splitlines(True) if line.endswith("\n")]
+    assert numbers == list(range(1, numbers[-1] + 1))
+
+
+def working_directory(pid: int) -> str:
+    return os.readlink(f"/proc/{pid}/cwd")  # noqa: PTH115 - as /proc says it
+
+
 # --- what becomes of the source -----------------------------------------------------------------
 
 
