@@ -1,0 +1,185 @@
+"""Which CRIU is used, and what is told when it fails: with real programs that play one."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from rosrm.criu.program import Criu, default_prefix, find, opened
+from rosrm.errors import CriuError
+
+ANSWERS = 'if [ "$1" = --version ]; then echo "Version: {}"; exit; fi\n'
+
+
+def script(path: Path, body: str = "", version: str = "4.2.1") -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("#!/bin/sh\n" + ANSWERS.format(version) + body)
+    path.chmod(0o755)
+    return path
+
+
+@pytest.fixture(autouse=True)
+def nothing_else(tmp_path, monkeypatch):
+    """No other CRIU of this machine is found, and a folder in PATH is ours."""
+    monkeypatch.delenv("ROSRM_CRIU", raising=False)
+    monkeypatch.setattr("rosrm.criu.program._PLACES", str(tmp_path / "sbin"))
+    monkeypatch.setenv("PATH", str(tmp_path / "path"))
+
+
+def test_the_variable_goes_before_the_prefix_and_that_before_path(tmp_path, monkeypatch):
+    script(tmp_path / "path/criu", version="1.1")
+    assert find(tmp_path / "prefix") == Criu((str(tmp_path / "path/criu"),), "1.1")
+    private = script(tmp_path / "prefix/bin/criu", version="2.2.2")
+    assert find(tmp_path / "prefix") == Criu((str(private),), "2.2.2")
+    named = script(tmp_path / "named", version="3.3")
+    monkeypatch.setenv("ROSRM_CRIU", str(named))
+    assert find(tmp_path / "prefix") == Criu((str(named),), "3.3")
+
+
+def test_it_is_found_where_debian_puts_it_although_a_user_s_path_leaves_that_out(tmp_path):
+    debian = script(tmp_path / "sbin/criu")
+    assert find(tmp_path / "prefix").command == (str(debian),)
+
+
+def test_one_that_does_not_start_is_passed_over(tmp_path):
+    script(tmp_path / "prefix/bin/criu", "exit 127\n", version="").write_text("#!/bin/no-shell\n")
+    script(tmp_path / "path/criu")
+    assert find(tmp_path / "prefix").command == (str(tmp_path / "path/criu"),)
+
+
+def test_where_none_starts_each_one_is_told(tmp_path):
+    script(tmp_path / "prefix/bin/criu").write_text("#!/bin/no-shell\n")
+    script(tmp_path / "path/criu").write_text("#!/bin/sh\necho libz is missing >&2; exit 127\n")
+    with pytest.raises(CriuError) as raised:
+        find(tmp_path / "prefix")
+    said = str(raised.value)
+    assert "prefix/bin/criu cannot be started: the C library that it names is missing" in said
+    assert "`--version` ended with code 127 and said 'libz is missing'" in said
+    assert said.endswith("`rosrm criu install` brings one, without touching the system")
+
+
+@pytest.mark.parametrize("kind", ["missing", "folder", "other"])
+def test_what_the_variable_names_has_to_be_one(kind, tmp_path, monkeypatch):
+    """Even where another one would do: whoever sets it does not mean that one."""
+    script(tmp_path / "path/criu")
+    named = tmp_path / "named"
+    if kind == "folder":
+        named.mkdir()
+    elif kind == "other":
+        named.write_text("#!/bin/sh\necho hello\n")
+        named.chmod(0o755)
+    monkeypatch.setenv("ROSRM_CRIU", str(named))
+    with pytest.raises(CriuError, match=r"^ROSRM_CRIU names a CRIU that cannot be used: /"):
+        find(tmp_path / "prefix")
+
+
+def test_the_prefix_is_below_the_users_data_or_where_a_variable_says(monkeypatch):
+    monkeypatch.delenv("ROSRM_CRIU_PREFIX")
+    monkeypatch.delenv("XDG_DATA_HOME", raising=False)
+    monkeypatch.setenv("HOME", "/home/ada")
+    assert default_prefix() == Path("/home/ada/.local/share/rosrm/criu")
+    monkeypatch.setenv("XDG_DATA_HOME", "/data")
+    assert default_prefix() == Path("/data/rosrm/criu")
+    monkeypatch.setenv("ROSRM_CRIU_PREFIX", "/opt/criu")
+    assert default_prefix() == Path("/opt/criu")
+
+
+# --- how it is run -----------------------------------------------------------------------------
+
+#: Finds the path after --log-file and writes to it.
+FAILS = """
+while [ "$1" != --log-file ]; do shift; done
+echo '(00.1) Error (criu/sk-unix.c:874): unix: External socket is used.' >"$2"
+echo '(00.1) Error (criu/cr-dump.c:1975): Dumping FAILED.' >>"$2"
+exit 1
+"""
+
+
+def test_a_failure_tells_what_its_log_calls_the_cause(tmp_path):
+    criu = opened(script(tmp_path / "criu", FAILS))
+    log = tmp_path / "dump.log"
+    with pytest.raises(CriuError) as raised:
+        criu.run(["dump", "--tree", "1"], timeout=30, log=log)
+    told = "CRIU 4.2.1 could not dump: unix: External socket is used."
+    assert str(raised.value) == f"{told} (its log: {log})"
+
+
+@pytest.mark.parametrize(
+    ("body", "expected"),
+    [
+        ("echo 'Error: no such option' >&2; exit 2", "no such option"),
+        ("echo 'criu: what is --tree?'; echo 'Try --help'; exit 2", "criu: what is --tree?"),
+        ("exit 3", "it ended with code 3 and said nothing of the cause"),
+        ("kill -9 $$", "it ended with code -9 and said nothing of the cause"),
+    ],
+)
+def test_a_failure_without_a_log_tells_what_it_said(tmp_path, body, expected):
+    log = tmp_path / "log"
+    log.write_text("(00.1) Error (a.c:1): an older failure\n")
+    with pytest.raises(CriuError, match=r"could not dump: ") as raised:
+        opened(script(tmp_path / "criu", body)).run(["dump"], timeout=30, log=log)
+    assert str(raised.value) == f"CRIU 4.2.1 could not dump: {expected} (its log: {log})"
+
+
+def test_one_that_hangs_is_ended_with_its_children(tmp_path):
+    body = f"echo $$ >{tmp_path}/pid; /bin/sleep 1000 & /bin/sleep 1000"
+    criu = opened(script(tmp_path / "criu", body))
+    began = time.monotonic()
+    with pytest.raises(CriuError, match=r"could not dump: it was not done after 1 s and was ended"):
+        criu.run(["dump"], timeout=1.0, log=tmp_path / "log")
+    assert time.monotonic() - began < 60
+    group = int((tmp_path / "pid").read_text())
+    until = time.monotonic() + 30
+    while members(group):
+        assert time.monotonic() < until, "30 s after its end its children are there"
+
+
+def members(group: int) -> list[int]:
+    """Processes of a group, but those whose end nobody has taken note of yet."""
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            state, _, of = stat.read_text().rpartition(")")[2].split()[:3]
+        except OSError:
+            continue
+        if int(of) == group and state != "Z":
+            found.append(int(stat.parent.name))
+    return found
+
+
+def test_it_gets_the_files_that_it_is_given_and_no_input(tmp_path):
+    read, write = os.pipe()
+    try:
+        criu = opened(
+            script(tmp_path / "criu", f'read -r line && exit 1; echo "$1" >/proc/self/fd/{write}')
+        )
+        criu.run(["dump"], timeout=30, log=tmp_path / "log", pass_fds=[write])
+        assert os.read(read, 100) == b"dump\n"
+    finally:
+        os.close(read)
+        os.close(write)
+
+
+def test_it_asks_for_all_rights_only_where_it_has_them(tmp_path):
+    """Root in a container may lack them, so it is the capability that counts."""
+    told = tmp_path / "told"
+    program = script(tmp_path / "criu", f'echo "$@" >{told}')
+    code = (
+        "import sys; from pathlib import Path; from rosrm.criu.program import Criu\n"
+        "Criu((sys.argv[1],), '4.2').run(['dump'], timeout=30, log=Path(sys.argv[2]))"
+    )
+    words = [sys.executable, "-c", code, program, tmp_path / "log"]
+    subprocess.run(words, check=True)
+    expected = "dump" if os.geteuid() == 0 else "dump --unprivileged"
+    assert told.read_text() == f"{expected} --log-file {tmp_path}/log\n"
+    if os.geteuid() == 0:
+        without = ["/usr/bin/setpriv", "--bounding-set=-sys_admin", "--inh-caps=-sys_admin"]
+        if subprocess.run([*without, "/bin/true"], check=False).returncode != 0:
+            pytest.skip("no setpriv, or not all rights to give away")
+        subprocess.run([*without, *words], check=True)
+        assert told.read_text() == f"dump --unprivileged --log-file {tmp_path}/log\n"
