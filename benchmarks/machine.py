@@ -24,6 +24,10 @@ _DISTRIBUTIONS = (
     "rosrm-checkpoint",
     "ros-jazzy-rclpy",
     "ros-jazzy-rmw-fastrtps-cpp",
+    "aiohttp",
+    "backports.zstd",
+    "cryptography",
+    "urllib3",
 )
 
 

@@ -62,7 +62,7 @@ class Archive:
         try:
             self._entries = list(_entries(directory, ""))
         except OSError as error:
-            raise TransferError(_unreadable(directory, error)) from None
+            raise TransferError(_unreadable(Path(error.filename or directory), error)) from None
         files = [entry for entry in self._entries if not entry.is_directory]
         self.size = sum(entry.size for entry in files)
         self.files = len(files)

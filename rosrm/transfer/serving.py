@@ -67,8 +67,7 @@ class _Desk:
             start = self._start(request)
         except _Refusal as refusal:
             return web.Response(status=refusal.status, text=str(refusal))
-        if self._sending is not None:
-            self._sending.cancel()  # the reader has given that connection up
+        self.stop()  # the reader has given that connection up
         self._sending = asyncio.current_task()
         response = web.StreamResponse(headers={"Content-Type": "application/zstd"})
         with contextlib.suppress(ConnectionError):  # the reader may come again
@@ -112,6 +111,11 @@ class _Desk:
         self._reader = self._reader or reader
         if not hmac.compare_digest(_bytes(reader), _bytes(self._reader)):
             raise _Refusal(403, "somebody has begun to fetch it already, and an offer stands once")
+
+    def stop(self) -> None:
+        """End the sending that is under way, if one is."""
+        if self._sending is not None:
+            self._sending.cancel()
 
     async def _send(self, response: web.StreamResponse, start: int) -> None:
         for piece in compressed(self._archive.pieces(start)):
@@ -171,6 +175,7 @@ async def serve(
         for task in over:
             task.cancel()
     finally:
+        desk.stop()
         await runner.cleanup()
     if desk.taken.is_set():
         return Sent("taken", desk.sent)

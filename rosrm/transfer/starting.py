@@ -95,7 +95,10 @@ class _End:
             late.cancel()
         if not line:
             status = self._process.wait()
-            raise TransferError(f"the process of the transfer ended with {status} and no answer")
+            raise TransferError(
+                f"the process of the transfer ended with status {status} and no answer: the log of "
+                "who started it may say why"
+            )
         answer: dict[str, Any] = json.loads(line)
         return answer
 

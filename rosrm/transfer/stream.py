@@ -185,7 +185,9 @@ class Stream:
             address,
             self._offer.port,
             maxsize=1,
-            timeout=urllib3.Timeout(connect=_CONNECT, read=_SILENCE),
+            timeout=urllib3.Timeout(
+                connect=self._patience(_CONNECT), read=self._patience(_SILENCE)
+            ),
             # Whoever shows this certificate has the key that was made for this offer.
             assert_fingerprint=self._offer.fingerprint,
             assert_hostname=False,
@@ -200,14 +202,18 @@ class Stream:
             decode_content=False,
         )
 
+    def _patience(self, most: float) -> float:
+        return max(0.1, min(most, self._deadline - time.monotonic()))
+
     def _begin(self, address: str, response: urllib3.BaseHTTPResponse) -> None:
         self._response = response
         self._decompressor = ZstdDecompressor()
         self.address = address
         self._addresses.sort(key=lambda one: one != address)
         if response.status != _OK:
-            why = response.read(_WORDS).decode(errors="replace")
-            raise TransferError(f"{address}:{self._offer.port} refuses the transfer: {why}")
+            raise TransferError(
+                f"{address}:{self._offer.port} refuses the transfer: {_answer(response)}"
+            )
 
     def _story(self, why: str) -> str:
         if not self._break:
@@ -229,6 +235,13 @@ def _context() -> ssl.SSLContext:
     return context
 
 
+def _answer(response: urllib3.BaseHTTPResponse) -> str:
+    try:
+        return response.read(_WORDS).decode(errors="replace")
+    except (HTTPError, OSError):
+        return f"status {response.status}"
+
+
 def _is_final(error: Exception) -> bool:
     """Nobody listens, or somebody else: neither changes by waiting."""
     if isinstance(error, SSLError):
@@ -239,10 +252,11 @@ def _is_final(error: Exception) -> bool:
 
 
 def _words(error: Exception) -> str:
-    if _is_final(error):
-        return "another server answers" if isinstance(error, SSLError) else "connection refused"
-    cause = error.__cause__ or error.__context__
-    if isinstance(cause, OSError) and cause.strerror:
-        return cause.strerror
-    text = str(error)
-    return text.rsplit(": ", 1)[-1].strip("')\" ") or type(error).__name__
+    if isinstance(error, SSLError):
+        return "another server answers" if _is_final(error) else "the TLS connection broke"
+    if isinstance(error, NewConnectionError):
+        cause = error.__cause__ or error.__context__
+        return str(getattr(cause, "strerror", None) or cause).lower()
+    if isinstance(error, urllib3.exceptions.TimeoutError):
+        return "nothing came in time"
+    return "the connection broke"

@@ -74,6 +74,7 @@ def tree(directory: Path) -> Path:
     (directory / "pages" / "none").write_bytes(b"")
     (directory / "pages" / ("long" * 50)).write_bytes(b"1")
     (directory / "ünicode").write_bytes(b"2" * 512)
+    (directory / os.fsdecode(b"no \xff unicode")).write_bytes(b"3")
     return directory
 
 
@@ -96,8 +97,8 @@ def test_what_is_packed_is_unpacked(tmp_path):
     (tmp_path / "to").mkdir()
     files = unpack(io.BytesIO(data[: archive.length]), tmp_path / "to")
 
-    assert files == archive.files == 5
-    assert archive.size == 1000 + 600_000 + 1 + 512
+    assert files == archive.files == 6
+    assert archive.size == 1000 + 600_000 + 1 + 512 + 1
     assert content(tmp_path / "to") == content(tmp_path / "from")
     for path in (tmp_path / "to").rglob("*"):
         assert stat.S_IMODE(path.stat().st_mode) == (0o700 if path.is_dir() else 0o600)

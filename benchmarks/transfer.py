@@ -1,0 +1,95 @@
+"""How long a directory takes from one process to another: `python -m benchmarks.transfer`.
+
+Files of which half is random and half is empty, as memory often is, over loopback: both ends, TLS,
+compression and checksums share the machine, so a network faster than `mb_per_s` gains nothing. For
+each size, p50 of the rounds: `offer_s` until the source can be fetched from, `fetch_s` from then on
+to the directory being in its place, both by processes that were started ahead; `cold_s` the whole
+with processes that are started for it; `wire_mb` what went over the wire. `peak_mib` is the largest
+memory of any of these processes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import random
+import resource
+import tempfile
+import time
+from pathlib import Path
+
+from benchmarks.machine import median, print_report, say
+from rosrm.transfer import Fetcher, Sender
+
+SIZES_MB = (10, 100, 500)
+#: Bytes of random, then as many of nothing.
+GRAIN = 2048
+#: Seconds in which a process has loaded its libraries, on a busy machine too.
+LOADING = 3.0
+
+
+def fill(directory: Path, megabytes: int) -> None:
+    """Write files of 25 MB at most."""
+    chance = random.Random(megabytes)  # noqa: S311 - any bytes will do
+    left = megabytes * 1_000_000
+    while left:
+        size = min(left, 25_000_000)
+        grains = (chance.randbytes(GRAIN) + bytes(GRAIN) for _ in range(size // (2 * GRAIN) + 1))
+        (directory / f"pages-{left}.img").write_bytes(b"".join(grains)[:size])
+        left -= size
+
+
+def moved(source: Path, target: Path, *, ahead: bool) -> dict[str, float]:
+    """The figures of one transfer."""
+    begun = time.perf_counter()
+    with Sender() as sender, Fetcher() as fetcher:
+        if ahead:
+            time.sleep(LOADING)
+            begun = time.perf_counter()
+        offer = sender.offer(source, seconds=600.0, max_rate=0)
+        offered = time.perf_counter()
+        fetched = fetcher.fetch(offer, target, timeout=600.0)
+        whole = time.perf_counter() - begun
+        sent = sender.wait(60.0)
+    if sent is None or sent.outcome != "taken":
+        raise SystemExit(f"the source says {sent}")
+    if not ahead:
+        return {"cold_s": whole}
+    return {
+        "offer_s": offered - begun,
+        "fetch_s": fetched.seconds,
+        "mb_per_s": fetched.size / 1e6 / fetched.seconds,
+        "wire_mb": fetched.received / 1e6,
+    }
+
+
+def measured(megabytes: int, rounds: int) -> dict[str, float]:
+    """The figures of one size."""
+    found: dict[str, list[float]] = {}
+    with tempfile.TemporaryDirectory() as directory:
+        source = Path(directory, "source")
+        source.mkdir()
+        fill(source, megabytes)
+        for number in range(2 * rounds):
+            target = Path(directory, f"target-{number}")
+            for name, value in moved(source, target, ahead=number % 2 == 0).items():
+                found.setdefault(name, []).append(value)
+            for file in target.iterdir():
+                file.unlink()
+    return {name: round(median(values), 4) for name, values in found.items()}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--sizes", type=int, nargs="+", default=list(SIZES_MB), metavar="MB")
+    parser.add_argument("--rounds", type=int, default=5)
+    options = parser.parse_args()
+    table = {}
+    for megabytes in options.sizes:
+        table[str(megabytes)] = measured(megabytes, options.rounds)
+        say(f"{megabytes} MB: {table[str(megabytes)]}")
+    peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
+    print_report("transfer", {"by_size_mb": table, "peak_mib": round(peak, 1)}, runs=options.rounds)
+
+
+if __name__ == "__main__":
+    main()
