@@ -6,6 +6,14 @@ the master has it for lost. `standby`: until an outside observer hears the stand
 process. `restart`: until it hears the instance that was started anew, from its kept state, of a
 process without a standby. Then a load on all cores, for minutes: how many hosts are taken for lost
 that were not?
+
+A cycle speaks, and then publishes its state. `state_lost` counts published states from which a
+standby did not go on; there must be none. `standby_repeated` counts outputs that it said again: one
+where the power went between the output and its state, which nobody can know better, or else as
+many as states were lost. `standby_skipped` counts outputs that nobody heard: of the standby's first
+cycles, before the observer had found it. Of as many as `standbys_of_heard_states` the states were
+heard to the last; of the others it is only known what was published before an output. `restart_repeated` is the age of a kept state, in cycles.
+Exit status: 1 where a state or a host was lost that should not have been.
 """
 
 from __future__ import annotations
@@ -22,12 +30,17 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from std_msgs.msg import Int64MultiArray
+
 from benchmarks.handoff import Observer, Output
+from benchmarks.handoff_nodes import QOS
 from benchmarks.machine import percentile, print_report, say
+from rosrm import kept
 from rosrm.config.settings import ClusterConfig, ControlSettings, HostConfig, LivenessSettings
 from rosrm.core.model import HostLossPolicy, MigrationPolicy, ProcessSpec, StandbyPolicy, StopPolicy
 from rosrm.local_cluster import LocalCluster
 from rosrm.loopback import enter_private_network
+from rosrm.ros.names import token
 
 _ROOT = Path(__file__).resolve().parents[1]
 _HOSTS = ("h0", "h1", "h2", "h3")
@@ -41,6 +54,66 @@ _SHORT = (
 _GUARDED, _KEPT = "guarded", "kept"
 
 
+@dataclass(frozen=True)
+class GoneOn:
+    """Where a successor went on.
+
+    Attributes:
+        said: last cycle whose output of the former one was heard.
+        published: the same, whose state was.
+        first: cycle of the successor's first output.
+    """
+
+    said: int
+    published: int
+    first: int
+
+    @property
+    def lost(self) -> int:
+        """States that were published, and from which it did not go on.
+
+        Before a cycle spoke, the state of the one before it was published, heard or not.
+        """
+        return max(0, max(self.published, self.said - 1) + 1 - self.first)
+
+    @property
+    def repeated(self) -> int:
+        """Outputs that it said again."""
+        return max(0, self.said + 1 - self.first)
+
+    @property
+    def skipped(self) -> int:
+        """Outputs that nobody heard, between the last and the first one."""
+        return max(0, self.first - self.said - 1)
+
+
+class Witness(Observer):
+    """Hears the states as well as the outputs."""
+
+    def __init__(self, domain: int) -> None:
+        super().__init__(domain)
+        #: Newest published cycle, by instance.
+        self.states: dict[int, int] = {}
+        self._topics: set[str] = set()
+
+    def find_states(self) -> None:
+        """Listen to the topics of states that there are by now."""
+        for topic, types in self._node.get_topic_names_and_types():
+            is_state = topic.endswith("/state") and "std_msgs/msg/Int64MultiArray" in types
+            if is_state and topic not in self._topics:
+                self._topics.add(topic)
+                self._node.create_subscription(Int64MultiArray, topic, self._note, QOS)
+
+    def _note(self, message: Int64MultiArray) -> None:
+        number, sequence = message.data
+        self.states[number] = max(sequence, self.states.get(number, 0))
+
+    def gone_on(self, former: int, after: Output) -> GoneOn:
+        """Where the successor of an instance went on, by its first output."""
+        said = max(one.sequence for one in self.outputs if one.instance == former)
+        return GoneOn(said, self.states.get(former, 0), after.sequence)
+
+
 @dataclass
 class Outcome:
     """What came of the rounds; seconds from the fault.
@@ -48,14 +121,14 @@ class Outcome:
     Attributes:
         detect: until the host was lost.
         standby, restart: until the successor was heard.
-        standby_behind, restart_behind: cycles that the successor did once more than it had to.
+        standby_gone_on, restart_gone_on: where it went on.
     """
 
     detect: list[float] = field(default_factory=list)
     standby: list[float] = field(default_factory=list)
     restart: list[float] = field(default_factory=list)
-    standby_behind: list[int] = field(default_factory=list)
-    restart_behind: list[int] = field(default_factory=list)
+    standby_gone_on: list[GoneOn] = field(default_factory=list)
+    restart_gone_on: list[GoneOn] = field(default_factory=list)
 
 
 def _process(name: str, rate: float, **fields: object) -> ProcessSpec:
@@ -92,7 +165,7 @@ def measure(rounds: int, rate: float) -> Outcome:
     outcome = Outcome()
     with contextlib.ExitStack() as stack:
         cluster = stack.enter_context(_cluster(*_SHORT))
-        observer = Observer(cluster.domain or 0)
+        observer = Witness(cluster.domain or 0)
         stack.callback(observer.close)
         cluster.client.submit(
             [
@@ -107,8 +180,9 @@ def measure(rounds: int, rate: float) -> Outcome:
     return outcome
 
 
-def _round(cluster: LocalCluster, observer: Observer, name: str, outcome: Outcome) -> None:
+def _round(cluster: LocalCluster, observer: Witness, name: str, outcome: Outcome) -> None:
     _wait_until_calm(cluster)
+    observer.find_states()
     before = {one: cluster.process(one) for one in (_GUARDED, _KEPT)}
     host = before[name].host
     last_event = cluster.client.list(events=True, newest=1).events[-1].sequence
@@ -119,20 +193,20 @@ def _round(cluster: LocalCluster, observer: Observer, name: str, outcome: Outcom
         if row.host != host:
             continue
         after = _wait_for_successor(observer, row.number, _of(cluster, one, row.number))
-        behind = max(0, _last_of(observer.outputs, row.number).sequence - after.sequence)
+        gone_on = observer.gone_on(row.number, after)
         seconds = after.received / _NS - fault
         if one == _GUARDED:
             outcome.standby.append(seconds)
-            outcome.standby_behind.append(behind)
+            outcome.standby_gone_on.append(gone_on)
         else:
             outcome.restart.append(seconds)
-            outcome.restart_behind.append(behind)
+            outcome.restart_gone_on.append(gone_on)
     outcome.detect.append(_lost_at(cluster, host, last_event) - fault)
     cluster.start_slave(next(one for one in _hosts() if one.host == host))
 
 
 def _wait_until_calm(cluster: LocalCluster) -> None:
-    """Both run, on hosts that are there, the standby is ready, and a state is kept."""
+    """Both run, on hosts that are there, the standby is ready, and a new state is elsewhere."""
 
     def calm(view: object) -> bool:
         rows = {row.name: row for row in view.processes}  # type: ignore[attr-defined]
@@ -141,9 +215,25 @@ def _wait_until_calm(cluster: LocalCluster) -> None:
 
     cluster.wait_for_hosts(_PATIENCE)
     cluster.wait_until("two processes and a standby", calm, _PATIENCE)
-    until = time.monotonic() + 3.0  # a kept state travels every second
-    while time.monotonic() < until:
+    row = cluster.process(_KEPT)
+    before, deadline = _copies(cluster, row.host, row.number), time.monotonic() + _PATIENCE
+    while not any(
+        sequence > before.get(host, 0)
+        for host, sequence in _copies(cluster, row.host, row.number).items()
+    ):
+        if time.monotonic() >= deadline:
+            raise TimeoutError(f"no other host kept a new state of {_KEPT} in {_PATIENCE:g} s")
         cluster.client.spin(0.1)
+
+
+def _copies(cluster: LocalCluster, own: str, number: int) -> dict[str, int]:
+    """Hosts other than its own that keep a state of an instance on their disks, and the cycle."""
+    heads = {
+        name: kept.newest_head(cluster.directory / "hosts" / name / "kept" / token(_KEPT))
+        for name in _HOSTS
+        if name != own
+    }
+    return {name: one.sequence for name, one in heads.items() if one and one.instance == number}
 
 
 def _of(cluster: LocalCluster, name: str, former: int) -> int:
@@ -165,10 +255,6 @@ def _wait_for_successor(observer: Observer, former: int, number: int) -> Output:
                 return output
         time.sleep(0.005)
     raise TimeoutError(f"#{number}, which follows #{former}, was not heard in {_PATIENCE:g} s")
-
-
-def _last_of(outputs: Sequence[Output], number: int) -> Output:
-    return [output for output in outputs if output.instance == number][-1]
 
 
 def _lost_at(cluster: LocalCluster, host: str, after: int) -> float:
@@ -212,8 +298,8 @@ def _load() -> Iterator[None]:
             burner.wait()
 
 
-def main() -> None:
-    """Measure and print one JSON object."""
+def main() -> int:
+    """Measure and print one JSON object; returns the exit status."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rounds", type=int, default=40, help="hosts that are switched off")
     parser.add_argument("--rate", type=float, default=50.0, help="Hz, of the nodes")
@@ -225,15 +311,22 @@ def main() -> None:
         "0.8 s": false_losses(chosen.minutes, *_SHORT),
         "default": false_losses(chosen.minutes, LivenessSettings(), ControlSettings()),
     }
+    lost = sum(one.lost for one in outcome.standby_gone_on)
     print_report(
         "failover",
         {
             "lease_s": _SHORT[0].lease, "rate_hz": chosen.rate,
             **_quantiles("detect", outcome.detect), **_quantiles("standby", outcome.standby),
             **_quantiles("restart", outcome.restart),
-            "state_lost": sum(outcome.standby_behind),
-            "standby_behind_most": max(outcome.standby_behind, default=None),
-            "restart_behind_most": max(outcome.restart_behind, default=None),
+            "state_lost": lost,
+            "standbys_of_heard_states": sum(
+                one.published >= one.said - 1 for one in outcome.standby_gone_on
+            ),
+            "standby_repeated": sum(one.repeated for one in outcome.standby_gone_on),
+            "standby_skipped": sum(one.skipped for one in outcome.standby_gone_on),
+            "restart_repeated_most": max(
+                (one.repeated for one in outcome.restart_gone_on), default=None
+            ),
             "standbys": len(outcome.standby), "restarts": len(outcome.restart),
             "false_losses": sum(losses.values()), "false_losses_by_lease": losses,
             "load_minutes": chosen.minutes,
@@ -241,6 +334,7 @@ def main() -> None:
         },
         runs=chosen.rounds,
     )  # fmt: skip
+    return 1 if lost or any(losses.values()) else 0
 
 
 def _quantiles(name: str, seconds: Sequence[float]) -> dict[str, float | None]:
@@ -253,4 +347,4 @@ def _quantiles(name: str, seconds: Sequence[float]) -> dict[str, float | None]:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -55,24 +55,27 @@ class Echo(Node):
 
 
 class Count(Node):
-    """Stateful: counts by a timer of its own."""
+    """Stateful: counts by a timer of its own.
+
+    A cycle speaks first, and its state follows: [instance, sequence], for who looks at both.
+    """
 
     def __init__(self, rate: float) -> None:
         super().__init__("count")
         self.sequence = 0
         self.output = self.create_publisher(Int64MultiArray, OUTPUT, QOS)
         self.create_timer(1.0 / rate, self.tick)
-        self.keep_state("~/state", Int64, self.save, self.restore)
+        self.keep_state("~/state", Int64MultiArray, self.save, self.restore)
 
     def tick(self) -> None:
         self.sequence += 1
         self.output.publish(Int64MultiArray(data=[instance(), self.sequence, self.sequence]))
 
-    def save(self) -> Int64:
-        return Int64(data=self.sequence)
+    def save(self) -> Int64MultiArray:
+        return Int64MultiArray(data=[instance(), self.sequence])
 
-    def restore(self, state: Int64) -> None:
-        self.sequence = state.data
+    def restore(self, state: Int64MultiArray) -> None:
+        self.sequence = state.data[-1]
 
 
 class Tick(rclpy.node.Node):  # type: ignore[misc]  # rclpy brings no types
