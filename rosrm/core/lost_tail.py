@@ -10,12 +10,22 @@ that has not been heard yet. So no work is given
 
 What runs unknown is stopped when its host registers, and what is queued under its name waits for
 that end.
+
+A master that is killed or stopped while it waits leaves that to the next one: it is an intent,
+`unheard`, until it has been waited for. A loss that hosts told of is waited for anew, for a lease
+from the next start, as they tell it to one master only.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any, Final
+
 from rosrm.core.hosts import HostCondition
 from rosrm.core.state import MasterState
+from rosrm.ports import Intent
+
+_KEY: Final = "unheard"
 
 
 def begin(state: MasterState, newest: int, now: float, *, fell: bool) -> None:
@@ -25,8 +35,36 @@ def begin(state: MasterState, newest: int, now: float, *, fell: bool) -> None:
         state: as it was restored.
         newest: sequence of the newest record that the journal holds.
         fell: the machine was started anew, and the last master had not stopped before.
+
+    Then `intent` is to become durable, together with what tells the next start from this one.
     """
-    state.tail.newest, state.tail.started, state.tail.fell = newest, now, fell
+    state.tail.newest, state.tail.started = newest, now
+    state.tail.fell = state.tail.fell or fell
+
+
+def restore(state: MasterState, cluster: Mapping[str, Mapping[str, Any]]) -> None:
+    """Take over what a former master had still to wait for, from the intents `cluster`."""
+    kept = cluster.get(_KEY, {})
+    state.tail.fell, state.tail.short = bool(kept.get("fell")), bool(kept.get("short"))
+
+
+def intent(state: MasterState) -> Intent:
+    """What the next master has to wait for, were it to start now."""
+    tail = state.tail
+    waits = {"fell": tail.fell, "short": tail.short}
+    return Intent("cluster", _KEY, waits if any(waits.values()) else None)
+
+
+def review(state: MasterState, now: float) -> None:
+    """What has been waited for is done with, for the next master too."""
+    tail = state.tail
+    before = (tail.fell, tail.short)
+    if not any(before):
+        return
+    tail.short = tail.short and now < tail.started + state.settings.lease
+    tail.fell = tail.fell and bool((state.hosts.condition == HostCondition.EXPECTED).any())
+    if (tail.fell, tail.short) != before:
+        state.emit(intent(state))
 
 
 def note_seen(state: MasterState, host: str, seen: int, now: float) -> None:
@@ -38,6 +76,9 @@ def note_seen(state: MasterState, host: str, seen: int, now: float) -> None:
     tail.lost = lost
     state.skip_numbers(state.next_instance + lost)  # each may have told of a new instance
     left = tail.started + state.settings.lease - now
+    if left > 0 and not tail.short:
+        tail.short = True
+        state.emit(intent(state))
     wait = f"; no work is given for {left:.1f} s, until all hosts were heard" if left > 0 else ""
     state.record(
         now, "journal_behind",
@@ -50,12 +91,9 @@ def note_seen(state: MasterState, host: str, seen: int, now: float) -> None:
 
 def why_no_work(state: MasterState, now: float) -> str:
     """Why nobody is given work just now; "" if they may be."""
-    tail = state.tail
-    if tail.lost and now < tail.started + state.settings.lease:
+    review(state, now)
+    if state.tail.short:
         return "the journal has lost its newest part: all hosts must be heard first"
-    if tail.fell:
-        away = state.hosts.condition == HostCondition.EXPECTED
-        if away.any():
-            return "the machine of the master fell: all hosts must be heard first"
-        tail.fell = False
+    if state.tail.fell:
+        return "the machine of the master fell: all hosts must be heard first"
     return ""

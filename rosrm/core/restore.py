@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from rosrm.core import lost_tail
 from rosrm.core.lifecycle import adopt_to_stop
 from rosrm.core.model import InstanceId
 from rosrm.core.plans import plan_from_dict
@@ -43,8 +44,10 @@ def restore(state: MasterState, intents: Callable[[str], _Table], now: float) ->
         if move is None or not _restore_move(state, process, item, move, now):
             _restore_place(state, process, now)
     state.next_order = 1 + max((int(item["order"]) for item in stored), default=0)
-    numbers = intents("cluster").get("instances", {})
+    cluster = intents("cluster")
+    numbers = cluster.get("instances", {})
     state.next_instance = state.reserved_instances = int(numbers.get("next", 1))
+    lost_tail.restore(state, cluster)
 
 
 def _restore_process(state: MasterState, item: Mapping[str, Any], now: float) -> Process:

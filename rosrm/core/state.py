@@ -55,12 +55,14 @@ class Tail:
         started: time of the start.
         fell: the machine fell before it, and not every host has come back.
         lost: records that are known to be lost.
+        short: some are, and not every host has had the time to be heard since.
     """
 
     newest: int = _LARGEST
     started: float = 0.0
     fell: bool = False
     lost: int = 0
+    short: bool = False
 
 
 class MasterState:
@@ -272,10 +274,13 @@ class MasterState:
     def new_instance_id(self, process: Process) -> InstanceId:
         """A number that no instance has had, in any run of the master."""
         if self.next_instance >= self.reserved_instances:
-            self.reserved_instances = self.next_instance + _RESERVED
-            self.emit(Intent("cluster", "instances", {"next": self.reserved_instances}))
+            self._reserve_numbers()
         self.next_instance += 1
         return InstanceId(process.name, self.next_instance - 1)
+
+    def _reserve_numbers(self) -> None:
+        self.reserved_instances = self.next_instance + _RESERVED
+        self.emit(Intent("cluster", "instances", {"next": self.reserved_instances}))
 
     def skip_numbers(self, seen: int) -> None:
         """A slave holds an instance that was not numbered by us: our journal was lost.
@@ -284,6 +289,7 @@ class MasterState:
         """
         if self.next_instance <= seen < _LARGEST:
             self.next_instance = seen + _RESERVED
+            self._reserve_numbers()  # that slave may never say it again
 
     def add_instance(
         self, instance: InstanceId, spec: ProcessSpec, host: Host, now: float

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from rosrm.core import abilities, keeping
+from rosrm.core import abilities, keeping, lost_tail
 from rosrm.core import events as happened
 from rosrm.core.assigning import reconsider_set_aside
 from rosrm.core.charges import settle_charge
@@ -32,6 +32,7 @@ def time_passed(state: MasterState, event: happened.TimePassed, now: float) -> N
     for instance in list(state.instances.values()):
         _review_instance(state, instance, now)
     review_lost_hosts(state, now)
+    lost_tail.review(state, now)
     review_standbys(state, now)
     _ask_for_missing_statuses(state, now)
     abilities.ask_hosts(state, now)

@@ -141,15 +141,6 @@ class MasterRuntime:
     ) -> MasterState:
         newest, fell, epoch = self._last_run()
         epoch += 1
-        self._journal.write(
-            [
-                Record(
-                    "master_started", message=f"master {self._config.name} started, epoch {epoch}"
-                )
-            ],
-            [Intent("cluster", "epoch", {"epoch": epoch, "boot": _boot()})],
-            0.0,
-        )
         state = MasterState(
             self._config.core(), self._config.scoring.policy or "", policy, strategies, epoch,
             self._fallback,
@@ -163,6 +154,16 @@ class MasterRuntime:
         except (AttributeError, KeyError, TypeError, ValueError) as fault:
             raise unreadable(self._config.state / "journal.sqlite", fault) from fault
         lost_tail.begin(state, newest, now, fell=fell)
+        started = f"master {self._config.name} started, epoch {epoch}"
+        self._journal.write(
+            [Record("master_started", message=started)],
+            # As one: from the boot the next master cannot tell what this one had to wait for.
+            [
+                Intent("cluster", "epoch", {"epoch": epoch, "boot": _boot()}),
+                lost_tail.intent(state),
+            ],
+            0.0,
+        )
         self._record_from(state, now)
         return state
 

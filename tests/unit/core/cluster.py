@@ -280,12 +280,14 @@ class Cluster:
         self.register(machine)
         return machine
 
-    def register(self, machine: Machine, kept: tuple[KeptState, ...] = ()) -> Reply:
+    def register(
+        self, machine: Machine, kept: tuple[KeptState, ...] = (), *, journal_seen: int = 0
+    ) -> Reply:
         """A slave registers; taken in, it sends a reading and asks for work."""
         machine.begin_to_register()
         reply = self.ask(
-            happened.HostRegistered, machine.description(), machine.slave.statuses(), 0, kept,
-            settle=False,
+            happened.HostRegistered, machine.description(), machine.slave.statuses(),
+            journal_seen, kept, settle=False,
         )  # fmt: skip
         if reply.accepted:
             machine.host_id, machine.fresh = reply.host_id, False

@@ -32,20 +32,23 @@ class Loss:
         cluster.intents.clear()
         cluster.intents.update(self._kept)
         cluster.kill_master()
-        lost_tail.begin(cluster.state, self._newest, cluster.now, fell=fell)
+        begin(cluster, self._newest, fell=fell)
 
     def come_back(self, host: str, seen: int) -> None:
         """The host registers and says how much of the journal it has seen."""
-        cluster = self.cluster
+        self.cluster.register(self.cluster.machines[host], journal_seen=seen)
 
-        def ask(kind, *fields, settle=True):
-            return Cluster.ask(cluster, kind, *fields, seen, settle=settle)
 
-        cluster.ask = ask
-        try:
-            cluster.register(cluster.machines[host])
-        finally:
-            del cluster.ask
+def begin(cluster: Cluster, newest: int, *, fell: bool = False) -> None:
+    """As a master does with its start: what it must remember becomes durable at once."""
+    lost_tail.begin(cluster.state, newest, cluster.now, fell=fell)
+    cluster.journal([lost_tail.intent(cluster.state)])
+
+
+def kill_again(cluster: Cluster) -> None:
+    """The master that came up from what is left is killed too; the next has all that it wrote."""
+    cluster.kill_master()
+    begin(cluster, len(cluster.records))
 
 
 @pytest.fixture
@@ -133,8 +136,66 @@ def test_after_a_fall_of_the_machine_all_known_hosts_are_heard_first(cluster, th
     assert cluster.phase("p") == "running"
 
 
-def test_numbers_of_what_is_lost_are_not_given_again(cluster) -> None:
-    """Also of instances that have ended and that no host remembers."""
+def test_a_master_that_is_killed_while_it_waits_forgets_nothing_of_it(cluster) -> None:
+    """After a fall of the machine: the next one waits for the same hosts, and then no more."""
+    cluster.set_host("a", "cordon")
+    cluster.set_host("b", "cordon")
+    cluster.submit(process("p"))
+    loss = Loss(cluster)
+    cluster.set_host("b", "uncordon")
+    loss.strike(fell=True)
+    kill_again(cluster)
+    loss.come_back("a", 0)
+    cluster.set_host("a", "uncordon")
+    cluster.wait(2.0)
+    assert cluster.where("p") == ["b"]
+    assert "all hosts must be heard first" in cluster["p"].reason
+    loss.come_back("b", 0)
+    cluster.wait(1.0)
+    assert len(cluster.where("p")) == 1
+    assert cluster.phase("p") == "running"
+    assert "unheard" not in cluster.intents["cluster"]
+
+
+def test_nothing_is_waited_for_twice(cluster) -> None:
+    """All have come back, with nothing to do: a later restart of the master is as any other."""
+    loss = Loss(cluster)
+    loss.strike(fell=True)
+    assert cluster.intents["cluster"]["unheard"]["fell"]
+    loss.come_back("a", 0)
+    loss.come_back("b", 0)
+    cluster.wait(0.5)
+    assert "unheard" not in cluster.intents["cluster"]
+    kill_again(cluster)
+    loss.come_back("a", 0)
+    cluster.submit(process("p"))
+    assert cluster.where("p") == ["a"]
+
+
+def test_what_one_host_knew_to_be_lost_counts_for_the_next_master_too(cluster) -> None:
+    """That host has seen no more than there is now; the others are still to be heard."""
+    cluster.set_host("a", "cordon")
+    cluster.set_host("b", "cordon")
+    cluster.submit(process("p"))
+    loss = Loss(cluster)
+    cluster.set_host("b", "uncordon")
+    loss.strike()
+    loss.come_back("a", loss.seen)
+    kill_again(cluster)
+    loss.come_back("a", 0)
+    cluster.set_host("a", "uncordon")
+    cluster.wait(2.0)
+    assert cluster.where("p") == ["b"]
+    assert "all hosts must be heard first" in cluster["p"].reason
+    cluster.machines["b"].connected = False
+    cluster.wait(LEASE)
+    assert "a" in cluster.where("p")
+    assert "unheard" not in cluster.intents["cluster"]
+
+
+@pytest.mark.parametrize("killed", [False, True])
+def test_numbers_of_what_is_lost_are_not_given_again(cluster, killed) -> None:
+    """Also of instances that have ended and that no host remembers, and by the next master."""
     loss = Loss(cluster)
     cluster.submit(process("p"))
     given = cluster["p"].owner
@@ -144,7 +205,10 @@ def test_numbers_of_what_is_lost_are_not_given_again(cluster) -> None:
     for machine in cluster.machines.values():
         machine.slave.held.clear()
     loss.come_back("a", seen)
-    loss.come_back("b", seen)
+    if killed:
+        kill_again(cluster)
+        loss.come_back("a", 0)
+    loss.come_back("b", 0 if killed else seen)
     cluster.wait(LEASE)
     cluster.submit(process("q"))
     cluster.wait(0.2)
