@@ -16,6 +16,7 @@ from rclpy.event_handler import EventHandler
 from rosrm.node.absence import Absence, absence_of, await_peers
 from rosrm.portable import VARIABLE
 from rosrm.ros.fast_dds import announcing
+from rosrm.ros.leftovers import close_leaked, open_sockets
 
 
 class PortableNode(rclpy.node.Node):  # type: ignore[misc]  # rclpy brings no types
@@ -84,14 +85,18 @@ class PortableNode(rclpy.node.Node):  # type: ignore[misc]  # rclpy brings no ty
         except Exception as error:  # noqa: BLE001 - the author's code: anything may come
             fault = f"{type(self).__name__}.leave raised {type(error).__name__}: {error}"
         self.destroy_node()
+        close_leaked(self._portable_sockets)
         return absence, fault
 
-    def _portable_join_again(self, absence: Absence) -> None:
+    def _portable_enter_again(self, absence: Absence) -> None:
+        """Be in the graph, with nothing but a name and parameters."""
         named = dict(self._portable_arguments[1])
         # Files of parameters need not be at the new host: what they said counts nevertheless.
         given = [*self._portable_given.values(), *(named.get("parameter_overrides") or ())]
         named["parameter_overrides"] = absence.overrides(given)
         self._portable_enter(named)
+
+    def _portable_join_again(self, absence: Absence) -> None:
         absence.declare_missing(self, self._portable_declared)
         self.join()
         absence.declare_missing(self)
@@ -106,8 +111,12 @@ class PortableNode(rclpy.node.Node):  # type: ignore[misc]  # rclpy brings no ty
         controlled = VARIABLE in os.environ
         # Shared memory of a participant would lie in the dumped process; over UDP none is left.
         profile = announcing(os.environ, "movable", udp=True)
+        before = open_sockets()
         with profile if controlled else contextlib.nullcontext():
             super().__init__(*self._portable_arguments[0], **named)
+        self._portable_sockets = {
+            number: one for number, one in open_sockets().items() if before.get(number) != one
+        }
 
     def _portable_entities(self) -> Iterator[Any]:
         for kind in ("publishers", "subscriptions", "timers", "services", "clients", "guards"):

@@ -191,9 +191,13 @@ def _ask(directory: Path, pid: int | None, request: Request) -> None:
 
 
 def _check_catches(pid: int) -> None:
-    """A process that does not catch the signal would be ended by it."""
-    caught = int(_of_process(pid).get("SigCgt", "0"), 16)
-    if not caught >> (SIGNAL - 1) & 1:
+    """A process that neither catches the signal nor awaits it would be ended by it.
+
+    Who holds a restored process blocks all signals, and passes them on.
+    """
+    status = _of_process(pid)
+    safe = int(status.get("SigCgt", "0"), 16) | int(status.get("SigBlk", "0"), 16)
+    if not safe >> (SIGNAL - 1) & 1:
         raise PortableError(
             f"process {pid} does not catch signal {SIGNAL}, so it is no portable node (or a "
             f"program around one: start the node itself); it was not asked"

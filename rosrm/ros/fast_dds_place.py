@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Final
 
 from rosrm.errors import PortableError
+from rosrm.ros.leftovers import close_leaked, open_sockets
 
 _LIBRARIES: Final = ("libfastrtps.so", "libfastdds.so")
 _INTERFACES: Final = "_ZN8eprosima10SystemInfo17update_interfacesEv"
@@ -89,9 +90,11 @@ def _renew_places(library: ctypes.CDLL) -> bool:
         pairs = [(library[made], _address(library, one)) for made, one in _PLACES]
     except (AttributeError, ValueError):
         return False
+    before = open_sockets()
     for construct, address in pairs:
         construct.argtypes, construct.restype = (ctypes.c_void_p,), None
         construct(address)
+    close_leaked({number: one for number, one in open_sockets().items() if number not in before})
     return True
 
 

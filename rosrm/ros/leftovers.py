@@ -1,0 +1,81 @@
+"""What of ROS is still in a process whose nodes and context are gone."""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Final
+
+#: How Fast DDS names its threads, and its files in shared memory.
+_THREADS: Final = "dds."
+_SHARED: Final = "/dev/shm/fastrtps_"  # noqa: S108 - not a file of ours
+#: Standard input, output and error are the supervisor's, and whoever restores takes care of them.
+_STANDARD: Final = frozenset({0, 1, 2})
+
+
+def what_is_left() -> str:
+    """Why this process cannot be dumped as it is, and what to do; "": nothing is in the way."""
+    threads = sorted(one for one in _thread_names() if one.startswith(_THREADS))
+    if threads:
+        return (
+            f"ROS is still at work after the node was destroyed (threads {', '.join(threads)}): "
+            f"something holds another node or an entity of this one; destroy it in leave()"
+        )
+    sockets = open_sockets()
+    if sockets:
+        numbers = ", ".join(map(str, sorted(sockets)))
+        return f"sockets are open (file descriptors {numbers}): close them in leave()"
+    shared = [target for target in _open_files().values() if target.startswith(_SHARED)]
+    if shared:
+        return (
+            f"Fast DDS left {', '.join(shared)} open: set FASTDDS_BUILTIN_TRANSPORTS=UDPv4 in the "
+            f"environment of this process, or leave transports out of its profile"
+        )
+    return ""
+
+
+def open_sockets() -> dict[int, str]:
+    """By number, what each socket is: `socket:[INODE]`, which no other has."""
+    return {number: one for number, one in _open_files().items() if one.startswith("socket:")}
+
+
+def close_leaked(sockets: Mapping[int, str]) -> None:
+    """Close those of these sockets that are still open and nobody uses: not bound, not connected.
+
+    Fast DDS 2.14 leaves one for each network interface, by which it asked for its MAC address.
+
+    Args:
+        sockets: that were opened while Fast DDS was at work.
+    """
+    now = open_sockets()
+    for number, one in sockets.items():
+        if now.get(number) == one and _is_unused(number):
+            os.close(number)
+
+
+def _is_unused(number: int) -> bool:
+    with socket.socket(fileno=os.dup(number)) as one:
+        is_udp = one.family == socket.AF_INET and one.type == socket.SOCK_DGRAM
+        return is_udp and one.getsockname()[1] == 0
+
+
+def _thread_names() -> Iterable[str]:
+    for task in Path("/proc/self/task").iterdir():
+        try:
+            yield (task / "comm").read_text(encoding="utf-8", errors="replace").strip()
+        except OSError:  # it has just ended
+            continue
+
+
+def _open_files() -> dict[int, str]:
+    """By number, but for the standard three."""
+    found = {}
+    for one in Path("/proc/self/fd").iterdir():
+        if int(one.name) not in _STANDARD:
+            try:
+                found[int(one.name)] = str(one.readlink())
+            except OSError:  # the one that lists them
+                continue
+    return found
