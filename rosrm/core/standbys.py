@@ -159,15 +159,8 @@ def _see_it_follow(state: MasterState, process: Process, run: Run, now: float) -
         _lost(state, process, run, gave_up or "it gave up", now)
     elif ReportPhase.READY not in said:
         _say_shadow(state, run, now)
-    elif process.standby_reason != (
-        ready := f"its standby is ready on {run.destination_host.name}"
-    ):
-        process.standby_reason, process.standby_tries = ready, 0
-        state.record(
-            now, "standby_ready",
-            f"the standby of {process.name} is ready on {run.destination_host.name}",
-            process=process.name, host=run.destination_host.name,
-        )  # fmt: skip
+    else:
+        _note_ready(state, process, run, now)
 
 
 def _note_ready(state: MasterState, process: Process, run: Run, now: float) -> None:
