@@ -12,7 +12,9 @@ standby did not go on; there must be none. `standby_repeated` counts outputs tha
 where the power went between the output and its state, which nobody can know better, or else as
 many as states were lost. `standby_skipped` counts outputs that nobody heard: of the standby's first
 cycles, before the observer had found it. Of as many as `standbys_of_heard_states` the states were
-heard to the last; of the others it is only known what was published before an output. `restart_repeated` is the age of a kept state, in cycles.
+heard to the last; of the others it is only known what was published before an output.
+`restart_repeated` is the age of a kept state, in cycles.
+
 Exit status: 1 where a state or a host was lost that should not have been.
 """
 
