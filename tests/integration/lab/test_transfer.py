@@ -1,0 +1,118 @@
+"""A directory moved between hosts whose network is really cut."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+
+import pytest
+
+from rosrm.lab import DATA
+
+#: Seconds for whatever a busy machine needs; nothing waits so long when all goes well.
+PATIENCE = 90.0
+#: Longer than a fetch waits for a byte (5 s), shorter than it waits for its source after that.
+LONG = 8.0
+SIZE = 12_000_000
+_SOURCE = """
+import hashlib, json, os, sys
+from pathlib import Path
+from rosrm.transfer import Sender
+directory = Path(sys.argv[1])
+directory.mkdir()
+content = os.urandom(int(sys.argv[2]))
+(directory / "pages").write_bytes(content)
+with Sender() as sender:
+    offer = sender.offer(directory, seconds=120.0, max_rate=3e6)
+    print(json.dumps([offer.as_json(), hashlib.sha256(content).hexdigest()]), flush=True)
+    print(json.dumps(sender.wait(120.0).as_json()), flush=True)
+"""
+_DESTINATION = """
+import hashlib, json, sys
+from pathlib import Path
+from rosrm.errors import TransferError
+from rosrm.transfer import Offer, fetch
+target = Path(sys.argv[1])
+try:
+    offer = Offer.from_json(json.loads(sys.argv[2]))
+    fetched = fetch(offer, target, timeout=float(sys.argv[3]), reserve=0).as_json()
+    digest = hashlib.sha256((target / "pages").read_bytes()).hexdigest()
+except TransferError as error:
+    fetched, digest = {"error": str(error)}, ""
+print(json.dumps([fetched, digest]))
+"""
+
+
+class Move:
+    """From host1 to host2.
+
+    Attributes:
+        offer: as it travels by the master.
+    """
+
+    def __init__(self, lab, *, timeout: float) -> None:
+        self.lab = lab
+        self.target = f"{DATA}/tmp/target"
+        command = [sys.executable, "-c", _SOURCE, f"{DATA}/tmp/source", str(SIZE)]
+        self.source = lab.popen("host1", command, limited=False, stdout=subprocess.PIPE)
+        self.offer, self.digest = json.loads(self.source.stdout.readline())
+        command = [
+            sys.executable, "-c", _DESTINATION, self.target, json.dumps(self.offer), str(timeout)
+        ]  # fmt: skip
+        self.destination = lab.popen("host2", command, limited=False, stdout=subprocess.PIPE)
+
+    def wait_until_it_flows(self) -> None:
+        place = self.lab.outside("host2", f"{DATA}/tmp")
+        end = time.monotonic() + PATIENCE
+        while not any(one.stat().st_size for one in place.glob(".rosrm-fetch-*/pages")):
+            assert time.monotonic() < end, "nothing has come"
+            time.sleep(0.05)
+
+    def fetched(self) -> tuple[dict, str]:
+        said, _ = self.destination.communicate(timeout=PATIENCE)
+        return tuple(json.loads(said))
+
+    def close(self) -> None:
+        for one in (self.source, self.destination):
+            one.kill()
+            one.communicate()
+
+
+@pytest.fixture
+def move(lab):
+    made = []
+
+    def begin(**settings) -> Move:
+        made.append(Move(lab, **settings))
+        return made[-1]
+
+    yield begin
+    for one in made:
+        one.close()
+
+
+def test_a_transfer_goes_on_when_the_network_is_back(lab, move):
+    """After a cut that is longer than a connection is waited for."""
+    moving = move(timeout=PATIENCE)
+    moving.wait_until_it_flows()
+    lab.cut("host1")
+    time.sleep(LONG)
+    lab.heal("host1")
+    fetched, digest = moving.fetched()
+    assert digest == moving.digest, fetched
+    assert fetched["address"] == lab.address("host1")
+    assert fetched["resumed"] > 0
+    assert fetched["received"] < SIZE * 1.5
+    assert json.loads(moving.source.stdout.readline())["outcome"] == "taken"
+
+
+def test_a_transfer_over_a_network_that_stays_cut_fails_in_time(lab, move):
+    """The destination says how far it was, and has nothing of it."""
+    moving = move(timeout=7.0)
+    moving.wait_until_it_flows()
+    lab.cut("host1")
+    fetched, _ = moving.fetched()
+    assert f"of {moving.offer['length']} bytes" in fetched["error"]
+    assert not list(lab.outside("host2", f"{DATA}/tmp").iterdir())
