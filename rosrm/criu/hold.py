@@ -24,6 +24,7 @@ import select
 import signal
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, NoReturn
 
@@ -67,13 +68,14 @@ def main() -> None:
     # What comes while it is restored waits for it; SIGKILL alone does not.
     signal.pthread_sigmask(signal.SIG_BLOCK, _PASSED_ON)
     try:
-        manifest = restoring.moved_here(image.read(directory))
-        restoring.check(manifest)
+        manifest = image.read(directory)
+        here = restoring.moved_here(manifest)
+        restoring.check(here)
         criu = opened(Path(options.criu))
     except CriuError as error:
         _fail(directory, str(error))
     os.chdir("/")
-    restore = _Restore(criu, directory, manifest, options.timeout, options.remove, began)
+    restore = _Restore(criu, directory, manifest, here, options.timeout, options.remove, began)
     if not options.no_namespace and _libc.unshare(_NEW_PIDS) == 0:
         _hold_namespace(restore)
     _hold_child(restore)
@@ -89,24 +91,27 @@ def _options() -> argparse.Namespace:
     return parser.parse_args()
 
 
+@dataclass(frozen=True)
 class _Restore:
     """One restore: what it needs, and what is told of it."""
 
-    def __init__(
-        self, criu: Criu, directory: Path, manifest: Manifest, timeout: float, remove: bool,
-        began: float,
-    ) -> None:  # fmt: skip
-        self.directory, self.manifest, self._remove = directory, manifest, remove
-        self._criu, self._timeout, self._began = criu, timeout, began
+    criu: Criu
+    directory: Path
+    manifest: Manifest
+    here: Manifest
+    timeout: float
+    remove: bool
+    began: float
 
     def run(self, marks: dict[str, str]) -> int:
         """Restore here and now; returns the pid in this namespace, raises CriuError."""
-        restoring.prepare(self.directory, self.manifest)
+        restoring.prepare(self.directory, self.here)
         log = _reopened_log()
         try:
             pid = restoring.restore(
-                self._criu, self.directory, self.manifest.shelter, log=log, timeout=self._timeout
-            )
+                self.criu, self.directory, self.manifest, self.here.shelter, log=log,
+                timeout=self.timeout,
+            )  # fmt: skip
         finally:
             os.close(log)
         for member in tree.tree(pid):
@@ -115,15 +120,15 @@ class _Restore:
 
     def tell(self, pid: int, *, namespace: bool) -> None:
         """That it is done."""
-        if self._remove:
-            image.remove(self.directory)
-        seconds = round(time.monotonic() - self._began, 3)
+        seconds = round(time.monotonic() - self.began, 3)
         told = Outcome(pid=pid, inner_pid=self.manifest.pid, namespace=namespace, seconds=seconds)
         outcome.write(self.directory, told)
+        if self.remove:
+            image.remove(self.directory)
 
     def clean(self) -> None:
         """What is left of the image, after the end of the process."""
-        if self._remove:
+        if self.remove:
             with contextlib.suppress(OSError):
                 (self.directory / outcome.FILE).unlink()
                 self.directory.rmdir()

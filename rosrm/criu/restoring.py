@@ -126,7 +126,9 @@ def _make_tracing_file(mapped: MappedFile) -> None:
         os.unlink(new)  # noqa: PTH108
 
 
-def restore(criu: Criu, directory: Path, shelter: str, *, log: int, timeout: float) -> int:
+def restore(
+    criu: Criu, directory: Path, manifest: Manifest, shelter: str, *, log: int, timeout: float
+) -> int:
     """Restore the process, as a descendant of the caller; returns its pid.
 
     CRIU's children end, so the nearest subreaper or init above the caller becomes its parent.
@@ -134,6 +136,7 @@ def restore(criu: Criu, directory: Path, shelter: str, *, log: int, timeout: flo
     Args:
         criu: to use.
         directory: of the image, checked and prepared for.
+        manifest: of the image, as it was read.
         shelter: takes the place of the image's.
         log: descriptor that becomes its standard output and error.
         timeout: seconds; CRIU is killed when they have passed.
@@ -141,7 +144,6 @@ def restore(criu: Criu, directory: Path, shelter: str, *, log: int, timeout: flo
     Raises:
         CriuError: what failed.
     """
-    manifest = image.read(directory)
     pid_file = directory / _PID_FILE
     pid_file.unlink(missing_ok=True)
     logs = [relocation.moved(path, manifest.shelter, shelter) for path in manifest.logs]

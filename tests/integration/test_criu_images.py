@@ -22,9 +22,9 @@ pytestmark = pytest.mark.timeout(240)
 
 #: Writes one number after the other; ends with 7 at SIGTERM, says so at SIGUSR1.
 COUNTER = """
-import signal, sys, time
+import os, signal, sys, time
 signal.signal(signal.SIGTERM, lambda *_: sys.exit(7))
-signal.signal(signal.SIGUSR1, lambda *_: print("usr1", flush=True))
+signal.signal(signal.SIGUSR1, lambda *_: os.write(1, b"usr1\\n"))
 count = 0
 while True:
     count += 1
@@ -307,7 +307,7 @@ def become_two(*_):
         os.setsid()
         if os.fork():
             os._exit(0)
-        print("daemon", flush=True)
+        os.write(1, b"daemon\\n")
 signal.signal(signal.SIGHUP, become_two)
 {COUNTER}"""
     actor = theatre.start(code)
@@ -350,7 +350,7 @@ import os, signal
 def become_two(*_):
     if os.fork() == 0:
         os.setsid()
-        print("daemon", flush=True)
+        os.write(1, b"daemon\\n")
 signal.signal(signal.SIGHUP, become_two)
 {COUNTER}"""
     actor = theatre.start(code)
@@ -380,7 +380,7 @@ def test_the_image_is_private_and_gone_when_it_was_told_so(theatre, counter):
     modes = {path.stat().st_mode & 0o077 for path in [directory, *directory.rglob("*")]}
     assert modes == {0}
     restored = theatre.restore(directory, remove=True)
-    assert [path.name for path in directory.iterdir()] == ["hold.json"]
+    eventually(lambda: [path.name for path in directory.iterdir()] == ["hold.json"], "a clean end")
     restored.process.terminate()
     restored.process.wait(TIMEOUT)
     assert not directory.exists()
