@@ -329,9 +329,12 @@ class MasterClient:
         answers = _ask_until_answered(self._participant, client, request, deadline, _AGAIN)
         response = answers.answer
         if response is None:
+            # What only reads has no envelope.
+            acts = hasattr(request, "envelope")
+            unknown = ". It is not known whether it was done" if acts else ""
             raise NoMaster(
                 f"{who} did not answer {path} within {self._timeout:g} s "
-                f"({self._participant.settings.describe()}){self._trouble(kind)}"
+                f"({self._participant.settings.describe()}){self._trouble(kind)}{unknown}"
             )
         if answers.sent > 1 and is_unsure(response.answer, self._master.epoch):
             raise Refused(
