@@ -65,6 +65,8 @@ class Criu:
         """Run CRIU and wait for its end; with `--unprivileged`, unless we may do all.
 
         It has a session of its own: a Ctrl-C that is meant for us does not cut a dump in two.
+        A process whose dump is cut off goes on; but where CRIU was to kill it after the dump, it
+        may have done so by then.
 
         Args:
             arguments: the first one is what it shall do: `dump`, `restore`, ...
