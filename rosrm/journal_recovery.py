@@ -19,11 +19,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from rosrm.errors import JournalError
+from rosrm.disk_space import room_for
+from rosrm.errors import JournalBlocked, JournalError
 from rosrm.journal import SqliteJournal
 from rosrm.ports import Intent, Record
 
-_FILES: Final = ("", "-wal", "-shm")
+_BESIDE: Final = ("-wal", "-shm")
 #: A damaged page hides all that is behind it in a scan. So events are read by a few, and from the
 #: end; intents from both ends, then one by one by the names that the events know.
 _EVENTS: Final = "SELECT * FROM record WHERE sequence BETWEEN ? AND ? AND facts IS NOT NULL"
@@ -39,6 +40,9 @@ _INTENT: Final = "SELECT tbl, key, value FROM intent WHERE tbl = ? AND key = ?"
 _MOST_EMPTY: Final = 2**30
 #: Numbers left free above the largest that is known.
 _FREE: Final = 1000
+#: Under these names events tell numbers of instances; no real one is as large as that.
+_NUMBERS: Final = ("number", "source", "destination")
+_NO_NUMBER: Final = 2**53
 
 
 @dataclass(slots=True)
@@ -61,19 +65,41 @@ def recover(path: Path, wall: Callable[[], float] = time.time) -> str:
         What was found and where the damaged file is now, for people.
 
     Raises:
-        JournalError: it is not damaged, or nothing can be read of it.
+        JournalError: it is not damaged, or nothing can be read of it, or there is no room, or a
+            right is missing; the journal is as it was.
     """
     _check_damaged(path)
+    try:
+        return _recover(path, wall)
+    except (OSError, sqlite3.Error) as error:
+        raise _not_recovered(path, error) from error
+    except JournalBlocked as blocked:  # of the new one
+        raise _not_recovered(path, blocked.__cause__ or blocked) from blocked
+
+
+def _recover(path: Path, wall: Callable[[], float]) -> str:
     with tempfile.TemporaryDirectory(dir=path.parent, prefix="recovery-") as place:
         found = _salvage(path, Path(place))
         new = Path(place) / "new.sqlite"
         aside = path.with_name(f"{path.name}.damaged-{int(wall())}")
         _write(new, found, aside)
-        for suffix in _FILES:
+        # Killed at any point, there is a journal: to a master that finds none all are strangers.
+        os.link(path, aside)
+        for suffix in _BESIDE:
             with contextlib.suppress(FileNotFoundError):
-                Path(f"{path}{suffix}").rename(f"{aside}{suffix}")
-        new.rename(path)
+                Path(f"{path}{suffix}").replace(f"{aside}{suffix}")
+        new.replace(path)
     return _summary(found, aside)
+
+
+def _not_recovered(path: Path, error: BaseException) -> JournalError:
+    why = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+    room = room_for(path)
+    return JournalError(
+        f"the journal {path} was not recovered, and is as it was: {why}. A recovery needs room "
+        f"beside it for two more of its size{f' ({room})' if room else ''}, and the right to write "
+        f"into its folder"
+    )
 
 
 def _check_damaged(path: Path) -> None:
@@ -94,7 +120,7 @@ def _check_damaged(path: Path) -> None:
 def _salvage(path: Path, place: Path) -> _Found:
     """Read a copy, as reading would write to the original (`-shm`, a checkpoint)."""
     copy = place / "damaged.sqlite"
-    for suffix in _FILES[:2]:
+    for suffix in ("", "-wal"):
         with contextlib.suppress(FileNotFoundError):
             shutil.copyfile(f"{path}{suffix}", f"{copy}{suffix}")
     _fill_up(copy)
@@ -170,7 +196,7 @@ def _put_right(found: _Found) -> None:
     """What the intents that are left presume of those that may be lost."""
     hosts = {key for table, key in found.intents if table == "host"}
     ids = [int(found.intents["host", name].get("host_id", 0)) for name in hosts]
-    largest = 0
+    largest = _largest_told(found)
     for (table, _), process in list(found.intents.items()):
         if table != "process":
             continue
@@ -184,6 +210,20 @@ def _put_right(found: _Found) -> None:
     found.intents.setdefault(("cluster", "instances"), {"next": largest + _FREE})
     epoch = found.intents.setdefault(("cluster", "epoch"), {"epoch": 0})
     epoch["boot"] = "recovered"  # as after a fall: all hosts are heard before work is given
+
+
+def _largest_told(found: _Found) -> int:
+    """The largest number that an instance had by the events, of those that have ended too.
+
+    A supervisor that has forgotten the end of a number starts none up to it any more.
+    """
+    largest = 0
+    for event in found.events.values():
+        with contextlib.suppress(ValueError, TypeError):
+            facts = dict(json.loads(event[7]))
+            told = [facts[name] for name in _NUMBERS if type(facts.get(name)) is int]
+            largest = max([largest, *(number for number in told if number < _NO_NUMBER)])
+    return largest
 
 
 def _summary(found: _Found, aside: Path) -> str:

@@ -12,8 +12,10 @@ from pathlib import Path
 import pytest
 
 from rosrm.config.settings import LivenessSettings
-from rosrm.errors import NoMaster, Refused
+from rosrm.errors import JournalError, NoMaster, Refused
+from rosrm.journal import SqliteJournal
 from rosrm.journal_recovery import recover
+from rosrm.ports import Intent
 from tests.faults.disks import small_disk
 from tests.ros.clusters import PATIENCE, alive, clusters, host, job, service, wait_gone, wait_until
 
@@ -151,6 +153,28 @@ def test_a_damaged_journal_is_refused_and_recovered(make_cluster) -> None:
     assert cluster.events("journal_recovered")
     assert cluster.wait("p", "running").pid == pid
     assert cluster.run(job("new", "true"))[0].state == "finished"
+
+
+def test_a_damaged_journal_on_a_full_disk_is_left_as_it_is(tmp_path) -> None:
+    """What it takes is said, without a traceback; with room it is recovered."""
+    with small_disk(tmp_path / "disk") as disk:
+        path = disk.place / "journal.sqlite"
+        journal = SqliteJournal(path)
+        many = [
+            Intent("process", f"p{n:03}", {"instances": {}, "x": "y" * 200}) for n in range(300)
+        ]
+        journal.write([], many, 0.0)
+        journal.close()
+        raw = bytearray(path.read_bytes())
+        raw[3 * 4096 : 4 * 4096] = os.urandom(4096)
+        path.write_bytes(raw)
+        disk.fill()
+        with pytest.raises(JournalError, match=r"not recovered.*No space left.*of 1\.0 MiB"):
+            recover(path)
+        assert path.read_bytes() == raw
+        assert not list(disk.place.glob("recovery-*"))
+        disk.make_room()
+        assert "was recovered" in recover(path)
 
 
 # --- one that cannot be written ---------------------------------------------------------------

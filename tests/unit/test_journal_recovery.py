@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sqlite3
 
@@ -104,6 +105,58 @@ def test_what_is_left_is_put_right(path) -> None:
     assert len({host["host_id"] for host in hosts.values()}) == 3
     assert journal.intents("cluster")["instances"]["next"] >= COUNT
     journal.close()
+
+
+def test_numbers_go_on_above_all_that_events_know(path) -> None:
+    """Supervisors refuse numbers that they have seen the end of, however few live now."""
+    journal = SqliteJournal(path)
+    ended = Record("ended", "p000", facts={"number": 70_000, "pid": 1})
+    moved = Record("moved", "p000", facts={"source": 3, "destination": 90_000})
+    odd = Record("odd", "p000", facts={"number": "100000", "destination": True})
+    journal.write([ended, moved, odd], [Intent("cluster", "instances", None)], 0.0)
+    journal.close()
+    spoil(path, pages_of(path, "record")[0])
+    recover(path)
+    journal = SqliteJournal(path)
+    assert 90_000 < journal.intents("cluster")["instances"]["next"] < 100_000
+    journal.close()
+
+
+class Killed(BaseException):
+    """As by SIGKILL, as far as a test can: nothing of ours is to handle it."""
+
+
+@pytest.mark.parametrize("step", range(5))
+def test_killed_at_any_step_the_journal_is_the_damaged_one_or_the_new_one(
+    path, monkeypatch, step
+) -> None:
+    """Never none, which the next start would take for a new cluster; and it can be tried again."""
+    spoil(path, pages_of(path, "intent")[1])
+    damaged = path.read_bytes()
+    steps = iter(range(100))
+
+    def dying(act):
+        def call(*args, **options):
+            if any(str(path) in str(one) for one in args) and next(steps) == step:
+                raise Killed
+            return act(*args, **options)
+
+        return call
+
+    with monkeypatch.context() as patch:
+        for name in ("link", "rename", "replace", "unlink"):
+            patch.setattr(os, name, dying(getattr(os, name)))
+        with contextlib.suppress(Killed):
+            recover(path, wall=lambda: 1700.0)
+    assert path.exists()
+    if path.read_bytes() == damaged:
+        recover(path, wall=lambda: 1800.0)
+    journal = SqliteJournal(path)
+    assert journal.records(newest=1)[0].record.kind == "journal_recovered"
+    journal.close()
+    kept = [one.read_bytes() for one in path.parent.glob("journal.sqlite.damaged-*")]
+    assert kept
+    assert all(one == damaged for one in kept)
 
 
 def test_all_hosts_are_heard_before_work_is_given(path) -> None:
