@@ -1,0 +1,355 @@
+"""Who moves a node asks it by files: what is asked, awaited and refused; real processes."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import pytest
+
+from rosrm.errors import PortableError
+from rosrm.portable import (
+    SIGNAL,
+    Request,
+    State,
+    Status,
+    Want,
+    ask_prepare,
+    ask_resume,
+    await_joined,
+    await_left,
+    control_directory,
+    make_directory,
+    remove_directory,
+    status_of,
+)
+from rosrm.portable.form import read_request, write_request, write_status
+from rosrm.portable.listening import Listener
+
+PATIENCE = 20.0
+
+
+@pytest.fixture
+def directory(tmp_path):
+    return tmp_path / "c"
+
+
+@pytest.fixture
+def node(directory):
+    """The node's side, running."""
+    listener = Listener(directory)
+    listener.say(Status(State.RUNNING))
+    return listener
+
+
+@pytest.fixture
+def start():
+    """Starts programs in Python, and ends them."""
+    started = []
+
+    def start(program: str) -> subprocess.Popen:
+        process = subprocess.Popen(
+            [
+                sys.executable,
+                "-c",
+                f"{program}\nprint('on', flush=True)\nimport time\ntime.sleep(60)",
+            ],
+            stdout=subprocess.PIPE,
+        )
+        started.append(process)
+        assert process.stdout.readline() == b"on\n"
+        return process
+
+    yield start
+    for process in started:
+        process.kill()
+        process.wait()
+        process.stdout.close()
+
+
+def leave(node: Listener) -> Request:
+    request = node.asked()
+    assert request.want is Want.LEAVE
+    node.say(Status(State.LEAVING, request.id))
+    node.say(Status(State.LEFT, request.id))
+    return request
+
+
+def join(node: Listener) -> Request:
+    request = node.asked()
+    assert request.want is Want.JOIN
+    node.enter(State.JOINING, request.id)
+    node.done(Status(State.RUNNING, request.id))
+    return request
+
+
+# --- the good course ---
+
+
+def test_a_node_leaves_and_joins_when_it_is_asked_to(directory, node) -> None:
+    """What is asked is heard once, and each state is seen by who awaits it."""
+    ask_prepare(directory, None, "m1")
+    assert leave(node) == Request("m1", Want.LEAVE)
+    assert await_left(directory, "m1", 0.0).state is State.LEFT
+    assert node.asked() is None
+    ask_resume(directory, None, "m1")
+    assert join(node) == Request("m1", Want.JOIN)
+    assert await_joined(directory, "m1", 0.0).state is State.RUNNING
+
+
+def test_what_is_awaited_may_come_later(directory, node) -> None:
+    """Waiting ends when the node answers, not with the time."""
+    ask_prepare(directory, None, "m1")
+    later = threading.Timer(0.1, leave, [node])
+    later.start()
+    assert await_left(directory, "m1", PATIENCE).request == "m1"
+    later.join()
+
+
+def test_times_and_missing_peers_arrive(directory, node) -> None:
+    """What the node tells of an absence is what is read."""
+    status = Status(State.RUNNING, "m1", "", {"leave": 0.25}, ("readers of /count: 0 of 1",))
+    node.say(status)
+    assert status_of(directory) == status
+
+
+# --- what comes twice, late, or in another order ---
+
+
+def test_a_request_that_comes_twice_does_nothing(directory, node) -> None:
+    """Asked again while it is away, and again after it is back: nothing happens."""
+    for _ in range(2):
+        ask_prepare(directory, None, "m1")
+    leave(node)
+    ask_prepare(directory, None, "m1")
+    assert node.asked() is None
+    ask_resume(directory, None, "m1")
+    join(node)
+    ask_resume(directory, None, "m1")
+    assert node.asked() is None
+    ask_prepare(directory, None, "m1")
+    assert node.asked() is None
+    assert status_of(directory).state is State.RUNNING
+
+
+def test_a_node_that_is_called_back_before_it_left_stays(directory, node) -> None:
+    """Who awaits that it leaves is told so; a late word to leave of that attempt does nothing."""
+    ask_prepare(directory, None, "m1")
+    ask_resume(directory, None, "m1")
+    assert node.asked() is None
+    assert await_joined(directory, "m1", 0.0).state is State.RUNNING
+    with pytest.raises(PortableError, match="asked to stay"):
+        await_left(directory, "m1", 0.0)
+    write_request(directory, Request("m1", Want.LEAVE))
+    assert node.asked() is None
+
+
+def test_a_node_that_is_away_answers_another_request_to_leave(directory, node) -> None:
+    """It is where it is wanted; any later request brings it back, and both are over then."""
+    ask_prepare(directory, None, "m1")
+    leave(node)
+    ask_prepare(directory, None, "m2")
+    assert node.asked() is None
+    assert await_left(directory, "m2", 0.0).state is State.LEFT
+    ask_resume(directory, None, "m3")
+    join(node)
+    for late in ("m1", "m2", "m3"):
+        write_request(directory, Request(late, Want.LEAVE))
+        assert node.asked() is None
+
+
+def test_what_an_earlier_process_was_asked_does_not_count(directory, node) -> None:
+    """A process that is started again in the same directory runs, whatever lies there."""
+    ask_prepare(directory, None, "m1")
+    leave(node)
+    again = Listener(directory)
+    assert status_of(directory) is None
+    again.say(Status(State.RUNNING))
+    assert again.asked() is None
+
+
+def test_a_restored_node_finds_what_was_asked_at_the_same_path(directory, node) -> None:
+    """The directory may be made anew, and the request lie there before the node runs again."""
+    ask_prepare(directory, None, "m1")
+    leave(node)
+    remove_directory(directory)
+    assert node.asked() is None
+    make_directory(directory)
+    ask_resume(directory, None, "m1")
+    join(node)
+    assert await_joined(directory, "m1", 0.0).state is State.RUNNING
+
+
+# --- refused, failed, not there ---
+
+
+def test_who_does_not_leave_says_why(directory, node) -> None:
+    """A refusal reaches who awaits; the node runs."""
+    ask_prepare(directory, None, "m1")
+    request = node.asked()
+    node.done(Status(State.RUNNING, request.id, "sockets are open"))
+    with pytest.raises(PortableError, match="does not leave the ROS graph: sockets are open"):
+        await_left(directory, "m1", 0.0)
+
+
+def test_who_cannot_join_says_why(directory, node) -> None:
+    """A failure reaches who awaits at once, whatever the request."""
+    node.say(Status(State.FAILED, "m1", "ValueError: no camera"))
+    with pytest.raises(PortableError, match="cannot join the ROS graph again: ValueError: no cam"):
+        await_joined(directory, "m1", PATIENCE)
+    with pytest.raises(PortableError, match="has failed: ValueError: no camera"):
+        ask_prepare(directory, None, "m2")
+
+
+def test_a_process_without_a_portable_node_is_not_asked(directory) -> None:
+    """No status, no node: it is said what is missing."""
+    with pytest.raises(PortableError, match="run_portable"):
+        ask_prepare(directory, None, "m1")
+
+
+def test_the_signal_goes_to_nobody_whom_it_would_end(directory, node, start) -> None:
+    """A process that neither catches nor blocks it is not asked, and lives."""
+    process = start("")
+    with pytest.raises(PortableError, match=f"does not catch signal {SIGNAL}"):
+        ask_prepare(directory, process.pid, "m1")
+    assert node.asked() is None
+    assert process.poll() is None
+
+
+CATCHES = "import signal, os; signal.signal({0}, lambda *_: os._exit(42))"
+BLOCKS = """
+import signal, os, threading
+signal.pthread_sigmask(signal.SIG_BLOCK, [{0}])
+threading.Thread(target=lambda: (signal.sigwait([{0}]), os._exit(42))).start()
+"""
+
+
+@pytest.mark.parametrize("how", [CATCHES, BLOCKS], ids=["caught", "blocked"])
+def test_the_signal_wakes_who_catches_or_awaits_it(directory, node, start, how) -> None:
+    """The request lies there, and the process is woken."""
+    process = start(how.format(SIGNAL))
+    ask_prepare(directory, process.pid, "m1")
+    assert process.wait(PATIENCE) == 42
+    assert read_request(directory) == Request("m1", Want.LEAVE)
+
+
+def test_a_process_that_has_ended_is_not_waited_for(directory, node, start) -> None:
+    """Dead, or dead and not reaped: said at once."""
+    process = start("")
+    ask_prepare(directory, None, "m1")
+    process.send_signal(signal.SIGKILL)
+    os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
+    for _ in range(2):  # a zombie, then nothing
+        with pytest.raises(PortableError, match=f"process {process.pid} has ended"):
+            await_left(directory, "m1", PATIENCE, process.pid)
+        process.wait()
+
+
+def test_a_stopped_process_is_named_when_the_time_has_passed(directory, node, start) -> None:
+    """The time-out says what was awaited, of whom, and what keeps it."""
+    process = start("")
+    process.send_signal(signal.SIGSTOP)
+    os.waitid(os.P_PID, process.pid, os.WSTOPPED)
+    ask_prepare(directory, None, "m1")
+    with pytest.raises(PortableError) as caught:
+        await_left(directory, "m1", 0.05, process.pid)
+    said = str(caught.value)
+    assert "has not left the ROS graph within 0.05 s (request m1" in said
+    assert "running and has not taken the request up" in said
+    assert f"process {process.pid} is stopped" in said
+
+
+def test_the_time_out_of_joining_says_how_it_stands(directory, node) -> None:
+    """Likewise; with no process named, nothing is said of one."""
+    ask_prepare(directory, None, "m1")
+    leave(node)
+    with pytest.raises(PortableError, match=r"joined .* again within 0 s .*: it is left$"):
+        await_joined(directory, "m1", 0.0)
+
+
+# --- the files ---
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"{", b"[]", b'{"format": 2}', b'{"format": 1}', b"\xff",
+     b'{"format": 1, "state": "asleep", "request": "", "fault": "", "seconds": {}, "missing": []}',
+     b'{"format": 1, "state": "left", "request": 7, "fault": "", "seconds": {}, "missing": []}'],
+)  # fmt: skip
+def test_a_damaged_status_is_said(directory, node, content) -> None:
+    """Whatever lies there: an error that names the file, and no traceback of ours."""
+    (directory / "status").write_bytes(content)
+    with pytest.raises(PortableError, match="status"):
+        status_of(directory)
+
+
+def test_a_damaged_request_is_left_alone(directory, node, capfd) -> None:
+    """The node runs on, says so once in its log, and hears the next one."""
+    (directory / "request").write_bytes(b"nonsense")
+    assert node.asked() is None
+    assert node.asked() is None
+    assert capfd.readouterr().err.count("holds no JSON") == 1
+    ask_prepare(directory, None, "m1")
+    assert leave(node).id == "m1"
+
+
+def test_a_status_is_seen_as_a_whole(directory, node) -> None:
+    """Read while it is written again and again, it is always the one or the other."""
+    over = threading.Event()
+    one, other = Status(State.RUNNING, "a" * 2000), Status(State.LEFT, "b")
+
+    def write() -> None:
+        while not over.is_set():
+            write_status(directory, one)
+            write_status(directory, other)
+
+    writer = threading.Thread(target=write)
+    writer.start()
+    try:
+        until = time.monotonic() + 0.3
+        while time.monotonic() < until:
+            assert status_of(directory) in (one, other, Status(State.RUNNING))
+    finally:
+        over.set()
+        writer.join()
+
+
+def test_a_node_whose_directory_is_gone_goes_on(directory, node, capfd) -> None:
+    """It says so in its log; nothing else happens to it."""
+    remove_directory(directory)
+    node.say(Status(State.LEFT, "m1"))
+    assert node.status.state is State.LEFT
+    assert "cannot be written" in capfd.readouterr().err
+
+
+def test_an_orderly_end_leaves_no_portable_node(directory, node) -> None:
+    """Nobody can be asked any more."""
+    node.close()
+    assert status_of(directory) is None
+
+
+def test_a_directory_is_readable_by_its_owner_alone(directory) -> None:
+    """Who may write there could have a node leave."""
+    make_directory(directory / "deep")
+    assert (directory / "deep").stat().st_mode & 0o777 == 0o700
+    assert directory.stat().st_mode & 0o777 == 0o700
+
+
+def test_a_directory_that_others_can_write_is_refused(directory) -> None:
+    """Also where that is one above it."""
+    directory.mkdir()
+    directory.chmod(0o777)
+    with pytest.raises(PortableError, match="open to all"):
+        make_directory(directory / "deep")
+
+
+def test_control_directories_are_told_apart_by_user_and_instance() -> None:
+    """The path is the same on all hosts; a name that leads elsewhere is refused."""
+    assert str(control_directory("c-p-7", 1000)) == "/tmp/rosrm-1000/portable/c-p-7"
+    for bad in ("", "..", "a/b"):
+        with pytest.raises(PortableError, match="plain file name"):
+            control_directory(bad, 1000)
