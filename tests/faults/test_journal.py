@@ -166,7 +166,8 @@ def test_a_damaged_journal_on_a_full_disk_is_left_as_it_is(tmp_path) -> None:
         journal.write([], many, 0.0)
         journal.close()
         raw = bytearray(path.read_bytes())
-        raw[3 * 4096 : 4 * 4096] = os.urandom(4096)
+        at = raw.index(b"p299") // 4096 * 4096
+        raw[at : at + 4096] = os.urandom(4096)
         path.write_bytes(raw)
         disk.fill()
         with pytest.raises(JournalError, match=r"not recovered.*No space left.*of 1\.0 MiB"):
