@@ -235,19 +235,22 @@ def _hold_child(restore: _Restore) -> NoReturn:
         root = restore.run(own)
     except (CriuError, OSError) as error:
         _fail(restore.directory, str(error))
-    guarding = _start_guard(root)
+    guard, guarding = _start_guard(root)
     restore.tell(root, namespace=False)
     status = _attend(root, root)
     os.write(guarding, b"ended")
+    with contextlib.suppress(ChildProcessError):  # it was reaped already: somebody killed it
+        os.waitpid(guard, 0)
     restore.clean()
     _end_as(status)
 
 
-def _start_guard(root: int) -> int:
-    """Beside us, to end the restored process with us; what is written here sends it away."""
+def _start_guard(root: int) -> tuple[int, int]:
+    """Beside us, to end the restored process with us; its pid, and where it is told to go."""
     living, end_of_life = os.pipe()
     hearing, saying = os.pipe()
-    if os.fork() == 0:
+    guard = os.fork()
+    if guard == 0:
         os.setsid()  # a SIGKILL to our group shall not reach it
         os.close(end_of_life)
         os.close(saying)
@@ -258,7 +261,7 @@ def _start_guard(root: int) -> int:
     os.close(saying)
     os.read(hearing, 1)  # until it stands apart
     os.close(hearing)
-    return end_of_life
+    return guard, end_of_life
 
 
 # --- both ---------------------------------------------------------------------------------------

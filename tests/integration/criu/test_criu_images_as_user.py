@@ -1,0 +1,79 @@
+"""An ordinary user's processes are dumped and restored too, without a namespace of their own."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+#: Runs as the user: a counter goes through two images, and is ended through its hold.
+HOPS = """
+import json, os, subprocess, sys, time
+from pathlib import Path
+from rosrm.criu import dumping, outcome
+from rosrm.criu.program import opened
+
+program, folder = Path(sys.argv[1]), Path(sys.argv[2])
+COUNTER = '''
+import signal, sys, time
+signal.signal(signal.SIGTERM, lambda *_: sys.exit(7))
+count = 0
+while True:
+    count += 1
+    print(count, flush=True)
+    time.sleep(0.01)
+'''
+
+def start(words, log):
+    with log.open("wb") as output:
+        return subprocess.Popen(
+            words, stdin=subprocess.DEVNULL, stdout=output, stderr=output, start_new_session=True
+        )
+
+def grown(log):
+    end = time.monotonic() + 60
+    while log.read_text().count("\\n") < 3:
+        if time.monotonic() > end:
+            sys.exit(f"no numbers in {log}")
+        time.sleep(0.01)
+
+logs = [folder / f"{number}.log" for number in range(3)]
+process = start([sys.executable, "-I", "-S", "-c", COUNTER], logs[0])
+try:
+    for log in logs[1:]:
+        grown(logs[logs.index(log) - 1])
+        image = folder / log.stem
+        dumping.dump(opened(program), process.pid, image, leave="killed", timeout=60)
+        process.wait(60)
+        words = outcome.command(sys.executable, image, criu=program, remove=True, timeout=60)
+        process = start(words, log)
+        over = lambda: process.poll() is not None
+        restored = outcome.wait(image, timeout=60, ended=over)
+    grown(logs[-1])
+    process.terminate()
+    code = process.wait(60)
+finally:
+    if process.poll() is None:
+        process.terminate()
+        process.wait(60)
+print(json.dumps([code, restored.namespace, "".join(log.read_text() for log in logs).split()]))
+"""
+
+
+@pytest.mark.timeout(240)
+def test_an_ordinary_users_process_goes_on(criu, as_nobody, public):
+    """With the capabilities on the program alone: twice in a row, no number lost, end and all."""
+    program = public / "criu"
+    shutil.copy(Path(criu.command[0]).resolve(), program)
+    able = "cap_checkpoint_restore,cap_setpcap+eip"
+    setcap = shutil.which("setcap", path="/usr/sbin:/sbin:/usr/bin:/bin")
+    if setcap is None or subprocess.run([setcap, able, program], check=False).returncode != 0:
+        pytest.skip("no setcap, or no capabilities on this file system")
+    done = as_nobody("-c", HOPS, program, public, home=public)
+    assert done.returncode == 0, done.stderr
+    code, namespace, numbers = json.loads(done.stdout)
+    assert (code, namespace) == (7, False)
+    assert numbers == [str(number) for number in range(1, len(numbers) + 1)]
