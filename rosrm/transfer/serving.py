@@ -11,7 +11,6 @@ nobody else begins again.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import hmac
 import secrets
 import socket
@@ -68,16 +67,20 @@ class _Desk:
         except _Refusal as refusal:
             return web.Response(status=refusal.status, text=str(refusal))
         self.stop()  # the reader has given that connection up
-        self._sending = asyncio.current_task()
+        self._sending = own = asyncio.current_task()
         response = web.StreamResponse(headers={"Content-Type": "application/zstd"})
-        with contextlib.suppress(ConnectionError):  # the reader may come again
+        try:
             await response.prepare(request)
-            try:
-                await self._send(response, start)
-            except TransferError as error:
-                self._fault = str(error)  # the reader hears it when it comes again
-                if request.transport is not None:
-                    request.transport.abort()
+            await self._send(response, start)
+        except ConnectionError:
+            return response  # the reader may come again
+        except TransferError as error:
+            self._fault = str(error)  # the reader hears it when it comes again
+            if request.transport is not None:
+                request.transport.abort()
+        finally:
+            if self._sending is own:  # its connection may serve another request yet
+                self._sending = None
         return response
 
     async def take(self, request: web.Request) -> web.Response:
