@@ -207,6 +207,11 @@ class ProcessSpec:
         return self.ros_node and migration.strategy == "handoff" and protocol == "rosrm"
 
     @property
+    def portable(self) -> bool:
+        """Whether its node is asked to leave the ROS graph before its memory is dumped and moved."""
+        return self.ros_node and self.migration.strategy == "criu"
+
+    @property
     def ros_node(self) -> bool:
         """Whether it is a ROS node, by its own word or as an executable of a ROS package."""
         return self.ros or self.package is not None

@@ -29,17 +29,9 @@ from rosrm.portable.form import (
 _LOOK: Final = 0.005
 
 
-def control_directory(token: str, uid: int) -> Path:
-    """Where the node of one instance is spoken to: a path that every host can make.
-
-    Args:
-        token: of the instance, unique on all hosts that share this /tmp; letters that a file name
-            may have, no slash.
-        uid: of the user that the process runs as.
-    """
-    if not token or "/" in token or token.startswith("."):
-        raise PortableError(f"{token!r} cannot name a control directory: a plain file name can")
-    return Path(f"/tmp/rosrm-{uid}/portable") / token  # noqa: S108 - owner and mode are checked
+def control_root(uid: int) -> Path:
+    """The directory of all control directories of a user: a path that every host can make."""
+    return Path(f"/tmp/rosrm-{uid}/portable")  # noqa: S108 - owner and mode are checked
 
 
 def make_directory(directory: Path, uid: int | None = None, gid: int | None = None) -> None:

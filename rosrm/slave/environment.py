@@ -10,6 +10,7 @@ from typing import Final
 from rosrm.bootstrapper import without_bootstrapper
 from rosrm.core.model import Assignment
 from rosrm.core.slave import qualified_name
+from rosrm.portable import VARIABLE as PORTABLE
 from rosrm.ros.fast_dds import announcements
 from rosrm.ros.names import token
 
@@ -30,6 +31,7 @@ _IDENTITY: Final = (
     SHADOW,
     KEEP,
     KEEP_EVERY,
+    PORTABLE,
 )
 
 
@@ -43,6 +45,8 @@ class Whereabouts:
         state_config: topic on which the master speaks of handoffs.
         kept: directory of the kept states of all processes; None: none are kept.
         keep_every: seconds by which a kept state may be behind.
+        portable: directory below which portable nodes are asked to leave and to join; it has the
+            same path on all hosts. None: none is asked.
     """
 
     host: str
@@ -50,6 +54,7 @@ class Whereabouts:
     state_config: str
     kept: Path | None = None
     keep_every: float = 1.0
+    portable: Path | None = None
 
 
 def kept_directory(kept: Path, process: str) -> Path:
@@ -84,6 +89,9 @@ def process_environment(
     if spec.keeps_state and where.kept is not None:
         environment[KEEP] = str(kept_directory(where.kept, spec.name))
         environment[KEEP_EVERY] = f"{where.keep_every:g}"
+    if spec.portable and where.portable is not None:
+        own = token(f"{where.cluster} {assignment.instance}")
+        environment[PORTABLE] = str(where.portable / own)
     environment["PYTHONUNBUFFERED"] = "1"
     environment.update(spec.environment)
     if assignment.shadow:  # a move waits until it has found everybody

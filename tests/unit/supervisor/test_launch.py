@@ -5,13 +5,21 @@ from __future__ import annotations
 import math
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import hypothesis.strategies as st
 import pytest
 import yaml
 from hypothesis import given
 
-from rosrm.core.model import Assignment, InstanceId, ProcessSpec, RestartPolicy, StopPolicy
+from rosrm.core.model import (
+    Assignment,
+    InstanceId,
+    MigrationPolicy,
+    ProcessSpec,
+    RestartPolicy,
+    StopPolicy,
+)
 from rosrm.errors import LaunchError
 from rosrm.slave.environment import Whereabouts, process_environment, without_bootstrapper
 from rosrm.slave.launch import launch_order
@@ -320,6 +328,19 @@ def test_a_node_is_told_by_which_name_it_is_known():
     assert made["ROSRM_EPOCH"] == "3"
     packaged = assignment(package="demo_nodes", executable="talker", namespace="/")
     assert process_environment(packaged, {}, HERE)["ROSRM_NODE"] == "/talker"
+
+
+def test_a_portable_node_is_told_where_it_is_asked_to_leave(tmp_path):
+    """Each instance of each cluster has a directory of its own; others are told nothing."""
+    where = replace(HERE, portable=tmp_path)
+    moves = {"migration": MigrationPolicy(strategy="criu"), "ros": True}
+    made = process_environment(assignment(command=("x",), **moves), {}, where)
+    other = process_environment(
+        assignment(command=("x",), **moves), {}, replace(where, cluster="other")
+    )
+    assert Path(made["ROSRM_PORTABLE"]).parent == Path(other["ROSRM_PORTABLE"]).parent == tmp_path
+    assert made["ROSRM_PORTABLE"] != other["ROSRM_PORTABLE"]
+    assert "ROSRM_PORTABLE" not in process_environment(assignment(command=("x",)), made, where)
 
 
 def test_who_the_slave_is_itself_is_not_handed_on():
