@@ -46,6 +46,8 @@ losses = st.sampled_from(["wait", "wait", "elsewhere", "elsewhere", "stop"])
 chance = st.booleans()
 #: Which of the things that are there at the moment; `Play.pick` takes it modulo their number.
 which_one = st.integers(0, 11)
+#: Seconds for which a host is heard until nothing runs there any more beside a successor.
+FENCED_WITHIN = 1.0
 
 
 def spec(
@@ -100,6 +102,8 @@ class Play(RuleBasedStateMachine):
         self.missing: set[tuple[str, str]] = set()
         self.late: list[happened.Event] = []
         self.left: set[int] = set()
+        #: Since when a host is heard, and nothing from or to it is on its way or was lost.
+        self.heard: dict[str, float] = {}
         self.records_seen = 0
         self.prompt = True
         # Something to play with from the beginning.
@@ -369,6 +373,7 @@ class Play(RuleBasedStateMachine):
         if fate != "twice":
             del machine.ordered[which]
         if fate == "lost":
+            self.heard.pop(machine.name, None)
             self.tell(happened.OrderAnswered(order.order, accepted=False, code="timeout"))
         else:
             self.tell(machine.obey(order, self.cluster.now))
@@ -388,6 +393,8 @@ class Play(RuleBasedStateMachine):
             self.late.append(batch)
         if fate != "lost":
             self.tell(batch)
+        else:
+            self.heard.pop(machine.name, None)
         self.flow()
 
     @rule(host=hosts, keep=chance)
@@ -621,14 +628,30 @@ class Play(RuleBasedStateMachine):
             assert (state.hosts.load[:, host.column] >= 0.0).all()
 
     def given_up(self) -> set[int]:
-        """Instances that may run on lost hosts, beside a successor that nobody there hears of."""
+        """Instances that may run on lost hosts, beside a successor that nobody there hears of.
+
+        Not for long once their host is heard again.
+        """
         for record in self.cluster.records[self.records_seen :]:
             if record.kind == "given_up":
                 self.left.add(record.facts["number"])
             elif record.kind == "taken_back":
                 self.left.discard(record.facts["number"])
         self.records_seen = len(self.cluster.records)
+        for machine in self.cluster.machines.values():
+            if self.is_heard_well(machine):
+                self.left -= {instance.number for instance in machine.programs}
         return self.left
+
+    def is_heard_well(self, machine: Machine) -> bool:
+        """For so long that everything there has been told."""
+        calm = self.known(machine) and self.is_up(machine)
+        if not calm or machine.ordered or machine.said or machine.polled:
+            self.heard.pop(machine.name, None)
+            return False
+        return self.cluster.now - self.heard.setdefault(machine.name, self.cluster.now) >= (
+            FENCED_WITHIN
+        )
 
     @invariant()
     def never_two_active(self) -> None:
