@@ -118,6 +118,12 @@ def _with_remedy(criu: Criu, reason: str) -> str:
     if criu.number < OLDEST:
         least = ".".join(map(str, OLDEST))
         return f"CRIU {criu.version} is too old, {least} is needed: {REMEDY} (tried: {reason})"
+    if _NO_RIGHT in reason and os.geteuid() == 0:
+        return (
+            f"CRIU {criu.version} has no right to dump and restore: root lacks CAP_SYS_ADMIN and "
+            "CAP_CHECKPOINT_RESTORE here. A container is given the latter when it is made "
+            "(`--cap-add CHECKPOINT_RESTORE`)"
+        )
     if _NO_RIGHT in reason:
         return (
             f"CRIU {criu.version} has no right to dump and restore as an ordinary user. "

@@ -25,7 +25,7 @@ def quiet(step: str) -> None:
 
 @pytest.fixture(scope="module")
 def installed(cached, tmp_path_factory) -> Path:
-    """A prefix with CRIU in it, for tests that leave it as it is."""
+    """A prefix with CRIU in it, for tests that leave one there, though it may be another one."""
     prefix = tmp_path_factory.mktemp("criu")
     install(prefix, quiet, given=cached)
     return prefix
@@ -60,12 +60,11 @@ def test_a_second_installation_changes_nothing(installed):
     assert said[0].endswith(" is there already")
 
 
-def test_a_broken_one_is_made_anew_from_the_packages_that_were_kept(cached, tmp_path):
+def test_a_broken_one_is_made_anew_from_the_packages_that_were_kept(installed):
     """Without network: the mirror that is named does not exist."""
-    install(tmp_path, quiet, given=cached)
-    (tmp_path / "bin/criu").resolve().unlink()
-    assert install(tmp_path, quiet, mirrors=["http://127.0.0.1:9/none"]).version
-    assert len(list((tmp_path / "trees").iterdir())) == 1
+    (installed / "bin/criu").resolve().unlink()
+    assert install(installed, quiet, mirrors=["http://127.0.0.1:9/none"]).version
+    assert len(list((installed / "trees").iterdir())) == 1
 
 
 def test_a_user_without_rights_installs_it(cached, as_nobody, public):
@@ -85,22 +84,21 @@ def test_one_that_works_already_is_enough(criu, tmp_path, monkeypatch):
     assert not (tmp_path / "p").exists()
 
 
-def test_killed_in_between_the_old_one_is_in_use_and_the_next_one_clears_up(cached, tmp_path):
-    install(tmp_path, quiet, given=cached)
-    before = (tmp_path / "bin/criu").readlink()
-    words = ["criu", "install", "--prefix", tmp_path, "--from", cached]
+def test_killed_in_between_the_old_one_is_in_use_and_the_next_one_clears_up(cached, installed):
+    before = (installed / "bin/criu").readlink()
+    words = ["criu", "install", "--prefix", installed, "--from", cached]
     new = subprocess.Popen([sys.executable, "-m", "rosrm.cli", *words], stdout=subprocess.PIPE)
     try:
         until = time.monotonic() + 60
-        while len(list((tmp_path / "trees").iterdir())) < 2:
+        while len(list((installed / "trees").iterdir())) < 2:
             assert time.monotonic() < until, "no second tree within 60 s"
     finally:
         new.kill()
         new.communicate()
-    assert (tmp_path / "bin/criu").readlink() == before
-    assert opened(tmp_path / "bin/criu").version
-    install(tmp_path, quiet, given=cached)
-    assert len(list((tmp_path / "trees").iterdir())) == 1
+    assert (installed / "bin/criu").readlink() == before
+    assert opened(installed / "bin/criu").version
+    install(installed, quiet, given=cached)
+    assert len(list((installed / "trees").iterdir())) == 1
 
 
 @pytest.mark.slow  # they are fetched once

@@ -86,6 +86,32 @@ def test_what_the_user_reads_gives_the_rights(criu, as_nobody, public):
     assert left_in(public, program) == []
 
 
+#: What Docker leaves to root by default.
+DOCKER = (
+    "chown,dac_override,fowner,fsetid,kill,setgid,setuid,setpcap,net_bind_service,net_raw,"
+    "sys_chroot,mknod,audit_write,setfcap"
+)
+
+
+@pytest.mark.parametrize("added", ["", ",checkpoint_restore"], ids=["default", "added"])
+def test_root_of_a_container_reads_which_capability_is_missing(criu, added):
+    if os.geteuid() != 0:
+        pytest.skip("only root has capabilities to give away")
+    bounds = f"-all,{DOCKER}{added}".replace(",", ",+")
+    contained = ["setpriv", f"--bounding-set={bounds}", "--inh-caps=-all"]
+    if subprocess.run([*contained, "true"], check=False).returncode != 0:
+        pytest.skip("no setpriv, or not all rights to give away")
+    done = subprocess.run(
+        [*contained, sys.executable, "-m", "rosrm.criu.probe"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    able = json.loads(done.stdout)
+    assert able["works"] is bool(added), able["reason"]
+    assert ("(`--cap-add CHECKPOINT_RESTORE`)" in able["reason"]) is not bool(added)
+
+
 @pytest.mark.parametrize("moment", ["folder", "dump.log", "restore.log"])
 def test_a_killed_probe_leaves_nothing_behind(criu, tmp_path, moment):
     """Killed as soon as it has its folder, in the dump, and in the restore."""
@@ -124,7 +150,7 @@ def test_one_that_only_claims_to_have_restored_does_not_work(tmp_path):
     lying = tmp_path / "criu"
     lying.write_text('#!/bin/sh\nif [ "$1" = dump ]; then kill -9 "$3"; fi\n')
     lying.chmod(0o755)
-    able = probe(Criu((str(lying),), "4.2"), timeout=5.0)
+    able = probe(Criu((str(lying),), "4.2"), timeout=3.0)
     assert able.reason == "a child that was restored does not answer over UDP on loopback"
 
 
