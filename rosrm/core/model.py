@@ -208,7 +208,7 @@ class ProcessSpec:
 
     @property
     def portable(self) -> bool:
-        """Whether its node is asked to leave the ROS graph before its memory is dumped and moved."""
+        """Whether its node is asked to leave the ROS graph before its memory is dumped."""
         return self.ros_node and self.migration.strategy == "criu"
 
     @property

@@ -34,6 +34,18 @@ def control_root(uid: int) -> Path:
     return Path(f"/tmp/rosrm-{uid}/portable")  # noqa: S108 - owner and mode are checked
 
 
+def control_directory(token: str, uid: int) -> Path:
+    """Where the node of one instance is spoken to.
+
+    Args:
+        token: of the instance, unique on all hosts that share this /tmp; a plain file name.
+        uid: of the user that the process runs as.
+    """
+    if not token or "/" in token or token.startswith("."):
+        raise PortableError(f"{token!r} cannot name a control directory: a plain file name can")
+    return control_root(uid) / token
+
+
 def make_directory(directory: Path, uid: int | None = None, gid: int | None = None) -> None:
     """Make a control directory, before a process starts or is restored; nothing of it remains.
 

@@ -22,6 +22,7 @@ from rosrm.portable import (
     ask_resume,
     await_joined,
     await_left,
+    control_directory,
     make_directory,
     remove_directory,
     status_of,
@@ -344,3 +345,11 @@ def test_a_directory_that_others_can_write_is_refused(directory) -> None:
     directory.chmod(0o777)
     with pytest.raises(PortableError, match="open to all"):
         make_directory(directory / "deep")
+
+
+def test_control_directories_are_told_apart_by_user_and_instance() -> None:
+    """The path is the same on all hosts; a name that leads elsewhere is refused."""
+    assert str(control_directory("c-p-7", 1000)) == "/tmp/rosrm-1000/portable/c-p-7"
+    for bad in ("", "..", "a/b"):
+        with pytest.raises(PortableError, match="plain file name"):
+            control_directory(bad, 1000)
