@@ -28,7 +28,7 @@ _DUMP: Final = (
     (r"[Dd]angling tty|tty: .*sid", "it has a terminal"),
     (r"(?:Unable to|Can't) seize|seize.*Operation not permitted",
      "it cannot be stopped: a debugger holds it, or it belongs to somebody else"),
-    (r"Can't lookup mount=\d+ for fd=(-?\d+) path=(\S+)",
+    (r"Can't lookup mount=\d+ for fd=(-?\d+) path=([^\s;,]+)",
      r"the file \2 lies on a mount that cannot be seen from here"),
     (r"Timeout reached", "not all of its threads could be stopped in time"),
     (r"No space left on device", "the file system of the image is full"),
