@@ -65,6 +65,8 @@ def main() -> None:
     began = time.monotonic()
     options = _options()
     directory = Path(options.directory).absolute()
+    if options.then and not (directory / image.MANIFEST).exists():
+        _start_anew(options.then)
     # What comes while it is restored waits for it; SIGKILL alone does not.
     signal.pthread_sigmask(signal.SIG_BLOCK, _PASSED_ON)
     try:
@@ -75,7 +77,10 @@ def main() -> None:
     except CriuError as error:
         _fail(directory, str(error))
     os.chdir("/")
-    restore = _Restore(criu, directory, manifest, here, options.timeout, options.remove, began)
+    cleans = options.remove and not options.again
+    restore = _Restore(
+        criu, directory, manifest, here, options.timeout, options.remove, cleans, began
+    )
     if not options.no_namespace and _libc.unshare(_NEW_PIDS) == 0:
         _hold_namespace(restore)
     _hold_child(restore)
@@ -88,7 +93,35 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--timeout", type=float, default=120.0, help="seconds for the restore")
     parser.add_argument("--remove", action="store_true", help="the image, once it is restored")
     parser.add_argument("--no-namespace", action="store_true", help="where its pids are free")
+    parser.add_argument("again", nargs="*", help="what to run where it was restored before")
+    parser.add_argument("then", nargs="*", help="command line of the process, after --")
     return parser.parse_args()
+
+
+def _start_anew(command: list[str]) -> NoReturn:
+    """It was restored, has ended since, and is started again: never from a memory of long ago."""
+    try:
+        os.execvp(command[0], command)  # noqa: S606 - as the supervisor would start it
+    except OSError as error:
+        sys.stderr.write(f"{command[0]} cannot be started: {error.strerror}\n")
+        sys.exit(FAILED)
+
+
+def _was_restored(directory: Path) -> bool:
+    with contextlib.suppress(CriuError):
+        told = outcome.read(directory)
+        return told is not None and not told.reason
+    return False
+
+
+def _start_anew(command: list[str]) -> NoReturn:
+    """Become the program itself: an image is for one life, its peers know what came after it."""
+    for number in (signal.SIGPIPE, signal.SIGXFSZ, signal.SIGINT):  # Python's own ways
+        signal.signal(number, signal.SIG_DFL)
+    try:
+        os.execvp(command[0], command)  # noqa: S606 - no shell is wanted
+    except OSError as error:
+        sys.exit(f"{command[0]} cannot be started: {error.strerror}")
 
 
 @dataclass(frozen=True)
@@ -101,6 +134,7 @@ class _Restore:
     here: Manifest
     timeout: float
     remove: bool
+    cleans: bool
     began: float
 
     def run(self, marks: dict[str, str]) -> int:
@@ -128,7 +162,7 @@ class _Restore:
 
     def clean(self) -> None:
         """What is left of the image, after the end of the process."""
-        if self.remove:
+        if self.cleans:
             with contextlib.suppress(OSError):
                 (self.directory / outcome.FILE).unlink()
                 self.directory.rmdir()

@@ -41,10 +41,10 @@ def tree(root: int) -> list[int]:
 
 def root_of(leader: int) -> int:
     """The process that an instance is about: its leader, or what the leader holds, if restored."""
-    if not _is_hold(leader):
+    if not is_hold(leader):
         return leader
     for child in children(leader):
-        if not _is_hold(child):
+        if not is_hold(child):
             return child
         held = children(child)
         if held:
@@ -52,7 +52,8 @@ def root_of(leader: int) -> int:
     return leader
 
 
-def _is_hold(pid: int) -> bool:
+def is_hold(pid: int) -> bool:
+    """It runs the program that holds a restored process."""
     try:
         words = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
     except OSError:

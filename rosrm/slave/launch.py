@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Final
 
 from rosrm.core.model import Assignment, ProcessSpec, RestartPolicy
-from rosrm.errors import LaunchError
+from rosrm.criu import outcome
+from rosrm.criu.places import incoming
+from rosrm.criu.program import find
+from rosrm.errors import CriuError, LaunchError
 from rosrm.slave import ament_index
 from rosrm.slave.environment import Whereabouts, process_environment
 from rosrm.slave.ros_arguments import join_arguments, parameters_text, ros_arguments
 from rosrm.supervisor.client import LaunchOrder, log_path
+
+#: Seconds for a restore, at most: whoever ordered it gives up sooner.
+_RESTORE: Final = 600.0
 
 
 def launch_order(
@@ -20,6 +27,7 @@ def launch_order(
     *,
     where: Whereabouts,
     state_directory: Path,
+    images: Path,
     heard: float = 0.0,
 ) -> LaunchOrder:
     """What the supervisor is to start for an assignment; its parameters are written to a file.
@@ -30,6 +38,7 @@ def launch_order(
         python: the interpreter for modules.
         where: it will run.
         state_directory: of this host's supervisor; the parameters lie beside the instance's log.
+        images: the slave's directory, where the image of one that is to be restored lies.
         heard: when the master last heard this host, monotonic; 0.0: just now.
 
     Raises:
@@ -44,9 +53,10 @@ def launch_order(
         arguments = join_arguments(spec.arguments, ros)
     else:
         arguments = list(spec.arguments)
+    argv = (*command, *arguments)
     return LaunchOrder(
         instance=assignment.instance,
-        argv=(*command, *arguments),
+        argv=_restoring(assignment, argv, python, images) if assignment.restored else argv,
         environment=environment,
         working_directory=_working_directory(spec),
         # One that ended in a move is never started again: the source is there, and may go on.
@@ -55,6 +65,20 @@ def launch_order(
         fence=assignment.fence,
         heard=heard,
     )
+
+
+def _restoring(
+    assignment: Assignment, argv: Sequence[str], python: str, images: Path
+) -> tuple[str, ...]:
+    """The program that restores the instance and holds it."""
+    try:
+        criu = find()
+    except CriuError as error:
+        raise LaunchError(f"{assignment.instance} cannot be restored: {error}") from None
+    return outcome.command(
+        python, incoming(images, assignment.instance.number), criu=Path(criu.command[-1]),
+        remove=True, timeout=_RESTORE, then=argv,
+    )  # fmt: skip
 
 
 def _working_directory(spec: ProcessSpec) -> str | None:

@@ -30,6 +30,7 @@ from rosrm.core.model import (
     StopPolicy,
 )
 from rosrm.errors import LaunchError, Refused
+from rosrm.portable import control_root
 from rosrm.ports import ProbeContext
 from rosrm.registry import Registry
 from rosrm.ros.graph import GraphWatch
@@ -39,7 +40,7 @@ from rosrm.ros.names import STATE_CONFIG, Names, token
 from rosrm.ros.participant import Participant
 from rosrm.ros.slave_endpoint import Link, LogSlice, SlaveEndpoint
 from rosrm.slave.environment import Whereabouts
-from rosrm.slave.executing import Done, execute
+from rosrm.slave.executing import Done, Here, execute
 from rosrm.slave.health import HealthWatch
 from rosrm.slave.keeping import Keeping
 from rosrm.slave.launch import launch_order
@@ -318,6 +319,7 @@ class SlaveRuntime:
             Names(self._config.ros.namespace)(STATE_CONFIG),
             self._kept,
             self._config.keep.every,
+            control_root(os.geteuid()),
         )
         for assignment in assignments:
             held = self._state.held[assignment.instance]
@@ -328,7 +330,8 @@ class SlaveRuntime:
             try:
                 order = launch_order(
                     assignment, self._environment, sys.executable, where=where,
-                    state_directory=self._supervisor.state, heard=self._state.heard_at,
+                    state_directory=self._supervisor.state, images=self._config.state,
+                    heard=self._state.heard_at,
                 )  # fmt: skip
                 orders.append(replace(order, memo=to_memo(held.memo)))
             except LaunchError as error:
@@ -403,10 +406,10 @@ class SlaveRuntime:
 
     def execute(self, executor: str, arguments: dict[str, Any], done: Done) -> None:
         """Run an executor in a thread of its own; raises `Refused`."""
-        execute(
-            self._executors, executor, arguments,
-            host=self._config.host, post=self._post, done=done,
-        )  # fmt: skip
+        held = self._state.held.items()
+        pids = {str(one): it.status.pid for one, it in held if not it.status.state.ended}
+        here = Here(self._config.host, self._config.state, pids)
+        execute(self._executors, executor, arguments, here=here, post=self._post, done=done)
 
     # --- the end -------------------------------------------------------------------------
 

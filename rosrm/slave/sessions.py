@@ -2,7 +2,8 @@
 
 Told of each session's leader, it finds the other members by their session id in one walk a second:
 `getsid` for each process of the host, which costs a microsecond each and reads no file. A member
-that begins a session of its own (a daemon) leaves the tree, as it does for job control.
+that begins a session of its own (a daemon) leaves the tree, as it does for job control. What was
+restored from an image has a session of its own below the program that holds it, and belongs there.
 """
 
 from __future__ import annotations
@@ -12,6 +13,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
+
+from rosrm.criu.tree import is_hold, tree
 
 _TICKS: Final = float(os.sysconf("SC_CLK_TCK"))
 _PAGE: Final = os.sysconf("SC_PAGE_SIZE")
@@ -46,6 +49,7 @@ class SessionTable:
         self._proc = str(proc)
         self._session_of = session_of
         self._members: dict[int, tuple[int, ...]] = {}
+        self._holds: set[int] = set()
         self._pids: tuple[int, ...] = ()
         self._ended_cpu_time = 0.0
         self._usage: dict[int, SessionUsage] = {}
@@ -71,6 +75,8 @@ class SessionTable:
             leader: pid, which is also the session id.
         """
         self._members[leader] = (leader,)
+        if is_hold(leader):
+            self._holds.add(leader)
         self._collect_pids()
 
     def remove(self, leader: int, cpu_time: float) -> None:
@@ -81,6 +87,7 @@ class SessionTable:
             cpu_time: seconds that it and its reaped children used, as `wait4` reports them.
         """
         self._members.pop(leader, None)
+        self._holds.discard(leader)
         self._usage.pop(leader, None)
         self._cpu_time.pop(leader, None)
         self._collect_pids()
@@ -124,6 +131,8 @@ class SessionTable:
                 continue
             if leader != pid and leader in found:
                 found[leader].append(pid)
+        for leader in self._holds:
+            found[leader] = tree(leader)
         self._members = {leader: tuple(pids) for leader, pids in found.items()}
         self._collect_pids()
 

@@ -51,6 +51,7 @@ def order(tmp_path, environment=None, **fields):
         sys.executable,
         where=HERE,
         state_directory=tmp_path,
+        images=tmp_path,
     )
 
 
@@ -105,7 +106,9 @@ def test_a_ros_node_gets_its_name_namespace_and_remappings(tmp_path):
 
 def test_an_alias_names_the_node(tmp_path):
     """In a handoff the node's name is the assignment's, not the spec's."""
-    made = launch_order(shadow(), {}, "python3", where=HERE, state_directory=tmp_path)
+    made = launch_order(
+        shadow(), {}, "python3", where=HERE, state_directory=tmp_path, images=tmp_path
+    )
     assert "__node:=talker_1700000000" in made.argv
     (file,) = (tmp_path / "logs").glob("*.yaml")
     assert yaml.safe_load(file.read_text()) == {"/**": {"ros__parameters": {"rate": 10}}}
@@ -113,10 +116,12 @@ def test_an_alias_names_the_node(tmp_path):
 
 def test_a_shadow_is_not_restarted(tmp_path):
     """Its end is final, whatever its spec says; what is no shadow follows its spec."""
-    made = launch_order(shadow(), {}, "python3", where=HERE, state_directory=tmp_path)
+    made = launch_order(
+        shadow(), {}, "python3", where=HERE, state_directory=tmp_path, images=tmp_path
+    )
     assert made.restart == RestartPolicy("never")
     plain = replace(shadow(), shadow=False)
-    made = launch_order(plain, {}, "python3", where=HERE, state_directory=tmp_path)
+    made = launch_order(plain, {}, "python3", where=HERE, state_directory=tmp_path, images=tmp_path)
     assert made.restart == RestartPolicy("always")
 
 
@@ -166,6 +171,7 @@ def test_packages_lie_in_the_prefix_of_python_too(tmp_path, prefix):
         str(prefix / "bin" / "python3"),
         where=HERE,
         state_directory=tmp_path,
+        images=tmp_path,
     )
     assert made.argv[0] == str(prefix / "lib" / "demo_nodes" / "talker")
 

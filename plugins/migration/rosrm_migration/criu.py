@@ -1,0 +1,181 @@
+"""`criu`: a node moves with its whole memory, for what its state is on no topic.
+
+The node leaves the ROS graph by itself (`rosrm.node.PortableNode`), stands still, and is dumped by
+CRIU. Its image is fetched by the destination and restored there, and the node joins the graph anew.
+The source stands still, and can go on, until the destination owns the name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+from rosrm.config.units import PositiveSeconds
+from rosrm.core.migration import Commit, Execute, Move, Plan, SetRestart, Start, Stop
+from rosrm.core.model import ProcessSpec, RestartPolicy
+from rosrm.criu.fitting import mismatch
+from rosrm_migration.options import check_seconds, options_of
+
+#: The executors of the plan; `criu_steps` has what they do.
+ABILITY: Final = "criu_ability"
+CHECKPOINT: Final = "criu_checkpoint"
+GO_ON: Final = "criu_go_on"
+FETCH: Final = "criu_fetch"
+AWAIT_RESTORED: Final = "criu_await_restored"
+JOIN: Final = "criu_join"
+END: Final = "criu_end"
+
+_NEVER: Final = RestartPolicy("never")
+
+
+@dataclass(frozen=True)
+class CriuOptions:
+    """What can be set, for all processes or for one.
+
+    Attributes:
+        start_timeout: seconds within which a slave must take an order, and the destination start.
+        leave_timeout: seconds within which the node must have left the ROS graph: a callback of its
+            author is finished first.
+        dump_timeout: seconds for dumping its memory.
+        transfer_timeout: seconds for the image to get to the destination.
+        restore_timeout: seconds for restoring it there.
+        join_timeout: seconds within which the node must have joined the ROS graph again.
+        max_rate: bytes a second that the image may take of the network; 0: all that there is.
+    """
+
+    start_timeout: PositiveSeconds = 10.0
+    leave_timeout: PositiveSeconds = 10.0
+    dump_timeout: PositiveSeconds = 60.0
+    transfer_timeout: PositiveSeconds = 120.0
+    restore_timeout: PositiveSeconds = 60.0
+    join_timeout: PositiveSeconds = 20.0
+    max_rate: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse a wait that is no time, and a rate that is none."""
+        check_seconds(
+            self, "start_timeout", "leave_timeout", "dump_timeout", "transfer_timeout",
+            "restore_timeout", "join_timeout",
+        )  # fmt: skip
+        if not 0.0 <= self.max_rate < float("inf"):
+            raise ValueError(
+                f"max_rate is {self.max_rate:g} bytes/s; allowed: 0 (no bound) or more"
+            )
+
+
+class Criu:
+    """Plans a move of the whole memory."""
+
+    def __init__(self, options: CriuOptions) -> None:
+        self._options = options
+
+    @property
+    def ability(self) -> str:
+        """The executor that tries CRIU on a host."""
+        return ABILITY
+
+    def host_fault(self, source: Mapping[str, str], destination: Mapping[str, str]) -> str:
+        """Why an image of one host cannot be restored on another one; "": it can."""
+        return mismatch(source, destination)
+
+    def spec_fault(self, spec: ProcessSpec) -> str:
+        """Why a process cannot be moved so; "" if it can."""
+        try:
+            options_of(spec, self._options)
+        except ValueError as fault:
+            return str(fault)
+        if not spec.ros_node:
+            return (
+                "it moves ROS nodes that leave and join by themselves (rosrm.node.PortableNode), "
+                "and this process is no node: say `ros: true`"
+            )
+        return ""
+
+    def propose(self, move: Move) -> Plan:
+        """Stand still, dump, fetch, restore, commit, join, end the source."""
+        fault = self.spec_fault(move.spec)
+        if fault:
+            raise ValueError(fault)
+        return _Draft(move, options_of(move.spec, self._options)).plan()
+
+
+class _Draft:
+    """One plan in the making."""
+
+    def __init__(self, move: Move, options: CriuOptions) -> None:
+        self._move = move
+        self._options = options
+        #: Of both sides, by all steps: an attempt is known by the instance that it is to make.
+        self._both: Mapping[str, Any] = {
+            "process": move.spec.name,
+            "source": move.source.number,
+            "destination": move.destination.number,
+        }
+
+    def plan(self) -> Plan:
+        move, options = self._move, self._options
+        stop_there = Stop(move.destination, move.destination_host, move.spec.stop.timeout)
+        return Plan(
+            (
+                self._suspend(),
+                self._checkpoint(),
+                self._fetch(),
+                Start(
+                    move.destination, move.destination_host, options.start_timeout,
+                    undo=stop_there, restored=True,
+                ),
+                self._there(AWAIT_RESTORED, options.restore_timeout),
+                Commit(),
+                self._there(JOIN, options.join_timeout),
+                SetRestart(
+                    move.destination, move.destination_host, move.spec.restart,
+                    options.start_timeout,
+                ),
+                self._here(END, options.start_timeout),
+                Stop(move.source, move.source_host, move.spec.stop.timeout),
+            )
+        )  # fmt: skip
+
+    def _suspend(self) -> SetRestart:
+        """A source that its slave started again by itself would be active beside its successor."""
+        move, seconds = self._move, self._options.start_timeout
+        give_back = SetRestart(move.source, move.source_host, move.spec.restart, seconds)
+        return SetRestart(move.source, move.source_host, _NEVER, seconds, undo=give_back)
+
+    def _checkpoint(self) -> Execute:
+        options = self._options
+        there = options.transfer_timeout + options.start_timeout
+        seconds = {"leave": options.leave_timeout, "dump": options.dump_timeout, "offer": there}
+        go_on = self._here(GO_ON, options.join_timeout)
+        return self._here(
+            CHECKPOINT, options.leave_timeout + options.dump_timeout,
+            undo=go_on, seconds=seconds, max_rate=options.max_rate,
+        )  # fmt: skip
+
+    def _fetch(self) -> Execute:
+        options = self._options
+        # Its undo would wait for a destination that may be lost, and the source with it: what is
+        # fetched for nothing goes by itself.
+        return self._there(
+            FETCH, options.transfer_timeout, keep=options.start_timeout + options.restore_timeout
+        )
+
+    def _here(
+        self, executor: str, timeout: float, undo: Execute | None = None, **arguments: Any
+    ) -> Execute:
+        host = self._move.source_host
+        return Execute(
+            executor, host, {**self._both, "timeout": timeout, **arguments}, _longer(timeout), undo
+        )
+
+    def _there(self, executor: str, timeout: float, **arguments: Any) -> Execute:
+        host = self._move.destination_host
+        return Execute(
+            executor, host, {**self._both, "timeout": timeout, **arguments}, _longer(timeout)
+        )
+
+
+def _longer(timeout: float) -> float:
+    """The executor's own time-out comes first: it knows what it waited for."""
+    return timeout + 5.0
