@@ -221,8 +221,8 @@ class _Run:
                 request = listener.asked()
                 if request is not None and request.want is Want.JOIN:
                     return request
-                # Not a wait for the signal: the locks and queues of CPython 3.11 whose time-out
-                # passes while the process is dumped wait for ever once it is restored.
+                # Not SimpleQueue.get, which a signal handler may fill: where its time-out passes
+                # while the process is dumped, CPython before 3.13 waits for ever after the restore.
                 time.sleep(_LOOK_AWAY)
 
     # --- joining ---------------------------------------------------------------------------
