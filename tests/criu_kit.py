@@ -117,11 +117,13 @@ class Theatre:
         command = [*self.hold_command(directory, remove=remove), *options]
         return self.run(command, environment=environment)
 
-    def hold_command(self, directory: Path, *, remove: bool = False) -> tuple[str, ...]:
+    def hold_command(
+        self, directory: Path, *, remove: bool = False, then: Sequence[str] = ()
+    ) -> tuple[str, ...]:
         """Its command line."""
         program = Path(self.criu.command[0])
         return outcome.command(
-            sys.executable, directory, criu=program, remove=remove, timeout=TIMEOUT
+            sys.executable, directory, criu=program, remove=remove, timeout=TIMEOUT, then=then
         )
 
     def restore(self, directory: Path, *options: str, **named: Any) -> Actor:

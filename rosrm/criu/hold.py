@@ -63,10 +63,11 @@ _libc = ctypes.CDLL(None, use_errno=True)
 def main() -> None:
     """Restore, hold, and end as the restored process ends."""
     began = time.monotonic()
-    options = _options()
+    words, then = _split(sys.argv[1:])
+    options = _options(words)
     directory = Path(options.directory).absolute()
-    if options.then and not (directory / image.MANIFEST).exists():
-        _start_anew(options.then)
+    if then and _was_restored(directory):
+        _start_anew(then)
     # What comes while it is restored waits for it; SIGKILL alone does not.
     signal.pthread_sigmask(signal.SIG_BLOCK, _PASSED_ON)
     try:
@@ -77,49 +78,42 @@ def main() -> None:
     except CriuError as error:
         _fail(directory, str(error))
     os.chdir("/")
-    cleans = options.remove and not options.again
-    restore = _Restore(
-        criu, directory, manifest, here, options.timeout, options.remove, cleans, began
-    )
+    restore = _Restore(criu, directory, manifest, here, options.timeout, options.remove, began)
     if not options.no_namespace and _libc.unshare(_NEW_PIDS) == 0:
         _hold_namespace(restore)
     _hold_child(restore)
 
 
-def _options() -> argparse.Namespace:
+def _split(words: list[str]) -> tuple[list[str], list[str]]:
+    """Our own words, and behind the first "--" the command line of the process itself."""
+    end = words.index("--") if "--" in words else len(words)
+    return words[:end], words[end + 1 :]
+
+
+def _options(words: list[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Restores a process and holds it.")
     parser.add_argument("directory", help="of the image")
     parser.add_argument("--criu", required=True, help="the program")
     parser.add_argument("--timeout", type=float, default=120.0, help="seconds for the restore")
     parser.add_argument("--remove", action="store_true", help="the image, once it is restored")
     parser.add_argument("--no-namespace", action="store_true", help="where its pids are free")
-    parser.add_argument("again", nargs="*", help="what to run where it was restored before")
-    parser.add_argument("then", nargs="*", help="command line of the process, after --")
-    return parser.parse_args()
-
-
-def _start_anew(command: list[str]) -> NoReturn:
-    """It was restored, has ended since, and is started again: never from a memory of long ago."""
-    try:
-        os.execvp(command[0], command)  # noqa: S606 - as the supervisor would start it
-    except OSError as error:
-        sys.stderr.write(f"{command[0]} cannot be started: {error.strerror}\n")
-        sys.exit(FAILED)
+    return parser.parse_args(words)
 
 
 def _was_restored(directory: Path) -> bool:
+    """An earlier life of ours told so, or has cleared up behind itself."""
     with contextlib.suppress(CriuError):
         told = outcome.read(directory)
-        return told is not None and not told.reason
+        return not directory.exists() if told is None else not told.reason
     return False
 
 
 def _start_anew(command: list[str]) -> NoReturn:
-    """Become the program itself: an image is for one life, its peers know what came after it."""
+    """Become the program itself: it was restored, has ended, and an image is for one life."""
     for number in (signal.SIGPIPE, signal.SIGXFSZ, signal.SIGINT):  # Python's own ways
         signal.signal(number, signal.SIG_DFL)
     try:
-        os.execvp(command[0], command)  # noqa: S606 - no shell is wanted
+        os.execvp(command[0], command)  # noqa: S606 - as the supervisor would start it
     except OSError as error:
         sys.exit(f"{command[0]} cannot be started: {error.strerror}")
 
@@ -134,7 +128,6 @@ class _Restore:
     here: Manifest
     timeout: float
     remove: bool
-    cleans: bool
     began: float
 
     def run(self, marks: dict[str, str]) -> int:
@@ -162,7 +155,7 @@ class _Restore:
 
     def clean(self) -> None:
         """What is left of the image, after the end of the process."""
-        if self.cleans:
+        if self.remove:
             with contextlib.suppress(OSError):
                 (self.directory / outcome.FILE).unlink()
                 self.directory.rmdir()

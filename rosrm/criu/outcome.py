@@ -57,8 +57,9 @@ def command(
         remove: the image goes as soon as the process is restored; what is left of the directory
             goes at the end of the process.
         timeout: seconds for the restore.
-        then: the process's own command line, which runs where the image is gone: it was restored,
-            has ended, and is started again.
+        then: the process's own command line, which runs when this is started again after the end of
+            the restored process: an image is for one life. Nobody else may remove the directory
+            before: that it is gone says that there was one.
     """
     program = str(Path(__file__).resolve().with_name("hold.py"))
     words = [python, "-I", "-S", program, str(directory), f"--criu={criu}", f"--timeout={timeout}"]

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from rosrm.core.model import InstanceState
+from rosrm.core.model import InstanceState, RestartPolicy
 from rosrm.criu import dumping, image, restoring, tree
 from rosrm.errors import CriuError
 from tests.criu_kit import TIMEOUT, eventually
@@ -403,6 +403,37 @@ def test_below_a_supervisor(theatre, counter, tmp_path):
         assert (ended.exit_code, ended.exit_signal) == (0, signal.SIGINT)
     finally:
         host.clean_up()
+
+
+def test_below_a_supervisor_a_crash_starts_it_anew(theatre, counter, tmp_path):
+    """The restart policy holds for what was restored: it begins at one, as after any crash."""
+    directory = theatre.dump(counter)
+    then = [sys.executable, "-I", "-S", "-c", COUNTER, "--", "a word of its own"]
+    command = theatre.hold_command(directory, remove=True, then=then)
+    host = Host(tmp_path / "host")
+    try:
+        client = host.connect()
+        restart = RestartPolicy("on-failure", delay=0.01)
+        client.start([host.order("actor", *command, number=2, restart=restart)])
+        running = host.wait(client, "actor", InstanceState.RUNNING, number=2)
+        log = host.log("actor", 2)
+        eventually(lambda: log.read_text().count("\n") > 2, "numbers in its log")
+        assert "\n1\n" not in log.read_text()
+        os.kill(tree.root_of(running.pid), signal.SIGKILL)
+        eventually(lambda: "\n1\n2\n" in log.read_text(), "numbers from the first on")
+        client.stop(running.instance)
+        host.ended(client, "actor", number=2)
+    finally:
+        host.clean_up()
+
+
+def test_an_image_that_is_gone_is_no_reason_to_start_anew(theatre, counter):
+    """Where nothing was restored yet the state would be lost without a word: it fails instead."""
+    directory = theatre.dump(counter)
+    image.remove(directory)
+    hold = theatre.run(theatre.hold_command(directory, then=["/bin/true"]))
+    assert hold.process.wait(TIMEOUT) == 125
+    assert "holds no complete image" in hold.log.read_text()
 
 
 # --- without a namespace ------------------------------------------------------------------------
