@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Final
 
 from rosrm.config.settings import LogSettings
 from rosrm.core import slave as core
@@ -21,12 +22,23 @@ from rosrm.supervisor.client import (
     SupervisorClient,
     SupervisorEnded,
     SupervisorGone,
+    SupervisorSilent,
     Told,
 )
+
+#: Seconds for another supervisor to be ready, or for one that is busy to answer.
+_PATIENCE: Final = 30.0
+#: Seconds for which orders may wait before the user hears of it.
+_TOLD_AFTER: Final = 5.0
 
 
 class SupervisorLink:
     """One supervisor after the other: one that was killed is replaced, and takes over.
+
+    Nothing here makes the loop wait: a thread hears the supervisor and finds the next one. What is
+    ordered meanwhile is lost: by the take-over the core sees what was not taken, as does the master
+    by what is reported then, which also gives its orders again until they are followed. Orders to
+    one that is stopped wait until it goes on.
 
     Args:
         state: directory of the supervisor.
@@ -52,13 +64,13 @@ class SupervisorLink:
         self._post, self._take, self._follow = post, take, follow
         self._say, self._ended = say, ended
         self._is_shutting_down = False
-        self._client = self._connect()
-
-    def _connect(self) -> SupervisorClient:
-        return SupervisorClient.connect(self.state, log=self._limits)
+        self._is_closed = False
+        self._told_waits = False
+        self._client = SupervisorClient.connect(state, log=self._limits)
 
     def close(self) -> None:
         """Leave it; it goes on with what it has."""
+        self._is_closed = True
         self._client.close()
 
     # --- what it is told -----------------------------------------------------------------
@@ -68,11 +80,22 @@ class SupervisorLink:
         # One that was killed takes no order; its reader says so, and it is replaced.
         with contextlib.suppress(SupervisorGone):
             self._client.start(orders)
+        self._say_if_it_waits()
 
     def carry_out(self, command: core.Command) -> None:
         """Have done what the core asks of it."""
         with contextlib.suppress(SupervisorGone):
             self._tell(command)
+        self._say_if_it_waits()
+
+    def _say_if_it_waits(self) -> None:
+        waits = self._client.waits
+        if waits > _TOLD_AFTER and not self._told_waits:
+            self._say(
+                f"the supervisor (pid {self._client.pid}) has taken no order for {waits:.0f} s: is "
+                f"it stopped? They wait until it goes on"
+            )
+        self._told_waits = waits > _TOLD_AFTER
 
     def _tell(self, command: core.Command) -> None:
         client = self._client
@@ -105,17 +128,45 @@ class SupervisorLink:
 
     def listen(self) -> None:
         """Hear it from now on."""
-        threading.Thread(target=self._read, name="supervisor", daemon=True).start()
+        thread = threading.Thread(
+            target=self._hear_all, args=[self._client], name="supervisor", daemon=True
+        )
+        thread.start()
 
-    def _read(self) -> None:
-        """Runs in a thread of its own: the supervisor's words, into the loop."""
+    def _hear_all(self, client: SupervisorClient) -> None:
+        """Runs in a thread of its own: the words of one after the other, into the loop."""
+        try:
+            while True:
+                self._hear(client)
+                client = self._next()
+                self._post(partial(self._replace, client))
+        except SupervisorError as error:
+            if not self._is_closed:
+                self._post(partial(self._end, error))
+
+    def _hear(self, client: SupervisorClient) -> None:
+        """Until another one is to take over; raises SupervisorError where none is."""
+        try:
+            while True:
+                told = client.receive(None)
+                self._post(partial(self._take_told, told))
+        except SupervisorGone as gone:
+            if self._is_shutting_down or self._is_closed:
+                raise
+            self._post(partial(self._say, f"{gone}; connecting to the next one"))
+
+    def _next(self) -> SupervisorClient:
+        """The one that takes over, or the same, where it took no orders."""
+        told = False
         while True:
             try:
-                told = self._client.receive(None)
-            except SupervisorError as error:
-                self._post(partial(self._gone, error))
-                return
-            self._post(partial(self._take_told, told))
+                return SupervisorClient.connect(self.state, log=self._limits, timeout=_PATIENCE)
+            except SupervisorSilent as silence:
+                if self._is_closed:
+                    raise
+                if not told:
+                    self._post(partial(self._say, f"{silence}; waiting until it does"))
+                told = True
 
     def _take_told(self, told: Sequence[Told]) -> None:
         statuses = tuple(one for one in told if isinstance(one, InstanceStatus))
@@ -142,18 +193,18 @@ class SupervisorLink:
         self._take(core.SupervisorReplaced(client.instances, memos, client.fenced))
         return len(client.instances)
 
-    def _gone(self, error: SupervisorError) -> None:
-        """It has ended as it was told to; or it was killed, and another one takes over."""
-        if isinstance(error, SupervisorGone) and not self._is_shutting_down:
-            self._say(f"{error}; starting another one")
-            try:
-                self._client.close()
-                self._client = self._connect()
-            except SupervisorError as failure:
-                error = failure
-            else:
-                self.listen()
-                self.take_over()
-                return
+    def _replace(self, client: SupervisorClient) -> None:
+        """Another one is there."""
+        self._client.close()
+        self._client = client
+        if self._is_closed:
+            client.close()
+            return
+        self.take_over()
+        if self._is_shutting_down:  # the former one may not have heard of it
+            self.shut_down()
+
+    def _end(self, error: SupervisorError) -> None:
+        """It has ended as it was told to; or it is gone, and there is no other one."""
         orderly = isinstance(error, SupervisorEnded)
         self._ended("" if orderly else f"the supervisor of this host is gone: {error}")

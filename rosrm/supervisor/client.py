@@ -28,7 +28,8 @@ from rosrm.core.supervision import (
 from rosrm.errors import SupervisorError
 from rosrm.supervisor import lines, paths, protocol
 from rosrm.supervisor.logs import LogLimits
-from rosrm.supervisor.starting import connect_or_start, readable, writable
+from rosrm.supervisor.outgoing import MOST_UNSENT, Outgoing, Overfull
+from rosrm.supervisor.starting import connect_or_start, readable
 from rosrm.supervisor.values import (
     Amended,
     LaunchOrder,
@@ -50,19 +51,25 @@ __all__ = [
     "SupervisorClient",
     "SupervisorEnded",
     "SupervisorGone",
+    "SupervisorSilent",
     "Told",
     "log_path",
     "newest_log",
 ]
 
-#: Seconds for the supervisor to take what it is sent.
-SEND_TIMEOUT: Final = 5.0
 DEFAULT_LOG_LIMITS: Final = LogLimits()
 _CHUNK: Final = 1 << 16
 
 
 class SupervisorGone(SupervisorError):
-    """The connection was lost: the supervisor was killed. Connect again: a new one takes over."""
+    """The connection was lost: the supervisor was killed, or takes no orders.
+
+    Connect again: a new one takes over, or the same tells what it has taken.
+    """
+
+
+class SupervisorSilent(SupervisorError):
+    """It is there and does not answer: it is stopped, or its machine is too busy. Try again."""
 
 
 class SupervisorEnded(SupervisorError):
@@ -86,6 +93,7 @@ def newest_log(state_directory: Path, process: str) -> InstanceId | None:
 class SupervisorClient:
     """A connection to the supervisor of this host.
 
+    To order never waits: what the supervisor does not take at once is sent when it does, in order.
     One thread may wait in `receive` while others order.
 
     Attributes:
@@ -99,6 +107,7 @@ class SupervisorClient:
 
     def __init__(self, peer: socket.socket, state_directory: Path) -> None:
         self._peer = peer
+        self._outgoing = Outgoing(peer)
         self._state = state_directory
         self._lines = lines.Lines()
         self._received: list[Told] = []
@@ -125,6 +134,7 @@ class SupervisorClient:
         """Connect to the supervisor of a state directory, and start one where none listens.
 
         Raises:
+            SupervisorSilent: there is one, and it does not answer in time.
             SupervisorError: there is none and none can be started in time, or it turned us down.
         """
         state = Path(os.path.abspath(state_directory))
@@ -169,7 +179,7 @@ class SupervisorClient:
 
         Left out while the supervisor does not read (it is stopped): a newer one will follow.
         """
-        if writable(self._peer, 0.0):
+        if self._outgoing.is_free:
             self._order(Heard(at, alive))
 
     def restart(self, instance: InstanceId) -> None:
@@ -213,6 +223,11 @@ class SupervisorClient:
 
     # --- answers ------------------------------------------------------------------------------
 
+    @property
+    def waits(self) -> float:
+        """Seconds for which it has taken none of the orders that wait for it; 0.0: none waits."""
+        return self._outgoing.waits
+
     def fileno(self) -> int:
         """Readable when `receive` has something; for a selector."""
         return self._peer.fileno()
@@ -238,7 +253,7 @@ class SupervisorClient:
 
     def close(self) -> None:
         """Leave; the instances go on."""
-        self._peer.close()
+        self._outgoing.close()
 
     def __enter__(self) -> Self:
         """The connection is closed with the block."""
@@ -280,17 +295,16 @@ class SupervisorClient:
             self._send(protocol.encode_order(order))
 
     def _send(self, data: bytes) -> None:
-        view = memoryview(data)
-        deadline = time.monotonic() + SEND_TIMEOUT
-        while view:
-            try:
-                view = view[self._peer.send(view, socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL) :]
-            except BlockingIOError:
-                if not writable(self._peer, max(0.0, deadline - time.monotonic())):
-                    message = f"{self._name()} took no order within {SEND_TIMEOUT:g} s"
-                    raise SupervisorError(message) from None
-            except OSError as error:
-                raise SupervisorGone(f"{self._name()} is gone: {error.strerror}") from None
+        try:
+            self._outgoing.send(data)
+        except Overfull:
+            most = f"{MOST_UNSENT >> 20} MiB"
+            full = SupervisorGone(f"{self._name()} takes no orders, and {most} of them wait for it")
+            self._fail(full)  # before the reader sees that the connection has ended
+            self._outgoing.drop()
+            raise full from None
+        except OSError as error:
+            raise SupervisorGone(f"{self._name()} is gone: {error.strerror}") from None
 
     # --- receiving ----------------------------------------------------------------------------
 
@@ -300,7 +314,7 @@ class SupervisorClient:
             if self._failure is not None:
                 raise self._failure
             if not readable(self._peer, max(0.0, deadline - time.monotonic())):
-                raise SupervisorError(f"{self._name()} did not answer in time")
+                raise SupervisorSilent(f"{self._name()} did not answer in time")
             self._read()
 
     def _read(self) -> None:

@@ -71,8 +71,8 @@ def readable(file: socket.socket | object, timeout: float | None) -> bool:
     return _poll(file, select.POLLIN, timeout)
 
 
-def writable(file: socket.socket, timeout: float) -> bool:
-    """Whether there is room to write, within so many seconds."""
+def writable(file: socket.socket, timeout: float | None) -> bool:
+    """Whether there is room to write, within so many seconds; None: however long."""
     return _poll(file, select.POLLOUT, timeout)
 
 

@@ -1,0 +1,140 @@
+"""The slave's end: whatever becomes of its supervisor, its loop does not wait, nothing is lost."""
+
+from __future__ import annotations
+
+import os
+import queue
+import signal
+import threading
+import time
+
+import pytest
+
+from rosrm.config.settings import LogSettings
+from rosrm.core import slave as core
+from rosrm.core.model import InstanceId
+from rosrm.slave.supervisor_link import SupervisorLink
+from rosrm.supervisor import outgoing
+from rosrm.supervisor.client import SupervisorClient
+
+from .conftest import TIMEOUT, wait_gone
+
+#: Together more than a socket holds.
+COUNT, LARGE = 10, "x" * 100_000
+MANY = tuple(InstanceId(f"p{number}", 1) for number in range(COUNT))
+
+
+class Loop:
+    """What a slave does with its supervisor: it takes in what is posted, one after the other."""
+
+    def __init__(self, host) -> None:
+        self.posted: queue.Queue = queue.Queue()
+        self.events: list[core.Event] = []
+        self.said: list[str] = []
+        self.ended: list[str] = []
+        self.host = host
+        self.link = SupervisorLink(
+            host.state, LogSettings(), post=self.posted.put, take=self.events.append,
+            follow=lambda status: None, say=self.said.append, ended=self.ended.append,
+        )  # fmt: skip
+        self.pid = self.supervisor()
+        self.link.take_over()
+        self.link.listen()
+
+    def supervisor(self) -> int:
+        pid = int((self.host.state / "supervisor.lock").read_text())
+        self.host.pids.add(pid)
+        return pid
+
+    def wait(self, condition, what: str) -> None:
+        deadline = time.monotonic() + TIMEOUT
+        while not condition():
+            left = deadline - time.monotonic()
+            assert left > 0, f"not within {TIMEOUT} s: {what}; said: {self.said}, {self.ended}"
+            try:
+                self.posted.get(timeout=min(left, 0.1))()
+            except queue.Empty:
+                continue
+
+    def replaced(self) -> list[core.SupervisorReplaced]:
+        return [one for one in self.events if isinstance(one, core.SupervisorReplaced)]
+
+    def started(self) -> set[InstanceId]:
+        told = [one for one in self.events if isinstance(one, core.SupervisorReported)]
+        return {status.instance for one in told for status in one.statuses if status.pid}
+
+    def start_many(self) -> None:
+        for instance in MANY:
+            self.link.start([self.host.order(instance.process, "sleep", "1000", memo=LARGE)])
+
+
+@pytest.fixture
+def loop(host):
+    loop = Loop(host)
+    yield loop
+    loop.link.close()
+
+
+def test_a_killed_supervisor_is_replaced_without_the_loop(loop, monkeypatch) -> None:
+    """To start another one takes as long as it takes: the slave must be heard meanwhile."""
+    by: list[threading.Thread] = []
+    connect = SupervisorClient.connect
+
+    def noted(*args, **options):
+        by.append(threading.current_thread())
+        return connect(*args, **options)
+
+    monkeypatch.setattr(SupervisorClient, "connect", noted)
+    loop.link.start([loop.host.order("one", "sleep", "1000")])
+    loop.wait(loop.started, "it runs")
+    os.kill(loop.pid, signal.SIGKILL)
+    wait_gone(loop.pid)
+    loop.wait(lambda: len(loop.replaced()) == 2, "another one has taken over")
+    assert loop.supervisor() != loop.pid
+    assert [status.instance.process for status in loop.replaced()[1].statuses] == ["one"]
+    assert by
+    assert threading.current_thread() not in by
+    loop.link.carry_out(core.Stop(InstanceId("one", 1)))
+    loop.wait(lambda: not loop.host.alive(), "the next one takes orders")
+
+
+def test_orders_to_a_stopped_supervisor_wait_for_it(loop) -> None:
+    """More than the socket holds: none makes the loop wait, none is lost, in order."""
+    os.kill(loop.pid, signal.SIGSTOP)
+    loop.start_many()
+    loop.link.carry_out(core.Fence(MANY[-1]))
+    loop.link.carry_out(core.Renew(time.monotonic(), time.monotonic()))
+    os.kill(loop.pid, signal.SIGCONT)
+    loop.wait(lambda: loop.started() >= set(MANY[:-1]), "all of them run")
+    loop.wait(lambda: len(loop.host.alive()) == COUNT - 1, "the last one was fenced")
+    assert len(loop.replaced()) == 1
+    assert not loop.ended
+
+
+def test_a_supervisor_that_takes_nothing_any_more_is_connected_to_anew(loop, monkeypatch) -> None:
+    """What it had taken runs and is told; what it had not the core hears to be unknown."""
+    monkeypatch.setattr(outgoing, "MOST_UNSENT", 300_000)
+    os.kill(loop.pid, signal.SIGSTOP)
+    loop.start_many()
+    loop.wait(lambda: any("takes no orders" in one for one in loop.said), "it is said")
+    os.kill(loop.pid, signal.SIGCONT)
+    loop.wait(lambda: len(loop.replaced()) == 2, "it is connected to anew")
+    known = {status.instance for status in loop.replaced()[1].statuses}
+    assert known < set(MANY)
+    assert loop.supervisor() == loop.pid
+    loop.link.start([loop.host.order("later", "sleep", "1000")])
+    loop.wait(lambda: InstanceId("later", 1) in loop.started(), "it takes orders")
+    assert not loop.ended
+
+
+def test_the_shutdown_reaches_one_that_is_just_taking_over(loop) -> None:
+    """The supervisor is killed in the moment in which the slave is told to end."""
+    loop.link.start([loop.host.order("one", "sleep", "1000")])
+    loop.wait(loop.started, "it runs")
+    os.kill(loop.pid, signal.SIGKILL)
+    wait_gone(loop.pid)
+    loop.wait(lambda: any("connecting" in one for one in loop.said), "its end is noticed")
+    loop.link.shut_down()
+    loop.wait(lambda: loop.ended, "the next one has stopped everything")
+    assert loop.ended == [""]
+    assert not loop.host.alive()
