@@ -67,6 +67,7 @@ class _End:
             start_new_session=True,
         )
         self._closing = threading.Lock()
+        self._asked = False
 
     def __enter__(self) -> Self:
         return self
@@ -77,7 +78,10 @@ class _End:
     def _ask(self, asked: Mapping[str, Any], timeout: float) -> dict[str, Any]:
         """The process's next answer; raises `TransferError` for an error and for none."""
         assert self._process.stdin is not None
-        with contextlib.suppress(OSError):  # then there is no answer either
+        if self._asked:
+            raise RuntimeError("one process makes one transfer: start another one")
+        self._asked = True
+        with contextlib.suppress(OSError, ValueError):  # it has ended: then there is no answer
             self._process.stdin.write(json.dumps(asked).encode() + b"\n")
             self._process.stdin.flush()
         answer = self._answer(timeout)

@@ -1,0 +1,27 @@
+"""What is moved, from where, and where to."""
+
+from __future__ import annotations
+
+import pytest
+
+from rosrm.transfer import Sender
+from tests.integration.transfer.trees import fill
+
+
+@pytest.fixture
+def source(tmp_path):
+    """Some files of 4 MB in all, which no compression makes smaller."""
+    directory = tmp_path / "source"
+    fill(directory, megabytes=4)
+    return directory
+
+
+@pytest.fixture
+def target(tmp_path):
+    return tmp_path / "there" / "target"
+
+
+@pytest.fixture
+def sender():
+    with Sender() as sender:
+        yield sender

@@ -1,0 +1,61 @@
+"""Directories that are moved, and how they arrive."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import random
+import socket
+import time
+from pathlib import Path
+
+from rosrm.transfer import Offer, Sender
+
+#: Generous: a busy machine may take its time.
+PATIENCE = 60.0
+
+
+def fill(directory: Path, *, megabytes: int, random_share: float = 1.0) -> None:
+    (directory / "pages" / "empty").mkdir(parents=True)
+    bits = random.Random(7)
+    for number in range(4):
+        with (directory / "pages" / f"{number}.img").open("wb") as file:
+            for _ in range(megabytes * 1_000_000 // 4 // 50_000):
+                fresh = int(50_000 * random_share)
+                file.write(bits.randbytes(fresh) + bytes(50_000 - fresh))
+    (directory / "inventory").write_bytes(b"1")
+
+
+def digests(directory: Path) -> dict[str, str]:
+    return {
+        str(path.relative_to(directory)): hashlib.sha256(path.read_bytes()).hexdigest()
+        if path.is_file() else "directory"
+        for path in directory.rglob("*")
+    }  # fmt: skip
+
+
+def through(offer: Offer, port: int) -> Offer:
+    return dataclasses.replace(offer, addresses=("127.0.0.1",), port=port)
+
+
+def listens(port: int) -> bool:
+    try:
+        socket.create_connection(("127.0.0.1", port), timeout=5).close()
+    except ConnectionRefusedError:
+        return False
+    return True
+
+
+def until(what: str, condition) -> None:
+    end = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < end, f"not within {PATIENCE} s: {what}"
+        time.sleep(0.02)
+
+
+def nothing_left(target: Path) -> bool:
+    return not target.parent.exists() or list(target.parent.iterdir()) == []
+
+
+def slowly(sender: Sender, source: Path) -> Offer:
+    return sender.offer(source, seconds=PATIENCE, max_rate=500e3)
