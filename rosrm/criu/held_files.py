@@ -9,10 +9,8 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from rosrm.criu.image import HeldFile, MappedFile
+from rosrm.criu.image import COPIES, HeldFile, MappedFile
 
-#: Where a copy lies, below an image.
-COPIES: Final = "files"
 #: Bytes of the largest file that follows.
 MOST: Final = 64 << 20
 

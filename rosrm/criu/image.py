@@ -23,6 +23,7 @@ FORMAT: Final = 1
 
 MANIFEST: Final = "manifest.json"
 PAGES: Final = "criu"
+COPIES: Final = "files"
 DUMP_LOG: Final = "dump.log"
 RESTORE_LOG: Final = "restore.log"
 
@@ -138,7 +139,7 @@ def file_sizes(directory: Path) -> dict[str, int]:
     sizes = {}
     for path in sorted(directory.rglob("*")):
         name = path.relative_to(directory).as_posix()
-        if path.is_file() and name.startswith((f"{PAGES}/", "files/")):
+        if path.is_file() and name.startswith((f"{PAGES}/", f"{COPIES}/")):
             path.chmod(0o600)
             sizes[name] = path.stat().st_size
     return sizes
@@ -203,9 +204,9 @@ def remove(directory: Path, *, logs: bool = True) -> None:
         directory: of the image.
         logs: CRIU's too.
     """
-    for name in (MANIFEST, *((DUMP_LOG, RESTORE_LOG) if logs else ())):
+    for name in (MANIFEST, f"{MANIFEST}.new", *((DUMP_LOG, RESTORE_LOG) if logs else ())):
         (directory / name).unlink(missing_ok=True)
-    for name in (PAGES, "files"):
+    for name in (PAGES, COPIES):
         shutil.rmtree(directory / name, ignore_errors=True)
 
 
