@@ -8,12 +8,13 @@ import signal
 import subprocess
 import sys
 import time
+import zlib
 from pathlib import Path
 
 import pytest
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
-from std_msgs.msg import Int64
+from std_msgs.msg import Int64, Int64MultiArray
 from std_srvs.srv import Trigger
 
 from rosrm.errors import PortableError
@@ -26,6 +27,7 @@ from rosrm.portable import (
     await_left,
     status_of,
 )
+from rosrm_examples.portable_counter import filled
 from tests.ros.nodes import PATIENCE
 
 PROGRAM = Path(__file__).parent / "programs" / "portable.py"
@@ -34,13 +36,15 @@ PROGRAM = Path(__file__).parent / "programs" / "portable.py"
 class Portable:
     """A portable node in a process of its own."""
 
-    def __init__(self, folder: Path, domain: int, fault: str = "", *, words=(), controlled=True):
+    def __init__(
+        self, folder: Path, domain: int, fault: str = "", *, words=(), command=None, controlled=True
+    ):
         self.directory = folder / "control"
         self.log = folder / "log"
         environment = {**os.environ, "ROS_DOMAIN_ID": str(domain)}
         if controlled:
             environment[VARIABLE] = str(self.directory)
-        command = [*words, sys.executable, str(PROGRAM), fault]
+        command = [*words, *(command or [sys.executable, str(PROGRAM), fault])]
         with self.log.open("wb") as log:
             self.process = subprocess.Popen(
                 command, env=environment, stdin=subprocess.DEVNULL, stdout=log, stderr=log,
@@ -301,6 +305,21 @@ def test_started_by_hand_it_is_an_ordinary_node(stage, start, heard) -> None:
     node.process.send_signal(signal.SIGINT)
     assert node.process.wait(PATIENCE) == 0
     assert "Traceback" not in node.said()
+
+
+def test_the_example_finds_its_memory_as_it_was(stage, start) -> None:
+    """Before a move and after it: the same checksum, and the count goes on by one each."""
+    example = [sys.executable, "-m", "rosrm_examples.portable_counter", "--mb", "9"]
+    heard = stage.listen(Int64MultiArray, "count", 100)
+    node = start(command=[*example, "--period", "0.01"])
+    stage.spin_until(lambda: heard and heard[-1].data[1] >= 2, "two passes")
+    node.prepare("m1")
+    passes = heard[-1].data[1]
+    node.resume("m1")
+    stage.spin_until(lambda: heard[-1].data[1] >= passes + 2, "two passes after the move")
+    assert {one.data[2] for one in heard if one.data[1]} == {zlib.crc32(filled(9_000_000))}
+    counts = [one.data[0] for one in heard]
+    assert counts == list(range(counts[0], counts[0] + len(counts)))
 
 
 # --- another address ---

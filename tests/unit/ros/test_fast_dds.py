@@ -39,6 +39,13 @@ def test_transports_of_nodes_are_the_users():
     assert "FASTDDS_BUILTIN_TRANSPORTS" not in announcements({}, "movable")
 
 
+def test_a_node_that_is_to_be_dumped_speaks_udp_alone():
+    """Shared memory could not be dumped; the user's own choice stands."""
+    assert announcements({}, "movable", udp=True)["FASTDDS_BUILTIN_TRANSPORTS"] == "UDPv4"
+    chosen = {"FASTDDS_BUILTIN_TRANSPORTS": "SHM"}
+    assert "FASTDDS_BUILTIN_TRANSPORTS" not in announcements(chosen, "movable", udp=True)
+
+
 @pytest.mark.parametrize(
     "variable", ["FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE"]
 )

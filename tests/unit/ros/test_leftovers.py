@@ -1,0 +1,94 @@
+"""What a process that has left ROS still holds, and what of it is closed."""
+
+from __future__ import annotations
+
+import ctypes
+import socket
+
+import pytest
+
+from rosrm.errors import PortableError
+from rosrm.ros import fast_dds_place
+from rosrm.ros.leftovers import close_leaked, open_sockets, what_is_left
+
+
+@pytest.fixture
+def make():
+    """Makes sockets, and closes what is left of them."""
+    made = []
+
+    def make(kind: int) -> socket.socket:
+        made.append(socket.socket(socket.AF_INET, kind))
+        return made[-1]
+
+    yield make
+    for one in made:
+        if one.fileno() in open_sockets():
+            one.close()
+        else:
+            one.detach()
+
+
+def test_an_open_socket_is_named(make) -> None:
+    """By its number, with what to do."""
+    one = make(socket.SOCK_DGRAM)
+    assert one.fileno() in open_sockets()
+    assert f"{one.fileno()}" in what_is_left()
+    assert "leave()" in what_is_left()
+
+
+def test_what_nobody_uses_is_closed(make) -> None:
+    """A UDP socket that is neither bound nor connected, as Fast DDS leaves them."""
+    number = make(socket.SOCK_DGRAM).fileno()
+    close_leaked(open_sockets())
+    assert number not in open_sockets()
+
+
+def test_what_somebody_uses_stays(make) -> None:
+    """Bound, connected, or of another kind: it is the author's."""
+    bound, connected, stream = (
+        make(kind) for kind in (socket.SOCK_DGRAM, socket.SOCK_DGRAM, socket.SOCK_STREAM)
+    )
+    bound.bind(("127.0.0.1", 0))
+    connected.connect(bound.getsockname())
+    numbers = {one.fileno() for one in (bound, connected, stream)}
+    close_leaked({number: one for number, one in open_sockets().items() if number in numbers})
+    assert numbers <= set(open_sockets())
+
+
+def test_a_number_that_is_another_socket_by_now_stays(make) -> None:
+    """What was noted is gone, and its number was given again."""
+    number = make(socket.SOCK_DGRAM).fileno()
+    close_leaked({number: "socket:[1]"})
+    assert number in open_sockets()
+
+
+def test_a_fast_dds_that_cannot_look_again_is_said(monkeypatch) -> None:
+    """Before the node leaves, and not by silence after its move."""
+    libc = ctypes.CDLL(None)
+    monkeypatch.setattr(fast_dds_place, "_library", lambda: libc)
+    for function in (fast_dds_place.check, fast_dds_place.look_again):
+        with pytest.raises(PortableError, match="update_interfaces.*loopback alone"):
+            function()
+
+
+def test_interfaces_that_cannot_be_read_are_said(monkeypatch) -> None:
+    """The node would be heard by nobody."""
+    monkeypatch.setattr(fast_dds_place, "_library", lambda: ctypes.CDLL(None))
+    monkeypatch.setattr(fast_dds_place, "_interfaces_of", lambda _: lambda: False)
+    with pytest.raises(PortableError, match="cannot read the network interfaces"):
+        fast_dds_place.look_again()
+
+
+def test_guids_that_cannot_be_renewed_are_told_of(monkeypatch) -> None:
+    """Less is lost by that: an image can be restored only once."""
+    monkeypatch.setattr(fast_dds_place, "_library", lambda: ctypes.CDLL(None))
+    monkeypatch.setattr(fast_dds_place, "_interfaces_of", lambda _: lambda: True)
+    assert fast_dds_place.look_again() is False
+
+
+def test_without_fast_dds_there_is_nothing_to_renew(monkeypatch) -> None:
+    """Another vendor's library looks by itself."""
+    monkeypatch.setattr(fast_dds_place, "_library", lambda: None)
+    fast_dds_place.check()
+    assert fast_dds_place.look_again() is True
