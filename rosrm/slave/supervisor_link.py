@@ -11,7 +11,7 @@ from typing import Final
 
 from rosrm.config.settings import LogSettings
 from rosrm.core import slave as core
-from rosrm.core.model import InstanceStatus
+from rosrm.core.model import InstanceId, InstanceState, InstanceStatus
 from rosrm.errors import SupervisorError
 from rosrm.slave.environment import SHADOW
 from rosrm.slave.memos import from_memo, to_memo
@@ -35,10 +35,10 @@ _TOLD_AFTER: Final = 5.0
 class SupervisorLink:
     """One supervisor after the other: one that was killed is replaced, and takes over.
 
-    Nothing here makes the loop wait: a thread hears the supervisor and finds the next one. What is
-    ordered meanwhile is lost: by the take-over the core sees what was not taken, as does the master
-    by what is reported then, which also gives its orders again until they are followed. Orders to
-    one that is stopped wait until it goes on.
+    Nothing here makes the loop wait: a thread hears the supervisor and finds the next one. Launches
+    that the former one has said nothing of are given to the next one again: that starts nothing
+    twice. Other orders that come meanwhile are lost; the core and the master give them again, as
+    long as they are not followed. Orders to one that is stopped wait until it goes on.
 
     Args:
         state: directory of the supervisor.
@@ -66,6 +66,7 @@ class SupervisorLink:
         self._is_shutting_down = False
         self._is_closed = False
         self._told_waits = False
+        self._unanswered: dict[InstanceId, LaunchOrder] = {}
         self._client = SupervisorClient.connect(state, log=self._limits)
 
     def close(self) -> None:
@@ -77,6 +78,7 @@ class SupervisorLink:
 
     def start(self, orders: Sequence[LaunchOrder]) -> None:
         """Have instances started."""
+        self._unanswered.update((order.instance, order) for order in orders)
         # One that was killed takes no order; its reader says so, and it is replaced.
         with contextlib.suppress(SupervisorGone):
             self._client.start(orders)
@@ -99,6 +101,8 @@ class SupervisorLink:
 
     def _tell(self, command: core.Command) -> None:
         client = self._client
+        if isinstance(command, core.Stop | core.Fence):
+            self._unanswered.pop(command.instance, None)
         if isinstance(command, core.Stop):
             client.stop(command.instance)
         elif isinstance(command, core.Fence):
@@ -171,6 +175,7 @@ class SupervisorLink:
     def _take_told(self, told: Sequence[Told]) -> None:
         statuses = tuple(one for one in told if isinstance(one, InstanceStatus))
         for status in statuses:
+            self._unanswered.pop(status.instance, None)
             self._follow(status)
         self._take(core.SupervisorReported(statuses))
         for one in told:
@@ -190,8 +195,17 @@ class SupervisorLink:
             self._follow(status)
         found = {one: from_memo(memo) for one, memo in client.memos.items()}
         memos = {one: memo for one, memo in found.items() if memo is not None}
-        self._take(core.SupervisorReplaced(client.instances, memos, client.fenced))
+        statuses = [*client.instances, *self._launch_again(client)]
+        self._take(core.SupervisorReplaced(tuple(statuses), memos, client.fenced))
         return len(client.instances)
+
+    def _launch_again(self, client: SupervisorClient) -> list[InstanceStatus]:
+        """Have started what the former one did not take; what it took the next one knows."""
+        for status in client.instances:
+            self._unanswered.pop(status.instance, None)
+        with contextlib.suppress(SupervisorGone):
+            client.start(list(self._unanswered.values()))
+        return [InstanceStatus(one, InstanceState.STARTING) for one in self._unanswered]
 
     def _replace(self, client: SupervisorClient) -> None:
         """Another one is there."""

@@ -12,7 +12,7 @@ import pytest
 
 from rosrm.config.settings import LogSettings
 from rosrm.core import slave as core
-from rosrm.core.model import InstanceId
+from rosrm.core.model import InstanceId, InstanceState, InstanceStatus
 from rosrm.slave.supervisor_link import SupervisorLink
 from rosrm.supervisor import outgoing
 from rosrm.supervisor.client import SupervisorClient
@@ -112,19 +112,32 @@ def test_orders_to_a_stopped_supervisor_wait_for_it(loop) -> None:
 
 
 def test_a_supervisor_that_takes_nothing_any_more_is_connected_to_anew(loop, monkeypatch) -> None:
-    """What it had taken runs and is told; what it had not the core hears to be unknown."""
+    """What it had taken runs and is told; what it had not is given to it again: all of it runs."""
     monkeypatch.setattr(outgoing, "MOST_UNSENT", 300_000)
     os.kill(loop.pid, signal.SIGSTOP)
     loop.start_many()
     loop.wait(lambda: any("takes no orders" in one for one in loop.said), "it is said")
     os.kill(loop.pid, signal.SIGCONT)
     loop.wait(lambda: len(loop.replaced()) == 2, "it is connected to anew")
-    known = {status.instance for status in loop.replaced()[1].statuses}
-    assert known < set(MANY)
+    assert {status.instance for status in loop.replaced()[1].statuses} == set(MANY)
     assert loop.supervisor() == loop.pid
-    loop.link.start([loop.host.order("later", "sleep", "1000")])
-    loop.wait(lambda: InstanceId("later", 1) in loop.started(), "it takes orders")
+    loop.wait(lambda: len(loop.host.alive()) == COUNT, "each runs, once")
     assert not loop.ended
+
+
+def test_a_launch_that_comes_between_two_supervisors_is_not_lost(loop) -> None:
+    """Nor is one that is stopped before it was given to the next one started."""
+    os.kill(loop.pid, signal.SIGKILL)
+    wait_gone(loop.pid)
+    stopped = InstanceId("stopped", 1)
+    loop.link.start([loop.host.order("one", "sleep", "1000")])
+    loop.link.start([loop.host.order("stopped", "sleep", "1000")])
+    loop.link.carry_out(core.Stop(stopped))
+    loop.wait(lambda: len(loop.replaced()) == 2, "another one has taken over")
+    loop.supervisor()
+    (status,) = loop.replaced()[1].statuses
+    assert status == InstanceStatus(InstanceId("one", 1), InstanceState.STARTING)
+    loop.wait(lambda: loop.started() == {status.instance}, "it runs")
 
 
 def test_the_shutdown_reaches_one_that_is_just_taking_over(loop) -> None:
