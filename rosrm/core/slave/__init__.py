@@ -142,5 +142,16 @@ def step(state: SlaveState, event: Event, now: float) -> Sequence[Command]:
 
 
 def step_all(state: SlaveState, events: Iterable[Event], now: float) -> list[Command]:
-    """Take several events in, in order."""
-    return [command for event in events for command in step(state, event, now)]
+    """Take several events in, in order.
+
+    What one of them launches a later one may have lost sight of: then it is not launched.
+    """
+    commands = [command for event in events for command in step(state, event, now)]
+    return [
+        _still_held(state, command) if isinstance(command, Launch) else command
+        for command in commands
+    ]
+
+
+def _still_held(state: SlaveState, launch: Launch) -> Launch:
+    return Launch(tuple(one for one in launch.assignments if one.instance in state.held))

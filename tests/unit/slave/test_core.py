@@ -65,6 +65,18 @@ def test_what_went_with_the_supervisor_cannot_be_refused_any_more(one):
     assert one.step(slave.LaunchRefused(InstanceId("p", 1), "no such package")) == []
 
 
+def test_what_is_taken_back_at_once_is_not_launched(one):
+    """An assignment and the next supervisor in one go: that one does not know it, so nobody has it.
+
+    The master gives it again, and hears that it is refused.
+    """
+    events = [assigned(), slave.SupervisorReplaced((), {}, frozenset())]
+    commands = slave.step_all(one.state, events, one.now)
+    assert [c for c in commands if isinstance(c, slave.Launch) and c.assignments] == []
+    (report,) = one.step(assigned(), after=2.0)
+    assert states([report]) == [STATE.REFUSED]
+
+
 def awaited_names(one: Slave) -> list[str]:
     """Who is looked for in the graph."""
     return [h.awaited.node_name for h in one.state.awaited_in_graph().values()]
