@@ -19,6 +19,7 @@ are stopped. When neither source nor destination is left, the process returns to
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 from rosrm.core import abilities, handoffs, keeping, lifecycle
 from rosrm.core import events as happened
@@ -267,9 +268,15 @@ def _conclude(state: MasterState, run: Run, now: float) -> None:
         facts={
             "from": run.source_host.name, "to": run.destination_host.name,
             "seconds": now - run.started, "cause": run.cause, "strategy": run.strategy,
+            "parts": _parts(run),
         },
     )  # fmt: skip
     _settle_owner(state, process, run, now)
+
+
+def _parts(run: Run) -> dict[str, Any]:
+    """What executors say of their own time, by their names."""
+    return {name: result["seconds"] for name, result in run.results.items() if "seconds" in result}
 
 
 def _settle_owner(state: MasterState, process: Process, run: Run, now: float) -> None:
