@@ -19,6 +19,7 @@ from rosrm.core.model import (
     InstanceId,
     InstanceState,
     InstanceStatus,
+    KeptState,
     ResourceDescription,
     RestartPolicy,
 )
@@ -59,6 +60,8 @@ class Machine:
         polled: assignments that wait for the slave's next request, in the master's hands.
         ordered: orders on their way to the slave.
         said: status batches on their way to the master.
+        kept: the newest state of each process that lies here, by its name.
+        ships: hosts that are given the states of a process here, by its name.
         connected: the wires work.
     """
 
@@ -86,6 +89,8 @@ class Machine:
     polled: list[Assignment] = field(default_factory=list)
     ordered: deque[Order] = field(default_factory=deque)
     said: deque[happened.StatusesReceived] = field(default_factory=deque)
+    kept: dict[str, KeptState] = field(default_factory=dict)
+    ships: dict[str, tuple[str, ...]] = field(default_factory=dict)
     connected: bool = True
     takes: bool = True
     fresh: bool = False
@@ -267,6 +272,8 @@ class Machine:
         if order.action == "set_restart":
             return self._set_restart(order, now)
         if order.action in ("keep", "drop_kept"):
+            assert order.instance is not None
+            self._keep_or_drop(order, order.instance)
             return happened.OrderAnswered(order.order, True)
         event: slave.Event
         if order.action == "report":
@@ -284,6 +291,27 @@ class Machine:
         self.tell(event, now)
         return happened.OrderAnswered(order.order, accepted=True)
 
+    def _keep_or_drop(self, order: Order, instance: InstanceId) -> None:
+        name, number = instance.process, instance.number
+        if order.action == "keep":
+            self.ships[name] = order.keep_on
+        elif name in self.kept and self.kept[name].instance.number <= number:
+            del self.kept[name]
+
+    def keep_state(self, instance: InstanceId) -> KeptState:
+        """A node of ours keeps a newer state than before."""
+        before = self.kept.get(instance.process)
+        cycles = before.sequence if before is not None and before.instance == instance else 0
+        self.kept[instance.process] = KeptState(instance, cycles + 1, 100)
+        return self.kept[instance.process]
+
+    def take_state(self, state: KeptState) -> None:
+        """Another host ships one here: the newest is kept."""
+        own = self.kept.get(state.instance.process)
+        age = (state.instance.number, state.sequence)
+        if own is None or (own.instance.number, own.sequence) < age:
+            self.kept[state.instance.process] = state
+
     def _set_restart(self, order: Order, now: float) -> happened.OrderAnswered:
         assert order.instance is not None
         assert order.restart is not None
@@ -299,6 +327,18 @@ class Machine:
         if batch:
             self.tell(slave.AssignmentsReceived(tuple(batch)), now)
 
+    def replace_supervisor(self, now: float) -> None:
+        """The supervisor is killed; the next one takes over what runs, and remembers what ended."""
+        fenced = {one for one, it in self.programs.items() if it.assignment.fence is not None}
+        statuses = (*self.ends.values(), *self._running())
+        self.tell(slave.SupervisorReplaced(statuses, {}, frozenset(fenced)), now)
+
+    def _running(self) -> list[InstanceStatus]:
+        return [
+            InstanceStatus(instance, program.state, pid=program.pid)
+            for instance, program in self.programs.items()
+        ]
+
     def restart_slave(self, now: float) -> None:
         """The slave is killed and comes up again; what runs, runs on."""
         self.incarnation += 1000
@@ -308,8 +348,5 @@ class Machine:
         self.ordered.clear()
         self.polled.clear()
         self.slave = slave.SlaveState(max_processes=self.max_processes)
-        found = [
-            InstanceStatus(instance, program.state, pid=program.pid)
-            for instance, program in self.programs.items()
-        ]
-        slave.step(self.slave, slave.SupervisorReported((*self.ends.values(), *found)), now)
+        found = (*self.ends.values(), *self._running())
+        slave.step(self.slave, slave.SupervisorReported(found), now)

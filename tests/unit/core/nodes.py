@@ -158,8 +158,12 @@ class Node:
     def _be_active(self) -> None:
         """The promise of all this: no other is, at this very moment."""
         self.active = True
-        if self.air is not None:
-            others = [str(one.instance) for one in self.air.others(self) if one.active]
+        if self.air is not None and self.instance.number not in self.air.left:
+            others = [
+                str(one.instance)
+                for one in self.air.others(self)
+                if one.active and one.instance.number not in self.air.left
+            ]
             assert not others, f"{self.instance} becomes active beside {others}"
 
 
@@ -170,6 +174,7 @@ class Air:
         latched: what the present master has said.
         channels: those to which it is subscribed.
         to_master: reports on their way to it, with the machine from which they come.
+        left: instances that were given up with their lost hosts, and may be active there.
     """
 
     def __init__(self, machines: Callable[[], Iterable[Machine]]) -> None:
@@ -177,6 +182,7 @@ class Air:
         self.latched: list[PublishStateConfig] = []
         self.channels: set[tuple[str, int]] = set()
         self.to_master: list[tuple[Machine, HandoffReported]] = []
+        self.left: set[int] = set()
 
     def nodes(self) -> Iterator[tuple[Machine, Node]]:
         """Every node that runs; one that has come up meanwhile joins."""

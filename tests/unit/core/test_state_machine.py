@@ -17,9 +17,11 @@ from rosrm.core import events as happened
 from rosrm.core import slave
 from rosrm.core.assigning import demand_of
 from rosrm.core.commands import Assign, Command
+from rosrm.core.keeping import awaits_states
 from rosrm.core.model import (
     HostLossPolicy,
     InstanceState,
+    KeptState,
     Kind,
     MigrationPolicy,
     ProcessSpec,
@@ -28,6 +30,7 @@ from rosrm.core.model import (
     StandbyPolicy,
 )
 from rosrm.core.state import ProcessPhase, Wanted
+from rosrm.ports import CheckpointChoice, CheckpointView
 from tests.unit.core.cluster import MIB, Cluster, HandOver, Machine, StartFirstOrStopFirst
 from tests.unit.core.nodes import QUIRKS, Node
 
@@ -70,6 +73,14 @@ def spec(
     )  # fmt: skip
 
 
+class OneOther:
+    """Keeps states on one other host, the same one as long as that is there."""
+
+    def choose(self, view: CheckpointView) -> CheckpointChoice:
+        there = [name for name in (*view.kept_on, *sorted(view.hosts)) if name in view.hosts]
+        return CheckpointChoice(tuple(name for name in there if name != view.host)[:1])
+
+
 class Play(RuleBasedStateMachine):
     """The rules of the play; the promises are its invariants."""
 
@@ -88,6 +99,7 @@ class Play(RuleBasedStateMachine):
                 "handoff": HandOver(timeout=3.0),
             },
         )  # fmt: skip
+        self.cluster.state.keeping.policy = OneOther()
         for name in HOSTS:
             labels = {"arm": "yes"} if name == LABELLED else {}
             machine = Machine(
@@ -102,9 +114,14 @@ class Play(RuleBasedStateMachine):
         self.missing: set[tuple[str, str]] = set()
         self.late: list[happened.Event] = []
         self.left: set[int] = set()
+        self.cluster.air.left = self.left
         #: Since when a host is heard, and nothing from or to it is on its way or was lost.
         self.heard: dict[str, float] = {}
         self.records_seen = 0
+        #: What each host has told this run of the master that it keeps, by name.
+        self.told_kept: dict[str, tuple[KeptState, ...]] = {}
+        #: Of the present life of each name: the instance that it began with, and its newest state.
+        self.newest: dict[str, tuple[int, tuple[int, int]]] = {}
         self.prompt = True
         # Something to play with from the beginning.
         for name, moves in (("p0", first), ("p1", second)):
@@ -120,6 +137,7 @@ class Play(RuleBasedStateMachine):
         commands = self.cluster.decide(event)
         self.cluster.journal(commands)
         self.look_at_assignments(commands)
+        self.note_given_up()
         self.cluster.carry_out(commands)
         return commands
 
@@ -139,6 +157,22 @@ class Play(RuleBasedStateMachine):
             assert state.hosts.open()[column], "assigned to a host that is closed"
             assert state.hosts.processes[column] <= state.hosts.bound[column]
         self.look_at_order(given)
+        self.look_at_states(given)
+
+    def look_at_states(self, given: list[Assign]) -> None:
+        """Nobody begins from nothing while a host that is heard has said that it keeps a state."""
+        for assign in given:
+            one = assign.assignment
+            keepers = {
+                machine.name
+                for machine in self.cluster.machines.values()
+                if self.known(machine) and self.is_in_reach(machine)
+                for kept in self.told_kept.get(machine.name, ())
+                if kept.instance.process == one.instance.process
+                and kept.instance.number >= one.kept_from
+            }
+            if one.spec.keeps_state:
+                assert keepers <= set(one.kept_on), "assigned to begin from less than is kept"
 
     def look_at_order(self, given: list[Assign]) -> None:
         """Nobody was passed by one of its equals (without backfill: by anybody)."""
@@ -147,6 +181,8 @@ class Play(RuleBasedStateMachine):
             chosen = state.processes[assign.assignment.instance.process]
             for name in state.queue:
                 waits = state.processes[name]
+                if awaits_states(state, waits):
+                    continue
                 ahead = (-waits.spec.priority, waits.order) < (-chosen.spec.priority, chosen.order)
                 alike = demand_of(state, waits).key[4:] == demand_of(state, chosen).key[4:]
                 assert not (ahead and (alike or not state.settings.backfill)), "passed"
@@ -158,8 +194,11 @@ class Play(RuleBasedStateMachine):
         if not machine.connected:
             return
         machine.begin_to_register()
-        event = (happened.HostRegistered, machine.description(), machine.slave.statuses())
-        if self.ask(*event):
+        statuses, kept = machine.slave.statuses(), tuple(machine.kept.values())
+        before, self.told_kept[machine.name] = self.told_kept.get(machine.name, ()), kept
+        if not self.ask(happened.HostRegistered, machine.description(), statuses, 0, kept):
+            self.told_kept[machine.name] = before
+        else:
             machine.host_id = self.cluster.replies[self.cluster._requests].host_id
             machine.fresh = False
             machine.polled.clear()
@@ -478,7 +517,18 @@ class Play(RuleBasedStateMachine):
     @rule(
         host=hosts,
         what=st.sampled_from(
-            ["cut", "mended", "killed", "killed", "leaves", "loses a poll", "full", "over", "empty"]
+            [
+                "cut",
+                "mended",
+                "killed",
+                "killed",
+                "leaves",
+                "loses a poll",
+                "full",
+                "over",
+                "empty",
+                "another supervisor",
+            ]
         ),
     )
     def host_changes(self, host: str, what: str) -> None:
@@ -493,6 +543,8 @@ class Play(RuleBasedStateMachine):
             self.ask(happened.HostLeft, machine.host_id, machine.incarnation)
             for instance in list(machine.programs):
                 machine.tell(slave.StopOrdered(instance), self.cluster.now)
+        elif what == "another supervisor":
+            machine.replace_supervisor(self.cluster.now)
         elif what == "loses a poll":
             machine.polled.clear()
         elif what in ("full", "over", "empty"):
@@ -514,8 +566,15 @@ class Play(RuleBasedStateMachine):
         self.time_passes(0.05, quiet=False)
 
     def is_up(self, machine: Machine) -> bool:
+        return self.condition(machine) == "UP"
+
+    def is_in_reach(self, machine: Machine) -> bool:
+        return self.condition(machine) in ("UP", "SUSPECT")
+
+    def condition(self, machine: Machine) -> str:
+        """As the master has it."""
         table = self.cluster.state.hosts
-        return table.condition_of(table.by_name[machine.name]).name == "UP"
+        return table.condition_of(table.by_name[machine.name]).name
 
     # --- time and the master -------------------------------------------------------------
 
@@ -563,9 +622,62 @@ class Play(RuleBasedStateMachine):
     def master_is_killed(self, registering: list[str]) -> None:
         """It comes up again from its journal, and some slaves register."""
         self.late.clear()
+        self.told_kept.clear()
         self.cluster.kill_master()
+        self.cluster.state.keeping.policy = OneOther()
         for host in registering:
             self.register(self.machine(host))
+
+    # --- kept states ---------------------------------------------------------------------
+
+    @precondition(lambda self: self.nodes())
+    @rule(which=which_one, told=chance)
+    def state_is_kept(self, which: int, told: bool) -> None:
+        """By the node on its own host, and by its slave where that was told to ship it."""
+        self.keep_a_state(*self.pick(self.nodes(), which), told=told)
+        self.flow()
+
+    def keep_a_state(self, machine: Machine, node: Node, *, told: bool) -> None:
+        if node.shadow or not node.active:
+            return
+        state = machine.keep_state(node.instance)
+        for name in machine.ships.get(node.instance.process, ()):
+            if machine.connected and self.machine(name).connected:
+                self.machine(name).take_state(state)
+        if told:
+            for one in self.cluster.machines.values():
+                self.tell_what_is_kept(one)
+
+    @precondition(lambda self: self.nodes())
+    @rule(which=which_one, comes_back=chance, stubborn=chance)
+    def host_is_lost_with_a_state(self, which: int, comes_back: bool, stubborn: bool) -> None:
+        """A process goes on from what is kept elsewhere, while its old host is cut off."""
+        machine, node = self.pick(self.nodes(), which)
+        self.all_is_well()
+        self.time_passes(1.0, quiet=False)
+        if node.instance not in machine.programs:
+            return
+        if stubborn:
+            machine.stubborn.add(node.instance.process)
+        self.keep_a_state(machine, node, told=True)
+        machine.connected = False
+        for _ in range(4):
+            self.time_passes(2.5, quiet=False)
+        if comes_back:
+            machine.connected = True
+            for _ in range(4):
+                self.time_passes(0.5, quiet=False)
+
+    @rule(host=hosts)
+    def kept_states_are_told(self, host: str) -> None:
+        self.tell_what_is_kept(self.machine(host))
+        self.flow()
+
+    def tell_what_is_kept(self, machine: Machine) -> None:
+        if self.known(machine):
+            kept = tuple(machine.kept.values())
+            self.told_kept[machine.name] = kept
+            self.tell(happened.KeptStatesReceived(machine.host_id, machine.incarnation, kept))
 
     @rule(name=names, durable=chance)
     def master_is_killed_in_the_act(self, name: str, durable: bool) -> None:
@@ -632,16 +744,19 @@ class Play(RuleBasedStateMachine):
 
         Not for long once their host is heard again.
         """
+        self.note_given_up()
+        for machine in self.cluster.machines.values():
+            if self.is_heard_well(machine):
+                self.left -= {instance.number for instance in machine.programs}
+        return self.left
+
+    def note_given_up(self) -> None:
         for record in self.cluster.records[self.records_seen :]:
             if record.kind == "given_up":
                 self.left.add(record.facts["number"])
             elif record.kind == "taken_back":
                 self.left.discard(record.facts["number"])
         self.records_seen = len(self.cluster.records)
-        for machine in self.cluster.machines.values():
-            if self.is_heard_well(machine):
-                self.left -= {instance.number for instance in machine.programs}
-        return self.left
 
     def is_heard_well(self, machine: Machine) -> bool:
         """For so long that everything there has been told."""
@@ -681,6 +796,26 @@ class Play(RuleBasedStateMachine):
             assert sum(node.active for node in active) <= 1, [str(one.instance) for one in active]
 
     @invariant()
+    def the_newest_state_of_a_life_is_not_dropped(self) -> None:
+        """What a process may go on from lies somewhere until it has finished or was cancelled."""
+        if not hasattr(self, "cluster"):
+            return
+        for process in self.cluster.state.processes.values():
+            name, born = process.name, process.born
+            before = self.newest.pop(name, (born, (0, 0)))
+            if process.phase.over or process.wanted is Wanted.CANCEL:
+                continue
+            ages = [
+                (kept.instance.number, kept.sequence)
+                for machine in self.cluster.machines.values()
+                if (kept := machine.kept.get(name)) is not None and kept.instance.number >= born
+            ]
+            newest = max(ages, default=(0, 0))
+            if before[0] == born:
+                assert newest >= before[1], (name, before, newest)
+            self.newest[name] = (born, newest)
+
+    @invariant()
     def an_end_is_told_as_it_was(self) -> None:
         """Nothing has finished or failed that did not end so by itself."""
         if not hasattr(self, "cluster"):
@@ -712,7 +847,7 @@ class Play(RuleBasedStateMachine):
         cluster.now += 2.0
         cluster.tell(happened.TimePassed())
         for machine in cluster.machines.values():
-            cluster.register(machine)
+            cluster.register(machine, tuple(machine.kept.values()))
         for name in HOSTS:
             cluster.set_host(name, "uncordon")
         self._let_nodes_come_up(40)
@@ -735,6 +870,7 @@ class Play(RuleBasedStateMachine):
             self.no_process_is_lost()
             self.the_books_balance()
             self.never_two_active()
+            self.the_newest_state_of_a_life_is_not_dropped()
 
     def _cancel_all(self) -> None:
         cluster = self.cluster
