@@ -117,16 +117,19 @@ def _offer(directory: Path, arguments: Answer) -> Offer:
     with _changing:
         _offers[int(arguments["source"])] = sender
     offer = sender.offer(directory, seconds=seconds, max_rate=float(arguments["max_rate"]))
-    threading.Thread(
-        target=_remove_when_over, args=(sender, directory, seconds), name="image", daemon=True
-    ).start()
+    over = (sender, int(arguments["source"]), directory, seconds)
+    threading.Thread(target=_remove_when_over, args=over, name="image", daemon=True).start()
     return offer
 
 
-def _remove_when_over(sender: Sender, directory: Path, seconds: float) -> None:
+def _remove_when_over(sender: Sender, number: int, directory: Path, seconds: float) -> None:
     """Nobody fetches it any more, whether it was taken or its time has passed."""
     sender.wait(seconds + 5.0)
-    image.remove(directory)
+    with _changing:
+        if _offers.get(number) is not sender:
+            return  # withdrawn: there may be another image by now
+        del _offers[number]
+        image.remove(directory)
 
 
 def _withdraw(arguments: Answer) -> None:
