@@ -660,6 +660,9 @@ class Play(RuleBasedStateMachine):
         if stubborn:
             machine.stubborn.add(node.instance.process)
         self.keep_a_state(machine, node, told=True)
+        self.time_passes(1.0, quiet=False)  # its slave is told where to ship the next one
+        if node.instance in machine.programs:
+            self.keep_a_state(machine, node, told=True)
         machine.connected = False
         for _ in range(4):
             self.time_passes(2.5, quiet=False)
