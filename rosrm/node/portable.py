@@ -126,8 +126,10 @@ class PortableNode(rclpy.node.Node):  # type: ignore[misc]  # rclpy brings no ty
     def destroy_node(self) -> None:
         """As rclpy's; and with it action servers and clients, which would hold the node."""
         for waitable in list(self.waitables):
-            if not isinstance(waitable, EventHandler):  # those go with their publishers and inputs
-                waitable.destroy()
+            destroy = getattr(waitable, "destroy", None)
+            # Event handlers go with their publishers and inputs; an author's own may have nothing.
+            if destroy is not None and not isinstance(waitable, EventHandler):
+                destroy()
         super().destroy_node()
 
 

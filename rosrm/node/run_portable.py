@@ -7,7 +7,6 @@ import gc
 import os
 import signal
 import sys
-import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -15,6 +14,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import rclpy
+from rclpy._rclpy_pybind11 import RCLError
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.signals import uninstall_signal_handlers
 
@@ -30,6 +30,8 @@ from rosrm.ros.leftovers import what_is_left
 #: woken as often; one that works notices the signal after its callback.
 _LOOK: Final = 0.25
 _LOOK_AWAY: Final = 0.01
+#: What ends a process; rclpy takes these while there is a context.
+_ENDING: Final = (signal.SIGINT, signal.SIGTERM)
 #: Seconds in which a participant is greeted by its neighbours, if it hears them at all.
 _GREETED: Final = 0.3
 #: Seconds within which what the callbacks have begun (threads, coroutines) has to end.
@@ -68,7 +70,9 @@ def run_portable(
         run.until_the_end()
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
-    except BaseException as error:
+    except Exception as error:
+        if run.was_ended_in(error):
+            return
         run.say_failed(error)
         raise
     finally:
@@ -96,6 +100,8 @@ class _Run:
         self._woken = False
         self._looked = 0.0
         self._node: Any = None
+        self._is_in = False  # the node has its part in the graph
+        self._signals: dict[int, Any] = {}  # handlers, while ours are in their place
         self._executor: Any = None
         if self._listener is not None:
             signal.signal(SIGNAL, self._wake)
@@ -110,6 +116,7 @@ class _Run:
         """Join for the first time."""
         rclpy.init(args=self._args)
         self._node = make()
+        self._is_in = True
         self._node._portable_join_first()  # noqa: SLF001 - the other half of one thing
         self._add_executor()
         if self._listener is not None:
@@ -126,7 +133,7 @@ class _Run:
 
     def end(self) -> None:
         """The process ends; the log says why, where it is not in good order."""
-        if self._node is not None and rclpy.ok():
+        if self._is_in:
             self._node.destroy_node()
         if self._executor is not None:
             self._executor.shutdown()
@@ -134,7 +141,11 @@ class _Run:
         if self._listener is not None and self._listener.status.state is not State.FAILED:
             self._listener.close()
 
-    def say_failed(self, error: BaseException) -> None:
+    def was_ended_in(self, error: Exception) -> bool:
+        """A signal took the context away under a callback that was about to publish."""
+        return isinstance(error, RCLError) and self._is_in and not rclpy.ok()
+
+    def say_failed(self, error: Exception) -> None:
         """Tell whoever waits; the traceback is in the log."""
         if self._listener is not None:
             said = str(error) if isinstance(error, PortableError) else _said(error)
@@ -202,6 +213,7 @@ class _Run:
     def _depart(self) -> tuple[Absence | None, str]:
         node = self._node
         absence, fault = node._portable_leave()  # noqa: SLF001 - the other half of one thing
+        self._is_in = False
         ended = not self._executor.context.ok()  # by a signal; ROS answers it up to here
         self._executor.shutdown()
         self._executor = None
@@ -209,21 +221,26 @@ class _Run:
         if ended:
             raise _Ended
         uninstall_signal_handlers()  # they need a context; in between there are ours
+        self._signals = {one: signal.signal(one, _end) for one in _ENDING}
         return absence, fault
+
+    def _give_signals_back(self) -> None:
+        for one, handler in self._signals.items():
+            signal.signal(one, handler)
+        self._signals = {}
 
     # --- away ------------------------------------------------------------------------------
 
     def _wait_away(self) -> Request:
         """Nothing of ROS is here, until the node shall join again."""
         listener = self._its_listener()
-        with _ends_by_signal():
-            while True:
-                request = listener.asked()
-                if request is not None and request.want is Want.JOIN:
-                    return request
-                # Not SimpleQueue.get, which a signal handler may fill: where its time-out passes
-                # while the process is dumped, CPython before 3.13 waits for ever after the restore.
-                time.sleep(_LOOK_AWAY)
+        while True:
+            request = listener.asked()
+            if request is not None and request.want is Want.JOIN:
+                return request
+            # Not SimpleQueue.get, which a signal handler may fill: where its time-out passes
+            # while the process is dumped, CPython before 3.13 waits for ever after the restore.
+            time.sleep(_LOOK_AWAY)
 
     # --- joining ---------------------------------------------------------------------------
 
@@ -281,10 +298,12 @@ class _Run:
         deadline = time.monotonic() + self._patience
         while True:
             entries += 1
+            self._give_signals_back()
             rclpy.init(args=without_parameter_files(self._args))
             self._node._portable_enter_again(absence)  # noqa: SLF001 - the other half of one thing
             left = deadline - time.monotonic()
             if left <= _GREETED or sees_again(self._node, absence.nodes, _GREETED):
+                self._is_in = True
                 return entries
             self._node.destroy_node()
             rclpy.try_shutdown()
@@ -307,22 +326,8 @@ def _not_clean() -> str:
     return what_is_left()
 
 
-@contextlib.contextmanager
-def _ends_by_signal() -> Any:
-    """Without ROS a signal to end is ours to take: in good order."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def end(*_: Any) -> None:
-        raise _Ended
-
-    before = {one: signal.signal(one, end) for one in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for one, handler in before.items():
-            signal.signal(one, handler)
+def _end(*_: object) -> None:
+    raise _Ended
 
 
 def without_parameter_files(args: Sequence[str]) -> list[str]:
@@ -337,5 +342,5 @@ def without_parameter_files(args: Sequence[str]) -> list[str]:
     return kept
 
 
-def _said(error: BaseException) -> str:
+def _said(error: Exception) -> str:
     return f"{type(error).__name__}: {error}"

@@ -297,6 +297,13 @@ def test_sigterm_is_an_orderly_end(stage, start, heard, away) -> None:
     assert status_of(node.directory) is None
 
 
+def test_a_program_that_exits_has_not_failed(start) -> None:
+    """Its own exit code, and no word of a failure."""
+    node = start("exits")
+    assert node.process.wait(PATIENCE) == 3
+    assert status_of(node.directory) is None
+
+
 def test_started_by_hand_it_is_an_ordinary_node(stage, start, heard) -> None:
     """No control directory: it joins, counts, and ends by SIGINT as any node."""
     node = start(wait=False, controlled=False)

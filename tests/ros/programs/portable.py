@@ -55,6 +55,8 @@ class Brain(PortableNode):
             self.other = Node("other")
 
     def tick(self) -> None:
+        if FAULT == "exits" and self.count == 20:
+            sys.exit(3)
         self.count += self.get_parameter("step").value
         self.output.publish(Int64(data=self.count))
 

@@ -68,7 +68,7 @@ def test_a_fast_dds_that_cannot_look_again_is_said(monkeypatch) -> None:
     libc = ctypes.CDLL(None)
     monkeypatch.setattr(fast_dds_place, "_library", lambda: libc)
     for function in (fast_dds_place.check, fast_dds_place.look_again):
-        with pytest.raises(PortableError, match="update_interfaces.*loopback alone"):
+        with pytest.raises(PortableError, match=r"update_interfaces.*loopback alone"):
             function()
 
 
