@@ -42,10 +42,11 @@ def moved(source: Path, target: Path, *, ahead: bool) -> dict[str, float]:
     """The figures of one transfer."""
     begun = time.perf_counter()
     with Sender() as sender, Fetcher() as fetcher:
+        to = fetcher.introduce()
         if ahead:
             time.sleep(LOADING)
             begun = time.perf_counter()
-        offer = sender.offer(source, seconds=600.0, max_rate=0)
+        offer = sender.offer(source, seconds=600.0, max_rate=0, to=to)
         offered = time.perf_counter()
         fetched = fetcher.fetch(offer, target, timeout=600.0)
         whole = time.perf_counter() - begun

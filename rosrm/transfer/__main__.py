@@ -1,7 +1,8 @@
 """The process of one transfer: `python -m rosrm.transfer send` or `… fetch`.
 
-It reads one JSON object from standard input, works, and answers with lines of JSON on standard
-output. It ends when standard input does: so it outlives neither its work nor who started it.
+It reads a line of JSON from standard input, works, and answers with lines of JSON on standard
+output. Before it fetches, it may be asked for the certificate that it will show. It ends when
+standard input does: so it outlives neither its work nor who started it.
 """
 
 from __future__ import annotations
@@ -84,9 +85,19 @@ def _fetch(asked: dict[str, Any]) -> Mapping[str, Any]:
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
 
     signal.signal(signal.SIGTERM, stop)
+    identity = None
+    if "introduce" in asked:
+        from rosrm.transfer.certificate import new_identity  # noqa: PLC0415
+
+        identity = new_identity()
+        _say({"certificate": identity.certificate})
+        line = sys.stdin.readline()
+        if not line:
+            raise TransferError("the fetch was stopped before it began")
+        asked = json.loads(line)
     threading.Thread(target=_stop_when_input_ends, daemon=True).start()
     offer, target = Offer.from_json(asked.pop("offer")), Path(asked.pop("target"))
-    return receive(offer, target, **asked, before_placing=ignore).as_json()
+    return receive(offer, target, **asked, identity=identity, before_placing=ignore).as_json()
 
 
 def _stop_when_input_ends() -> None:

@@ -1,32 +1,62 @@
-"""A certificate for one offer, that nobody has signed: its fingerprint travels in the offer."""
+"""Certificates for one transfer, that nobody has signed: the master tells whose they are."""
 
 from __future__ import annotations
 
 import datetime as dt
 import hashlib
 import os
+import secrets
 import ssl
+from dataclasses import dataclass, field
+from typing import Final
 
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
+#: Robots without a clock of their own begin in 1970: any time is right.
+_FROM: Final = dt.datetime(1970, 1, 1, tzinfo=dt.timezone.utc)
+_TO: Final = dt.datetime(9999, 12, 31, tzinfo=dt.timezone.utc)
 
-def new_certificate() -> tuple[ssl.SSLContext, str]:
-    """What a server needs to show it, and its SHA-256. The key touches no disk."""
+
+@dataclass(frozen=True)
+class Identity:
+    """A certificate and its key, in memory alone.
+
+    Attributes:
+        certificate: to be shown to anybody, in PEM.
+        fingerprint: SHA-256 of it, in hexadecimal digits.
+        key: the secret, in PEM.
+    """
+
+    certificate: str
+    fingerprint: str
+    key: bytes = field(repr=False)
+
+    def load_into(self, context: ssl.SSLContext) -> None:
+        """Have a connection show it. `ssl` takes nothing but a file: here one in memory."""
+        memory = os.memfd_create("rosrm-transfer", os.MFD_CLOEXEC)
+        with os.fdopen(memory, "wb") as file:
+            file.write(self.certificate.encode() + self.key)
+            file.flush()
+            context.load_cert_chain(f"/proc/self/fd/{memory}")
+
+
+def new_identity() -> Identity:
+    """Another one each time."""
     key = ec.generate_private_key(ec.SECP256R1())
-    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "rosrm")])
-    # Robots' clocks differ, and the fetching side compares the fingerprint alone.
-    now = dt.datetime.now(dt.timezone.utc)
+    # No two of one name: a peer would look for the signer of the one in the other.
+    own = f"rosrm {secrets.token_hex(8)}"
+    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, own)])
     certificate = (
         x509.CertificateBuilder()
         .subject_name(name)
         .issuer_name(name)
         .public_key(key.public_key())
         .serial_number(x509.random_serial_number())
-        .not_valid_before(now - dt.timedelta(days=365))
-        .not_valid_after(now + dt.timedelta(days=365))
+        .not_valid_before(_FROM)
+        .not_valid_after(_TO)
         .sign(key, hashes.SHA256())
     )
     private = key.private_bytes(
@@ -34,17 +64,11 @@ def new_certificate() -> tuple[ssl.SSLContext, str]:
         serialization.PrivateFormat.PKCS8,
         serialization.NoEncryption(),
     )
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    context.minimum_version = ssl.TLSVersion.TLSv1_3
-    _load(context, certificate.public_bytes(serialization.Encoding.PEM) + private)
-    shown = certificate.public_bytes(serialization.Encoding.DER)
-    return context, hashlib.sha256(shown).hexdigest()
+    shown = certificate.public_bytes(serialization.Encoding.PEM).decode()
+    return Identity(certificate=shown, fingerprint=fingerprint_of(shown), key=private)
 
 
-def _load(context: ssl.SSLContext, chain: bytes) -> None:
-    """As a file, which is all that `ssl` takes: one in memory."""
-    memory = os.memfd_create("rosrm-transfer", os.MFD_CLOEXEC)
-    with os.fdopen(memory, "wb") as file:
-        file.write(chain)
-        file.flush()
-        context.load_cert_chain(f"/proc/self/fd/{memory}")
+def fingerprint_of(certificate: str) -> str:
+    """SHA-256 of a certificate in PEM, in hexadecimal digits; raises `ValueError`."""
+    x509.load_pem_x509_certificate(certificate.encode())
+    return hashlib.sha256(ssl.PEM_cert_to_DER_cert(certificate)).hexdigest()

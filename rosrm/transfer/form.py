@@ -45,6 +45,8 @@ class Offer:
         files: how many there are.
         length: bytes of the archive, uncompressed: what has to have room.
         seconds: that it stands from when it was made.
+        to: SHA-256 of the certificate of the only destination that may fetch it; "": whoever has
+            the token.
         digest: how the archive's checksum is computed.
         version: of this description and of the stream.
     """
@@ -57,6 +59,7 @@ class Offer:
     files: int
     length: int
     seconds: float
+    to: str = ""
     digest: str = DIGEST
     version: int = VERSION
 
@@ -83,13 +86,15 @@ class Offer:
 
     def _is_sound(self) -> bool:
         counts = (self.size, self.files, self.length)
+        texts = (*self.addresses, self.token, self.fingerprint, self.to)
         return (
-            all(isinstance(one, str) for one in (*self.addresses, self.token, self.fingerprint))
+            all(isinstance(one, str) for one in texts)
             and all(type(one) is int and 0 <= one < _MOST for one in counts)
             and type(self.port) is int
             and 0 < self.port < 1 << 16
             and type(self.seconds) in (int, float)
             and self.digest == DIGEST
+            and bool(not self.to or _HEX.fullmatch(self.to))
             and bool(self.addresses and self.token and _HEX.fullmatch(self.fingerprint))
             and all(map(_is_address, self.addresses))
         )

@@ -6,7 +6,7 @@ import contextlib
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from rosrm.disk_space import room_for
 from rosrm.errors import TransferError
@@ -15,13 +15,16 @@ from rosrm.transfer.landing import Landing
 from rosrm.transfer.stream import Stream
 from rosrm.transfer.unpacking import unpack
 
+if TYPE_CHECKING:
+    from rosrm.transfer.certificate import Identity
+
 #: Bytes that a file may take beyond its content, rounded up.
 _ROUNDING: Final = 4096
 
 
 def receive(
     offer: Offer, target: Path, *, timeout: float, max_rate: float, reserve: int,
-    before_placing: Callable[[], None],
+    identity: Identity | None, before_placing: Callable[[], None],
 ) -> Fetched:  # fmt: skip
     """Fetch a directory.
 
@@ -31,15 +34,18 @@ def receive(
         timeout: seconds for all of it.
         max_rate: bytes a second that are read, as compressed; 0: there is no bound.
         reserve: bytes that stay free on the file system.
+        identity: that the source was told of, if it was.
         before_placing: called when all is here and whole, before the target appears.
 
     Raises:
         TransferError: it cannot be had, or not whole; nothing of it is left.
     """
     began = time.monotonic()
+    if offer.to and (identity is None or identity.fingerprint != offer.to):
+        raise TransferError("what is offered is for another destination than this one")
     with contextlib.closing(Landing(target)) as landing:
         landing.require(offer.length + offer.files * _ROUNDING, reserve)
-        stream = Stream(offer, timeout=timeout, max_rate=max_rate)
+        stream = Stream(offer, timeout=timeout, max_rate=max_rate, identity=identity)
         with contextlib.closing(stream):
             try:
                 files = unpack(stream, landing.path)

@@ -5,7 +5,7 @@
 
 Both with `Authorization: Bearer TOKEN` and a number that the reader has drawn (`Rosrm-Reader`). The
 first reader that brings the token is the only one: it may go on where its connection broke, and
-nobody else begins again.
+nobody else begins again. Where the destination has introduced itself, no other is spoken with.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import asyncio
 import hmac
 import secrets
 import socket
+import ssl
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -24,7 +25,7 @@ from aiohttp import web
 from rosrm.errors import TransferError
 from rosrm.transfer.addresses import own_addresses
 from rosrm.transfer.archive import Archive
-from rosrm.transfer.certificate import new_certificate
+from rosrm.transfer.certificate import Identity, fingerprint_of, new_identity
 from rosrm.transfer.form import DIGEST_SIZE, READER_HEADER, Offer, Sent
 from rosrm.transfer.rate import Pace
 from rosrm.transfer.zstd import compressed
@@ -133,8 +134,18 @@ def _bytes(header: str) -> bytes:
     return header.encode("utf-8", "surrogateescape")
 
 
+def _context(identity: Identity, to: str) -> ssl.SSLContext:
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.minimum_version = ssl.TLSVersion.TLSv1_3
+    identity.load_into(context)
+    if to:
+        context.verify_mode = ssl.CERT_REQUIRED
+        context.load_verify_locations(cadata=to)
+    return context
+
+
 async def serve(
-    directory: Path, *, seconds: float, max_rate: float, loopback: bool,
+    directory: Path, *, seconds: float, max_rate: float, loopback: bool, to: str,
     announce: Callable[[Offer], None], withdrawn: asyncio.Event,
 ) -> Sent:  # fmt: skip
     """Offer a directory, and wait until that is over.
@@ -144,6 +155,7 @@ async def serve(
         seconds: after which the offer ends.
         max_rate: bytes a second that go out, as compressed; 0: there is no bound.
         loopback: listen for this host alone.
+        to: the certificate of the only one who may fetch it, in PEM; "": whoever has the token.
         announce: told of the offer once it can be fetched.
         withdrawn: set to end it.
 
@@ -151,7 +163,11 @@ async def serve(
         TransferError: the directory cannot be offered.
     """
     archive = Archive(directory)
-    context, fingerprint = new_certificate()
+    try:
+        only = fingerprint_of(to) if to else ""
+    except ValueError:
+        raise TransferError("what came as the destination's certificate is none") from None
+    identity = new_identity()
     desk = _Desk(archive, token := secrets.token_urlsafe(32), max_rate)
     application = web.Application()
     application.add_routes([web.get("/archive", desk.archive), web.post("/taken", desk.take)])
@@ -160,17 +176,18 @@ async def serve(
     await runner.setup()
     try:
         listener = socket.create_server((_LOOPBACK if loopback else "", 0))
-        await web.SockSite(runner, listener, ssl_context=context).start()
+        await web.SockSite(runner, listener, ssl_context=_context(identity, to)).start()
         announce(
             Offer(
                 addresses=(_LOOPBACK,) if loopback else own_addresses() or (_LOOPBACK,),
                 port=listener.getsockname()[1],
-                fingerprint=fingerprint,
+                fingerprint=identity.fingerprint,
                 token=token,
                 size=archive.size,
                 files=archive.files,
                 length=archive.length,
                 seconds=seconds,
+                to=only,
             )
         )
         over = [asyncio.create_task(one.wait()) for one in (desk.taken, withdrawn)]

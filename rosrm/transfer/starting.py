@@ -67,7 +67,7 @@ class _End:
             start_new_session=True,
         )
         self._closing = threading.Lock()
-        self._asked = False
+        self._begun = False
 
     def __enter__(self) -> Self:
         return self
@@ -75,12 +75,14 @@ class _End:
     def __exit__(self, *_: object) -> None:
         self._end()
 
+    def _begin(self) -> None:
+        if self._begun:
+            raise RuntimeError("one process makes one transfer: start another one")
+        self._begun = True
+
     def _ask(self, asked: Mapping[str, Any], timeout: float) -> dict[str, Any]:
         """The process's next answer; raises `TransferError` for an error and for none."""
         assert self._process.stdin is not None
-        if self._asked:
-            raise RuntimeError("one process makes one transfer: start another one")
-        self._asked = True
         with contextlib.suppress(OSError, ValueError):  # it has ended: then there is no answer
             self._process.stdin.write(json.dumps(asked).encode() + b"\n")
             self._process.stdin.flush()
@@ -131,22 +133,25 @@ class Sender(_End):
 
     def offer(
         self, directory: Path, *, seconds: float, max_rate: float = DEFAULT_RATE,
-        loopback: bool = False,
+        to: str = "", loopback: bool = False,
     ) -> Offer:  # fmt: skip
-        """Offer a directory, once, to whoever brings the offer's token.
+        """Offer a directory, once.
 
         Args:
             directory: of files and directories; it stays, and must not change meanwhile.
             seconds: after which the offer ends.
             max_rate: bytes a second that go out, as compressed; 0: there is no bound.
+            to: what the destination's `Fetcher.introduce` said: it alone may fetch then; "":
+                whoever brings the offer's token.
             loopback: to this host alone.
 
         Raises:
             TransferError: the directory cannot be offered.
         """
+        self._begin()
         asked = {
             "directory": str(directory.absolute()), "seconds": seconds, "max_rate": max_rate,
-            "loopback": loopback,
+            "loopback": loopback, "to": to,
         }  # fmt: skip
         return Offer.from_json(self._ask(asked, _START))
 
@@ -180,6 +185,16 @@ class Fetcher(_End):
     def __init__(self) -> None:
         super().__init__("fetch")
 
+    def introduce(self) -> str:
+        """A certificate, which only this fetch can show: for `Sender.offer`, to be called before.
+
+        It is no secret; the key stays in the process.
+
+        Raises:
+            TransferError: the process has ended.
+        """
+        return str(self._ask({"introduce": True}, _START)["certificate"])
+
     def fetch(
         self, offer: Offer, target: Path, *, timeout: float, max_rate: float = 0.0,
         reserve: int = DEFAULT_RESERVE,
@@ -196,6 +211,7 @@ class Fetcher(_End):
         Raises:
             TransferError: it cannot be had, not whole, not in time, or there is no room.
         """
+        self._begin()
         asked = {
             "offer": offer.as_json(), "target": str(target.absolute()), "timeout": timeout,
             "max_rate": max_rate, "reserve": reserve,

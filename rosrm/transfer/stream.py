@@ -7,7 +7,7 @@ import hmac
 import secrets
 import ssl
 import time
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import urllib3
 from urllib3.exceptions import HTTPError, NewConnectionError, SSLError
@@ -17,6 +17,9 @@ from rosrm.transfer.addresses import nearest_first
 from rosrm.transfer.form import DIGEST_SIZE, READER_HEADER, Offer, new_digest
 from rosrm.transfer.rate import Pace
 from rosrm.transfer.zstd import ZstdDecompressor, ZstdError
+
+if TYPE_CHECKING:
+    from rosrm.transfer.certificate import Identity
 
 #: Seconds for one address to answer.
 _CONNECT: Final = 2.0
@@ -45,6 +48,7 @@ class Stream:
         offer: of the source.
         timeout: seconds for all of it.
         max_rate: bytes a second that are read, as compressed; 0: there is no bound.
+        identity: to show to the source; None: it was told of none.
 
     Attributes:
         address: of the source, once it was reached.
@@ -52,11 +56,14 @@ class Stream:
         resumed: times that a broken connection was made again.
     """
 
-    def __init__(self, offer: Offer, *, timeout: float, max_rate: float) -> None:
+    def __init__(
+        self, offer: Offer, *, timeout: float, max_rate: float, identity: Identity | None
+    ) -> None:
         self._offer = offer
         self._timeout = timeout
         self._deadline = time.monotonic() + timeout
         self._pace = Pace(max_rate)
+        self._context = _context(identity)
         self._addresses = list(nearest_first(offer.addresses))
         self._headers = {
             "Authorization": f"Bearer {offer.token}",
@@ -191,7 +198,7 @@ class Stream:
             # Whoever shows this certificate has the key that was made for this offer.
             assert_fingerprint=self._offer.fingerprint,
             assert_hostname=False,
-            ssl_context=_context(),
+            ssl_context=self._context,
         )
         return self._pool.urlopen(
             "GET",
@@ -227,11 +234,13 @@ class Stream:
         )
 
 
-def _context() -> ssl.SSLContext:
+def _context(identity: Identity | None) -> ssl.SSLContext:
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.minimum_version = ssl.TLSVersion.TLSv1_3
     context.check_hostname = False  # urllib3 compares the fingerprint before it says anything
     context.verify_mode = ssl.CERT_NONE
+    if identity is not None:
+        identity.load_into(context)
     return context
 
 

@@ -56,6 +56,8 @@ def test_the_token_is_in_no_representation():
         ({"token": ""}, "values"),
         ({"seconds": "long"}, "values"),
         ({"digest": "md5"}, "values"),
+        ({"to": "AB"}, "values"),
+        ({"to": None}, "values"),
         ({"more": 1}, "fields"),
     ],
 )

@@ -158,7 +158,7 @@ def lying(directory: Path) -> Iterator[Offer]:
         stop = asyncio.Event()
         ends.append((asyncio.get_running_loop(), stop))
         await serve(
-            directory, seconds=PATIENCE, max_rate=0, loopback=True, announce=made.put,
+            directory, seconds=PATIENCE, max_rate=0, loopback=True, to="", announce=made.put,
             withdrawn=stop,
         )  # fmt: skip
 

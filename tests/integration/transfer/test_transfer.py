@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 import socket
 import ssl
@@ -13,7 +14,7 @@ import psutil
 import pytest
 
 from rosrm.errors import TransferError
-from rosrm.transfer import Offer, Sender, Sent, fetch
+from rosrm.transfer import Fetcher, Offer, Sender, Sent, fetch
 from tests.integration.transfer.trees import PATIENCE, digests, fill, listens, nothing_left, through
 from tests.integration.transfer.wires import Fault, wire
 
@@ -104,6 +105,34 @@ def test_nobody_goes_on_where_another_reader_began(source, target, sender, tmp_p
     with pytest.raises(TransferError, match="somebody has begun to fetch it already"):
         fetch(offer, tmp_path / "second", timeout=PATIENCE)
     assert not (tmp_path / "second").exists()
+
+
+def test_a_destination_that_was_introduced_is_the_only_one(source, target, sender, tmp_path):
+    """Who has read the offer on its way, token and all, gets nothing, with or without a key."""
+    with Fetcher() as fetcher, Fetcher() as other:
+        offer = sender.offer(source, seconds=PATIENCE, to=fetcher.introduce())
+        with pytest.raises(TransferError, match="is for another destination than this one"):
+            fetch(offer, tmp_path / "second", timeout=PATIENCE)
+        own = ssl.PEM_cert_to_DER_cert(other.introduce())
+        for end, told in ((other, hashlib.sha256(own).hexdigest()), (Fetcher(), "")):
+            forged = dataclasses.replace(offer, to=told)
+            with end, pytest.raises(TransferError, match=r"the (TLS )?connection broke"):
+                end.fetch(forged, tmp_path / "third", timeout=1.0)
+        fetched = fetcher.fetch(offer, target, timeout=PATIENCE)
+    assert digests(target) == digests(source)
+    assert sender.wait(PATIENCE) == Sent("taken", fetched.received)
+
+
+def test_a_token_is_needed_also_where_one_was_introduced(source, target, sender):
+    with Fetcher() as fetcher:
+        offer = sender.offer(source, seconds=PATIENCE, to=fetcher.introduce())
+        with pytest.raises(TransferError, match="the token is not the one of this offer"):
+            fetcher.fetch(dataclasses.replace(offer, token="guessed"), target, timeout=PATIENCE)
+
+
+def test_an_introduction_that_is_none_is_refused(source, sender):
+    with pytest.raises(TransferError, match="the destination's certificate is none"):
+        sender.offer(source, seconds=PATIENCE, to="-----BEGIN NOTHING-----")
 
 
 def test_another_server_is_told_nothing(source, target, sender):
