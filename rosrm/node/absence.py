@@ -42,13 +42,13 @@ class Absence:
         parameters: by name.
         timers: period and nanoseconds until due (-1: cancelled) of each, in order of creation.
         peers: how many each of its ends had, by what a user knows it by.
-        nodes: that it saw in the ROS graph.
+        neighbours: nodes at the other end of its topics.
     """
 
     parameters: Mapping[str, Declared]
     timers: tuple[tuple[int, int], ...]
     peers: Mapping[str, int]
-    nodes: frozenset[str]
+    neighbours: frozenset[str]
 
     def overrides(self, given: Iterable[Parameter] | None) -> list[Parameter]:
         """What parameters begin with when they are declared anew.
@@ -110,22 +110,33 @@ def absence_of(node: Any) -> Absence:
         for name, parameter in node.get_parameters_by_prefix("").items()
     }
     timers = tuple((one.timer_period_ns, TimerOf(one, True).due_ns()) for one in node.timers)
-    return Absence(parameters, timers, peers_of(node), nodes_of(node))
+    return Absence(parameters, timers, peers_of(node), neighbours_of(node))
 
 
-def nodes_of(node: Any) -> frozenset[str]:
-    """The nodes that a node sees, but for hidden ones, which come and go (`ros2 topic echo`)."""
-    return frozenset(
-        f"{namespace.rstrip('/')}/{name}"
-        for name, namespace in node.get_node_names_and_namespaces()
-        if not name.startswith("_")
-    )
+def neighbours_of(node: Any) -> frozenset[str]:
+    """The nodes at the other end of a node's topics, but for hidden ones, which come and go."""
+    ends = [
+        *((one.topic_name, node.get_subscriptions_info_by_topic) for one in node.publishers),
+        *((one.topic_name, node.get_publishers_info_by_topic) for one in node.subscriptions),
+    ]
+    found = {
+        (one.node_namespace, one.node_name)
+        for topic, infos in ends
+        if topic not in _INTERNAL
+        for one in infos(topic)
+    }
+    own = (node.get_namespace(), node.get_name())
+    return frozenset(_qualified(*one) for one in found - {own} if not one[1].startswith("_"))
+
+
+def _qualified(namespace: str, name: str) -> str:
+    return f"{namespace.rstrip('/')}/{name}"
 
 
 def sees_again(node: Any, nodes: frozenset[str], patience: float) -> bool:
     """Whether a node that has entered the graph sees these within so many seconds. Polled, too."""
     deadline = time.monotonic() + patience
-    while not nodes <= nodes_of(node):
+    while not nodes <= {_qualified(*one[::-1]) for one in node.get_node_names_and_namespaces()}:
         if time.monotonic() >= deadline or not node.context.ok():
             return False
         time.sleep(_LOOK)

@@ -34,6 +34,8 @@ _LOOK_AWAY: Final = 0.01
 _ENDING: Final = (signal.SIGINT, signal.SIGTERM)
 #: Seconds in which a participant is greeted by its neighbours, if it hears them at all.
 _GREETED: Final = 0.3
+#: Most entries: who is not seen then may have gone, and others have found the node meanwhile.
+_ENTRIES: Final = 4
 #: Seconds within which what the callbacks have begun (threads, coroutines) has to end.
 _REST: Final = 5.0
 
@@ -288,7 +290,7 @@ class _Run:
         return missing
 
     def _enter(self, absence: Absence) -> int:
-        """Be in the graph, and see the nodes that were seen before; returns how often it took.
+        """Be in the graph, and see the neighbours again; returns how many entries it took.
 
         A neighbour answers the first word of a participant within 0.1 ms. Fast DDS 2.14 may not be
         ready to hear it then, and is told again only after the neighbour's period of 3 s: a new
@@ -301,8 +303,8 @@ class _Run:
             self._give_signals_back()
             rclpy.init(args=without_parameter_files(self._args))
             self._node._portable_enter_again(absence)  # noqa: SLF001 - the other half of one thing
-            left = deadline - time.monotonic()
-            if left <= _GREETED or sees_again(self._node, absence.nodes, _GREETED):
+            last = entries == _ENTRIES or deadline - time.monotonic() <= _GREETED
+            if last or sees_again(self._node, absence.neighbours, _GREETED):
                 self._is_in = True
                 return entries
             self._node.destroy_node()

@@ -1,0 +1,145 @@
+"""What a node takes through the time in which it has no part in the ROS graph."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from std_msgs.msg import Int64
+
+from rosrm.node.absence import Absence, absence_of, await_peers, neighbours_of, peers_of, sees_again
+from tests.ros.nodes import RELIABLE
+
+
+def again(stage, absence: Absence, name: str = "again", **named) -> Node:
+    """A node that begins with what another one had."""
+    overrides = absence.overrides(named.pop("parameter_overrides", None))
+    return stage.add(Node(name, context=stage.context, parameter_overrides=overrides, **named))
+
+
+@pytest.fixture
+def node(stage):
+    return stage.add(Node("first", context=stage.context, allow_undeclared_parameters=True))
+
+
+@pytest.mark.parametrize(
+    "value",
+    [True, 7, 0.5, math.inf, "", "text", b"\x00", [True], [1, 2], [0.5], ["a", ""]],
+    ids=str,
+)
+def test_a_parameter_keeps_its_value(stage, node, value) -> None:
+    """Of every type, set at run time, and declared anew with the same words."""
+    default = [type(value[0])()] if isinstance(value, list) else type(value)()
+    default = [b"\x01"] if isinstance(value, bytes) else default
+    value = [value] if isinstance(value, bytes) else value
+    node.declare_parameter("p", default)
+    node.set_parameters([Parameter("p", value=value)])
+    copy = again(stage, absence_of(node))
+    assert copy.declare_parameter("p", default).value == node.get_parameter("p").value
+
+
+def test_what_is_declared_elsewhere_is_declared_again(stage, node) -> None:
+    """With its descriptor; what has a type and no value yet has neither more nor less after."""
+    node.declare_parameter("limit", 3, ParameterDescriptor(description="of all", read_only=True))
+    node.declare_parameter("unset", Parameter.Type.DOUBLE)
+    node.declare_parameter("free", None, ParameterDescriptor(dynamic_typing=True))
+    node.set_parameters([Parameter("undeclared", value="here")])
+    absence = absence_of(node)
+    copy = again(stage, absence)
+    absence.declare_missing(copy)
+    assert copy.get_parameter("limit").value == 3
+    assert copy.describe_parameter("limit").description == "of all"
+    assert copy.describe_parameter("limit").read_only
+    assert copy.get_parameter("undeclared").value == "here"
+    assert copy.get_parameter("free").value is None
+    assert copy.describe_parameter("unset").type == Parameter.Type.DOUBLE.value
+    assert copy.set_parameters([Parameter("unset", value=0.5)])[0].successful
+
+
+def test_a_later_value_goes_before_what_the_author_gave(stage, node) -> None:
+    """And what was given and never declared is still there to be declared."""
+    node.declare_parameter("speed", 2.0)
+    given = [Parameter("speed", value=1.0), Parameter("later", value=5)]
+    copy = again(stage, absence_of(node), parameter_overrides=given)
+    assert copy.declare_parameter("speed", 0.0).value == 2.0
+    assert copy.declare_parameter("later", 0).value == 5
+
+
+def test_timers_go_on_in_their_period_and_only_the_same_ones(stage, node) -> None:
+    """Matched in order; cancelled ones rest; one of another period is a new one."""
+    for period in (50.0, 60.0, 70.0):
+        node.create_timer(period, lambda: None)
+    kept, cancelled, _ = node.timers
+    cancelled.cancel()
+    absence = absence_of(node)
+    due = kept.time_until_next_call()
+    copy = again(stage, absence)
+    for period in (50.0, 60.0, 80.0, 90.0):
+        copy.create_timer(period, lambda: None)
+    absence.start_timers(copy)
+    first, second, third, fourth = copy.timers
+    assert 0 < first.time_until_next_call() <= due + 1_000_000
+    assert second.is_canceled()
+    assert third.time_until_next_call() > 70e9
+    assert fourth.time_until_next_call() > 80e9
+
+
+def test_a_timer_is_back_in_its_own_period_after_the_first(stage, node) -> None:
+    """The first comes when it was due; the next ones a period later each."""
+    node.create_timer(0.5, lambda: None)
+    absence = absence_of(node)
+    copy, calls = again(stage, absence), []
+    timer = copy.create_timer(0.5, lambda: calls.append(1))
+    absence.start_timers(copy)
+    assert timer.timer_period_ns < 5e8
+    stage.spin_until(lambda: len(calls) == 2, "two calls")
+    assert timer.timer_period_ns == 5e8
+
+
+def test_a_rate_is_left_alone(stage, node) -> None:
+    """Its timer has no callback of an author."""
+    node.create_rate(10.0)
+    absence = absence_of(node)
+    copy = again(stage, absence)
+    copy.create_rate(10.0)
+    absence.start_timers(copy)
+
+
+def test_peers_are_counted_by_their_ends(stage, node) -> None:
+    """Two publishers of a topic are two ends; rclpy's own topics are none of the author's."""
+    node.create_publisher(Int64, "out", RELIABLE)
+    node.create_publisher(Int64, "out", RELIABLE)
+    node.create_subscription(Int64, "in", lambda _: None, RELIABLE)
+    stage.plain.create_subscription(Int64, "out", lambda _: None, RELIABLE)
+    expected = {"readers of /out": 1, "readers of /out (2)": 1, "writers of /in": 0}
+    stage.spin_until(lambda: peers_of(node) == expected, "one reader of each")
+
+
+def test_missing_peers_are_named_when_patience_ends(node) -> None:
+    """Who is there is not named; an end that is not made again is nobody's."""
+    node.create_publisher(Int64, "out", RELIABLE)
+    node.create_subscription(Int64, "in", lambda _: None, RELIABLE)
+    before = {"readers of /out": 2, "writers of /in": 0, "a server of /gone": 1}
+    assert await_peers(node, before, 0.02) == ("readers of /out: 0 of 2",)
+
+
+def test_neighbours_are_the_nodes_at_the_other_end(stage, node) -> None:
+    """Of the author's topics; neither the node itself, nor hidden nodes, nor anybody else."""
+    node.create_publisher(Int64, "out", RELIABLE)
+    node.create_subscription(Int64, "out", lambda _: None, RELIABLE)
+    node.create_subscription(Int64, "in", lambda _: None, RELIABLE)
+    for name, topic in (("reader", "out"), ("_hidden", "out"), ("stranger", "elsewhere")):
+        other = stage.add(Node(name, context=stage.context, namespace="/far"))
+        other.create_subscription(Int64, f"/{topic}", lambda _: None, RELIABLE)
+    stage.plain.create_publisher(Int64, "in", RELIABLE)
+    expected = {"/far/reader", "/observer"}
+    stage.spin_until(lambda: neighbours_of(node) == expected, "both neighbours")
+
+
+def test_nodes_that_are_not_seen_again_end_the_wait(node) -> None:
+    """Who is seen is waited for no longer."""
+    assert sees_again(node, frozenset({"/first"}), 5.0)
+    assert not sees_again(node, frozenset({"/first", "/gone"}), 0.02)
