@@ -1,4 +1,4 @@
-"""What ties a process to others outside of what is dumped: pipes and Unix sockets.
+"""What ties a process to others outside of what is dumped: pipes, Unix sockets, a debugger.
 
 CRIU dumps most of them without a word; the restore fails, or the process finds nobody there.
 """
@@ -32,6 +32,10 @@ def outward(pids: Iterable[int]) -> str:
         pids: all processes of the tree.
     """
     inside = list(pids)
+    for pid in inside:
+        tracer = _tracer(pid)
+        if tracer:
+            return f"pid {pid} ({program(pid)}) is held by pid {tracer} ({program(tracer)})"
     held = [one for one in descriptors(inside) if one.target.startswith(("pipe:", "socket:"))]
     for one in _half_pipes(held):
         other = _holder_outside(one.target, inside)
@@ -45,6 +49,15 @@ def outward(pids: Iterable[int]) -> str:
             other = _holder_outside(f"socket:[{peer}]", inside) or "a process outside"
             return f"{_named(one)} is a Unix socket that is connected to {other}"
     return ""
+
+
+def _tracer(pid: int) -> int:
+    """Who follows it by ptrace, as a debugger does; 0: nobody."""
+    try:
+        lines = Path(f"/proc/{pid}/status").read_text(errors="replace").splitlines()
+    except OSError:
+        return 0
+    return next((int(line.split()[1]) for line in lines if line.startswith("TracerPid:")), 0)
 
 
 def _half_pipes(held: Iterable[Descriptor]) -> Iterator[Descriptor]:

@@ -25,12 +25,8 @@ _DUMP: Final = (
      r"a child of it lives in a \1 namespace of its own"),
     (r"Can't dump ghost file (\S+) of (\d+) size",
      r"it holds the deleted file \1 of \2 bytes open, which is too large to go along"),
-    (r"[Dd]angling tty|tty: .*sid", "it has a terminal"),
-    (r"(?:Unable to|Can't) seize|seize.*Operation not permitted",
-     "it cannot be stopped: a debugger holds it, or it belongs to somebody else"),
     (r"Can't lookup mount=\d+ for fd=(-?\d+) path=([^\s;,]+)",
      r"the file \2 lies on a mount that cannot be seen from here"),
-    (r"Timeout reached", "not all of its threads could be stopped in time"),
     (r"No space left on device", "the file system of the image is full"),
 )  # fmt: skip
 _RESTORE: Final = (
@@ -38,19 +34,15 @@ _RESTORE: Final = (
      "a socket of it is bound to a network address that this host does not have"),
     (r"Can't bind inet socket.*Address already in use",
      "the port of a socket of it is in use here, or by a listening socket of its own"),
-    (r"Can't fork for (\d+): File exists|Pid (\d+) do not match expected",
+    (r"Can't fork for (\d+): File exists",
      r"its pid \1 is in use here"),
     (r"Can't open file (\S+) on restore: (.*)", r"the file /\1 cannot be opened here: \2"),
     (r"File (\S+) has bad size (\d+) \(expect (\d+)\)",
      r"the file /\1 has \2 bytes here; the process knows it with \3"),
     (r"unix: .*Peer \d+ unresolved",
      "it had a Unix socket that was connected to a process outside"),
-    (r"CPU .*(?:capabilit|feature|instruction)|cpu: .*(?:not support|mismatch|do not match)",
-     "this host's processor lacks something that the process found where it was dumped"),
+    (r"Read \d+ bytes while \d+ expected", "the image is damaged"),
     (r"No space left on device", "a file system is full here"),
-    (r"Cannot allocate memory", "there is not enough memory here"),
-    (r"[Uu]nexpected EOF|[Bb]ad magic|[Ii]mage format|Magic doesn't match",
-     "the image is damaged"),
 )  # fmt: skip
 
 

@@ -260,6 +260,28 @@ def test_a_socket_pair_within_the_process_is_no_tie(theatre):
     theatre.restore(theatre.dump(actor)).counts()
 
 
+def test_a_debugger_is_named_and_goes_on(theatre, counter):
+    """Two cannot hold one process; the process does not suffer."""
+    code = """
+import ctypes, signal, sys
+libc = ctypes.CDLL(None, use_errno=True)
+libc.ptrace.argtypes = [ctypes.c_long, ctypes.c_long, ctypes.c_void_p, ctypes.c_void_p]
+SEIZE = 0x4206
+print(libc.ptrace(SEIZE, int(sys.argv[1]), None, None), flush=True)
+while True:
+    signal.pause()
+"""
+    debugger = theatre.start(code, str(counter.pid))
+    eventually(debugger.lines, "an answer of the kernel")
+    if debugger.lines() != ["0\n"]:
+        pytest.skip("no process may be traced here")
+    with pytest.raises(CriuError, match=f"is held by pid {debugger.pid} "):
+        theatre.dump(counter)
+    debugger.process.kill()
+    debugger.process.wait(TIMEOUT)
+    counter.counts()
+
+
 @pytest.mark.skipif(not os.access("/dev/fuse", os.W_OK), reason="/dev/fuse may not be opened")
 def test_a_device_is_named_and_the_source_runs_on(theatre):
     """What CRIU itself refuses is said in words, and nothing but its log is left of the image."""
