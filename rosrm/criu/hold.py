@@ -200,6 +200,7 @@ def _hold_namespace(restore: _Restore) -> NoReturn:
             os.waitpid(init, 0)
             _fail(restore.directory, first.get("failed", "the restore was killed"))
         root = tree.children(init)[0]
+        os.write(end_of_life, b"seen")
         restore.tell(root, namespace=True)
         _attend(root, init)
         last = said.readline()
@@ -226,9 +227,13 @@ def _be_init(restore: _Restore, living: int, saying: int) -> NoReturn:
                 said.write(json.dumps({"failed": str(error)}) + "\n")
                 os._exit(code)
             said.write(json.dumps({"restored": root}) + "\n")
+            os.read(living, 16)  # until the hold has seen it: it may end at once
             said.write(f"{_reap_until(root)}\n")
         code = 0
+    except Exception:  # noqa: BLE001 - a bug: it is told in the log, and the hold told of the end
+        sys.excepthook(*sys.exc_info())
     finally:
+        sys.stderr.flush()
         os._exit(code)
 
 
@@ -261,6 +266,7 @@ def _hold_child(restore: _Restore) -> NoReturn:
     try:
         root = restore.run(own)
     except (CriuError, OSError) as error:
+        tree.send(tree.tree(os.getpid())[1:], signal.SIGKILL)  # what CRIU had begun with
         _fail(restore.directory, str(error))
     guard, guarding = _start_guard(root)
     restore.tell(root, namespace=False)

@@ -309,6 +309,20 @@ def test_the_exit_code_comes_through_the_hold(theatre, counter):
     assert restored.process.wait(TIMEOUT) == 7
 
 
+@pytest.mark.parametrize("option", [[], ["--no-namespace"]])
+def test_who_ends_at_once_was_restored_all_the_same(theatre, option):
+    """A process that waits for nothing but its last instruction: its end comes through."""
+    code = "import os, signal; os.kill(os.getpid(), signal.SIGSTOP); os._exit(9)"
+    actor = theatre.start(code)
+    assert tree.wait_until_stopped([actor.pid], TIMEOUT)
+    directory = theatre.dump(actor)
+    hold = theatre.hold(directory, *option)
+    eventually((directory / "hold.json").exists, "the end of the restore")
+    os.killpg(hold.pid, signal.SIGCONT)
+    assert hold.process.wait(TIMEOUT) == 9
+    assert json.loads((directory / "hold.json").read_text())["reason"] == ""
+
+
 def test_signals_come_through_the_hold(theatre, counter):
     """What the process handles it handles; what kills it, the hold dies of too."""
     restored = theatre.restore(theatre.dump(counter))

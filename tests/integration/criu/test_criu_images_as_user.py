@@ -68,6 +68,8 @@ def test_an_ordinary_users_process_goes_on(criu, as_nobody, public):
     """With the capabilities on the program alone: twice in a row, no number lost, end and all."""
     program = public / "criu"
     shutil.copy(Path(criu.command[0]).resolve(), program)
+    if program.read_bytes()[:4] != b"\x7fELF":
+        pytest.skip(f"{criu.command[0]} is a script, which can be given no capabilities")
     able = "cap_checkpoint_restore,cap_setpcap+eip"
     setcap = shutil.which("setcap", path="/usr/sbin:/sbin:/usr/bin:/bin")
     if setcap is None or subprocess.run([setcap, able, program], check=False).returncode != 0:
