@@ -1,0 +1,299 @@
+"""What an outside observer notices when a node moves with its whole memory, by CRIU.
+
+A lab of three hosts with addresses of their own: the master and the observer on one, and a counter
+that goes to and fro between the two others (`rosrm_examples.portable_counter`, 50 Hz), with a heap
+of 10, 100 and 500 MB (--heaps). Blackout: from the last count heard before a move to the first one
+after it. After each move the node reads its whole heap at least once. Beside it the same counter,
+of the first heap, started anew by `relaunch`, and one whose state is a number, by `handoff`.
+
+Exit status: 1 where a move failed, a cycle was executed twice, or a heap has changed. Needs root,
+and a CRIU that works.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import math
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from benchmarks.machine import percentile, print_report, say
+from benchmarks.stopping import Stopped, raise_signals
+from rosrm.criu.probe import ability
+from rosrm.errors import LabError
+from rosrm.lab import DATA, GIB, HostPlan, Lab, uniform
+
+_ROOT: Final = Path(__file__).resolve().parents[1]
+_ROSRM: Final = (sys.executable, "-m", "rosrm.cli")
+_HOSTS: Final = ("host1", "host2")
+_DESK: Final = "desk"
+#: Room for two images of the largest heap, and for what the transfer leaves free.
+_DISK: Final = 4 * GIB
+#: Moves of each strategy beside.
+_BESIDE: Final = 10
+#: Seconds for a part to end in good order, and for the desk.
+_END: Final = 30.0
+
+#: The parts of a move: executor and name of each one's own seconds.
+_PARTS: Final = {
+    "prepare": (("criu_checkpoint", "prepare"),),
+    "dump": (("criu_checkpoint", "dump"),),
+    "transfer": (("criu_checkpoint", "offer"), ("criu_fetch", "transfer")),
+    "restore": (("criu_await_restored", "restore"),),
+    "rejoin": (("criu_join", "join"),),
+}
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of the moves of one heap.
+
+    Attributes:
+        hops: as `benchmarks.criu_desk` tells them.
+    """
+
+    hops: Sequence[Mapping[str, Any]]
+
+    @property
+    def failures(self) -> list[str]:
+        """Why moves failed."""
+        return [hop["why"] for hop in self.hops if hop["end"] != "migrated"]
+
+    @property
+    def repeated(self) -> int:
+        """Cycles that were executed twice."""
+        return sum(hop["repeated"] for hop in self.hops)
+
+    @property
+    def heap_ok(self) -> bool:
+        """All that was ever found in the memory was the same."""
+        return len({one for hop in self.hops for one in hop["checksums"]}) == 1
+
+    def silences(self) -> list[float]:
+        """Seconds without a count, of each move."""
+        return [hop["silence"] for hop in self.hops if hop["end"] == "migrated"]
+
+    def part(self, name: str) -> list[float]:
+        """Seconds of one part, of each move."""
+        return [
+            sum(hop["parts"][executor][word] for executor, word in _PARTS[name])
+            for hop in self.hops
+            if hop["end"] == "migrated"
+        ]
+
+    def figures(self) -> dict[str, Any]:
+        """All of it."""
+        return {
+            "hops": len(self.hops), "failures": len(self.failures),
+            **quantiles("blackout", self.silences()),
+            **{key: value for name in _PARTS for key, value in
+               quantiles(name, self.part(name)).items()},
+            "heap_ok": self.heap_ok, "repeated": self.repeated,
+            "missed": sum(hop["missed"] for hop in self.hops),
+        }  # fmt: skip
+
+
+def quantiles(name: str, seconds: Sequence[float]) -> dict[str, float | None]:
+    """Median and 99th percentile; None where there is nothing."""
+    return {
+        f"{name}_p{percent}_s": round(percentile(seconds, percent / 100), 3) if seconds else None
+        for percent in (50, 99)
+    }
+
+
+def shared(hops: int, heaps: Sequence[float]) -> list[int]:
+    """How often each heap is moved: the first one, of which most is said, most often."""
+    others = max(1, hops // (len(heaps) + 2))
+    return [max(1, hops - others * (len(heaps) - 1)), *[others] * (len(heaps) - 1)]
+
+
+# --- the lab ----------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def parts(lab: Lab, folder: Path) -> Iterator[None]:
+    """The master on the desk, and a slave on each other host."""
+    settings: dict[str, dict[str, Any]] = {
+        _DESK: {
+            "name": "criu", "state": f"{DATA}/master",
+            "migration": {
+                "strategies": {"relaunch": {}, "handoff": {}, "criu": {}}, "automatic": False,
+            },
+        },
+        **{
+            # Without cpu: the processor is shared by all hosts, and a busy one takes no work.
+            host: {"host": host, "state": f"{DATA}/slave", "probes": {"memory": {}, "disk": {}}}
+            for host in _HOSTS
+        },
+    }  # fmt: skip
+    started = []
+    try:
+        for host, values in settings.items():
+            file = folder / f"{host}.yaml"
+            file.write_text(json.dumps(values))  # JSON is YAML too
+            command = [*_ROSRM, "master" if host == _DESK else "slave", "--config", str(file)]
+            with (folder / f"{host}.log").open("ab") as log:
+                started.append(
+                    lab.popen(
+                        host, command, cwd=str(_ROOT), stdin=subprocess.DEVNULL, stdout=log,
+                        stderr=log,
+                    )
+                )  # fmt: skip
+        yield
+        for part in reversed(started):  # the slaves first
+            part.terminate()
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                part.wait(_END)
+    finally:
+        for part in started:
+            part.kill()
+            part.wait(_END)
+
+
+def play(lab: Lab, asked: Sequence[Mapping[str, Any]]) -> Iterator[dict[str, Any]]:
+    """The hops that the desk has made, one after the other; raises `LabError` where it fails."""
+    command = [sys.executable, "-m", "benchmarks.criu_desk", *map(json.dumps, asked)]
+    process = lab.popen(_DESK, command, cwd=str(_ROOT), stdout=subprocess.PIPE)
+    assert process.stdout is not None
+    try:
+        for line in process.stdout:
+            yield json.loads(line)
+    except BaseException:  # nobody wants to hear more
+        process.kill()
+        raise
+    finally:
+        process.stdout.close()
+        code = process.wait(_END)
+    if code:
+        raise LabError(f"the desk ended with {code}: what it said stands above")
+
+
+def measure(hops: int, heaps: Sequence[float]) -> list[dict[str, Any]]:
+    """Every hop, of every strategy."""
+    asked: list[dict[str, Any]] = [
+        {"strategy": "criu", "mb": mb, "hops": number}
+        for mb, number in zip(heaps, shared(hops, heaps), strict=True)
+    ]
+    beside = min(_BESIDE, hops)
+    asked += [
+        {"strategy": name, "mb": heaps[0], "hops": beside} for name in ("relaunch", "handoff")
+    ]
+    plans = [*uniform(len(_HOSTS), disk=_DISK), HostPlan(_DESK)]
+    made: list[dict[str, Any]] = []
+    with contextlib.ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="rosrm-criu-bench-")))
+        lab = stack.enter_context(Lab(f"criu-{os.getpid()}", plans))
+        stack.enter_context(parts(lab, folder))
+        try:
+            for hop in play(lab, asked):
+                made.append(hop)
+                say(_story(len(made), hop))
+        except LabError:
+            for log in sorted(folder.glob("*.log")):
+                say(f"{log.name}:\n{log.read_text(errors='replace')[-2000:]}")
+            raise
+    return made
+
+
+def _story(number: int, hop: Mapping[str, Any]) -> str:
+    how = hop["why"] or f"{hop['silence']:.3f} s of silence"
+    return f"{number}: {hop['strategy']} of {hop['mb']:g} MB {hop['end']}: {how}"
+
+
+# --- the report -------------------------------------------------------------------------------
+
+
+def beside(hops: Sequence[Mapping[str, Any]], strategy: str) -> dict[str, Any]:
+    """What the other strategies cost: how long nobody is heard, and what is lost."""
+    own = [hop for hop in hops if hop["strategy"] == strategy]
+    silences = [hop["silence"] for hop in own if hop["end"] == "migrated"]
+    return {
+        "hops": len(own), "failures": sum(hop["end"] != "migrated" for hop in own),
+        **quantiles("silence", silences),
+        "state_lost": sum(hop["began_anew"] for hop in own),
+        "memory": "lost" if strategy == "relaunch" else "not in the state",
+    }  # fmt: skip
+
+
+def table(by_heap: Mapping[str, Mapping[str, Any]], others: Mapping[str, Any]) -> str:
+    """For reading."""
+    words = ["", "p50 s", "p99 s", *_PARTS, "lost"]
+    rows = [words]
+    for mb, found in by_heap.items():
+        times = [found[f"{name}_p50_s"] for name in _PARTS]
+        rows.append(
+            [f"criu {mb} MB", found["blackout_p50_s"], found["blackout_p99_s"], *times, "nothing"]
+        )
+    for name, found in others.items():
+        lost = "count and memory" if found["state_lost"] else "nothing of its state"
+        blank = ["-"] * len(_PARTS)
+        rows.append([name, found["silence_p50_s"], found["silence_p99_s"], *blank, lost])
+    return "\n".join("  ".join(f"{word!s:>10}" for word in row) for row in rows)
+
+
+def main() -> int:
+    """Measure and print one JSON object; returns the exit status."""
+    os.environ.setdefault("ROSRM_CRIU_PREFIX", str(_ROOT / ".venv/criu"))
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--hops", type=int, default=50, help="moves in all")
+    parser.add_argument(
+        "--heaps", type=_heap, nargs="+", default=[10.0, 100.0, 500.0], metavar="MB",
+        help="the flat figures are of the first one",
+    )  # fmt: skip
+    chosen = parser.parse_args()
+    able = ability()
+    if not able.works:
+        say(f"no CRIU that works here: {able.reason}")
+        return 2
+    raise_signals()
+    try:
+        hops = measure(max(1, chosen.hops), chosen.heaps)
+    except LabError as error:
+        say(str(error))
+        return 2
+    except Stopped as stopped:
+        return 128 + stopped.number
+    moved = [hop for hop in hops if hop["strategy"] == "criu"]
+    outcomes = {
+        f"{mb:g}": Outcome([hop for hop in moved if hop["mb"] == mb]) for mb in chosen.heaps
+    }
+    by_heap = {mb: outcome.figures() for mb, outcome in outcomes.items()}
+    others = {name: beside(hops, name) for name in ("relaunch", "handoff")}
+    first = next(iter(by_heap.values()))
+    say(table(by_heap, others))
+    failures = [why for outcome in outcomes.values() for why in outcome.failures]
+    repeated = sum(outcome.repeated for outcome in outcomes.values())
+    heap_ok = all(outcome.heap_ok for outcome in outcomes.values())
+    print_report(
+        "criu",
+        {
+            "by_heap_mb": by_heap, "beside": others, "hops": len(moved),
+            "failures": len(failures), "reasons": sorted(set(failures)),
+            **{key: first[key] for key in ("blackout_p50_s", "blackout_p99_s", "rejoin_p50_s")},
+            "heap_ok": heap_ok, "repeated": repeated, "criu": able.facts.get("version", ""),
+        },
+        runs=len(moved),
+    )  # fmt: skip
+    return 1 if failures or repeated or not heap_ok else 0
+
+
+def _heap(text: str) -> float:
+    try:
+        mb = float(text)
+    except ValueError:
+        mb = math.nan
+    if not 0 < mb < 100_000:
+        raise argparse.ArgumentTypeError(f"{text} is no number of MB above 0")
+    return mb
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,226 @@
+"""Moves a counter to and fro and listens to it: on the desk of the lab of `benchmarks.criu`.
+
+    python -m benchmarks.criu_desk '{"strategy": "criu", "mb": 10, "hops": 4}' ...
+
+For each of what it is given it starts a process, moves it `hops` times, and ends it. It prints one
+line of JSON for each hop: see `Hop`.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import threading
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from std_msgs.msg import Int64MultiArray
+
+from benchmarks.handoff_nodes import OUTPUT, QOS
+from rosrm.core.model import MigrationPolicy, ProcessSpec, RestartPolicy
+from rosrm.errors import Refused
+from rosrm.ros.client import MasterClient
+from rosrm.ros.settings import RosSettings
+
+_ROOT: Final = Path(__file__).resolve().parents[1]
+#: Hz, of the counters.
+RATE: Final = 50.0
+#: Seconds for whatever a busy machine needs; a move of 500 MB is done in some seconds.
+_PATIENCE: Final = 180.0
+#: Seconds between two moves, at least.
+_SETTLE: Final = 0.5
+_NAME: Final = "portable_counter"
+_NS: Final = 1e9
+
+
+class Heard(NamedTuple):
+    """One count as it was heard.
+
+    Attributes:
+        at: when DDS received it, unix time in seconds.
+        number: the count: 1, 2, 3, ...
+        passes: how often the node had read all its memory; 0 of one without.
+        checksum: of what it found there.
+    """
+
+    at: float
+    number: int
+    passes: int = 0
+    checksum: int = 0
+
+
+@dataclass(frozen=True)
+class Hop:
+    """One move, as it was heard.
+
+    Attributes:
+        strategy, mb: what was moved, and how.
+        end: "migrated", "stayed" or "refused".
+        why: it was not "migrated".
+        silence: seconds of the longest time in which no count was heard.
+        seconds: of the whole move, as the master says.
+        parts: of it, by executor, likewise.
+        repeated: counts that were heard again, or out of order.
+        missed: counts that nobody heard.
+        checksums: of its memory; more than one: it has changed.
+        began_anew: it counts from 1 again.
+    """
+
+    strategy: str
+    mb: float
+    end: str
+    why: str = ""
+    silence: float = 0.0
+    seconds: float = 0.0
+    parts: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    repeated: int = 0
+    missed: int = 0
+    checksums: tuple[int, ...] = ()
+    began_anew: bool = False
+
+
+class Ear:
+    """Hears every count, in a thread of its own."""
+
+    def __init__(self) -> None:
+        self.heard: list[Heard] = []
+        rclpy.init()
+        self._node = Node("criu_ear")
+        self._node.create_subscription(Int64MultiArray, "count", self._take, QOS)
+        self._node.create_subscription(Int64MultiArray, OUTPUT, self._take_handed, QOS)
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self._node)
+        self._thread = threading.Thread(target=self._executor.spin, daemon=True)
+        self._thread.start()
+
+    def _take(self, message: Int64MultiArray, info: Any) -> None:
+        self.heard.append(Heard(info["received_timestamp"] / _NS, *message.data))
+
+    def _take_handed(self, message: Int64MultiArray, info: Any) -> None:
+        self.heard.append(Heard(info["received_timestamp"] / _NS, message.data[1]))
+
+    def wait_for(self, counts: int, passes: int = 0) -> None:
+        """Until so many more counts have come, and its memory was read so often meanwhile."""
+        begin, deadline = len(self.heard), time.monotonic() + _PATIENCE
+        while not self._has(begin, counts, passes):
+            if time.monotonic() > deadline:
+                raise TimeoutError(f"{counts} more counts were not heard in {_PATIENCE:g} s")
+            time.sleep(0.01)
+
+    def _has(self, begin: int, counts: int, passes: int) -> bool:
+        new = self.heard[begin:]
+        return len(new) >= counts and new[-1].passes - new[0].passes >= passes
+
+    def close(self) -> None:
+        self._executor.shutdown()
+        self._thread.join(5.0)
+        rclpy.try_shutdown()
+
+
+class Desk:
+    """Moves one process after the other."""
+
+    def __init__(self, ear: Ear, client: MasterClient) -> None:
+        self._ear, self._client = ear, client
+
+    def play(self, strategy: str, mb: float, hops: int) -> None:
+        """Start a counter, move it to and fro, and end it."""
+        self._client.submit([_spec(strategy, mb)])
+        self._wait("running")
+        passes = 2 if strategy == "criu" else 0  # the second one began after the move
+        self._ear.wait_for(int(RATE * _SETTLE), passes)
+        for _ in range(hops):
+            hop = self._hop(strategy, mb, passes)
+            print(json.dumps(asdict(hop)), flush=True)
+        self._client.cancel([_NAME])
+        self._wait("cancelled", "finished", "failed")
+        self._ear.heard.clear()
+
+    def _hop(self, strategy: str, mb: float, passes: int) -> Hop:
+        self._wait("running")
+        before = self._client.list().last_sequence
+        del self._ear.heard[:-2]  # the last ones of before
+        if refusal := self._ask():
+            return Hop(strategy, mb, "refused", refusal)
+        end = self._end_after(before)
+        self._ear.wait_for(int(RATE * _SETTLE), passes)
+        heard = list(self._ear.heard)
+        numbers = [one.number for one in heard]
+        steps = [after - one for one, after in pairwise(numbers)]
+        return Hop(
+            strategy, mb, end.kind, "" if end.kind == "migrated" else end.message,
+            silence=max(after.at - one.at for one, after in pairwise(heard)),
+            seconds=end.facts["seconds"], parts=end.facts.get("parts", {}),
+            repeated=sum(step < 1 for step in steps),
+            missed=max(numbers) - min(numbers) + 1 - len(set(numbers)),
+            checksums=tuple({one.checksum for one in heard if one.passes}),
+            began_anew=numbers[-1] < numbers[0],
+        )  # fmt: skip
+
+    def _ask(self) -> str:
+        """Why it cannot be moved; "": it is on its way. Hosts may have to be asked first."""
+        deadline = time.monotonic() + _PATIENCE
+        while True:
+            try:
+                self._client.migrate(_NAME)
+            except Refused as refusal:
+                if "not known yet" not in str(refusal) or time.monotonic() > deadline:
+                    return str(refusal)
+                self._client.spin(0.1)
+            else:
+                return ""
+
+    def _end_after(self, before: int) -> Any:
+        """The event with which a move ends."""
+        deadline = time.monotonic() + _PATIENCE
+        while time.monotonic() < deadline:
+            for event in self._client.list(events=True, process=_NAME, after=before).events:
+                if event.kind in ("migrated", "stayed"):
+                    return event
+            self._client.spin(0.02)
+        raise TimeoutError(f"the move did not end in {_PATIENCE:g} s")
+
+    def _wait(self, *states: str) -> None:
+        deadline = time.monotonic() + _PATIENCE
+        while True:
+            rows = [one for one in self._client.list(processes=True).processes if one.name == _NAME]
+            if any(row.state in states for row in rows):
+                return
+            if time.monotonic() > deadline:
+                raise TimeoutError(f"{_NAME} was not {' or '.join(states)} in {_PATIENCE:g} s")
+            self._client.spin(0.05)
+
+
+def _spec(strategy: str, mb: float) -> ProcessSpec:
+    module, arguments = "rosrm_examples.portable_counter", f"--mb {mb:g} --period {1 / RATE:g}"
+    if strategy == "handoff":
+        module, arguments = "benchmarks.handoff_nodes", f"count --rate {RATE:g}"
+    return ProcessSpec(
+        _NAME, module=module, arguments=tuple(arguments.split()), ros=True,
+        environment={"PYTHONPATH": str(_ROOT)}, migration=MigrationPolicy(strategy),
+        restart=RestartPolicy("on-failure", delay=0.5),
+        needs={"memory": 100e6 + 2e6 * mb},
+    )  # fmt: skip
+
+
+def main() -> None:
+    """Play what is asked for, one after the other."""
+    ear = Ear()
+    try:
+        with MasterClient.connect(RosSettings(), name="criu desk", timeout=_PATIENCE) as client:
+            desk = Desk(ear, client)
+            for asked in map(json.loads, sys.argv[1:]):
+                desk.play(asked["strategy"], asked["mb"], asked["hops"])
+    finally:
+        ear.close()
+
+
+if __name__ == "__main__":
+    main()
