@@ -28,6 +28,7 @@ from rosrm.portable import (
     status_of,
 )
 from rosrm_examples.portable_counter import filled
+from tests.ros.clusters import wait_until
 from tests.ros.nodes import PATIENCE
 
 PROGRAM = Path(__file__).parent / "programs" / "portable.py"
@@ -353,6 +354,9 @@ class Cable:
             self._ip(side, "link", "set", "lo", "up")
             self._ip(side, "address", "add", address, "dev", "e0")
             self._ip(side, "link", "set", "e0", "up")
+        # The kernel tells of a carrier up to a second later; Fast DDS takes no interface without.
+        for side in (self.here, self.there):
+            wait_until(lambda side=side: "state UP" in self._ip(side, "link", "show", "e0"), "e0")
 
     @staticmethod
     def _namespace() -> subprocess.Popen:
@@ -363,10 +367,11 @@ class Cable:
         return holder
 
     @staticmethod
-    def _ip(side: tuple[str, ...], *words: str) -> None:
+    def _ip(side: tuple[str, ...], *words: str) -> str:
         done = subprocess.run([*side, "ip", *words], capture_output=True, text=True, check=False)
         if done.returncode:
             pytest.skip(f"ip {' '.join(words)}: {done.stderr}")
+        return done.stdout
 
     def readdress(self) -> None:
         """The far side is at another address from now on."""
