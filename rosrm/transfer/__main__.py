@@ -1,8 +1,9 @@
 """The process of one transfer: `python -m rosrm.transfer send` or `… fetch`.
 
 It reads a line of JSON from standard input, works, and answers with lines of JSON on standard
-output. Before it fetches, it may be asked for the certificate that it will show. It ends when
-standard input does: so it outlives neither its work nor who started it.
+output. Before that it may be asked whether it is ready, and before it fetches for the certificate
+that it will show. It ends when standard input does: so it outlives neither its work nor who started
+it.
 """
 
 from __future__ import annotations
@@ -32,6 +33,9 @@ def main() -> int:
     else:
         import rosrm.transfer.receiving  # noqa: F401, PLC0415
     line = sys.stdin.readline()
+    if line and json.loads(line) == {"ready": True}:
+        _say({})
+        line = sys.stdin.readline()
     if not line:
         return 0
     try:

@@ -75,6 +75,14 @@ class _End:
     def __exit__(self, *_: object) -> None:
         self._end()
 
+    def ready(self) -> None:
+        """Wait until it has its libraries, before anything is to be quick.
+
+        Raises:
+            TransferError: it has ended, or is not ready in time.
+        """
+        self._ask({"ready": True}, _START)
+
     def _begin(self) -> None:
         if self._begun:
             raise RuntimeError("one process makes one transfer: start another one")

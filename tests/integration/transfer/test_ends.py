@@ -133,3 +133,13 @@ def test_closing_twice_and_from_several_threads_does_no_harm(source):
     for thread in threads:
         thread.join(PATIENCE)
     assert sender.close() == Sent("withdrawn", 0)
+
+
+def test_an_end_that_is_ready_works_as_any_other(source, target):
+    """Its libraries are there before somebody has to stand still for them."""
+    with Sender() as sender, Fetcher() as fetcher:
+        for end in (sender, fetcher):
+            end.ready()
+        offer = sender.offer(source, seconds=PATIENCE, to=fetcher.introduce())
+        fetcher.fetch(offer, target, timeout=PATIENCE)
+    assert digests(target) == digests(source)
