@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
-from rosrm.config.units import PositiveSeconds
+from rosrm.config.units import Bytes, PositiveSeconds
 from rosrm.core.migration import Commit, Execute, Move, Plan, SetRestart, Start, Stop
 from rosrm.core.model import ProcessSpec, RestartPolicy
 from rosrm.criu.fitting import mismatch
@@ -19,6 +19,7 @@ from rosrm_migration.options import check_seconds, options_of
 
 #: The executors of the plan; `criu_steps` has what they do.
 ABILITY: Final = "criu_ability"
+INTRODUCE: Final = "criu_introduce"
 CHECKPOINT: Final = "criu_checkpoint"
 GO_ON: Final = "criu_go_on"
 FETCH: Final = "criu_fetch"
@@ -34,14 +35,17 @@ class CriuOptions:
     """What can be set, for all processes or for one.
 
     Attributes:
-        start_timeout: seconds within which a slave must take an order, and the destination start.
+        start_timeout: seconds within which a slave must take an order or start what it needs, and
+            the destination start.
         leave_timeout: seconds within which the node must have left the ROS graph: a callback of its
             author is finished first.
         dump_timeout: seconds for dumping its memory.
         transfer_timeout: seconds for the image to get to the destination.
         restore_timeout: seconds for restoring it there.
         join_timeout: seconds within which the node must have joined the ROS graph again.
-        max_rate: bytes a second that the image may take of the network; 0: all that there is.
+        max_rate: bytes a second that the image may take of the network; 0: all that there is. The
+            default leaves something of a gigabit to others.
+        reserve: bytes that stay free where the image goes to.
     """
 
     start_timeout: PositiveSeconds = 10.0
@@ -50,7 +54,8 @@ class CriuOptions:
     transfer_timeout: PositiveSeconds = 120.0
     restore_timeout: PositiveSeconds = 60.0
     join_timeout: PositiveSeconds = 20.0
-    max_rate: float = 0.0
+    max_rate: Bytes = 100_000_000
+    reserve: Bytes = 256 << 20
 
     def __post_init__(self) -> None:
         """Refuse a wait that is no time, and a rate that is none."""
@@ -58,10 +63,10 @@ class CriuOptions:
             self, "start_timeout", "leave_timeout", "dump_timeout", "transfer_timeout",
             "restore_timeout", "join_timeout",
         )  # fmt: skip
-        if not 0.0 <= self.max_rate < float("inf"):
-            raise ValueError(
-                f"max_rate is {self.max_rate:g} bytes/s; allowed: 0 (no bound) or more"
-            )
+        if self.max_rate < 0:
+            raise ValueError(f"max_rate is {self.max_rate} bytes/s; allowed: 0 (no bound) or more")
+        if self.reserve < 0:
+            raise ValueError(f"reserve is {self.reserve} bytes; allowed: 0 or more")
 
 
 class Criu:
@@ -93,7 +98,10 @@ class Criu:
         return ""
 
     def propose(self, move: Move) -> Plan:
-        """Stand still, dump, fetch, restore, commit, join, end the source."""
+        """Stand still, dump, fetch, restore, commit, join, end the source.
+
+        Before the node is asked to leave, the destination says that it is ready.
+        """
         fault = self.spec_fault(move.spec)
         if fault:
             raise ValueError(fault)
@@ -119,6 +127,7 @@ class _Draft:
         return Plan(
             (
                 self._suspend(),
+                self._introduce(),
                 self._checkpoint(),
                 self._fetch(),
                 Start(
@@ -143,23 +152,37 @@ class _Draft:
         give_back = SetRestart(move.source, move.source_host, move.spec.restart, seconds)
         return SetRestart(move.source, move.source_host, _NEVER, seconds, undo=give_back)
 
+    # What is got ready at the destination, and what is fetched, has no undo: that would wait for a
+    # host that may be lost, and the source with it. Both go by themselves after a while.
+
+    def _introduce(self) -> Execute:
+        options = self._options
+        keep = self._until_dumped() + 2 * options.start_timeout
+        return self._there(
+            INTRODUCE, options.start_timeout, keep=keep,
+            working_directory=self._move.spec.working_directory,
+        )  # fmt: skip
+
     def _checkpoint(self) -> Execute:
         options = self._options
         there = options.transfer_timeout + options.start_timeout
         seconds = {"leave": options.leave_timeout, "dump": options.dump_timeout, "offer": there}
         go_on = self._here(GO_ON, options.join_timeout)
         return self._here(
-            CHECKPOINT, options.leave_timeout + options.dump_timeout,
+            CHECKPOINT, self._until_dumped(),
             undo=go_on, seconds=seconds, max_rate=options.max_rate,
         )  # fmt: skip
 
+    def _until_dumped(self) -> float:
+        options = self._options
+        return options.start_timeout + options.leave_timeout + options.dump_timeout
+
     def _fetch(self) -> Execute:
         options = self._options
-        # Its undo would wait for a destination that may be lost, and the source with it: what is
-        # fetched for nothing goes by itself.
         return self._there(
-            FETCH, options.transfer_timeout, keep=options.start_timeout + options.restore_timeout
-        )
+            FETCH, options.transfer_timeout, reserve=options.reserve,
+            keep=options.start_timeout + options.restore_timeout,
+        )  # fmt: skip
 
     def _here(
         self, executor: str, timeout: float, undo: Execute | None = None, **arguments: Any

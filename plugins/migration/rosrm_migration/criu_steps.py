@@ -1,18 +1,20 @@
 """What the slaves do for `criu`: each function is an executor, given JSON and answering with it.
 
-Every one may be asked for twice: a master that was killed gives the step in hand once more.
+Every one may be asked for twice: a master that was killed gives the step in hand once more, and so
+does one whose slave was started again. `criu_luggage` has what is kept from one to the next.
 """
 
 from __future__ import annotations
 
 import os
+import re
 import threading
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
-from rosrm.criu import dumping, image, outcome, tree
+from rosrm.criu import dumping, outcome, tree
 from rosrm.criu.places import incoming, outgoing
 from rosrm.criu.probe import ability
 from rosrm.criu.program import find
@@ -20,26 +22,33 @@ from rosrm.errors import CriuError, PortableError
 from rosrm.portable import (
     VARIABLE,
     State,
+    Status,
     ask_prepare,
     ask_resume,
     await_joined,
     await_left,
-    control_root,
+    control_directory,
     make_directory,
     status_of,
 )
-from rosrm.transfer import Offer, Sender, fetch
-from rosrm_migration.criu import CHECKPOINT
+from rosrm.transfer import Offer, Sender
+from rosrm_migration import criu_luggage as luggage
+from rosrm_migration.criu import CHECKPOINT, FETCH, INTRODUCE
+from rosrm_migration.criu_luggage import Answer
 
-Answer = Mapping[str, Any]
+#: Destinations of moves that were turned back: a checkpoint under way for one goes no further.
+_turned_back: Final[set[int]] = set()
+_turning: Final = threading.Lock()
+#: CRIU's logs go with the image; what matters of them is in the message.
+_LOG: Final = re.compile(r" \((its )?log: [^)]*\)")
 
-#: What this host offers to others, by the number of the instance that an image is of.
-_offers: Final[dict[int, Sender]] = {}
-_changing: Final = threading.Lock()
 
+def say_ability(arguments: Answer) -> Answer:
+    """Whether CRIU works here, and what an image of this host needs elsewhere.
 
-def say_ability(_arguments: Answer) -> Answer:
-    """Whether CRIU works here, and what an image of this host needs elsewhere."""
+    A slave is asked for it when it has registered: what one before it has left, goes.
+    """
+    luggage.sweep(_state(arguments), _pids(arguments))
     found = ability()
     if not found.works:
         raise CriuError(found.reason)
@@ -54,17 +63,23 @@ def checkpoint(arguments: Answer) -> Answer:
 
     It stands still from then on; whatever fails, it is asked to go on.
     """
-    pid, control = _leader(arguments, "source"), None
+    destination = int(arguments["destination"])
+    return luggage.once(CHECKPOINT, destination, lambda: _checkpoint(arguments))
+
+
+def _checkpoint(arguments: Answer) -> Answer:
+    pid = _leader(arguments, "source")
+    control = _control_of(pid)
     try:
-        control = _control_of(pid)
+        sender = luggage.open_sender(int(arguments["source"]))
         began = time.monotonic()
         left = _leave(pid, control, arguments)
         dumped = time.monotonic()
         directory = _dump(pid, arguments)
         offered = time.monotonic()
-        offer = _offer(directory, arguments)
+        offer = _offer(sender, directory, arguments)
     except Exception:
-        _go_on(pid, control, arguments)
+        _call_back(pid, control, arguments)
         raise
     return {
         "offer": offer.as_json(), "control": str(control), "uid": _owner(pid), "size": offer.size,
@@ -76,15 +91,29 @@ def checkpoint(arguments: Answer) -> Answer:
 
 
 def go_on(arguments: Answer) -> Answer:
-    """The move has failed: the node goes on where it stands still."""
-    pid = _leader(arguments, "source")
-    _go_on(pid, _control_of(pid), arguments)
-    return {}
+    """The move has failed: the node goes on where it stands still.
+
+    One that has ended meanwhile does not: its restart policy says what follows.
+    """
+    destination, timeout = int(arguments["destination"]), float(arguments["timeout"])
+    with _turning:
+        _turned_back.add(destination)
+    luggage.after(CHECKPOINT, destination, timeout)
+    pid = _pids(arguments).get(_instance(arguments, "source"), 0)
+    if not pid or not tree.is_alive(pid):
+        luggage.withdraw(_state(arguments), int(arguments["source"]))
+        return {"fault": "it has ended"}
+    control = _control_of(pid)
+    before = status_of(control)
+    if not _call_back(pid, control, arguments) or (before and before.state is State.RUNNING):
+        return {}  # it had not left: what it does just now, it does to its end
+    status = await_joined(control, _attempt(arguments), timeout, tree.root_of(pid))
+    return {"missing": list(status.missing)}
 
 
 def end(arguments: Answer) -> Answer:
     """The destination owns the name: what is left of the source goes."""
-    _withdraw(arguments)
+    luggage.withdraw(_state(arguments), int(arguments["source"]))
     pid = _pids(arguments).get(_instance(arguments, "source"))
     if pid:
         dumping.kill(pid)
@@ -96,6 +125,7 @@ def _leave(pid: int, control: Path, arguments: Answer) -> float:
     attempt, root = _attempt(arguments), tree.root_of(pid)
     if tree.is_stopped(root):  # an earlier asking of this very step has dumped it
         dumping.resume(pid)
+    _check_wanted(arguments)
     ask_prepare(control, root, attempt)
     status = await_left(control, attempt, float(arguments["seconds"]["leave"]), root)
     return status.seconds.get("leave", 0.0)
@@ -103,85 +133,103 @@ def _leave(pid: int, control: Path, arguments: Answer) -> float:
 
 def _dump(pid: int, arguments: Answer) -> Path:
     directory = outgoing(_state(arguments), int(arguments["source"]))
-    _withdraw(arguments)
-    dumping.dump(
-        find(), pid, directory, leave="stopped", timeout=float(arguments["seconds"]["dump"]),
-        process=str(arguments["process"]), instance=int(arguments["source"]),
-    )  # fmt: skip
+    luggage.discard(directory)
+    _check_wanted(arguments)
+    try:
+        dumping.dump(
+            find(), pid, directory, leave="stopped", timeout=float(arguments["seconds"]["dump"]),
+            process=str(arguments["process"]), instance=int(arguments["source"]),
+        )  # fmt: skip
+    except CriuError as error:
+        raise CriuError(_LOG.sub("", str(error))) from None
     return directory
 
 
-def _offer(directory: Path, arguments: Answer) -> Offer:
+def _offer(sender: Sender, directory: Path, arguments: Answer) -> Offer:
     seconds = float(arguments["seconds"]["offer"])
-    sender = Sender()
-    with _changing:
-        _offers[int(arguments["source"])] = sender
-    offer = sender.offer(directory, seconds=seconds, max_rate=float(arguments["max_rate"]))
-    over = (sender, int(arguments["source"]), directory, seconds)
-    threading.Thread(target=_remove_when_over, args=over, name="image", daemon=True).start()
+    _check_wanted(arguments)
+    offer = sender.offer(
+        directory, seconds=seconds, max_rate=float(arguments["max_rate"]),
+        to=str(arguments["results"][INTRODUCE]["certificate"]),
+    )  # fmt: skip
+    luggage.remove_when_over(_state(arguments), int(arguments["source"]), sender, seconds)
     return offer
 
 
-def _remove_when_over(sender: Sender, number: int, directory: Path, seconds: float) -> None:
-    """Nobody fetches it any more, whether it was taken or its time has passed."""
-    sender.wait(seconds + 5.0)
-    with _changing:
-        if _offers.get(number) is not sender:
-            return  # withdrawn: there may be another image by now
-        del _offers[number]
-        image.remove(directory)
+def _check_wanted(arguments: Answer) -> None:
+    with _turning:
+        if int(arguments["destination"]) in _turned_back:
+            raise CriuError("the move was turned back meanwhile")
 
 
-def _withdraw(arguments: Answer) -> None:
-    """There is no offer any more, nor an image."""
-    number = int(arguments["source"])
-    with _changing:
-        sender = _offers.pop(number, None)
-    if sender is not None:
-        sender.close()
-    image.remove(outgoing(_state(arguments), number))
+def _call_back(pid: int, control: Path, arguments: Answer) -> bool:
+    """Let it go on where it stands still, and ask it to join; that is not waited for.
 
-
-def _go_on(pid: int, control: Path | None, arguments: Answer) -> None:
-    _withdraw(arguments)
-    root = tree.root_of(pid)
+    False: it cannot be asked, so it is no portable node, and never was asked to leave.
+    """
+    luggage.withdraw(_state(arguments), int(arguments["source"]))
     dumping.resume(pid)
-    if control is not None:
-        ask_resume(control, root, _attempt(arguments))
-        await_joined(control, _attempt(arguments), float(arguments["timeout"]), root)
+    try:
+        ask_resume(control, tree.root_of(pid), _attempt(arguments))
+    except PortableError:
+        return False
+    return True
 
 
 # --- the destination --------------------------------------------------------------------------
 
 
+def introduce(arguments: Answer) -> Answer:
+    """Be ready for the image, before anything stands still; say who alone may fetch it."""
+    named = arguments.get("working_directory")
+    if named and not Path(named).expanduser().is_dir():
+        raise CriuError(
+            f"its working directory {named} does not exist on {arguments['here']['host']}: make it"
+        )
+    certificate = luggage.open_fetcher(int(arguments["destination"]), float(arguments["keep"]))
+    return {"certificate": certificate}
+
+
 def fetch_image(arguments: Answer) -> Answer:
     """Bring the image here, for the start that follows."""
-    told = arguments["results"][CHECKPOINT]
-    control = Path(told["control"])
-    if control.parent != control_root(int(told["uid"])):
-        raise PortableError(f"{control} is no control directory of user {told['uid']}")
-    directory = incoming(_state(arguments), int(arguments["destination"]))
-    image.remove(directory)
-    fetched = fetch(Offer.from_json(told["offer"]), directory, timeout=float(arguments["timeout"]))
-    make_directory(control, int(told["uid"]))
-    threading.Timer(float(arguments["keep"]), _remove_unused, [directory]).start()
+    return luggage.once(FETCH, int(arguments["destination"]), lambda: _fetch(arguments))
+
+
+def _fetch(arguments: Answer) -> Answer:
+    told, number = arguments["results"][CHECKPOINT], int(arguments["destination"])
+    uid, control = int(told["uid"]), Path(told["control"])
+    if control != control_directory(control.name, uid):
+        raise PortableError(f"{control} is no control directory of user {uid}")
+    directory = incoming(_state(arguments), number)
+    luggage.discard(directory)
+    fetcher = luggage.take_fetcher(number)
+    if fetcher is None:
+        raise CriuError(
+            f"the slave of {arguments['here']['host']} was started again in the midst of the move, "
+            f"and the image is for the former one alone: ask for the move again"
+        )
+    with fetcher:
+        fetched = fetcher.fetch(
+            Offer.from_json(told["offer"]), directory, timeout=float(arguments["timeout"]),
+            reserve=int(arguments["reserve"]),
+        )  # fmt: skip
+    luggage.remove_unused_later(directory, float(arguments["keep"]))
+    make_directory(control, uid)
     return {"seconds": {"transfer": fetched.seconds}, "received": fetched.received}
 
 
-def _remove_unused(directory: Path) -> None:
-    """It was fetched for nothing, unless a process was restored from it."""
-    told = outcome.read(directory)
-    if told is None or told.reason:
-        image.remove(directory)
-
-
 def await_restored(arguments: Answer) -> Answer:
-    """Wait until the image is a process again."""
-    pid = _leader(arguments, "destination")
+    """Wait until the image is a process again; there is nothing left of one that cannot be."""
+    pid = _pids(arguments).get(_instance(arguments, "destination"), 0)
     directory = incoming(_state(arguments), int(arguments["destination"]))
-    found = outcome.wait(
-        directory, timeout=float(arguments["timeout"]), ended=lambda: not tree.is_alive(pid)
-    )
+    try:
+        found = outcome.wait(
+            directory, timeout=float(arguments["timeout"]), ended=lambda: not tree.is_alive(pid)
+        )
+    except CriuError as error:
+        if not tree.is_alive(pid):
+            luggage.discard(directory)
+        raise CriuError(_LOG.sub("", str(error))) from None
     return {"seconds": {"restore": found.seconds}}
 
 
@@ -202,12 +250,12 @@ def join(arguments: Answer) -> Answer:
             raise
         dumping.kill(pid)
         return {"fault": str(error)}
-    seconds = {"join": time.monotonic() - began, **_rejoin(status.seconds)}
-    return {"seconds": seconds, "missing": list(status.missing)}
+    return {"seconds": _of_joining(status, began), "missing": list(status.missing)}
 
 
-def _rejoin(seconds: Mapping[str, float]) -> dict[str, float]:
-    return {f"node_{name}": value for name, value in seconds.items()}
+def _of_joining(status: Status, began: float) -> dict[str, float]:
+    own = {f"node_{name}": value for name, value in status.seconds.items()}
+    return {"join": time.monotonic() - began, **own}
 
 
 # --- both -------------------------------------------------------------------------------------

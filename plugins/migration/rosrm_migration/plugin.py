@@ -40,6 +40,7 @@ def register_migration_strategies() -> Sequence[MigrationOffer]:
             summary="the whole memory of a portable node is dumped, and restored elsewhere",
             executors={
                 criu.ABILITY: _when_asked("say_ability"),
+                criu.INTRODUCE: _when_asked("introduce"),
                 criu.CHECKPOINT: _when_asked("checkpoint"),
                 criu.GO_ON: _when_asked("go_on"),
                 criu.FETCH: _when_asked("fetch_image"),

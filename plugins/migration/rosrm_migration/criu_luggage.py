@@ -1,0 +1,200 @@
+"""What a slave holds of moves by `criu`: images and the ends of transfers, which go by themselves.
+
+A master may ask for a step a second time, and turn a move back while a step is under way; a slave
+may be killed and be started again. So each thing is known by the number of an instance, and what
+nobody uses any more is removed after a time.
+"""
+
+from __future__ import annotations
+
+import shutil
+import threading
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import Future
+from pathlib import Path
+from typing import Any, Final
+
+from rosrm.criu import outcome
+from rosrm.criu.places import incoming, outgoing
+from rosrm.errors import CriuError
+from rosrm.transfer import Fetcher, Sender
+
+Answer = Mapping[str, Any]
+
+#: Of an image that a killed slave has left: seconds after which nobody will start from it.
+_LEFT_BEHIND: Final = 120.0
+#: Steps whose answers are remembered; far more than there are moves at a time.
+_REMEMBERED: Final = 50
+
+_changing: Final = threading.Lock()
+_senders: Final[dict[int, Sender]] = {}
+_fetchers: Final[dict[int, Fetcher]] = {}
+_flights: Final[dict[tuple[str, int], Future[Answer]]] = {}
+
+
+# --- steps that are asked for twice -----------------------------------------------------------
+
+
+def once(step: str, number: int, work: Callable[[], Answer]) -> Answer:
+    """Do a step; who asks for it again while it is done, or afterwards, gets the same answer.
+
+    Args:
+        step: its name.
+        number: of the instance that the move is to make.
+        work: the step. When it raises it is forgotten, and done anew when it is asked for again.
+    """
+    with _changing:
+        flight = _flights.get((step, number))
+        is_ours = flight is None
+        if flight is None:
+            flight = _flights[step, number] = Future()
+            while len(_flights) > _REMEMBERED:
+                del _flights[next(iter(_flights))]
+    if not is_ours:
+        return flight.result()
+    try:
+        answer = work()
+    except BaseException as error:
+        with _changing:
+            _flights.pop((step, number), None)
+        flight.set_exception(error)
+        raise
+    flight.set_result(answer)
+    return answer
+
+
+def after(step: str, number: int, timeout: float) -> None:
+    """Wait until a step that is under way is over; raises CriuError after so many seconds."""
+    with _changing:
+        flight = _flights.get((step, number))
+    if flight is None:
+        return
+    try:
+        flight.exception(timeout)
+    except TimeoutError:
+        raise CriuError(f"{step} is still under way after {timeout:g} s") from None
+
+
+# --- the source -------------------------------------------------------------------------------
+
+
+def open_sender(number: int) -> Sender:
+    """The end of a transfer, ready for the image of an instance; a former one of it is over."""
+    sender = Sender()
+    with _changing:
+        former = _senders.get(number)
+        _senders[number] = sender
+    if former is not None:
+        former.close()
+    sender.ready()
+    return sender
+
+
+def remove_when_over(state: Path, number: int, sender: Sender, seconds: float) -> None:
+    """Remove an image that was offered when it was taken, or its time is over."""
+
+    def wait() -> None:
+        sender.wait(seconds + 5.0)
+        with _changing:
+            if _senders.get(number) is not sender:
+                return  # withdrawn: there may be another image by now
+            del _senders[number]
+            discard(outgoing(state, number))
+        sender.close()
+
+    threading.Thread(target=wait, name="offered image", daemon=True).start()
+
+
+def withdraw(state: Path, number: int) -> None:
+    """There is no offer any more, nor an image."""
+    with _changing:
+        sender = _senders.pop(number, None)
+    if sender is not None:
+        sender.close()
+    discard(outgoing(state, number))
+
+
+# --- the destination --------------------------------------------------------------------------
+
+
+def open_fetcher(number: int, keep: float) -> str:
+    """The end of a transfer for an instance that is to be; the certificate that it will show."""
+    fetcher = Fetcher()
+    try:
+        certificate = fetcher.introduce()
+    except BaseException:
+        fetcher.close()
+        raise
+    with _changing:
+        former = _fetchers.get(number)
+        _fetchers[number] = fetcher
+    if former is not None:
+        former.close()
+    _later(keep, _dismiss, number, fetcher)
+    return certificate
+
+
+def take_fetcher(number: int) -> Fetcher | None:
+    """That end, for the one fetch that it makes; None: it is gone, or never was."""
+    with _changing:
+        return _fetchers.pop(number, None)
+
+
+def _dismiss(number: int, fetcher: Fetcher) -> None:
+    with _changing:
+        if _fetchers.get(number) is not fetcher:
+            return
+        del _fetchers[number]
+    fetcher.close()
+
+
+def remove_unused_later(directory: Path, keep: float) -> None:
+    """Remove an image unless a process is restored from it until then."""
+    _later(keep, _remove_unused, directory)
+
+
+def _remove_unused(directory: Path) -> None:
+    try:
+        told = outcome.read(directory)
+    except CriuError:
+        told = None
+    if told is None or told.reason:
+        discard(directory)
+
+
+# --- both -------------------------------------------------------------------------------------
+
+
+def discard(directory: Path) -> None:
+    """Nothing of an image is left."""
+    shutil.rmtree(directory, ignore_errors=True)
+
+
+def sweep(state: Path, instances: Iterable[str]) -> None:
+    """Remove what a former slave of this host has left.
+
+    Args:
+        state: of the slave.
+        instances: `process#number` of each that runs here.
+    """
+    here = {int(one.rpartition("#")[2]) for one in instances}
+    with _changing:
+        for number in _numbers(state, "out"):
+            if number not in _senders:
+                discard(outgoing(state, number))
+    for number in _numbers(state, "in"):
+        if number not in here:
+            remove_unused_later(incoming(state, number), _LEFT_BEHIND)
+
+
+def _numbers(state: Path, way: str) -> list[int]:
+    images = outgoing(state, 0).parent.glob(f"{way}-*")
+    words = [path.name.partition("-")[2] for path in images]
+    return [int(word) for word in words if word.isdigit()]
+
+
+def _later(seconds: float, do: Callable[..., None], *arguments: Any) -> None:
+    """In a thread that keeps no slave from ending."""
+    timer = threading.Timer(seconds, do, arguments)
+    timer.daemon = True
+    timer.start()
