@@ -40,7 +40,10 @@ def tree(root: int) -> list[int]:
 
 
 def root_of(leader: int) -> int:
-    """The process that an instance is about: its leader, or what the leader holds, if restored."""
+    """The process that an instance is about: its leader, or what the leader holds, if restored.
+
+    While it is being restored that is CRIU.
+    """
     if not is_hold(leader):
         return leader
     for child in children(leader):

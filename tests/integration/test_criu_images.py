@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from rosrm.core.model import InstanceState, RestartPolicy
+from rosrm.core.model import RestartPolicy
 from rosrm.criu import dumping, image, restoring, tree
 from rosrm.errors import CriuError
 from tests.criu_kit import TIMEOUT, eventually
@@ -422,45 +422,80 @@ def test_the_image_is_private_and_gone_when_it_was_told_so(theatre, counter):
     assert not directory.exists()
 
 
-def test_below_a_supervisor(theatre, counter, tmp_path):
+@pytest.fixture
+def host(tmp_path):
+    """A supervisor's state directory."""
+    host = Host(tmp_path / "host")
+    yield host
+    host.clean_up()
+
+
+def test_below_a_supervisor(theatre, counter, host):
     """The supervisor starts a hold like any process: it stops it, and sees its end."""
     directory = theatre.dump(counter)
-    command = theatre.hold_command(directory)
-    host = Host(tmp_path / "host")
-    try:
-        client = host.connect()
-        client.start([host.order("actor", *command, number=2)])
-        running = host.wait(client, "actor", InstanceState.RUNNING, number=2)
-        log = host.log("actor", 2)
-        eventually(lambda: log.read_text().count("\n") > 2, "numbers in its log")
-        assert tree.root_of(running.pid) != running.pid
-        client.stop(running.instance)
-        ended = host.wait(client, "actor", InstanceState.EXITED, InstanceState.FAILED, number=2)
-        assert (ended.exit_code, ended.exit_signal) == (0, signal.SIGINT)
-    finally:
-        host.clean_up()
+    client = host.connect()
+    client.start([host.order("actor", *theatre.hold_command(directory), number=2)])
+    running = host.running(client, "actor", number=2)
+    eventually((directory / "hold.json").exists, "the end of the restore")
+    assert tree.root_of(running.pid) != running.pid
+    client.stop(running.instance)
+    ended = host.ended(client, "actor", number=2)
+    assert (ended.exit_code, ended.exit_signal) == (0, signal.SIGINT)
 
 
-def test_below_a_supervisor_a_crash_starts_it_anew(theatre, counter, tmp_path):
+def test_a_supervisor_that_was_killed_takes_it_over(theatre, counter, host):
+    """It runs on meanwhile, is known again, and is stopped like any other."""
+    directory = theatre.dump(counter)
+    client = host.connect()
+    client.start([host.order("actor", *theatre.hold_command(directory), number=2)])
+    before = host.running(client, "actor", number=2)
+    eventually((directory / "hold.json").exists, "the end of the restore")
+    log = host.log("actor", 2)
+    host.kill_supervisor(client)
+    client = host.connect()
+    [after] = client.instances
+    seen = log.read_text()
+    eventually(lambda: len(log.read_text()) > len(seen), "more numbers")
+    client.stop(after.instance)
+    host.ended(client, "actor", number=2)
+    assert (after.state, after.pid) == (before.state, before.pid)
+    assert not tree.is_alive(before.pid)
+
+
+def test_who_does_not_stop_is_killed_by_the_supervisor(theatre, host):
+    """The stop policy and the fences come to a SIGKILL of the hold's group, which leaves nobody."""
+    ignoring = "signal.signal(signal.SIGINT, signal.SIG_IGN)\n"
+    code = COUNTER.replace("count = 0", f"{ignoring}count = 0").replace("sys.exit(7)", "None")
+    actor = theatre.start(code)
+    actor.counts()
+    directory = theatre.dump(actor)
+    client = host.connect()
+    client.start([host.order("actor", *theatre.hold_command(directory), number=2)])
+    running = host.running(client, "actor", number=2)
+    eventually((directory / "hold.json").exists, "the end of the restore")
+    namespace = pid_namespace(tree.root_of(running.pid))
+    client.stop(running.instance)
+    ended = host.ended(client, "actor", number=2)
+    assert ended.exit_signal == signal.SIGKILL
+    eventually(lambda: not living_in(namespace), "the end of all in the namespace")
+
+
+def test_below_a_supervisor_a_crash_starts_it_anew(theatre, counter, host):
     """The restart policy holds for what was restored: it begins at one, as after any crash."""
     directory = theatre.dump(counter)
     then = [sys.executable, "-I", "-S", "-c", COUNTER, "--", "a word of its own"]
     command = theatre.hold_command(directory, remove=True, then=then)
-    host = Host(tmp_path / "host")
-    try:
-        client = host.connect()
-        restart = RestartPolicy("on-failure", delay=0.01)
-        client.start([host.order("actor", *command, number=2, restart=restart)])
-        running = host.wait(client, "actor", InstanceState.RUNNING, number=2)
-        log = host.log("actor", 2)
-        eventually(lambda: log.read_text().count("\n") > 2, "numbers in its log")
-        assert "\n1\n" not in log.read_text()
-        os.kill(tree.root_of(running.pid), signal.SIGKILL)
-        eventually(lambda: "\n1\n2\n" in log.read_text(), "numbers from the first on")
-        client.stop(running.instance)
-        host.ended(client, "actor", number=2)
-    finally:
-        host.clean_up()
+    client = host.connect()
+    restart = RestartPolicy("on-failure", delay=0.01)
+    client.start([host.order("actor", *command, number=2, restart=restart)])
+    running = host.running(client, "actor", number=2)
+    eventually((directory / "hold.json").exists, "the end of the restore")
+    log = host.log("actor", 2)
+    assert "\n1\n" not in log.read_text()
+    os.kill(tree.root_of(running.pid), signal.SIGKILL)
+    eventually(lambda: "\n1\n2\n" in log.read_text(), "numbers from the first on")
+    client.stop(running.instance)
+    host.ended(client, "actor", number=2)
 
 
 def test_an_image_that_is_gone_is_no_reason_to_start_anew(theatre, counter):
