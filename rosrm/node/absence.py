@@ -9,6 +9,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
+from rclpy.duration import Duration
 from rclpy.parameter import Parameter
 
 from rosrm.node.entities import TimerOf
@@ -111,6 +112,19 @@ def absence_of(node: Any) -> Absence:
     }
     timers = tuple((one.timer_period_ns, TimerOf(one, True).due_ns()) for one in node.timers)
     return Absence(parameters, timers, peers_of(node), neighbours_of(node))
+
+
+def await_readers(node: Any, patience: float) -> None:
+    """Wait until reliable readers have what was published: they forget a writer that goes.
+
+    Args:
+        node: that is about to leave.
+        patience: seconds for all of them; a reader that is stopped holds nobody up.
+    """
+    deadline = time.monotonic() + patience
+    for one in node.publishers:
+        left = max(0.0, deadline - time.monotonic())
+        one.wait_for_all_acked(Duration(seconds=left))
 
 
 def neighbours_of(node: Any) -> frozenset[str]:

@@ -8,15 +8,18 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, Final
 
 import rclpy.node
 from rclpy.event_handler import EventHandler
 
-from rosrm.node.absence import Absence, absence_of, await_peers
+from rosrm.node.absence import Absence, absence_of, await_peers, await_readers
 from rosrm.portable import VARIABLE
 from rosrm.ros.fast_dds import announcing
 from rosrm.ros.leftovers import close_leaked, open_sockets
+
+#: Seconds in which what was published arrives at its readers, before the node leaves.
+_READERS: Final = 0.5
 
 
 class PortableNode(rclpy.node.Node):  # type: ignore[misc]  # rclpy brings no types
@@ -84,6 +87,7 @@ class PortableNode(rclpy.node.Node):  # type: ignore[misc]  # rclpy brings no ty
             self.leave()
         except Exception as error:  # noqa: BLE001 - the author's code: anything may come
             fault = f"{type(self).__name__}.leave raised {type(error).__name__}: {error}"
+        await_readers(self, _READERS)
         self.destroy_node()
         close_leaked(self._portable_sockets)
         return absence, fault

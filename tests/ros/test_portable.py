@@ -188,7 +188,7 @@ def test_to_leave_twice_is_to_leave_once(stage, start, heard) -> None:
     hear_more(stage, heard, 30)
     assert node.runs()
     assert report(stage)["joined"] == 2
-    assert counts_on(heard)
+    assert counts_on(heard), numbers(heard)
 
 
 def test_a_node_that_is_called_back_at_once_goes_on(stage, start, heard) -> None:
@@ -198,7 +198,7 @@ def test_a_node_that_is_called_back_at_once_goes_on(stage, start, heard) -> None
     ask_prepare(node.directory, node.pid, "m1")
     assert node.resume("m1").state is State.RUNNING
     hear_more(stage, heard)
-    assert counts_on(heard)
+    assert counts_on(heard), numbers(heard)
 
 
 def test_parameters_and_timers_are_as_they_were(stage, start, heard) -> None:
@@ -237,7 +237,7 @@ def test_callbacks_in_threads_come_to_rest(stage, start, heard) -> None:
         node.prepare(move)
         node.resume(move)
         hear_more(stage, heard)
-    assert counts_on(heard)
+    assert counts_on(heard), numbers(heard)
 
 
 @pytest.mark.parametrize(
@@ -255,7 +255,7 @@ def test_a_node_that_cannot_leave_stays_and_says_why(stage, start, heard, fault,
     with pytest.raises(PortableError, match=said):
         node.prepare("m1")
     hear_more(stage, heard)
-    assert counts_on(heard)
+    assert counts_on(heard), numbers(heard)
     assert re.search(said, node.said())
 
 
