@@ -12,6 +12,7 @@ from rosrm.core.commands import Order, Reply
 from rosrm.core.hosts import Host, HostCondition, description_fault
 from rosrm.core.liveness import welcome_back
 from rosrm.core.lost_tail import note_seen
+from rosrm.core.migration import Execute
 from rosrm.core.readings import take_readings
 from rosrm.core.state import MasterState, Wanted
 from rosrm.ports import Intent
@@ -52,8 +53,17 @@ def host_registered(state: MasterState, event: happened.HostRegistered, now: flo
     host_loss.regain_sight(state, host, now)
     lifecycle.reconcile(state, host, event.instances, now, registering=True)
     _forgive(state, host)
+    _execute_again(state, host)
     reconsider_set_aside(state, now)
     state.emit(Reply(event.request, host_id=host.host_id))
+
+
+def _execute_again(state: MasterState, host: Host) -> None:
+    """What an executor of the slave's former run had in hand ended with it: it begins anew."""
+    for run in state.runs.values():
+        step = run.step_in_hand
+        if isinstance(step, Execute) and step.host == host.name:
+            run.begun = False
 
 
 def _refuse_host(

@@ -425,6 +425,27 @@ def test_an_executor_does_the_open_step_on_its_host() -> None:
     assert (cluster.phase("p"), cluster.where("p")) == ("running", ["b"])
 
 
+def test_an_executor_is_asked_again_when_its_slave_was_started_again() -> None:
+    """Nobody waits for the answer of the former run, which ended with it."""
+    done: list[Any] = []
+    cluster = Cluster(
+        Machine("a", executors={"dump": done.append, "sweep": done.append}),
+        Machine("b", busy={"memory": 0.5}), strategies={"strange": Strange(executing)},
+    )  # fmt: skip
+    cluster.submit(process("p", migration=MigrationPolicy("strange")))
+    machine = cluster.machines["a"]
+    machine.connected = False
+    cluster.migrate("p")
+    assert (done, cluster.phase("p")) == ([], "migrating")
+    cluster.wait(2.0)  # until its former run counts as silent
+    machine.connected = True
+    machine.restart_slave(cluster.now)
+    assert cluster.register(machine).accepted
+    cluster.wait(0.2)
+    assert done == [{"what": "image"}]
+    assert (cluster.phase("p"), cluster.where("p")) == ("running", ["b"])
+
+
 def test_a_new_instance_that_is_to_settle_runs_beside_the_old_one() -> None:
     """The others have to find it."""
 
