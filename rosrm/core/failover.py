@@ -51,7 +51,7 @@ def take_over(state: MasterState, process: Process, end: End, now: float) -> boo
     run.started, run.wall = now, state.wall
     run.cause = f"{run.source} has ended"
     process.wanted = Wanted.RUN
-    process.left_behind = None
+    process.left_behind, process.standby_reason = None, ""
     state.runs[process.name] = run
     state.set_phase(process, ProcessPhase.MIGRATING, now, f"its standby takes over: {run.cause}")
     state.record(

@@ -187,12 +187,12 @@ def _lost(state: MasterState, process: Process, run: Run, why: str, now: float) 
     wait = min(_FIRST_WAIT * 2.0**process.standby_tries, _LONGEST_WAIT)
     process.standby_tries = min(process.standby_tries + 1, 16)
     process.standby_at = now + wait
-    process.standby_reason = f"it has no standby: {why}"
     state.record(
         now, "standby_lost", f"{process.name} has no standby: {why}; another one in {wait:g} s",
         process=process.name, host=run.destination_host.name,
     )  # fmt: skip
     end_standby(state, process, now)
+    process.standby_reason = f"it has no standby: {why}"
 
 
 def end_standby(state: MasterState, process: Process, now: float) -> None:
@@ -200,6 +200,7 @@ def end_standby(state: MasterState, process: Process, now: float) -> None:
     run = state.standbys.pop(process.name, None)
     if run is None:
         return
+    process.standby_reason = ""
     handoffs.close(state, run)
     instance = state.instances.get(run.destination.number)
     if instance is not None and process.owner != instance.id.number and not instance.stopping:

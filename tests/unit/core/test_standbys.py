@@ -59,6 +59,7 @@ def test_when_the_host_is_lost_the_standby_goes_on(then: str) -> None:
     lose(cluster, "a", 10.5)
     assert (cluster.phase("p"), cluster.active()) == ("running", ["a", "b"])
     assert cluster["p"].owner == 2
+    assert "is ready" not in cluster.explain("p")["reason"]  # that one is the owner now
     cluster.machines["a"].connected = True
     cluster.wait(0.3)
     assert cluster.active() == ["b"]
