@@ -99,6 +99,9 @@ class Host:
         self.heard: list[float] = []
         self.said: list[str] = []
 
+    def kept_states(self):
+        return ()
+
     def take(self, event) -> None:
         if isinstance(event, core.MasterHears):
             self.heard.append(event.at)
