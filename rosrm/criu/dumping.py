@@ -7,6 +7,7 @@ locked again; `--manage-cgroups=ignore`: it comes back in the cgroup of its new 
 
 from __future__ import annotations
 
+import errno
 import os
 import platform
 import signal
@@ -70,18 +71,20 @@ def dump(
     if tie:
         raise CriuError(f"{process or f'pid {pid}'} cannot be dumped: {tie}")
     image.create(directory)
-    image.check_room(directory, tree.memory_of(pids))
     try:
+        image.check_room(directory, tree.memory_of(pids))
         _run(criu, root, directory, timeout, process)
         manifest = _describe(root, directory, Manifest(
             process, instance, platform.node(), time.time(), criu.version, platform.release(),
             platform.machine(), tree.inner_pid(root), (), (), "", _shelter(pid), "",
         ))  # fmt: skip
         image.write(directory, manifest)
-    except (CriuError, OSError) as error:
+    except BaseException as error:
         image.remove(directory, logs=False)
-        why = str(error) if isinstance(error, CriuError) else _disk_trouble(directory, error)
-        raise CriuError(why + _go_on(root, was_stopped)) from None
+        outcome = _go_on(root, was_stopped)
+        if not isinstance(error, CriuError | OSError):
+            raise
+        raise CriuError(_told(directory, error) + outcome) from None
     if leave == "killed":
         kill(pid)
     elif leave == "running" and not was_stopped:
@@ -160,8 +163,12 @@ def _link(pid: int, name: str) -> str:
     return os.readlink(f"/proc/{pid}/{name}")  # noqa: PTH115 - as /proc says it
 
 
-def _disk_trouble(directory: Path, error: OSError) -> str:
-    return f"the image in {directory} cannot be written: {error.strerror}"
+def _told(directory: Path, error: Exception) -> str:
+    if isinstance(error, OSError) and error.errno in (errno.ENOENT, errno.ESRCH):
+        return f"it could not be looked at: {error.strerror}"
+    if isinstance(error, OSError):
+        return f"the image in {directory} cannot be written: {error.strerror}"
+    return str(error)
 
 
 def _go_on(root: int, was_stopped: bool) -> str:

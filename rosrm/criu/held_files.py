@@ -15,6 +15,8 @@ from rosrm.criu.image import COPIES, HeldFile, MappedFile
 MOST: Final = 64 << 20
 
 _DELETED: Final = " (deleted)"
+#: What the kernel shows as files; its processes are others elsewhere.
+_OF_THE_KERNEL: Final = ("/proc/", "/sys/")
 
 
 class Descriptor(NamedTuple):
@@ -86,7 +88,9 @@ def open_files(
     found: dict[str, HeldFile] = {}
     for one in descriptors(pids):
         known = found.get(one.target)
-        if one.target in leave_out or not _is_regular(one.pid, one.target):
+        if one.target in leave_out or one.target.startswith(_OF_THE_KERNEL):
+            continue
+        if not _is_regular(one.pid, one.target):
             continue
         status = _status(one.pid, one.target)
         grows = bool(one.flags & os.O_APPEND) and one.flags & os.O_ACCMODE == os.O_WRONLY

@@ -195,6 +195,14 @@ def working_directory(pid: int) -> str:
     return os.readlink(f"/proc/{pid}/cwd")  # noqa: PTH115 - as /proc says it
 
 
+def test_a_file_of_the_kernels_needs_not_lie_there(theatre):
+    """What it reads of itself in /proc is elsewhere in /proc, and CRIU knows that."""
+    actor = theatre.start(f"import os; own = open(f'/proc/{{os.getpid()}}/stat')\n{COUNTER}")
+    actor.counts()
+    theatre.restore(theatre.dump(actor)).counts()
+    assert theatre.manifest.files == ()
+
+
 # --- what becomes of the source -----------------------------------------------------------------
 
 
@@ -237,6 +245,15 @@ def test_a_pipe_to_outside_is_named_and_the_source_runs_on(theatre):
     finally:
         os.close(ours)
         os.close(theirs)
+
+
+def test_whatever_fails_the_source_runs_on(theatre, counter, monkeypatch):
+    """A bug of ours too, after CRIU has stopped the process."""
+    monkeypatch.setattr(image, "write", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        theatre.dump(counter)
+    counter.counts()
+    assert not tree.is_stopped(counter.pid)
 
 
 @pytest.mark.parametrize("kind", [socket.SOCK_STREAM, socket.SOCK_DGRAM])
@@ -293,10 +310,13 @@ def test_a_device_is_named_and_the_source_runs_on(theatre):
     assert [path.name for path in (theatre.folder / "image").iterdir()] == ["dump.log"]
 
 
-def test_an_image_that_has_no_room_is_not_begun(tmp_path):
-    """The file system of the image keeps some space."""
+def test_an_image_that_has_no_room_is_not_begun(theatre, counter, monkeypatch):
+    """The file system of the image keeps some space; the process is not touched."""
+    monkeypatch.setattr(tree, "memory_of", lambda pids: 1 << 60)
     with pytest.raises(CriuError, match=r"no room for the image .* MiB are free"):
-        image.check_room(tmp_path, 1 << 60)
+        theatre.dump(counter)
+    counter.counts()
+    assert [*(theatre.folder / "image").iterdir()] == []
 
 
 # --- below the hold -----------------------------------------------------------------------------
