@@ -215,6 +215,26 @@ class HostChecking(Protocol):
         """Why nothing can be moved so between two hosts of these answers; "": it can. Pure."""
 
 
+@runtime_checkable
+class Imaging(Protocol):
+    """A migration strategy that dumps a process into an image, and restores it on the same host."""
+
+    def checkpoint(self, move: Move) -> Plan:
+        """The steps until the source has ended, and its image owns the name. Pure.
+
+        They name one host, start nothing, and stop the source after the commit: it must not run
+        again. Raises `ValueError` with the reason where it can make no image of the process.
+        """
+
+    def restore(self, move: Move) -> Plan:
+        """The steps until the destination goes on from the image of the source. Pure.
+
+        The source does not run. Before the commit each step is undone so that the image lies where
+        it lay; an undo that finds the destination going on already answers `active: true`, and the
+        plan goes forward from there. Raises `ValueError` as `checkpoint`.
+        """
+
+
 @dataclass(frozen=True)
 class MigrationOffer:
     """Registers a migration strategy; the fields are as in `ProbeOffer`.

@@ -34,6 +34,7 @@ _ORDER: Final = (
     "starting",
     "assigned",
     "running",
+    "checkpointed",
     "set_aside",
     "queued",
     "failed",

@@ -26,6 +26,7 @@ STYLES: Final = {
     "set_aside": "yellow",
     "backoff": "yellow",
     "migrating": "cyan",
+    "checkpointed": "cyan",
     "suspect": "yellow",
     "absent": "yellow",
     "failed": "red",

@@ -48,6 +48,14 @@ def demand_to_move(
     return Demand(process.spec, amounts, frozenset(guessed), excluded, headroom)
 
 
+def demand_to_restore(state: MasterState, process: Process, seen: Mapping[str, float]) -> Demand:
+    """What its host must have for a process that goes on from an image that lies there."""
+    estimate = state.learned.estimate(process.spec, state.settings.default_needs)
+    amounts = larger(estimate.amounts, seen)
+    guessed = {name for name in estimate.estimated if amounts[name] > seen.get(name, 0.0)}
+    return Demand(process.spec, amounts, frozenset(guessed))
+
+
 def _unable(state: MasterState, process: Process, source: str) -> dict[str, str]:
     """Hosts to which its strategy cannot move it, with the reason."""
     strategy = process.spec.migration.strategy or ""

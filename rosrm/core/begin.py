@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 
 from rosrm.core.hosts import Host
-from rosrm.core.migration import Move, Plan, Start, plan_fault
+from rosrm.core.images import reason_of
+from rosrm.core.migration import Aim, Move, Plan, Start, plan_fault
 from rosrm.core.placement import Ranking
 from rosrm.core.plans import plan_to_dict
 from rosrm.core.state import MasterState, Process, ProcessPhase, Run
@@ -59,12 +61,12 @@ def plan_move(
         destination.name, state.new_instance_id(process), int(state.wall),
         source.node_name or process.name,
     )  # fmt: skip
-    plan = _propose(state, name, move)
+    plan = proposed(name, move, state.strategies[name].propose)
     if isinstance(plan, str):
         return plan
     return Run(
         process.name, plan, name, source.id, source.host, move.destination, destination, cause,
-        now, move.source_node, _destination_node(plan, move), state.wall,
+        now, move.source_node, destination_node(plan, move), state.wall,
     )  # fmt: skip
 
 
@@ -73,13 +75,20 @@ def moves_under_way(state: MasterState) -> int:
     return sum(not run.stuck for run in state.runs.values())
 
 
+def why_busy(run: Run) -> str:
+    """What is under way with a process already."""
+    if run.aim is Aim.MOVE:
+        return f"{run.process} is moving already, to {run.destination_host.name}"
+    return f"{run.process} is busy: {run.course}"
+
+
 def why_immovable(state: MasterState, process: Process) -> str:
     """Why a process cannot be moved now; "" if it can."""
     strategy = process.spec.migration.strategy
     if process.name in state.runs:
-        return (
-            f"{process.name} is moving already, to {state.runs[process.name].destination_host.name}"
-        )
+        return why_busy(state.runs[process.name])
+    if process.phase is ProcessPhase.CHECKPOINTED:
+        return f"{process.name} is checkpointed: {reason_of(state, process)}; restore it first"
     if process.phase is not ProcessPhase.RUNNING:
         return f"{process.name} is {process.phase.value}; only a running process can be moved"
     standby = state.standbys.get(process.name)
@@ -96,18 +105,28 @@ def why_immovable(state: MasterState, process: Process) -> str:
     return ""
 
 
-def _propose(state: MasterState, name: str, move: Move) -> Plan | str:
-    """The strategy's plan, or why there is none; a strategy that raises is named."""
+def proposed(
+    name: str, move: Move, propose: Callable[[Move], Plan], aim: Aim = Aim.MOVE
+) -> Plan | str:
+    """The plan of a strategy, or why there is none; a strategy that raises is named.
+
+    Args:
+        name: of the strategy.
+        move: to be planned.
+        propose: the strategy's own function.
+        aim: of the plan.
+    """
     try:
-        plan = state.strategies[name].propose(move)
-        fault = plan_fault(plan, move)
+        plan = propose(move)
+        fault = plan_fault(plan, move, aim)
         json.dumps(plan_to_dict(plan))  # it goes into the journal
     except Exception as error:  # noqa: BLE001 - a third party's code: anything may come
         return f"the migration strategy {name!r} gave no plan: {type(error).__name__}: {error}"
     return f"the migration strategy {name!r} gave an unsound plan: {fault}" if fault else plan
 
 
-def _destination_node(plan: Plan, move: Move) -> str:
+def destination_node(plan: Plan, move: Move) -> str:
+    """The name under which the node of the destination runs, without its namespace."""
     starts = (step for step in plan.steps if isinstance(step, Start))
     aliases = [step.node_name for step in starts if step.instance == move.destination]
     return next(iter(aliases), "") or move.spec.name

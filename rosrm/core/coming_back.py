@@ -55,10 +55,12 @@ def _take_back(
 def has_successor(state: MasterState, status: InstanceStatus) -> bool:
     """Another instance owns the name that this one ran under, or is about to.
 
-    It is where a plan goes on as if this one had ended.
+    It is where a plan goes on as if this one had ended, and where its image owns the name.
     """
     process = state.processes.get(status.instance.process)
     number, run = status.instance.number, state.runs.get(status.instance.process)
     if run is not None and number in run.ended:
         return True
-    return process is not None and process.owner not in (0, number)
+    if process is None:
+        return False
+    return process.owner not in (0, number) or process.image is not None

@@ -134,6 +134,22 @@ class MigrationRequested:
 
 
 @dataclass(frozen=True, slots=True)
+class CheckpointRequested:
+    """Somebody has a process dumped into an image, and stopped there."""
+
+    request: int
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class RestoreRequested:
+    """Somebody has a process go on from its image."""
+
+    request: int
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
 class HostStateRequested:
     """Somebody cordons, uncordons or drains a host."""
 
@@ -204,6 +220,8 @@ Event = (
     | CancelRequested
     | RestartRequested
     | MigrationRequested
+    | CheckpointRequested
+    | RestoreRequested
     | HostStateRequested
     | OrderAnswered
     | AssignmentWithdrawn

@@ -7,7 +7,8 @@ from typing import Any, Final
 
 from rosrm.core.assigning import decide_now
 from rosrm.core.hosts import Host, HostCondition
-from rosrm.core.state import MasterState, Process, ProcessPhase
+from rosrm.core.images import reason_of
+from rosrm.core.state import Instance, MasterState, Process, ProcessPhase
 from rosrm.core.views import HostRow, ProcessRow, ResourceRow
 
 _CONDITION: Final = {
@@ -55,13 +56,19 @@ def process_row(state: MasterState, process: Process, now: float) -> ProcessRow:
     seen = owner.seen if owner else {}
     return ProcessRow(
         name=process.name, kind=process.spec.kind.value, state=process.phase.value,
-        host=owner.host.name if owner else "", number=process.owner,
+        host=_host_of(process, owner), number=process.owner,
         pid=owner.pid if owner else 0, restarts=process.restarts, migrations=process.migrations,
         exit_code=process.exit_code, priority=process.spec.priority,
         queue_position=state.queue.position(process.name), since=now - process.since,
         cpu=seen.get("cpu", 0.0), memory=int(seen.get("memory", 0.0)),
-        reason=process.reason or _of_standby(process),
+        reason=reason_of(state, process) or _of_standby(process),
     )  # fmt: skip
+
+
+def _host_of(process: Process, owner: Instance | None) -> str:
+    if owner is not None:
+        return owner.host.name
+    return process.image.host if process.image is not None else ""
 
 
 def _of_standby(process: Process) -> str:
@@ -106,6 +113,6 @@ def _kept(state: MasterState, process: Process, now: float) -> list[Mapping[str,
 
 def _reason(state: MasterState, process: Process, position: int) -> str:
     if process.phase is not ProcessPhase.QUEUED or position <= 1:
-        return process.reason
+        return reason_of(state, process)
     ahead = f"{position - 1} before it in the queue, {state.queue.head()} first"
     return ahead if state.settings.backfill else f"{ahead}, and those behind wait with it"

@@ -14,6 +14,8 @@ SubmissionReceived      refuses or queues all of them; places
 CancelRequested         takes out of the queue, or stops
 RestartRequested        restarts where it runs, or queues anew what has ended
 MigrationRequested      begins a migration
+CheckpointRequested     begins to dump a process into an image
+RestoreRequested        begins to restore a process from its image
 HostStateRequested      cordons, uncordons, drains
 OrderAnswered           notes that a slave took an order or refused it
 HandoffReported         notes how far the nodes of a handoff are
@@ -53,6 +55,8 @@ HANDLERS: Final[Mapping[type, _Handler]] = MappingProxyType(
         happened.CancelRequested: requests.cancel_requested,
         happened.RestartRequested: requests.restart_requested,
         happened.MigrationRequested: requests.migration_requested,
+        happened.CheckpointRequested: requests.checkpoint_requested,
+        happened.RestoreRequested: requests.restore_requested,
         happened.HostStateRequested: requests.host_state_requested,
         happened.OrderAnswered: moves.order_answered,
         happened.HandoffReported: handoffs.handoff_reported,

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from enum import IntEnum
+from enum import Enum, IntEnum
 from math import inf
 from typing import Any, Final
 
@@ -39,6 +39,18 @@ class Move:
     fallback: InstanceId
     now: int
     source_node: str
+
+
+class Aim(str, Enum):
+    """What a plan is to bring about.
+
+    Of a checkpoint the source ends in an image on its own host, and no destination is started; of a
+    restore the source is the instance that the image is of, which does not run any more.
+    """
+
+    MOVE = "move"
+    CHECKPOINT = "checkpoint"
+    RESTORE = "restore"
 
 
 class HandoffPhase(IntEnum):
@@ -151,10 +163,15 @@ class SetRestart:
 
 @dataclass(frozen=True, slots=True)
 class Commit:
-    """From here on the destination owns the name; there is one in each plan."""
+    """From here on the destination owns the name; there is one in each plan.
+
+    In the plan of a checkpoint it is the image that does: no instance is the owner then. `image`
+    names the executor that removes one that nobody wants any more; "": this is no checkpoint.
+    """
 
     timeout: float = 0.0
     undo: Step | None = None
+    image: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,8 +207,8 @@ class Plan:
     options: Mapping[str, Any] = field(default_factory=lambda: EMPTY)
 
 
-def plan_fault(plan: Plan, move: Move) -> str:
-    """What is wrong with a plan that a strategy proposed; "" for a sound one."""
+def plan_fault(plan: Plan, move: Move, aim: Aim = Aim.MOVE) -> str:
+    """What is wrong with a plan that a strategy proposed for an aim; "" for a sound one."""
     commits = sum(isinstance(step, Commit) for step in plan.steps)
     if commits != 1:
         return f"it has {commits} commit points, not one"
@@ -205,11 +222,34 @@ def plan_fault(plan: Plan, move: Move) -> str:
         fault = _handoff_fault(step)
         if fault:
             return fault
-    for step in plan.steps:
-        if isinstance(step, Commit):
-            return "it commits to a destination that it never starts or awaits"
-        if isinstance(step, (Start, AwaitReady)) and step.instance == move.destination:
-            return ""
+    return _commit_fault(plan, move, aim)
+
+
+def _commit_fault(plan: Plan, move: Move, aim: Aim) -> str:
+    """Whether what owns the name after the commit is there before it."""
+    at = next(at for at, step in enumerate(plan.steps) if isinstance(step, Commit))
+    before, commit, after = plan.steps[:at], plan.steps[at], plan.steps[at + 1 :]
+    if isinstance(commit, Commit) and bool(commit.image) != (aim is Aim.CHECKPOINT):
+        return f"the plan of a {aim.value} commits to {'an image' if commit.image else 'no image'}"
+    if aim is Aim.CHECKPOINT:
+        return _checkpoint_fault(plan, after, move)
+    begun = [
+        step for step in before
+        if isinstance(step, (Start, AwaitReady)) and step.instance == move.destination
+    ]  # fmt: skip
+    if not begun:
+        return "it commits to a destination that it never starts or awaits"
+    if aim is Aim.RESTORE and not any(isinstance(one, Start) and one.restored for one in begun):
+        return "a restore starts the destination anew, not from its image"
+    return ""
+
+
+def _checkpoint_fault(plan: Plan, after: Iterable[Step], move: Move) -> str:
+    """The source must never run again beside its image, and nothing else is begun."""
+    if any(isinstance(step, Start) for step in all_steps(plan.steps)):
+        return "a checkpoint starts an instance"
+    if not any(isinstance(step, Stop) and step.instance == move.source for step in after):
+        return "a checkpoint does not stop its source after the commit"
     return ""
 
 

@@ -9,7 +9,8 @@ forward   fails, committed    it is tried again; the process is shown as stuck u
 back      is done             the next undo; after the last, the source goes on
 back      fails               it is tried again; the process is shown as stuck until it is done
 any       cannot be done      it is left out: an instance that has ended never starts again
-back      destination active  forward to the commit: in a handoff the destination decides
+back      destination active  forward to the commit: in a handoff it decides itself; of a restore
+                              an executor has found that it goes on
 ========  ==================  ==============================================================
 
 A process that is to be cancelled turns back; one that is stuck is given up, and all its instances
@@ -21,10 +22,10 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from rosrm.core import abilities, handoffs, keeping, lifecycle
+from rosrm.core import abilities, handoffs, images, imaging, keeping, lifecycle
 from rosrm.core import events as happened
 from rosrm.core.hosts import HostCondition
-from rosrm.core.migration import AwaitReady, Commit, Configure, Start, Step, Stop
+from rosrm.core.migration import Aim, AwaitReady, Commit, Configure, Start, Step, Stop
 from rosrm.core.model import InstanceId, InstanceState
 from rosrm.core.runs import End
 from rosrm.core.state import MasterState, Process, ProcessPhase, Run, Wanted
@@ -51,6 +52,8 @@ def advance_all(state: MasterState, now: float) -> None:
 def order_answered(state: MasterState, event: happened.OrderAnswered, now: float) -> None:
     """A slave took an order, refused it, or did not answer in time."""
     if keeping.order_answered(state, event) or abilities.order_answered(state, event, now):
+        return
+    if images.order_answered(state, event, now):
         return
     name = state.runs_by_order.pop(event.order, None)
     run = state.runs.get(name) if name is not None else None
@@ -90,7 +93,7 @@ def _choose_way(state: MasterState, run: Run, now: float) -> None:
     """Before the commit: a destination that is active decides, or else what befell the source."""
     if run.committed:
         return
-    if handoffs.is_active(state, run):
+    if handoffs.is_active(state, run) or run.went_on:
         if run.undo is not None:
             _go_forward(state, run, now)
     elif run.undo is None:
@@ -131,17 +134,26 @@ def _next(state: MasterState, run: Run, step: Step, now: float) -> None:
     )  # fmt: skip
     process = state.processes[run.process]
     if isinstance(step, Commit):
-        run.committed = True
-        process.owner = run.destination.number
-        process.migrations += 1
-        process.moved_at = now
-        if process.wanted is Wanted.REQUEUE:
-            process.wanted = Wanted.RUN  # that was meant for the host which it has left
-        state.save(process)
+        _commit(state, run, step, now)
     elif isinstance(step, Start) and run.undo is not None:
         process.owner = step.instance.number
         state.save(process)
     _go_on(state, run, now)
+
+
+def _commit(state: MasterState, run: Run, step: Commit, now: float) -> None:
+    process = state.processes[run.process]
+    run.committed = True
+    if run.aim is Aim.CHECKPOINT:
+        imaging.commit_to_image(state, process, run, step)
+    else:
+        process.owner = run.destination.number
+        images.set_image(state, process, None)
+    process.migrations += run.aim is Aim.MOVE
+    process.moved_at = now
+    if process.wanted is Wanted.REQUEUE:
+        process.wanted = Wanted.RUN  # that was meant for the host which it has left
+    state.save(process)
 
 
 def _cannot_be_done(state: MasterState, run: Run, step: Step, now: float) -> bool:
@@ -168,7 +180,7 @@ def _go_on(state: MasterState, run: Run, now: float) -> None:
 def _not_stuck(state: MasterState, run: Run, now: float) -> None:
     run.stuck = False
     process = state.processes[run.process]
-    state.set_phase(process, ProcessPhase.MIGRATING, now, f"to {run.destination_host.name}")
+    state.set_phase(process, ProcessPhase.MIGRATING, now, run.course)
 
 
 def _failed(state: MasterState, run: Run, step: Step, reason: str, now: float) -> None:
@@ -210,8 +222,9 @@ def _go_forward(state: MasterState, run: Run, now: float) -> None:
     run.retry_at = now
     if run.stuck:
         _not_stuck(state, run, now)
+    what = "moves" if run.aim is Aim.MOVE else "goes on"
     state.record(
-        now, "migration_redone", f"{run.process} moves after all: {run.destination} is active",
+        now, "migration_redone", f"{run.process} {what} after all: {run.destination} is active",
         process=run.process,
     )  # fmt: skip
     state.save_run(run)
@@ -260,10 +273,9 @@ def _conclude(state: MasterState, run: Run, now: float) -> None:
                 lifecycle.stop_instance(state, instance, now)
     for name in run.source_host.over_since:
         run.source_host.over_since[name] = now  # see first what this move brings
+    kind, message = imaging.ending_of(run)
     state.record(
-        now, "migrated" if moved else "stayed",
-        f"{run.process} moved from {run.source_host.name} to {run.destination_host.name}"
-        if moved else f"{run.process} stayed on {run.source_host.name}: {run.failure}",
+        now, kind, message,
         process=run.process, host=(run.destination_host if moved else run.source_host).name,
         facts={
             "from": run.source_host.name, "to": run.destination_host.name,
@@ -281,6 +293,9 @@ def _parts(run: Run) -> dict[str, Any]:
 
 def _settle_owner(state: MasterState, process: Process, run: Run, now: float) -> None:
     owner = state.instances.get(process.owner)
+    if process.image is not None and process.owner == 0:
+        imaging.settle(state, process, run, now)
+        return
     if owner is None:
         host = run.destination_host if run.committed else run.source_host
         lifecycle.conclude(state, process, _end_of_owner(process, run), host, now)

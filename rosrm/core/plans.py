@@ -160,4 +160,5 @@ _READ: Final[Mapping[str, Callable[[Any], Any]]] = {
     "arguments": _mapping,
     "remappings": _mapping,
     "undo": _undo,
+    "image": _text,
 }

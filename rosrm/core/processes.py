@@ -32,6 +32,7 @@ class ProcessPhase(str, Enum):
     CANCELLED = "cancelled"
     UNREACHABLE = "unreachable"
     STUCK = "stuck"
+    CHECKPOINTED = "checkpointed"
 
     @property
     def over(self) -> bool:
@@ -119,6 +120,29 @@ class LeftBehind:
     node_name: str = ""
 
 
+@dataclass(frozen=True, slots=True)
+class Image:
+    """What a process goes on from that was checkpointed: it owns the name.
+
+    Attributes:
+        number: of the instance that it is of.
+        host: name of the host on which it lies.
+        strategy: that made it, and restores it.
+        drop: the executor that removes it.
+        made_at: unix time.
+        node_name: under which its node runs, where that is not the process's name.
+        needs: base units that it was seen to use, by resource.
+    """
+
+    number: int
+    host: str
+    strategy: str
+    drop: str
+    made_at: float
+    node_name: str = ""
+    needs: Mapping[str, float] = field(default_factory=dict)
+
+
 class PlainSpec(Lazy):
     """A spec as JSON has it: made once for all the intents that it is in."""
 
@@ -146,6 +170,7 @@ class Process:
         decision: the newest one about it, with its kind.
         left_behind: the instance that may still run on a lost host, while this process waits in the
             queue for another one.
+        image: what it goes on from, when it is restored; None: it is not checkpointed.
         standby_at: time before which no standby is begun.
         standby_tries: standbys that were lost, one after the other.
         standby_reason: how it stands with its standby, for people.
@@ -169,6 +194,7 @@ class Process:
     decision: Mapping[str, Any] | None = None
     decided_at: float = 0.0
     left_behind: LeftBehind | None = None
+    image: Image | None = None
     standby_at: float = 0.0
     standby_tries: int = 0
     standby_reason: str = ""

@@ -149,8 +149,20 @@ def _drain(state: MasterState, host: Host, now: float) -> None:
         reason = try_move(state, process, f"{host.name} is being drained", now)
         if reason:
             reasons.append(reason)
+    reasons += _images_on(state, host)
     if reasons:
         _tell_nothing_moves(state, host, "drain", reasons, now)
+
+
+def _images_on(state: MasterState, host: Host) -> list[str]:
+    """An image is restored where it lies: what is checkpointed leaves with nobody."""
+    names = sorted(state.images.of)
+    of_host = ((name, state.processes[name].image) for name in names)
+    return [
+        f"{name} is checkpointed: its image stays on {host.name}"
+        for name, image in of_host
+        if image is not None and image.host == host.name
+    ]
 
 
 def _tell_nothing_moves(

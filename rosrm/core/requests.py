@@ -1,13 +1,14 @@
-"""What people ask for: submit, cancel, restart, migrate, cordon, drain."""
+"""What people ask for: submit, cancel, restart, migrate, checkpoint, restore, cordon, drain."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 from rosrm.core import events as happened
-from rosrm.core import keeping, lifecycle
+from rosrm.core import images, imaging, keeping, lifecycle
 from rosrm.core.assigning import reconsider_set_aside
+from rosrm.core.begin import why_busy
 from rosrm.core.commands import Order, Reply
 from rosrm.core.intake import save_host
 from rosrm.core.model import ProcessSpec
@@ -150,7 +151,14 @@ def _cancel(state: MasterState, process: Process, now: float) -> None:
         state.record(
             now, "cancelled", f"{process.name} cancelled in the queue", process=process.name
         )
-    elif process.owner == 0:
+    elif process.image is not None and process.name not in state.runs:
+        images.drop(state, process)
+        state.set_phase(process, ProcessPhase.CANCELLED, now)
+        state.record(
+            now, "cancelled", f"{process.name} cancelled; its image is removed",
+            process=process.name,
+        )  # fmt: skip
+    elif process.owner == 0 and process.name not in state.runs:
         # Its owner has ended and a former instance is being stopped: that goes on by itself.
         state.set_phase(process, ProcessPhase.CANCELLED, now)
         state.record(now, "cancelled", f"{process.name} cancelled", process=process.name)
@@ -179,8 +187,8 @@ def _restart_fault(state: MasterState, process: Process) -> str:
     if process.phase in WAITING:
         return f"{process.name} waits in the queue already"
     if process.name in state.runs:
-        return f"{process.name} is moving"
-    if process.phase.over:
+        return why_busy(state.runs[process.name])
+    if process.phase.over or process.image is not None:
         return _still_stopping(state, process.name)
     if process.wanted is not Wanted.RUN:
         return f"{process.name} is being stopped"
@@ -191,7 +199,8 @@ def _restart_fault(state: MasterState, process: Process) -> str:
 
 def _restart(state: MasterState, process: Process, now: float) -> None:
     state.record(now, "restart_requested", f"{process.name} is restarted", process=process.name)
-    if process.phase.over:
+    if process.phase.over or process.image is not None:
+        images.drop(state, process)
         keeping.begin_anew(state, process)
         process.excluded.clear()
         process.demand = None
@@ -227,6 +236,36 @@ def migration_requested(state: MasterState, event: happened.MigrationRequested, 
         return
     name = state.runs[process.name].destination_host.name
     state.emit(Reply(event.request, message=f"{process.name} moves to {name}", host=name))
+
+
+def checkpoint_requested(
+    state: MasterState, event: happened.CheckpointRequested, now: float
+) -> None:
+    """Begin to dump a process into an image."""
+    _begin(state, event, imaging.begin_checkpoint, now)
+
+
+def restore_requested(state: MasterState, event: happened.RestoreRequested, now: float) -> None:
+    """Begin to restore a process from its image."""
+    _begin(state, event, imaging.begin_restore, now)
+
+
+def _begin(
+    state: MasterState,
+    event: happened.CheckpointRequested | happened.RestoreRequested,
+    begin: Callable[[MasterState, Process, float], str],
+    now: float,
+) -> None:
+    processes = _known(state, event.request, [event.name])
+    if processes is None:
+        return
+    refusal = begin(state, processes[0], now)
+    if refusal:
+        _refuse(state, event.request, refusal)
+        return
+    run = state.runs[event.name]
+    message = f"{event.name}: {run.course}"
+    state.emit(Reply(event.request, message=message, host=run.source_host.name))
 
 
 def _refuse_host(state: MasterState, request: int, name: str) -> None:

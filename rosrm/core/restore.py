@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from rosrm.core import lost_tail
+from rosrm.core import images, lost_tail
 from rosrm.core.lifecycle import adopt_to_stop
+from rosrm.core.migration import Aim
 from rosrm.core.model import InstanceId
 from rosrm.core.plans import plan_from_dict
-from rosrm.core.processes import LeftBehind
+from rosrm.core.processes import Image, LeftBehind
 from rosrm.core.runs import end_from_dict, way_back
 from rosrm.core.specs import spec_from_dict
 from rosrm.core.state import MasterState, Process, ProcessPhase, Run, Wanted
@@ -48,6 +49,7 @@ def restore(state: MasterState, intents: Callable[[str], _Table], now: float) ->
     numbers = cluster.get("instances", {})
     state.next_instance = state.reserved_instances = int(numbers.get("next", 1))
     lost_tail.restore(state, cluster)
+    images.restore(state, cluster)
 
 
 def _restore_process(state: MasterState, item: Mapping[str, Any], now: float) -> Process:
@@ -59,6 +61,8 @@ def _restore_process(state: MasterState, item: Mapping[str, Any], now: float) ->
         left_behind=LeftBehind(*left) if (left := item.get("left_behind")) else None,
     )  # fmt: skip
     state.add_process(process)
+    image = item.get("image")  # older journals have none
+    images.set_image(state, process, None if image is None else Image(**image))
     return process
 
 
@@ -67,6 +71,9 @@ def _restore_place(state: MasterState, process: Process, now: float) -> None:
         state.queue.add(process.name, process.spec.priority, process.order)
     elif process.phase is ProcessPhase.SET_ASIDE:
         state.set_aside.add(process.name)
+    elif process.image is not None:
+        trouble = process.reason if process.phase is ProcessPhase.CHECKPOINTED else ""
+        images.note_checkpointed(state, process, now, trouble)
     elif not process.phase.over:
         _expect_to_run(state, process, now)
 
@@ -147,9 +154,14 @@ def _restore_move(
     state.runs[process.name] = run
     for number in process.instances.intersection(move["stopping"]):
         state.instances[number].stopping = True
-    state.set_phase(process, ProcessPhase.MIGRATING, now, f"to {run.destination_host.name}")
+    state.set_phase(process, ProcessPhase.MIGRATING, now, run.course)
+    goes_on = (
+        f"goes on moving to {run.destination_host.name}"
+        if run.aim is Aim.MOVE
+        else (f"goes on: {run.course}")
+    )
     state.record(
-        now, "migration_taken_up", f"{process.name} goes on moving to {run.destination_host.name}",
+        now, "migration_taken_up", f"{process.name} {goes_on}",
         process=process.name, host=run.destination_host.name,
     )  # fmt: skip
     return True
@@ -168,6 +180,7 @@ def _run_of(state: MasterState, process: Process, move: Mapping[str, Any], now: 
         committed=bool(move["committed"]), failure=move["failure"],
         launched=set(move["launched"]), suspended=set(move["suspended"]),
         results=dict(move.get("results", {})),  # older journals have none
+        aim=Aim(move.get("aim", Aim.MOVE)),
     )  # fmt: skip
     if move["back"]:
         run.undo = way_back(plan, run.turned_at)

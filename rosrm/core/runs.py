@@ -8,7 +8,7 @@ from typing import Any
 
 from rosrm.core.hosts import Host
 from rosrm.core.lazy import Lazy
-from rosrm.core.migration import Commit, Plan, ReportPhase, Step
+from rosrm.core.migration import Aim, Commit, Plan, ReportPhase, Step
 from rosrm.core.model import InstanceId, InstanceState, InstanceStatus
 from rosrm.core.plans import plan_to_dict
 
@@ -80,6 +80,8 @@ class Run:
         heard: what they said of a handoff, by number.
         taking_over: the destination was told to go on without its source.
         results: what executors have answered, by their names.
+        aim: what it is to bring about. Source and destination of a checkpoint or a restore have the
+            same host.
     """
 
     process: str
@@ -112,6 +114,7 @@ class Run:
     heard: dict[int, Heard] = field(default_factory=dict)
     taking_over: bool = False
     results: dict[str, Mapping[str, Any]] = field(default_factory=dict)
+    aim: Aim = Aim.MOVE
     plain_plan: PlainPlan = field(init=False)
 
     def __post_init__(self) -> None:
@@ -137,6 +140,21 @@ class Run:
         """The steps of the plan that were begun, or may have been, on the way forward."""
         reached = self.index if self.undo is None else self.turned_at
         return self.plan.steps[: reached + 1]
+
+    @property
+    def went_on(self) -> bool:
+        """An executor has answered that the destination goes on already: there is no way back."""
+        return any(result.get("active") is True for result in self.results.values())
+
+    @property
+    def course(self) -> str:
+        """What happens to the process meanwhile, for people."""
+        host = self.destination_host.name
+        return {
+            Aim.MOVE: f"to {host}",
+            Aim.CHECKPOINT: f"it is being checkpointed on {host}",
+            Aim.RESTORE: f"it is being restored on {host}",
+        }[self.aim]
 
     @property
     def commit_index(self) -> int:
@@ -188,6 +206,7 @@ def run_to_dict(run: Run, stopping: Sequence[int]) -> dict[str, Any]:
         "suspended": sorted(run.suspended), "stopping": list(stopping),
         "ended": {str(number): _end_to_dict(end) for number, end in run.ended.items()},
         "results": {name: dict(result) for name, result in run.results.items()},
+        "aim": run.aim.value,
     }  # fmt: skip
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from math import inf
 from typing import Any, Final
 
@@ -15,6 +15,7 @@ from rosrm.core.commands import Command
 from rosrm.core.fencing import fence_of
 from rosrm.core.holdings import Keeping
 from rosrm.core.hosts import Host, HostTable
+from rosrm.core.images import Images
 from rosrm.core.model import EMPTY, Assignment, InstanceId, ProcessSpec
 from rosrm.core.needs import LearnedNeeds
 from rosrm.core.placement import Demand, NamedPolicy, Ranking
@@ -110,6 +111,7 @@ class MasterState:
         self.placed_at: tuple[int, ...] = ()
         self.keeping = Keeping()
         self.abilities = Abilities()
+        self.images = Images()
         self.next_order = 1
         self.next_instance = 1
         self.reserved_instances = 1
@@ -177,6 +179,7 @@ class MasterState:
                 "restarts": process.restarts, "node_names": aliases,
                 "standby": self._standby_of(process), "born": process.born,
                 "left_behind": left and [left.number, left.host, left.node_name],
+                "image": None if process.image is None else asdict(process.image),
             },
         )  # fmt: skip
 

@@ -50,8 +50,9 @@ class ProcessRow:
 
     Attributes:
         state: "queued", "set_aside", "assigned", "starting", "running", "backoff", "stopping",
-            "migrating", "finished", "failed", "cancelled", "unreachable" or "stuck".
-        host: where the owning instance is; "" for none.
+            "migrating", "checkpointed", "finished", "failed", "cancelled", "unreachable" or
+            "stuck".
+        host: where the owning instance is, or the image; "" for none.
         number: of the owning instance; 0: none.
         queue_position: 1 is the head; 0: not in the queue.
         since: seconds in this state.

@@ -26,6 +26,8 @@ _REFUSED: Final = (
     happened.CancelRequested,
     happened.RestartRequested,
     happened.MigrationRequested,
+    happened.CheckpointRequested,
+    happened.RestoreRequested,
     happened.HostStateRequested,
 )
 #: These come again by themselves.

@@ -357,6 +357,12 @@ class Cluster:
     def migrate(self, name: str, host: str | None = None) -> Reply:
         return self.ask(happened.MigrationRequested, name, host)
 
+    def checkpoint(self, name: str) -> Reply:
+        return self.ask(happened.CheckpointRequested, name)
+
+    def restore(self, name: str) -> Reply:
+        return self.ask(happened.RestoreRequested, name)
+
     def set_host(self, host: str, action: str) -> Reply:
         return self.ask(happened.HostStateRequested, host, action)
 

@@ -32,7 +32,7 @@ EVERYTHING = Plan(
         Configure(HandoffPhase.SHADOW, 4.0, awaited=False),
         SetRestart(ONE, "a", RestartPolicy("always", delay=0.1, attempts=7), 5.0),
         Execute("dump", "b", {"to": ["x", {"deep": 1}], "n": None}, 6.0),
-        Commit(),
+        Commit(image="drop"),
         AwaitReleased(ONE, "a", 2.5),
     ),
     overlap=7.5,

@@ -107,6 +107,8 @@ EVENTS = {
     happened.MigrationRequested: st.builds(
         happened.MigrationRequested, INT, TEXT, st.one_of(st.none(), TEXT)
     ),
+    happened.CheckpointRequested: st.builds(happened.CheckpointRequested, INT, TEXT),
+    happened.RestoreRequested: st.builds(happened.RestoreRequested, INT, TEXT),
     happened.HostStateRequested: st.builds(happened.HostStateRequested, INT, TEXT, TEXT),
     happened.OrderAnswered: st.builds(
         happened.OrderAnswered, INT, st.booleans(), TEXT, TEXT, st.one_of(st.none(), JSON)

@@ -1,0 +1,137 @@
+"""A host that takes images of its processes, and a strategy that plans it, as `criu` does."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from rosrm.core.migration import Commit, Execute, Move, Plan, SetRestart, Start, Step, Stop
+from rosrm.core.model import RestartPolicy
+from tests.unit.core.cluster import Cluster, StartFirstOrStopFirst
+from tests.unit.core.machine import Machine
+
+#: Seconds that each step is given.
+PATIENCE = 5.0
+
+
+class Freezer(StartFirstOrStopFirst):
+    """Moves as `relaunch`, and takes images."""
+
+    ability = "can_freeze"
+
+    def host_fault(self, source: Mapping[str, str], destination: Mapping[str, str]) -> str:
+        return ""
+
+    def checkpoint(self, move: Move) -> Plan:
+        here, source, policy = move.source_host, move.source, move.spec.restart
+        give_back = SetRestart(source, here, policy, PATIENCE)
+        return Plan(
+            (
+                SetRestart(source, here, RestartPolicy("never"), PATIENCE, undo=give_back),
+                self._execute("freeze", move, undo=self._execute("thaw", move)),
+                Commit(image="drop"),
+                self._execute("kill", move),
+                Stop(source, here, PATIENCE),
+            )
+        )
+
+    def restore(self, move: Move) -> Plan:
+        here, one = move.destination_host, move.destination
+        alias = move.source_node if move.source_node != move.spec.name else ""
+        return Plan(
+            (
+                self._execute("take", move, undo=self._execute("put_back", move)),
+                Start(one, here, PATIENCE, alias, restored=True),
+                self._execute("await", move),
+                Commit(),
+                SetRestart(one, here, move.spec.restart, PATIENCE),
+            )
+        )
+
+    def _execute(self, name: str, move: Move, undo: Step | None = None) -> Execute:
+        arguments = {"source": move.source.number, "destination": move.destination.number}
+        return Execute(name, move.source_host, arguments, PATIENCE, undo)
+
+
+class Shelf:
+    """A machine with these executors, and its images.
+
+    Attributes:
+        images: numbers of the instances of which there is an image.
+        taken: images that are being restored: the number of the instance to be, to that of which
+            it is.
+        frozen: instances that stand still.
+        alive: restored instances that go on with their memory.
+        trouble: by the name of an executor, why it fails.
+        asked: names of the executors, in order.
+    """
+
+    def __init__(self, name: str, **fields: Any) -> None:
+        self.images: set[int] = set()
+        self.taken: dict[int, int] = {}
+        self.frozen: set[int] = set()
+        self.alive: set[int] = set()
+        self.trouble: dict[str, str] = {}
+        self.asked: list[str] = []
+        tasks = {
+            "can_freeze": lambda _: {}, "freeze": self._freeze, "thaw": self._thaw,
+            "kill": lambda _: {}, "take": self._take, "put_back": self._put_back,
+            "await": self._await, "drop": self._drop,
+        }  # fmt: skip
+        self.machine = Machine(
+            name, executors={one: self._task(one, task) for one, task in tasks.items()}, **fields
+        )
+
+    def _task(self, name: str, task: Any) -> Any:
+        def execute(arguments: Mapping[str, Any]) -> Any:
+            self.asked.append(name)
+            if name in self.trouble:
+                raise RuntimeError(self.trouble[name])
+            return task(arguments) or {}
+
+        return execute
+
+    def _freeze(self, arguments: Mapping[str, Any]) -> None:
+        number = arguments["source"]
+        assert any(one.number == number for one in self.machine.programs), "it has ended"
+        self.frozen.add(number)
+        self.images.add(number)
+
+    def _thaw(self, arguments: Mapping[str, Any]) -> None:
+        self.frozen.discard(arguments["source"])
+        self.images.discard(arguments["source"])
+
+    def _take(self, arguments: Mapping[str, Any]) -> None:
+        source, destination = arguments["source"], arguments["destination"]
+        if self.taken.get(destination) == source:
+            return
+        if source not in self.images:
+            raise RuntimeError("there is no image")
+        self.images.remove(source)
+        self.taken[destination] = source
+
+    def _await(self, arguments: Mapping[str, Any]) -> None:
+        destination = arguments["destination"]
+        assert any(one.number == destination for one in self.machine.programs), "it has ended"
+        self.taken.pop(destination, None)
+        self.alive.add(destination)
+
+    def _put_back(self, arguments: Mapping[str, Any]) -> Any:
+        destination = arguments["destination"]
+        if destination in self.alive:
+            return {"active": True}
+        for instance in list(self.machine.programs):
+            if instance.number == destination:  # what holds it ends with its failure
+                self.machine.finish(instance.process, self.cluster.now, code=125)
+        if destination in self.taken:
+            self.images.add(self.taken.pop(destination))
+        return {}
+
+    def _drop(self, arguments: Mapping[str, Any]) -> None:
+        self.images.difference_update(arguments["numbers"])
+
+    def play(self, *others: Machine | str, **settings: Any) -> Cluster:
+        """A cluster whose first host this is."""
+        self.cluster = Cluster(self.machine, *others, strategies={"freezer": Freezer()}, **settings)
+        self.cluster.wait(0.5)
+        return self.cluster

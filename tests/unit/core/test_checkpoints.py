@@ -1,0 +1,569 @@
+"""Checkpoint and restore: what owns the name when, what is refused, and that nothing is lost."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from rosrm.core.commands import Command, Order
+from rosrm.core.migration import Aim, Commit, Move, Plan, Start, Stop, plan_fault
+from rosrm.core.model import (
+    HostLossPolicy,
+    InstanceId,
+    MigrationPolicy,
+    ProcessSpec,
+    RestartPolicy,
+    StandbyPolicy,
+)
+from tests.unit.core.cluster import GIB, Cluster, Machine, movable, process
+from tests.unit.core.shelf import PATIENCE, Freezer, Shelf
+
+
+def playing(spec: ProcessSpec | None = None, **fields: Any) -> tuple[Shelf, Cluster]:
+    """P runs on a, which takes images."""
+    shelf = Shelf("a", **fields)
+    cluster = shelf.play()
+    cluster.submit(spec or process("p"))
+    assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
+    return shelf, cluster
+
+
+def checkpointed(spec: ProcessSpec | None = None, **fields: Any) -> tuple[Shelf, Cluster]:
+    """P is checkpointed on a."""
+    shelf, cluster = playing(spec, **fields)
+    reply = cluster.checkpoint("p")
+    assert (reply.accepted, reply.message) == (True, "p: it is being checkpointed on a")
+    return shelf, cluster
+
+
+def row(cluster: Cluster, name: str = "p") -> dict[str, Any]:
+    return cluster.explain(name)
+
+
+# --- there and back ---------------------------------------------------------------------------
+
+
+def test_a_checkpoint_ends_the_process_and_leaves_its_image() -> None:
+    """The name is not free, nothing runs, the host has its room back, and the row says where."""
+    shelf, cluster = checkpointed()
+    assert (cluster.phase("p"), cluster.where("p"), shelf.images) == ("checkpointed", [], {1})
+    assert cluster["p"].owner == 0
+    assert cluster.state.hosts.processes.tolist() == [0]
+    assert not cluster.submit(process("p")).accepted
+    told = row(cluster)
+    assert (told["host"], told["reason"]) == ("a", "its image is on a")
+    assert cluster.told("checkpointed") == ["p is checkpointed: its image is on a"]
+    assert not cluster.intents["migration"]
+    cluster.wait(60.0)
+    assert (cluster.phase("p"), cluster.where("p"), shelf.images) == ("checkpointed", [], {1})
+
+
+def test_a_restore_goes_on_from_the_image() -> None:
+    """As a new instance with the process's own restart policy; the image is used up."""
+    policy = RestartPolicy("on-failure", delay=0.1)
+    shelf, cluster = checkpointed(process("p", restart=policy))
+    assert cluster.restore("p").message == "p: it is being restored on a"
+    assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
+    assert (shelf.images, shelf.taken, shelf.alive) == (set(), {}, {cluster["p"].owner})
+    instance = shelf.machine.find("p")
+    assert shelf.machine.programs[instance].assignment.restored
+    assert shelf.machine.programs[instance].restart == policy
+    assert cluster["p"].image is None
+    assert cluster["p"].migrations == 0
+    assert cluster.told("restored") == ["p goes on from its image on a"]
+    assert cluster.checkpoint("p").accepted
+    assert shelf.images == {instance.number}
+
+
+def test_a_process_keeps_the_name_of_its_node_through_an_image() -> None:
+    """One that came by a handoff runs under an alias."""
+    shelf, cluster = playing()
+    cluster.state.instances[cluster["p"].owner].node_name = "p_7"
+    cluster.checkpoint("p")
+    cluster.restart_master()
+    cluster.wait(0.5)
+    assert cluster.restore("p").accepted
+    assert shelf.machine.programs[shelf.machine.find("p")].assignment.node_name == "p_7"
+
+
+def test_a_restored_process_that_ends_before_its_plan_does_follows_its_policy() -> None:
+    """Its image is used up: there is no way back, and it ends as any process does."""
+    shelf, cluster = checkpointed(process("p", restart=RestartPolicy("never")))
+    restored = shelf.machine.executors["await"]
+
+    def end_after(arguments: Any) -> Any:
+        result = restored(arguments)
+        shelf.machine.finish("p", cluster.now, code=3)
+        return result
+
+    shelf.machine.executors["await"] = end_after
+    cluster.restore("p")
+    cluster.wait(1.0)
+    assert "p goes on from its image" in cluster.told("restored")[0]
+    assert (cluster.where("p"), cluster["p"].image, shelf.images) == ([], None, set())
+    assert cluster.phase("p") == "failed"
+
+
+# --- what fails -------------------------------------------------------------------------------
+
+
+def test_what_cannot_be_dumped_runs_on_and_the_reason_is_said() -> None:
+    """With the restart policy that it had."""
+    policy = RestartPolicy("always")
+    shelf, cluster = playing(process("p", restart=policy))
+    shelf.trouble["freeze"] = "file descriptor 7 is a pipe"
+    cluster.checkpoint("p")
+    assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
+    assert shelf.machine.programs[shelf.machine.find("p")].restart == policy
+    (said,) = cluster.told("checkpoint_failed")
+    assert said == "p runs on on a: freeze failed on a: file descriptor 7 is a pipe"
+    assert (shelf.frozen, shelf.images) == (set(), set())
+
+
+@pytest.mark.parametrize("step", ["take", "await"])
+def test_a_restore_that_fails_leaves_the_image_where_it_was(step: str) -> None:
+    """The process is checkpointed again, with the reason, and can be restored later."""
+    shelf, cluster = checkpointed()
+    shelf.trouble[step] = "its pid 7 is in use here"
+    cluster.restore("p")
+    cluster.wait(2.0)
+    assert (cluster.phase("p"), cluster.where("p"), shelf.images) == ("checkpointed", [], {1})
+    assert "its pid 7 is in use here" in row(cluster)["reason"]
+    assert "its image is on a; it was not restored" in row(cluster)["reason"]
+    assert cluster.state.hosts.processes.tolist() == [0]
+    assert "p stays checkpointed on a" in cluster.told("restore_failed")[0]
+    cluster.restart_master()
+    assert "its pid 7 is in use here" in row(cluster)["reason"]
+    shelf.trouble.clear()
+    cluster.wait(0.5)
+    assert cluster.restore("p").accepted
+    assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
+
+
+def test_a_slave_that_refuses_the_start_leaves_the_image() -> None:
+    """As where CRIU has gone meanwhile."""
+    shelf, cluster = checkpointed()
+    shelf.machine.refuses["p"] = "there is no CRIU here"
+    cluster.restore("p")
+    cluster.wait(1.0)
+    assert (cluster.phase("p"), shelf.images) == ("checkpointed", {1})
+    assert "there is no CRIU here" in row(cluster)["reason"]
+
+
+def test_a_process_that_was_restored_is_not_put_back() -> None:
+    """Nobody heard that it was: an older image would tell its peers what they have heard."""
+    shelf, cluster = checkpointed()
+    restored = shelf.machine.executors["await"]
+
+    def say_nothing(arguments: Any) -> Any:
+        restored(arguments)
+        raise RuntimeError("nothing was heard")
+
+    shelf.machine.executors["await"] = say_nothing
+    cluster.restore("p")
+    cluster.wait(1.0)
+    assert (cluster.phase("p"), cluster.where("p"), shelf.images) == ("running", ["a"], set())
+    assert cluster.told("migration_redone") == [
+        f"p goes on after all: p#{cluster['p'].owner} is active"
+    ]
+
+
+def test_a_cancelled_restore_that_has_succeeded_is_stopped() -> None:
+    """It turns back, finds the process alive, goes forward, and is cancelled then."""
+    shelf, cluster = checkpointed()
+    restored = shelf.machine.executors["await"]
+
+    def cancel_meanwhile(arguments: Any) -> Any:
+        restored(arguments)
+        shelf.machine.executors["await"] = restored
+        raise RuntimeError("nothing was heard")
+
+    shelf.machine.executors["await"] = cancel_meanwhile
+    shelf.trouble["put_back"] = "busy"
+    cluster.restore("p")
+    assert cluster.phase("p") == "stuck"
+    cluster["p"].wanted = cluster["p"].wanted.CANCEL
+    cluster.wait(2.0)
+    assert (cluster.phase("p"), cluster.where("p")) == ("cancelled", [])
+
+
+# --- what is refused --------------------------------------------------------------------------
+
+
+def test_what_cannot_be_checkpointed_is_refused_with_its_reason() -> None:
+    """Nothing has changed then."""
+    shelf = Shelf("a")
+    cluster = shelf.play()
+    cluster.submit(
+        process("p"),
+        process("waits", memory=1e9),
+        movable("watched", standby=StandbyPolicy(wanted=True)),
+        process("stateful", ros=True, migration=MigrationPolicy("handoff")),
+    )  # fmt: skip
+    shelf.machine.seen_in_graph("stateful", cluster.now)
+    cluster.settle()
+    cases = [
+        ("x", "no such process: x"),
+        ("waits", "only a running process is checkpointed"),
+        ("watched", "watched has a standby, which would go on in its place"),
+        ("stateful", "takes part under the number of its instance"),
+    ]
+    for name, said in cases:
+        reply = cluster.checkpoint(name)
+        assert not reply.accepted
+        assert said in reply.message
+    assert "p is running; only a checkpointed process is restored" in cluster.restore("p").message
+    cluster.checkpoint("p")
+    assert "p is checkpointed already: its image is on a" in cluster.checkpoint("p").message
+    assert "p is checkpointed: its image is on a; restore it first" in cluster.migrate("p").message
+
+
+def test_while_one_is_under_way_there_is_no_other() -> None:
+    """Neither a second checkpoint, nor a restore, nor a restart."""
+    shelf, cluster = playing()
+    shelf.machine.connected = False
+    cluster.checkpoint("p")
+    for reply in (cluster.checkpoint("p"), cluster.restore("p"), cluster.migrate("p"),
+                  cluster.restart("p")):  # fmt: skip
+        assert "p is busy: it is being checkpointed on a" in reply.message
+
+
+def test_without_a_strategy_that_takes_images_there_is_no_checkpoint() -> None:
+    """What to do is said."""
+    cluster = Cluster("a")
+    cluster.submit(movable("p"))
+    said = cluster.checkpoint("p").message
+    assert "nothing that is selected here can checkpoint p: name `criu`" in said
+
+
+def test_a_host_that_is_not_able_takes_no_image() -> None:
+    """With its own reason."""
+    shelf = Shelf("a")
+    shelf.trouble["can_freeze"] = "CRIU 3.17 is too old"
+    cluster = shelf.play()
+    cluster.submit(process("p"))
+    reply = cluster.checkpoint("p")
+    assert not reply.accepted
+    assert "freezer does not work on a: CRIU 3.17 is too old" in reply.message
+
+
+def test_the_own_strategy_goes_before_the_first_that_is_selected() -> None:
+    """A process that moves by another one that takes images is checkpointed by that."""
+    shelf = Shelf("a")
+    shelf.cluster = cluster = Cluster(
+        shelf.machine, strategies={"first": Freezer(), "own": Freezer()}
+    )
+    cluster.wait(0.5)
+    cluster.submit(process("p", migration=MigrationPolicy("own")), process("q"))
+    cluster.checkpoint("p")
+    cluster.checkpoint("q")
+    assert [cluster[name].image.strategy for name in "pq"] == ["own", "first"]  # type: ignore[union-attr]
+
+
+class Refusing(Freezer):
+    """Makes no image of anything."""
+
+    def checkpoint(self, move: Move) -> Plan:
+        raise ValueError(f"{move.spec.name} holds a camera")
+
+
+def test_a_strategy_may_refuse_a_process() -> None:
+    """It says why."""
+    shelf = Shelf("a")
+    cluster = Cluster(shelf.machine, strategies={"freezer": Refusing()})
+    cluster.wait(0.5)
+    cluster.submit(process("p"))
+    assert "p holds a camera" in cluster.checkpoint("p").message
+    assert (cluster.phase("p"), cluster.state.runs) == ("running", {})
+
+
+def test_a_host_that_is_closed_or_away_restores_nothing() -> None:
+    """An image lies where it lies; whoever asks is told what is the matter."""
+    shelf, cluster = checkpointed()
+    cluster.set_host("a", "cordon")
+    assert "where its image is, and does not fit there now: it is cordoned" in (
+        cluster.restore("p").message
+    )
+    cluster.set_host("a", "uncordon")
+    shelf.machine.connected = False
+    cluster.wait(60.0)
+    assert "on a alone, which is lost" in cluster.restore("p").message
+    assert row(cluster)["reason"] == "its image is on a, which is lost"
+    assert cluster.phase("p") == "checkpointed"
+    cluster.kill_master()
+    assert "a, which has not come back" in row(cluster)["reason"]
+    shelf.machine.connected = True
+    cluster.register(shelf.machine)
+    cluster.wait(0.5)
+    assert row(cluster)["reason"] == "its image is on a"
+    assert cluster.restore("p").accepted
+    assert cluster.phase("p") == "running"
+
+
+def test_a_restore_needs_the_room_that_the_process_used() -> None:
+    """What it was seen to use, not what somebody declared: else its host would go over."""
+    shelf, cluster = playing()
+    shelf.machine.shown["p"] = {"memory": 6 * GIB}
+    cluster.wait(0.3)
+    cluster.checkpoint("p")
+    shelf.machine.shown.clear()
+    shelf.machine.busy["memory"] = 0.6
+    cluster.wait(0.3)
+    reply = cluster.restore("p")
+    assert not reply.accepted
+    assert "does not fit there now: memory: reading 60.0%" in reply.message
+    shelf.machine.busy["memory"] = 0.1
+    cluster.wait(0.3)
+    assert cluster.restore("p").accepted
+    charged = cluster.state.instances[cluster["p"].owner].amounts["memory"]
+    assert charged == pytest.approx(6 * GIB)
+
+
+def test_a_drained_host_says_that_images_stay() -> None:
+    """They are restored where they lie."""
+    _, cluster = checkpointed()
+    cluster.set_host("a", "drain")
+    cluster.wait(0.5)
+    assert "p is checkpointed: its image stays on a" in " ".join(cluster.told("nothing_moves"))
+
+
+@pytest.mark.parametrize("then", ["wait", "elsewhere", "stop"])
+def test_a_checkpointed_process_outlives_the_loss_of_its_host(then: Any) -> None:
+    """Whatever its policy: its image is there."""
+    shelf = Shelf("a")
+    cluster = shelf.play(Machine("b", busy={"memory": 0.5}))
+    cluster.submit(process("p", host_loss=HostLossPolicy(then)))
+    cluster.checkpoint("p")
+    shelf.machine.connected = False
+    cluster.wait(60.0)
+    assert (cluster.phase("p"), cluster.where("p"), shelf.images) == ("checkpointed", [], {1})
+
+
+# --- cancel and restart -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("end", ["cancel", "restart"])
+def test_an_image_that_nobody_wants_is_removed(end: str) -> None:
+    """`restart` begins the process anew."""
+    shelf, cluster = checkpointed()
+    assert getattr(cluster, end)("p").accepted
+    cluster.wait(1.0)
+    assert shelf.images == set()
+    assert cluster["p"].image is None
+    assert cluster.told("image_removed") == ["the image of p was removed from a"]
+    assert not cluster.intents["cluster"].get("unwanted_images")
+    phase, alive = (cluster.phase("p"), cluster.where("p"))
+    assert (phase, alive) == (("cancelled", []) if end == "cancel" else ("running", ["a"]))
+
+
+def test_an_unwanted_image_is_removed_once_its_host_is_heard() -> None:
+    """Also by the next master."""
+    shelf, cluster = checkpointed()
+    shelf.machine.connected = False
+    cluster.wait(2.0)
+    cluster.cancel("p")
+    cluster.wait(1.0)
+    assert shelf.images == {1}
+    cluster.kill_master()
+    shelf.machine.connected = True
+    cluster.restart_master()
+    cluster.wait(1.0)
+    assert (cluster.phase("p"), shelf.images) == ("cancelled", set())
+
+
+def test_a_removal_that_fails_is_tried_again() -> None:
+    """And said each time."""
+    shelf, cluster = checkpointed()
+    shelf.trouble["drop"] = "read-only file system"
+    cluster.cancel("p")
+    cluster.wait(1.0)
+    assert "was not removed from a: read-only file system" in cluster.told("image_left")[0]
+    shelf.trouble.clear()
+    cluster.wait(61.0)
+    assert shelf.images == set()
+
+
+def test_a_checkpoint_that_is_cancelled_ends_the_process() -> None:
+    """Before the commit it turns back, and the process is stopped as any other."""
+    shelf, cluster = playing()
+    freeze = shelf.machine.executors["freeze"]
+
+    def slow(arguments: Any) -> Any:
+        cluster["p"].wanted = cluster["p"].wanted.CANCEL
+        return freeze(arguments)
+
+    shelf.machine.executors["freeze"] = slow
+    cluster.checkpoint("p")
+    cluster.wait(1.0)
+    assert (cluster.phase("p"), cluster.where("p"), shelf.images) == ("cancelled", [], set())
+
+
+def test_a_source_that_cannot_be_ended_yet_is_waited_for() -> None:
+    """After the commit there is no way back; cancelled then, its image goes too."""
+    shelf, cluster = playing()
+    shelf.trouble["kill"] = "the host is slow"
+    cluster.checkpoint("p")
+    cluster.wait(1.0)
+    assert (cluster.phase("p"), cluster["p"].owner) == ("stuck", 0)
+    cluster.cancel("p")
+    cluster.wait(1.0)
+    assert (cluster.phase("p"), cluster.where("p"), shelf.images) == ("cancelled", [], set())
+
+
+def test_a_former_instance_that_comes_back_beside_its_image_is_killed() -> None:
+    """It must never run again."""
+    shelf, cluster = playing()
+    shelf.machine.stubborn.add("p")
+    shelf.trouble["kill"] = "no answer"
+    cluster.checkpoint("p")
+    cluster.wait(1.0)
+    number = shelf.machine.find("p")
+    cluster.state.drop_instance(cluster.state.instances[number.number])
+    cluster.register(shelf.machine)
+    cluster.wait(1.0)
+    assert any(
+        isinstance(one, Order) and one.action == "fence" and one.instance == number
+        for one in cluster.carried
+    )
+
+
+# --- kill of the master at every point --------------------------------------------------------
+
+
+class Killed(Exception):
+    """The master was."""
+
+
+def kill_at(cluster: Cluster, turn: int, *, durable: bool) -> Callable[[], None]:
+    """Have the master killed in its nth turn from now, after what it decided was made durable.
+
+    Returns:
+        What lets it live again.
+    """
+    left, tell = [turn], cluster.tell
+
+    def told(event: Any) -> list[Command]:
+        left[0] -= 1
+        if left[0]:
+            return tell(event)
+        commands = cluster.decide(event)
+        if durable:
+            cluster.journal(commands)
+        raise Killed
+
+    cluster.tell = told  # type: ignore[method-assign]
+
+    def live() -> None:
+        cluster.tell = tell  # type: ignore[method-assign]
+
+    return live
+
+
+def calm(cluster: Cluster) -> str:
+    """The phase of p once nothing is under way."""
+    for _ in range(60):
+        cluster.wait(0.5)
+        if cluster.phase("p") in ("running", "checkpointed") and "p" not in cluster.state.runs:
+            return cluster.phase("p")
+    raise AssertionError(f"p is {cluster.phase('p')}: {cluster['p'].reason}")
+
+
+def look(shelf: Shelf, cluster: Cluster, first: int) -> None:
+    """Its memory is in one place: in a process that goes on, or in an image."""
+    running = [instance.number for instance in shelf.machine.programs]
+    awake = [number for number in running if number not in shelf.frozen]
+    if cluster.phase("p") == "checkpointed":
+        assert (running, len(shelf.images), shelf.taken) == ([], 1, {})
+    else:
+        assert awake == running == [cluster["p"].owner]
+        assert set(running) <= shelf.alive | {first}, "it has begun anew"
+        assert not shelf.images
+
+
+@pytest.mark.parametrize("durable", [True, False], ids=["decided", "undecided"])
+@pytest.mark.parametrize("asked", ["checkpoint", "restore"])
+def test_nothing_is_lost_when_the_master_is_killed_at_any_point(asked: str, durable: bool) -> None:
+    """Whatever was in hand is finished or undone, and the other request works afterwards."""
+    for turn in range(1, 40):
+        shelf, cluster = playing()
+        first = cluster["p"].owner
+        if asked == "restore":
+            cluster.checkpoint("p")
+        live = kill_at(cluster, turn, durable=durable)
+        try:
+            getattr(cluster, asked)("p")
+        except Killed:
+            pass
+        else:
+            break
+        finally:
+            live()
+        cluster.restart_master()
+        phase = calm(cluster)
+        look(shelf, cluster, first)
+        other = cluster.checkpoint if phase == "running" else cluster.restore
+        assert other("p").accepted
+        calm(cluster)
+        look(shelf, cluster, first)
+    assert turn > 5, "it was killed at every step"
+
+
+@pytest.mark.parametrize(
+    "lost", ["set_restart", "freeze", "kill", "stop", "take", "start", "await"]
+)
+def test_nothing_is_lost_when_an_answer_is(lost: str) -> None:
+    """The step is undone, or given again: the process runs, or is checkpointed, in the end."""
+    shelf, cluster = playing()
+    first, obey, once = cluster["p"].owner, shelf.machine.obey, [lost]
+
+    def hard_of_hearing(order: Order, now: float) -> Any:
+        answer = obey(order, now)
+        if once and once[0] in (order.action, order.executor):
+            once.clear()
+            cluster.now += PATIENCE + 1.0
+            return type(answer)(answer.order, False, "timeout")
+        return answer
+
+    shelf.machine.obey = hard_of_hearing  # type: ignore[method-assign]
+    cluster.checkpoint("p")
+    if calm(cluster) == "checkpointed":
+        look(shelf, cluster, first)
+        cluster.restore("p")
+        calm(cluster)
+    look(shelf, cluster, first)
+    assert not once or lost in ("take", "await"), "it was lost"
+
+
+# --- plans ------------------------------------------------------------------------------------
+
+ONE, TWO = InstanceId("p", 1), InstanceId("p", 2)
+MOVE = Move(process("p"), ONE, "a", TWO, "a", InstanceId("p", 3), 0, "p")
+
+
+@pytest.mark.parametrize(
+    ("aim", "steps", "said"),
+    [
+        (Aim.CHECKPOINT, (Commit(), Stop(ONE, "a", 1.0)), "commits to no image"),
+        (Aim.CHECKPOINT, (Commit(image="x"),), "does not stop its source after the commit"),
+        (Aim.CHECKPOINT, (Stop(ONE, "a", 1.0), Commit(image="x")), "does not stop its source"),
+        (
+            Aim.CHECKPOINT,
+            (Start(TWO, "a", 1.0), Commit(image="x"), Stop(ONE, "a", 1.0)),
+            "starts an instance",
+        ),
+        (Aim.RESTORE, (Start(TWO, "a", 1.0), Commit()), "not from its image"),
+        (Aim.RESTORE, (Commit(),), "never starts or awaits"),
+        (Aim.MOVE, (Start(TWO, "a", 1.0), Commit(image="x")), "commits to an image"),
+    ],
+)
+def test_an_unsound_plan_is_refused(aim: Aim, steps: Any, said: str) -> None:
+    """A source could go on beside its image, or a process begin anew."""
+    assert said in plan_fault(Plan(steps), MOVE, aim)
+
+
+def test_the_plans_of_the_tests_are_sound() -> None:
+    """As those of `criu` have to be."""
+    assert plan_fault(Freezer().checkpoint(MOVE), MOVE, Aim.CHECKPOINT) == ""
+    assert plan_fault(Freezer().restore(MOVE), MOVE, Aim.RESTORE) == ""
