@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from rosrm.errors import Refused
+from rosrm.errors import Refused, RosrmError
 from rosrm.ros.slave_endpoint import result_json
 
 Executor = Callable[[Mapping[str, Any]], Mapping[str, Any]]
@@ -65,6 +65,8 @@ def execute(
         try:
             result = result_json(function(told))
             outcome = (True, "", result)
+        except RosrmError as error:
+            outcome = (False, str(error), "")
         except Exception as error:  # noqa: BLE001 - a third party's code: anything may come
             outcome = (False, f"{name} raised {type(error).__name__}: {error}", "")
         post(partial(done, *outcome))
