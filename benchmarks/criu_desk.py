@@ -161,7 +161,7 @@ class Desk:
             repeated=sum(step < 1 for step in steps),
             missed=max(numbers) - min(numbers) + 1 - len(set(numbers)),
             checksums=tuple({one.checksum for one in heard if one.passes}),
-            began_anew=numbers[-1] < numbers[0],
+            began_anew=min(numbers) < numbers[0],
         )  # fmt: skip
 
     def _ask(self) -> str:
