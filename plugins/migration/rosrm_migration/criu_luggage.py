@@ -150,10 +150,11 @@ def _dismiss(number: int, fetcher: Fetcher) -> None:
 
 def remove_unused_later(directory: Path, keep: float) -> None:
     """Remove an image unless a process is restored from it until then."""
-    _later(keep, _remove_unused, directory)
+    _later(keep, remove_unused, directory)
 
 
-def _remove_unused(directory: Path) -> None:
+def remove_unused(directory: Path) -> None:
+    """Remove an image unless a process was restored from it."""
     try:
         told = outcome.read(directory)
     except CriuError:
