@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
 from rosrm.core.model import InstanceId
 from rosrm.core.slave import Held, Look, LookedAt, Watch
+from rosrm.criu import tree
 from rosrm.ros.graph import GraphWatch
 from rosrm.ros.health import HealthEar
 from rosrm.ros.participant import Participant
@@ -53,15 +55,29 @@ class HealthWatch:
                 yield LookedAt(instance, held.status.pid, look)
 
     def _look(self, instance: InstanceId, pid: int, watch: Watch, now: float) -> Look:
-        stat = read_stat(pid)
+        stat = read_stat(tree.root_of(pid))
         stopped = stat is not None and stat.state == _STOPPED
         if not watch.topics and not watch.services:
             return Look(stopped)
         ear = self._ears.get((instance, pid))
         if ear is None:
             ear = self._ears[instance, pid] = self._listen(watch, now)
-        heard, trouble = ear.topic(self._sessions.members(pid), now)
+        heard, trouble = ear.topic(self._pids(pid), now)
         return Look(stopped, heard, trouble, ear.state(now))
+
+    def _pids(self, leader: int) -> tuple[int, ...]:
+        """Of the processes of an instance; of those that were restored, as they see themselves.
+
+        That is what Fast DDS writes into the names of endpoints.
+        """
+        members = self._sessions.members(leader)
+        if not tree.is_hold(leader):
+            return members
+        own = []
+        for pid in members:
+            with contextlib.suppress(OSError):  # it has ended meanwhile
+                own.append(tree.inner_pid(pid))
+        return (*members, *own)
 
     def _listen(self, watch: Watch, now: float) -> HealthEar:
         if self._node is None:
