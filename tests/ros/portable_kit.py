@@ -1,0 +1,119 @@
+"""Portable counters in a cluster: who hears them, who moves them, what a move must not leave."""
+
+from __future__ import annotations
+
+import time
+from itertools import pairwise
+from pathlib import Path
+
+import psutil
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import QoSProfile
+from std_msgs.msg import Int64MultiArray
+
+from rosrm.core.model import MigrationPolicy, ProcessSpec, RestartPolicy
+from rosrm.criu import outcome, tree
+from rosrm.errors import Refused
+from tests.ros.clusters import PATIENCE, QUICK, Cluster, wait_until
+
+NAME = "portable_counter"
+
+
+class Ear:
+    """Hears what portable counters count."""
+
+    def __init__(self, domain: int) -> None:
+        self._context = rclpy.Context()
+        self._context.init(domain_id=domain)
+        self._node = rclpy.create_node("ear", context=self._context)
+        self._node.create_subscription(Int64MultiArray, "count", self._take, QoSProfile(depth=1000))
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        self.counts: list[int] = []
+        self.checksums: set[int] = set()
+
+    def _take(self, message: Int64MultiArray) -> None:
+        count, passes, checksum = message.data
+        self.counts.append(count)
+        if passes:
+            self.checksums.add(checksum)
+
+    def hear(self, more: int) -> None:
+        """So many counts more."""
+        wanted, deadline = len(self.counts) + more, time.monotonic() + PATIENCE
+        while len(self.counts) < wanted:
+            assert time.monotonic() < deadline, f"{len(self.counts)} counts of {wanted}"
+            self._executor.spin_once(0.1)
+
+    def steps(self) -> list[int]:
+        """From each count to the next one."""
+        return [after - before for before, after in pairwise(self.counts)]
+
+    def forget(self) -> None:
+        """Another counter begins."""
+        self.counts.clear()
+        self.checksums.clear()
+
+    def close(self) -> None:
+        self._node.destroy_node()
+        self._context.try_shutdown()
+
+
+def counter(*arguments: str, **fields) -> ProcessSpec:
+    """The example; it counts 50 times a second, and holds 1 MB."""
+    options = fields.pop("options", {})
+    program = fields.pop("command", ())
+    if not program:
+        fields["module"] = "rosrm_examples.portable_counter"
+        arguments = arguments or ("--period", "0.02")
+    fields.setdefault("restart", RestartPolicy("on-failure", delay=0.1))
+    return ProcessSpec(
+        NAME, command=program, arguments=arguments, ros=True,
+        migration=MigrationPolicy("criu", options=options), stop=QUICK, **fields,
+    )  # fmt: skip
+
+
+def ask(cluster: Cluster, host: str | None = None, name: str = NAME) -> str:
+    """Ask for a move, as soon as the hosts have said whether they can; why it is refused, or ""."""
+    deadline = time.monotonic() + PATIENCE
+    while "not known yet" in (refusal := _asked(cluster, host, name)):
+        assert time.monotonic() < deadline, refusal
+        cluster.client.spin(0.1)
+    return refusal
+
+
+def _asked(cluster: Cluster, host: str | None, name: str) -> str:
+    try:
+        cluster.client.migrate(name, host)
+    except Refused as refusal:
+        return str(refusal)
+    return ""
+
+
+def nothing_left(cluster: Cluster) -> None:
+    """No image, no process that stands still, nobody who offers anything."""
+
+    def images() -> list[Path]:
+        found = cluster.directory.glob("hosts/*/images/**/*")
+        # How a restore went stands there as long as what was restored.
+        return [path for path in found if path.is_file() and path.name != outcome.FILE]
+
+    wait_until(lambda: not images(), f"no image left: {images()}")
+    parts = [psutil.Process(part.process.pid) for part in cluster.slaves.values()]
+    serving = [one for part in parts for one in part.children() if "send" in one.cmdline()]
+    assert not serving
+    for pid in pids(cluster):
+        assert not tree.is_stopped(tree.root_of(pid))
+
+
+def pids(cluster: Cluster) -> list[int]:
+    """Of the leaders of the counter's instances."""
+    mark = f"{NAME}#"
+    found = []
+    for one in psutil.process_iter(["environ"]):
+        environment = one.info["environ"] or {}
+        ours = str(cluster.directory) in environment.get("ROSRM_SUPERVISOR", "")
+        if ours and environment.get("ROSRM_INSTANCE", "").startswith(mark):
+            found.append(one.pid)
+    return found

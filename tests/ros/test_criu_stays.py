@@ -1,0 +1,173 @@
+"""What cannot move by criu says why, and goes on where it is; nothing of the attempt is left."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from rosrm.config.settings import MigrationSettings, ProcessDefaults
+from tests.integration.criu.conftest import old, older  # noqa: F401 - fixtures
+from tests.ros.clusters import MIB, PATIENCE, host, node
+from tests.ros.portable_kit import NAME, Ear, ask, counter, nothing_left
+
+TROUBLED = str(Path(__file__).parent / "programs/troubled.py")
+
+
+@pytest.fixture(scope="module")
+def cluster(make_shared):
+    """Two hosts; nothing moves by itself."""
+    return make_shared(
+        host("left"), host("right"),
+        migration=MigrationSettings(strategies={"relaunch": {}, "criu": {}}, automatic=False),
+        defaults=ProcessDefaults(needs={"memory": MIB}),
+    )  # fmt: skip
+
+
+@pytest.fixture
+def ear(cluster):
+    ear = Ear(cluster.domain)
+    yield ear
+    ear.close()
+
+
+@pytest.fixture
+def running(criu, cluster, ear):
+    """Starts a counter; it is ended after the test."""
+
+    def start(*arguments: str, **fields) -> str:
+        cluster.submit(counter(*arguments, **fields))
+        row = cluster.wait(NAME, "running")
+        ear.hear(10)
+        return row.host
+
+    yield start
+    cluster.cancel(NAME)
+
+
+def stayed(cluster, ear) -> str:
+    """Why a move that was asked for has failed; the node counts on, and nothing is left of it."""
+    before = cluster.client.list().last_sequence
+    assert not ask(cluster)
+    event = cluster.wait_for_event("stayed", process=NAME, after=before, timeout=60.0)
+    cluster.wait(NAME, "running")
+    ear.hear(30)
+    assert min(ear.steps()) == 1
+    nothing_left(cluster)
+    return event.message
+
+
+@pytest.mark.parametrize(
+    ("which", "reason"),
+    [
+        ("none", "names a CRIU that cannot be used"),
+        ("bookworm", "CRIU 3.17.1 is too old, 4.2 is needed"),
+        ("trixie", "CRIU 4.1.1 is too old, 4.2 is needed"),
+    ],
+)
+def test_a_host_without_a_criu_that_works_gets_nothing(
+    which, reason, cluster, ear, running, request, monkeypatch, tmp_path
+):
+    """The request is refused with the reason; it stands in the events and in `explain`, too."""
+    program = tmp_path / "criu"
+    if which != "none":
+        program = Path(request.getfixturevalue("old")(which).command[-1])
+    running()
+    with monkeypatch.context() as changed:
+        changed.setenv("ROSRM_CRIU", str(program))
+        cluster.add(host(which))
+    refusal = ask(cluster, which)
+    assert f"criu does not work on {which}" in refusal
+    assert reason in refusal
+    assert str(program) in refusal or which != "none"
+    absent = cluster.wait_for_event("strategy_absent", host=which)
+    assert reason in absent.message
+    ear.hear(30)
+    assert set(ear.steps()) == {1}
+    part = cluster.slaves.pop(which)
+    part.end(signal.SIGINT)
+    part.process.wait(PATIENCE)
+
+
+def test_there_is_no_working_directory_at_the_destination(cluster, ear, running, tmp_path):
+    """It is said before the node is asked to leave: not one count is late."""
+    place = tmp_path / "place"
+    place.mkdir()
+    running(working_directory=str(place))
+    place.rmdir()
+    why = stayed(cluster, ear)
+    assert f"its working directory {place} does not exist on" in why
+    assert why.endswith("make it")
+    assert set(ear.steps()) == {1}
+
+
+def test_the_destination_has_no_room(cluster, ear, running):
+    """More is to stay free there than there is."""
+    running(options={"reserve": 10**15})
+    why = stayed(cluster, ear)
+    assert "do not fit beside" in why
+    assert f"{10**15} are to stay free" in why
+
+
+def test_an_image_that_was_damaged_is_not_restored(cluster, ear, running):
+    """A file of it is cut short before the restore; the image and the half of it are gone."""
+    source = running()
+    other = {"left": "right", "right": "left"}[source]
+    images = cluster.directory / "hosts" / other / "images"
+    cutter = threading.Thread(target=cut_short, args=(images,))
+    cutter.start()
+    why = stayed(cluster, ear)
+    cutter.join(PATIENCE)
+    assert "is damaged: criu/core-" in why
+    assert "bytes instead of" in why
+
+
+def cut_short(images: Path) -> None:
+    """The first file of a process's registers that arrives there."""
+    deadline = time.monotonic() + PATIENCE
+    while time.monotonic() < deadline:
+        for file in images.glob("in-*/criu/core-*.img"):
+            os.truncate(file, file.stat().st_size // 2)
+            return
+        time.sleep(0.001)
+
+
+def test_a_process_that_holds_a_pipe_to_another_one_is_not_dumped(cluster, ear, running):
+    """The descriptor and who is at the other end are named."""
+    running("pipe", command=(sys.executable, TROUBLED))
+    why = stayed(cluster, ear)
+    assert "is a pipe that it shares with pid" in why
+    assert "(cat)" in why
+
+
+def test_a_node_that_hangs_in_a_callback_is_left_alone(cluster, ear, running, tmp_path):
+    """It is waited for as long as was said; when the callback ends it goes on as if nothing was."""
+    block = tmp_path / "block"
+    running("hangs", str(block), command=(sys.executable, TROUBLED), options={"leave_timeout": 1.0})
+    before = cluster.client.list().last_sequence
+    block.touch()
+    assert not ask(cluster)
+    event = cluster.wait_for_event("stayed", process=NAME, after=before, timeout=60.0)
+    assert "the node has not left the ROS graph within 1 s" in event.message
+    assert "a callback may be taking its time" in event.message
+    block.unlink()
+    ear.hear(30)
+    assert set(ear.steps()) == {1}
+    nothing_left(cluster)
+
+
+def test_a_node_that_cannot_leave_says_what_to_use(criu, cluster):
+    """An ordinary node is not touched; the error names what makes it movable."""
+    cluster.submit(node("ordinary", migration=counter().migration))
+    cluster.wait("ordinary", "running")
+    assert not ask(cluster, name="ordinary")
+    event = cluster.wait_for_event("stayed", process="ordinary", timeout=60.0)
+    assert "does not use rosrm.node.run_portable" in event.message
+    assert cluster.process("ordinary").state == "running"
+    nothing_left(cluster)
+    cluster.cancel("ordinary")
