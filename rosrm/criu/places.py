@@ -1,4 +1,4 @@
-"""Where a host keeps the images of moves under way, below its slave's directory."""
+"""Where a host keeps images, of moves under way and of checkpoints, below its slave's directory."""
 
 from __future__ import annotations
 
@@ -13,3 +13,19 @@ def outgoing(state: Path, number: int) -> Path:
 def incoming(state: Path, number: int) -> Path:
     """The image that an instance is restored from."""
     return state / "images" / f"in-{number}"
+
+
+def kept(state: Path, number: int) -> Path:
+    """The image of an instance that was checkpointed: it lies there until it is restored."""
+    return state / "images" / f"kept-{number}"
+
+
+def ports_of_kept(state: Path, number: int) -> Path:
+    """The ports that such an instance had, beside its image."""
+    return state / "images" / f"kept-{number}.ports"
+
+
+def kept_numbers(state: Path) -> list[int]:
+    """Of the instances of which there is such an image."""
+    names = [path.name.removeprefix("kept-") for path in (state / "images").glob("kept-*")]
+    return sorted(int(name) for name in names if name.isdigit())

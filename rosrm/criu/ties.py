@@ -24,6 +24,9 @@ _PEER: Final = 2
 _DONE: Final = 3
 _ERROR: Final = 2
 
+#: How Fast DDS names its files in shared memory.
+_OF_FAST_DDS: Final = "/dev/shm/fastrtps_"  # noqa: S108 - not a file of ours
+
 
 def outward(pids: Iterable[int]) -> str:
     """What a process of the tree shares with one outside, in words; "" where there is nothing.
@@ -58,6 +61,27 @@ def _tracer(pid: int) -> int:
     except OSError:
         return 0
     return next((int(line.split()[1]) for line in lines if line.startswith("TracerPid:")), 0)
+
+
+def shared_memory(pids: Iterable[int]) -> str:
+    """What of Fast DDS a tree shares with its peers in memory, in words; "" where there is nothing.
+
+    The peers of one that stands still, or has ended, clear that away.
+    """
+    for pid in pids:
+        try:
+            maps = Path(f"/proc/{pid}/maps").read_text(errors="replace")
+        except OSError:  # it has ended
+            continue
+        found = next((line for line in maps.splitlines() if _OF_FAST_DDS in line), "")
+        if found:
+            path = found.split(None, 5)[5]
+            return (
+                f"its ROS participant has shared memory ({path}), which its peers clear away while "
+                f"it stands still: say `FASTDDS_BUILTIN_TRANSPORTS: UDPv4` in its `environment`, "
+                f"or `transports: UDPv4` below `ros:` in the file of its host, and restart it"
+            )
+    return ""
 
 
 def _half_pipes(held: Iterable[Descriptor]) -> Iterator[Descriptor]:

@@ -15,8 +15,11 @@ from rosrm.config.units import Bytes, PositiveSeconds
 from rosrm.core.migration import Commit, Execute, Move, Plan, SetRestart, Start, Stop
 from rosrm.core.model import ProcessSpec, RestartPolicy
 from rosrm.criu.fitting import mismatch
+from rosrm_migration.criu_kept import checkpoint_plan, restore_plan
 from rosrm_migration.options import check_seconds, options_of
 
+#: Under which it is selected.
+NAME: Final = "criu"
 #: The executors of the plan; `criu_steps` has what they do.
 ABILITY: Final = "criu_ability"
 INTRODUCE: Final = "criu_introduce"
@@ -106,6 +109,18 @@ class Criu:
         if fault:
             raise ValueError(fault)
         return _Draft(move, options_of(move.spec, self._options)).plan()
+
+    def checkpoint(self, move: Move) -> Plan:
+        """Dump it where it runs, ROS node or not, and end it; no node is asked to leave."""
+        return checkpoint_plan(move, self._options_for(move.spec))
+
+    def restore(self, move: Move) -> Plan:
+        """Restore it where its image lies."""
+        return restore_plan(move, self._options_for(move.spec))
+
+    def _options_for(self, spec: ProcessSpec) -> CriuOptions:
+        """Its own where it moves so; those of another strategy mean something else."""
+        return options_of(spec, self._options) if spec.migration.strategy == NAME else self._options
 
 
 class _Draft:

@@ -34,6 +34,7 @@ from rosrm.portable import (
 from rosrm.transfer import Offer, Sender
 from rosrm_migration import criu_luggage as luggage
 from rosrm_migration.criu import CHECKPOINT, FETCH, INTRODUCE
+from rosrm_migration.criu_kept_steps import reserve_all
 from rosrm_migration.criu_luggage import Answer
 
 #: Destinations of moves that were turned back: a checkpoint under way for one goes no further.
@@ -49,6 +50,7 @@ def say_ability(arguments: Answer) -> Answer:
     A slave is asked for it when it has registered: what one before it has left, goes.
     """
     luggage.sweep(_state(arguments), _pids(arguments))
+    reserve_all(_state(arguments))
     found = ability()
     if not found.works:
         raise CriuError(found.reason)
@@ -227,8 +229,7 @@ def await_restored(arguments: Answer) -> Answer:
             directory, timeout=float(arguments["timeout"]), ended=lambda: not tree.is_alive(pid)
         )
     except CriuError as error:
-        if not tree.is_alive(pid):
-            luggage.discard(directory)
+        luggage.remove_unused(directory)
         raise CriuError(_LOG.sub("", str(error))) from None
     return {"seconds": {"restore": found.seconds}}
 

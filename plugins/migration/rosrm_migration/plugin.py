@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from importlib import import_module
+from typing import Any, Final
 
 from rosrm.hookspecs import hookimpl
 from rosrm.ports import MigrationOffer
-from rosrm_migration import criu
+from rosrm_migration import criu, criu_kept
 from rosrm_migration.criu import Criu, CriuOptions
 from rosrm_migration.handoff import WATCH, Handoff, HandoffOptions, watch
 from rosrm_migration.relaunch import Relaunch, RelaunchOptions
+
+_KEPT: Final = "rosrm_migration.criu_kept_steps"
 
 
 @hookimpl
@@ -34,7 +37,7 @@ def register_migration_strategies() -> Sequence[MigrationOffer]:
             executors={WATCH: watch},
         ),
         MigrationOffer(
-            name="criu",
+            name=criu.NAME,
             create=Criu,
             options=CriuOptions,
             summary="the whole memory of a portable node is dumped, and restored elsewhere",
@@ -47,18 +50,25 @@ def register_migration_strategies() -> Sequence[MigrationOffer]:
                 criu.AWAIT_RESTORED: _when_asked("await_restored"),
                 criu.JOIN: _when_asked("join"),
                 criu.END: _when_asked("end"),
+                criu_kept.KEEP: _when_asked("keep", _KEPT),
+                criu_kept.RUN_ON: _when_asked("run_on", _KEPT),
+                criu_kept.KILL: _when_asked("kill", _KEPT),
+                criu_kept.TAKE: _when_asked("take", _KEPT),
+                criu_kept.PUT_BACK: _when_asked("put_back", _KEPT),
+                criu_kept.AWAIT_KEPT: _when_asked("await_kept", _KEPT),
+                criu_kept.DROP: _when_asked("drop", _KEPT),
             },
         ),
     ]
 
 
-def _when_asked(step: str) -> Callable[[Mapping[str, Any]], Mapping[str, Any]]:
+def _when_asked(
+    step: str, module: str = "rosrm_migration.criu_steps"
+) -> Callable[[Mapping[str, Any]], Mapping[str, Any]]:
     """A step of `criu`; a slave that has no such moves never loads what it needs."""
 
     def execute(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
-        from rosrm_migration import criu_steps  # noqa: PLC0415 - see above
-
-        answer: Mapping[str, Any] = getattr(criu_steps, step)(arguments)
+        answer: Mapping[str, Any] = getattr(import_module(module), step)(arguments)
         return answer
 
     return execute

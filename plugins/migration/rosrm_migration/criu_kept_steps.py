@@ -1,0 +1,234 @@
+"""What a slave does for checkpoints and restores by `criu`: each function is an executor.
+
+Every one may be asked for twice, as those of `criu_steps`. The image of a checkpoint lies apart
+from those of moves. What a restore uses up is a second name of it (hard links): until the process
+is there again, whatever fails on the way leaves the image as it was.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import socket
+import threading
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from rosrm.criu import dumping, image, outcome, ties, tree, udp_ports
+from rosrm.criu.places import incoming, kept, kept_numbers, ports_of_kept
+from rosrm.criu.program import find
+from rosrm.errors import CriuError
+from rosrm_migration import criu_luggage as luggage
+from rosrm_migration.criu_kept import KEEP, TAKE
+
+#: Sockets that keep the ports of processes that wait in their images, by the instance's number.
+_reserved: Final[dict[int, list[socket.socket]]] = {}
+#: Attempts that were turned back: a dump that is still to begin for one does not.
+_turned_back: Final[set[int]] = set()
+_changing: Final = threading.Lock()
+#: CRIU's logs go with the image; what matters of them is in the message.
+_LOG: Final = re.compile(r" \((its )?log: [^)]*\)")
+#: Seconds between two looks at what nothing tells of.
+_LOOK: Final = 0.005
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """What an executor is asked: of the instance `source`, in the attempt `destination`."""
+
+    process: str
+    source: int
+    destination: int
+    timeout: float
+    state: Path
+    pids: Mapping[str, int]
+    results: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, arguments: Mapping[str, Any]) -> _Asked:
+        here = arguments["here"]
+        return cls(
+            str(arguments["process"]), int(arguments["source"]), int(arguments["destination"]),
+            float(arguments["timeout"]), Path(here["state"]), here["pids"],
+            arguments.get("results", {}),
+        )  # fmt: skip
+
+    def pid(self, number: int) -> int:
+        """Of the leader of an instance that runs here; 0: it does not."""
+        pid = self.pids.get(f"{self.process}#{number}", 0)
+        return pid if pid and tree.is_alive(pid) else 0
+
+
+# --- checkpoint -------------------------------------------------------------------------------
+
+
+def keep(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Dump the process into an image; it stands still from then on."""
+    asked = _Asked.of(arguments)
+    return luggage.once(KEEP, asked.destination, lambda: _keep(asked))
+
+
+def _keep(asked: _Asked) -> Mapping[str, Any]:
+    pid = asked.pid(asked.source)
+    if not pid:
+        raise CriuError(f"{asked.process}#{asked.source} does not run here")
+    root = tree.root_of(pid)
+    if tree.is_stopped(root):  # by an earlier asking, whose slave was killed
+        dumping.resume(pid)
+    pids = tree.tree(root)
+    trouble = ties.shared_memory(pids)
+    if trouble:
+        raise CriuError(f"{asked.process} cannot be checkpointed: {trouble}")
+    directory, began = kept(asked.state, asked.source), time.monotonic()
+    luggage.discard(directory)
+    with _changing:
+        if asked.destination in _turned_back:
+            raise CriuError("the checkpoint was turned back meanwhile")
+    try:
+        manifest = dumping.dump(
+            find(), pid, directory, leave="stopped", timeout=asked.timeout,
+            process=asked.process, instance=asked.source,
+        )  # fmt: skip
+        udp_ports.write(ports_of_kept(asked.state, asked.source), udp_ports.bound(pids))
+    except Exception as error:
+        _discard(asked.state, asked.source)
+        if not isinstance(error, CriuError):
+            dumping.resume(pid)
+            raise
+        raise CriuError(_LOG.sub("", str(error))) from None
+    return {"size": manifest.size, "seconds": {"dump": time.monotonic() - began}}
+
+
+def run_on(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The checkpoint has failed: the process goes on, unless it has ended."""
+    asked = _Asked.of(arguments)
+    with _changing:
+        _turned_back.add(asked.destination)
+    luggage.after(KEEP, asked.destination, asked.timeout)
+    _discard(asked.state, asked.source)
+    pid = asked.pid(asked.source)
+    if pid:
+        dumping.resume(pid)
+    return {}
+
+
+def kill(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The image owns the name: the process ends at once, and its ports are kept for it."""
+    asked = _Asked.of(arguments)
+    pid = asked.pid(asked.source)
+    if pid:
+        members = tree.tree(tree.root_of(pid))
+        dumping.kill(pid)
+        deadline = time.monotonic() + asked.timeout
+        while any(map(tree.is_alive, members)):
+            if time.monotonic() > deadline:
+                raise CriuError(f"{asked.process}#{asked.source} does not end")
+            time.sleep(_LOOK)
+    _reserve(asked.state, asked.source)
+    return {}
+
+
+# --- restore ----------------------------------------------------------------------------------
+
+
+def take(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Lay the image out for the start that follows."""
+    asked = _Asked.of(arguments)
+    if asked.pid(asked.destination):
+        return {"taken": True}  # by an earlier asking: it is being restored
+    source, target = kept(asked.state, asked.source), incoming(asked.state, asked.destination)
+    image.read(source)
+    luggage.discard(target)
+    try:
+        target.mkdir(mode=0o700)
+        shutil.copytree(source, target, copy_function=_link, dirs_exist_ok=True)
+    except (OSError, shutil.Error) as error:
+        luggage.discard(target)
+        raise CriuError(f"the image {source} cannot be laid out as {target}: {error}") from None
+    return {"taken": True}
+
+
+def _link(source: str, target: str) -> None:
+    try:
+        os.link(source, target)
+    except OSError:  # a file system without
+        shutil.copy2(source, target)
+
+
+def await_kept(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Wait until the image is a process again; it is used up then."""
+    asked = _Asked.of(arguments)
+    found = _wait(asked, asked.pid(asked.destination))
+    _discard(asked.state, asked.source)
+    return {"seconds": {"restore": found.seconds}}
+
+
+def put_back(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The restore is to be undone: the image is as it was, unless the process is there again.
+
+    A restore under way is waited for: it is not ended while it may succeed.
+    """
+    asked = _Asked.of(arguments)
+    directory = incoming(asked.state, asked.destination)
+    if not directory.exists():
+        gone = not kept(asked.state, asked.source).exists()
+        return {"active": True} if gone and TAKE in asked.results else {}
+    pid = asked.pid(asked.destination)
+    try:
+        _wait(asked, pid)
+    except CriuError:
+        if asked.pid(asked.destination):
+            tree.send([pid], signal.SIGKILL)  # the holding program, and so whatever it holds
+            raise
+        luggage.discard(directory)
+        return {}
+    _discard(asked.state, asked.source)
+    return {"active": True}
+
+
+def _wait(asked: _Asked, pid: int) -> outcome.Outcome:
+    try:
+        return outcome.wait(
+            incoming(asked.state, asked.destination), timeout=asked.timeout,
+            ended=lambda: not pid or not tree.is_alive(pid),
+        )  # fmt: skip
+    except CriuError as error:
+        raise CriuError(_LOG.sub("", str(error))) from None
+
+
+# --- both -------------------------------------------------------------------------------------
+
+
+def drop(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Nobody wants the image any more."""
+    state = Path(arguments["here"]["state"])
+    for number in map(int, arguments["numbers"]):
+        _discard(state, number)
+        luggage.discard(incoming(state, number))
+    return {}
+
+
+def reserve_all(state: Path) -> None:
+    """A slave has come up: the ports of what waits in images here are kept again."""
+    for number in kept_numbers(state):
+        _reserve(state, number)
+
+
+def _reserve(state: Path, number: int) -> None:
+    with _changing:
+        if number not in _reserved:
+            _reserved[number] = udp_ports.reserve(udp_ports.read(ports_of_kept(state, number)))
+
+
+def _discard(state: Path, number: int) -> None:
+    """Nothing is left of an image, and its ports are anybody's."""
+    luggage.discard(kept(state, number))
+    ports_of_kept(state, number).unlink(missing_ok=True)
+    with _changing:
+        for one in _reserved.pop(number, ()):
+            one.close()

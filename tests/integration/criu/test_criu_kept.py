@@ -1,0 +1,270 @@
+"""What a slave does for a checkpoint and a restore, with real processes and a CRIU that works."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import socket
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rosrm.criu import image, outcome, tree
+from rosrm.criu.places import incoming, kept, kept_numbers, ports_of_kept
+from rosrm.errors import CriuError
+from rosrm_migration import criu_kept_steps as steps
+from rosrm_migration import criu_luggage as luggage
+from tests.criu_kit import TIMEOUT, eventually
+
+pytestmark = pytest.mark.timeout(240)
+
+#: Writes one number after the other, and holds a UDP port, which it tells first.
+COUNTER = """
+import socket, time
+one = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+one.bind(("127.0.0.1", 0))
+print("port", one.getsockname()[1], flush=True)
+count = 0
+while True:
+    count += 1
+    print(count, flush=True)
+    time.sleep(0.01)
+"""
+
+
+class Slave:
+    """Asks the executors as the slave of a host does.
+
+    Args:
+        theatre: starts and restores the processes.
+        state: the slave's directory.
+    """
+
+    def __init__(self, theatre: Any, state: Path) -> None:
+        self.theatre, self.state = theatre, state
+        self.pids: dict[str, int] = {}
+        self.results: dict[str, Any] = {}
+
+    def ask(self, step: str, *, source: int = 1, destination: int = 2, **more: Any) -> Any:
+        arguments = {
+            "process": "p", "source": source, "destination": destination, "timeout": TIMEOUT,
+            "results": self.results, **more,
+            "here": {"host": "here", "state": str(self.state), "pids": self.pids},
+        }  # fmt: skip
+        answer = getattr(steps, step)(arguments)
+        json.dumps(answer)
+        if answer:
+            self.results[f"criu_{step}"] = answer
+        return answer
+
+    def hold(self, number: int = 2) -> Any:
+        """What the supervisor starts for an instance that is to be restored."""
+        actor = self.theatre.hold(incoming(self.state, number), remove=True)
+        self.pids[f"p#{number}"] = actor.pid
+        return actor
+
+    def end(self, actor: Any) -> None:
+        tree.send(reversed(tree.tree(actor.pid)), 9)
+        actor.process.wait(TIMEOUT)
+
+
+@pytest.fixture
+def slave(theatre, tmp_path):
+    """A slave that was just started: it has no attempt in mind."""
+    luggage._flights.clear()
+    steps._turned_back.clear()
+    return Slave(theatre, tmp_path / "state")
+
+
+@pytest.fixture
+def counter(slave, theatre):
+    """Counts, as instance p#1."""
+    actor = theatre.start(COUNTER)
+    actor.counts()
+    slave.pids["p#1"] = actor.pid
+    return actor
+
+
+def port_of(actor: Any) -> int:
+    return int(actor.lines()[0].split()[1])
+
+
+def is_free(port: int) -> bool:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+        try:
+            one.bind(("127.0.0.1", port))
+        except OSError:
+            return False
+    return True
+
+
+def checkpointed(slave: Slave, counter: Any) -> list[int]:
+    """All that it counted before."""
+    slave.ask("keep")
+    slave.ask("kill")
+    counter.process.wait(TIMEOUT)
+    slave.results.clear()
+    return counter.numbers()
+
+
+def nothing_left(slave: Slave) -> None:
+    assert kept_numbers(slave.state) == []
+    assert not list((slave.state / "images").glob("kept-*"))
+
+
+def test_a_process_goes_on_from_its_image_with_its_port(slave, counter):
+    """No number is missing or written twice; its port was nobody else's meanwhile."""
+    before, port = checkpointed(slave, counter), port_of(counter)
+    assert kept_numbers(slave.state) == [1]
+    assert not is_free(port)
+    slave.ask("take", destination=3)
+    restored = slave.hold(3)
+    assert slave.ask("await_kept", destination=3)["seconds"]["restore"] > 0.0
+    restored.counts()
+    assert before + restored.numbers() == list(range(1, restored.numbers()[-1] + 1))
+    nothing_left(slave)
+    slave.end(restored)
+    assert is_free(port)
+
+
+def test_it_can_be_checkpointed_again(slave, counter):
+    """The image of what was restored is one of the instance that holds it."""
+    before = checkpointed(slave, counter)
+    slave.ask("take", destination=3)
+    restored = slave.hold(3)
+    slave.ask("await_kept", destination=3)
+    restored.counts()
+    slave.ask("keep", source=3, destination=4)
+    slave.ask("kill", source=3, destination=4)
+    restored.process.wait(TIMEOUT)
+    slave.ask("take", source=3, destination=5)
+    again = slave.hold(5)
+    slave.ask("await_kept", source=3, destination=5)
+    again.counts()
+    told = before + restored.numbers() + again.numbers()
+    assert told == list(range(1, told[-1] + 1))
+    slave.end(again)
+
+
+def test_a_checkpoint_that_is_undone_lets_it_run_on(slave, counter):
+    """It stood still; nothing of the image is left. A second asking does it no harm."""
+    slave.ask("keep")
+    assert slave.ask("keep") == slave.results["criu_keep"]
+    assert tree.is_stopped(counter.pid)
+    slave.ask("run_on")
+    slave.ask("run_on")
+    counter.counts()
+    nothing_left(slave)
+
+
+def test_a_dump_that_comes_after_its_undo_is_none(slave, counter):
+    """The order was late."""
+    slave.ask("run_on", destination=30)
+    with pytest.raises(CriuError, match="turned back"):
+        slave.ask("keep", destination=30)
+    counter.counts()
+
+
+def test_an_undo_after_its_end_only_removes_the_image(slave, counter):
+    """There is nobody to go on."""
+    slave.ask("keep", destination=31)
+    slave.end(counter)
+    assert slave.ask("run_on", destination=31) == {}
+    nothing_left(slave)
+
+
+def test_what_cannot_be_dumped_runs_on(slave, theatre):
+    """The reason names the file descriptor."""
+    reading, writing = os.pipe()
+    actor = theatre.start(COUNTER, pass_fds=(writing,))
+    actor.counts()
+    slave.pids["p#1"] = actor.pid
+    with pytest.raises(CriuError, match=rf"file descriptor {writing} .* is a pipe"):
+        slave.ask("keep", destination=32)
+    actor.counts()
+    nothing_left(slave)
+    os.close(reading)
+    os.close(writing)
+
+
+def test_an_undone_restore_leaves_the_image_as_it_was(slave, counter):
+    """Before it was begun, and after it failed; then it can be restored."""
+    before = checkpointed(slave, counter)
+    slave.ask("take")
+    assert slave.ask("put_back") == {}
+    assert not incoming(slave.state, 2).exists()
+    slave.ask("take")
+    page = next((incoming(slave.state, 2) / image.PAGES).glob("core-*"))
+    page.unlink()  # of the second name alone
+    failed = slave.hold()
+    with pytest.raises(CriuError, match="damaged"):
+        slave.ask("await_kept")
+    failed.process.wait(TIMEOUT)
+    assert slave.ask("put_back") == {}
+    slave.ask("take")
+    restored = slave.hold()
+    slave.ask("await_kept")
+    restored.counts()
+    assert before + restored.numbers() == list(range(1, restored.numbers()[-1] + 1))
+    slave.end(restored)
+
+
+def test_a_restored_process_is_not_put_back(slave, counter):
+    """There is no way back from it, whether that was heard or not, and also once it has ended."""
+    checkpointed(slave, counter)
+    slave.ask("take")
+    restored = slave.hold()
+    eventually(lambda: outcome.read(incoming(slave.state, 2)), "the restore")
+    assert slave.ask("put_back") == {"active": True}
+    nothing_left(slave)
+    restored.counts()
+    assert slave.ask("put_back") == {"active": True}
+    slave.end(restored)
+    shutil.rmtree(incoming(slave.state, 2), ignore_errors=True)
+    assert slave.ask("put_back") == {"active": True}
+
+
+def test_a_slave_that_was_started_again_keeps_the_ports(slave, counter):
+    """Of each process that waits in an image here; a dropped one's are anybody's."""
+    checkpointed(slave, counter)
+    port = port_of(counter)
+    for one in steps._reserved.pop(1):
+        one.close()
+    assert is_free(port)
+    steps.reserve_all(slave.state)
+    assert not is_free(port)
+    steps.drop({"numbers": [1, 9], "here": {"state": str(slave.state)}})
+    assert is_free(port)
+    nothing_left(slave)
+
+
+def test_without_an_image_nothing_is_restored(slave, counter):
+    """It says so, and the undo has nothing to put back."""
+    checkpointed(slave, counter)
+    shutil.rmtree(kept(slave.state, 1))
+    with pytest.raises(CriuError, match="holds no complete image"):
+        slave.ask("take")
+    assert slave.ask("put_back") == {}
+    ports_of_kept(slave.state, 1).unlink()
+    steps.drop({"numbers": [1], "here": {"state": str(slave.state)}})
+
+
+def test_shared_memory_of_fast_dds_is_refused(slave, theatre):
+    """Its peers would clear it away; what to set is said."""
+    path = Path("/dev/shm/fastrtps_rosrm_test")
+    path.write_bytes(b"\0" * 4096)
+    code = (
+        f"import mmap\nfile = open({str(path)!r}, 'r+b')\nheld = mmap.mmap(file.fileno(), 4096)\n"
+        + COUNTER
+    )
+    actor = theatre.start(code)
+    try:
+        actor.counts()
+    finally:
+        path.unlink()
+    slave.pids["p#1"] = actor.pid
+    with pytest.raises(CriuError, match="FASTDDS_BUILTIN_TRANSPORTS: UDPv4"):
+        slave.ask("keep", destination=40)
+    actor.counts()
