@@ -100,8 +100,12 @@ def nothing_left(cluster: Cluster) -> None:
         return [path for path in found if path.is_file() and path.name != outcome.FILE]
 
     wait_until(lambda: not images(), f"no image left: {images()}")
-    parts = [psutil.Process(part.process.pid) for part in cluster.slaves.values()]
-    serving = [one for part in parts for one in part.children() if "send" in one.cmdline()]
+    slaves = {part.process.pid for part in cluster.slaves.values()}
+    serving = [
+        one.pid
+        for one in psutil.process_iter(["ppid", "cmdline"])
+        if one.info["ppid"] in slaves and "send" in (one.info["cmdline"] or ())
+    ]
     assert not serving
     for pid in pids(cluster):
         assert not tree.is_stopped(tree.root_of(pid))

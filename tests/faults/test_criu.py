@@ -1,0 +1,149 @@
+"""Everybody who has a part in a move by criu is killed at each of its steps.
+
+Who is killed with SIGKILL is started again, as its service manager would. Afterwards one instance
+owns the name, and its memory is the same: the count goes on from where it was, and no number was
+ever heard twice. Moments are told by what lies on the disks of the hosts.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from rosrm.config.settings import LivenessSettings, MigrationSettings, ProcessDefaults
+from rosrm.criu import outcome
+from tests.faults.watching import instances
+from tests.ros.clusters import MIB, PATIENCE, host
+from tests.ros.portable_kit import NAME, Ear, ask, counter, nothing_left
+
+pytestmark = pytest.mark.timeout(180)
+
+_OTHER = {"left": "right", "right": "left"}
+#: Bytes a second, so that a transfer takes a while.
+_SLOWLY = 4_000_000
+
+
+class Scene:
+    """A counter that is moved to and fro."""
+
+    def __init__(self, make) -> None:
+        strategies = {"relaunch": {}, "criu": {}}
+        self.cluster = make(
+            host("left"), host("right"), liveness=LivenessSettings(),
+            migration=MigrationSettings(strategies=strategies, automatic=False),
+            defaults=ProcessDefaults(needs={"memory": MIB}),
+        )  # fmt: skip
+        self.ear = Ear(self.cluster.domain)
+        self.cluster.submit(counter(options={"max_rate": _SLOWLY}))
+        self._source = self._number = 0
+        self.source = ""
+
+    def close(self) -> None:
+        self.ear.close()
+
+    def move(self, moment: str) -> None:
+        """Begin a move, and return at one of its moments."""
+        row = self.cluster.wait(NAME, "running")
+        self.ear.hear(20)
+        self.source, self._number = row.host, row.number
+        self._before = self.cluster.client.list().last_sequence
+        refusal = ask(self.cluster, _OTHER[row.host])
+        assert not refusal, refusal
+        deadline = time.monotonic() + PATIENCE
+        while not any(self._signs(moment)):
+            assert time.monotonic() < deadline, f"no {moment}: {self._log()}"
+            time.sleep(0.001)
+
+    def _signs(self, moment: str) -> Iterator[Path]:
+        here, there = (
+            self.cluster.directory / "hosts" / name / "images"
+            for name in (self.source, _OTHER[self.source])
+        )
+        if moment == "checkpoint":
+            return here.glob("out-*")
+        if moment == "fetch":
+            return there.glob(".rosrm-fetch-*/*")
+        if moment == "restore":
+            return there.glob("in-*/manifest.json")
+        return there.glob(f"in-*/{outcome.FILE}")
+
+    def kill(self, victim: str) -> None:
+        """SIGKILL, and what a service manager does then."""
+        cluster = self.cluster
+        if victim == "master":
+            cluster.master.process.kill()
+            cluster.master.process.wait(PATIENCE)
+            cluster.reconnect()
+            cluster.start_master()
+            return
+        if victim in ("source", "destination"):
+            found = instances(cluster, NAME)
+            number = self._number if victim == "source" else max(found)
+            os.kill(found[number], signal.SIGKILL)
+            return
+        name = self.source if victim == "source's slave" else _OTHER[self.source]
+        cluster.slaves[name].process.kill()
+        cluster.slaves[name].process.wait(PATIENCE)
+        cluster.start_slave(next(one for one in cluster.hosts if one.host == name))
+
+    def end(self) -> str:
+        """How the move has ended: "migrated" or "stayed"; one instance is there, and is heard."""
+        deadline = time.monotonic() + 90.0
+        while not (ends := self._ends()):
+            assert time.monotonic() < deadline, f"the move has not ended: {self._log()}"
+            self.cluster.client.spin(0.1)
+        assert len(ends) == 1, ends
+        row = self.cluster.wait(NAME, "running")
+        self.ear.hear(30)
+        assert set(instances(self.cluster, NAME)) == {row.number}
+        self.cluster.wait_for_hosts()
+        nothing_left(self.cluster)
+        return ends[0]
+
+    def _ends(self) -> list[str]:
+        events = self.cluster.events(process=NAME, after=self._before)
+        return [event.kind for event in events if event.kind in ("migrated", "stayed")]
+
+    def _log(self) -> str:
+        return self.cluster.log_of("master")[-3000:]
+
+
+@pytest.fixture(scope="module")
+def scene(make_shared):
+    one = Scene(make_shared)
+    yield one
+    one.close()
+
+
+@pytest.mark.parametrize("moment", ["checkpoint", "fetch", "restore", "join"])
+@pytest.mark.parametrize("victim", ["master", "source's slave", "destination's slave"])
+def test_one_who_carries_the_move_out_is_killed(criu, scene, victim, moment):
+    """The node counts on, here or there, and no count is heard twice."""
+    scene.move(moment)
+    scene.kill(victim)
+    scene.end()
+    assert min(scene.ear.steps()) > 0
+    assert len(scene.ear.checksums) == 1
+
+
+@pytest.mark.parametrize("moment", ["restore", "join"])
+def test_the_destination_is_killed(criu, scene, moment):
+    """Before the commit the source goes on; after it, the policy starts another one."""
+    scene.move(moment)
+    scene.kill("destination")
+    if scene.end() == "stayed":
+        assert min(scene.ear.steps()) > 0
+    scene.ear.forget()
+
+
+def test_the_source_is_killed_in_its_dump(criu, scene):
+    """Its policy starts it again; nobody else is there."""
+    scene.move("checkpoint")
+    scene.kill("source")
+    assert scene.end() == "stayed"
+    scene.ear.forget()
