@@ -43,13 +43,13 @@ class Absence:
         parameters: by name.
         timers: period and nanoseconds until due (-1: cancelled) of each, in order of creation.
         peers: how many each of its ends had, by what a user knows it by.
-        neighbours: nodes at the other end of its topics.
+        others: ends of other nodes on its topics, and servers of its clients.
     """
 
     parameters: Mapping[str, Declared]
     timers: tuple[tuple[int, int], ...]
     peers: Mapping[str, int]
-    neighbours: frozenset[str]
+    others: Mapping[tuple[str, str], int]
 
     def overrides(self, given: Iterable[Parameter] | None) -> list[Parameter]:
         """What parameters begin with when they are declared anew.
@@ -111,7 +111,7 @@ def absence_of(node: Any) -> Absence:
         for name, parameter in node.get_parameters_by_prefix("").items()
     }
     timers = tuple((one.timer_period_ns, TimerOf(one, True).due_ns()) for one in node.timers)
-    return Absence(parameters, timers, peers_of(node), neighbours_of(node))
+    return Absence(parameters, timers, peers_of(node), others_of(node))
 
 
 def await_readers(node: Any, patience: float) -> None:
@@ -127,30 +127,38 @@ def await_readers(node: Any, patience: float) -> None:
         one.wait_for_all_acked(Duration(seconds=left))
 
 
-def neighbours_of(node: Any) -> frozenset[str]:
-    """The nodes at the other end of a node's topics, but for hidden ones, which come and go."""
-    ends = [
-        *((one.topic_name, node.get_subscriptions_info_by_topic) for one in node.publishers),
-        *((one.topic_name, node.get_publishers_info_by_topic) for one in node.subscriptions),
-    ]
-    found = {
-        (one.node_namespace, one.node_name)
-        for topic, infos in ends
-        if topic not in _INTERNAL
-        for one in infos(topic)
+def others_of(node: Any) -> Counter[tuple[str, str]]:
+    """How many ends of other nodes a node's topics and clients have, as the graph knows them."""
+    own = Counter(
+        [
+            *(("publishers", one.topic_name) for one in node.publishers),
+            *(("subscribers", one.topic_name) for one in node.subscriptions),
+            *(("services", node.resolve_service_name(one.srv_name)) for one in node.services),
+        ]
+    )
+    wanted = {
+        *(("subscribers", one.topic_name) for one in node.publishers),
+        *(("publishers", one.topic_name) for one in node.subscriptions),
+        *(("services", node.resolve_service_name(one.srv_name)) for one in node.clients),
     }
-    own = (node.get_namespace(), node.get_name())
-    return frozenset(_qualified(*one) for one in found - {own} if not one[1].startswith("_"))
+    return Counter({end: _count(node, end) - own[end] for end in wanted if end[1] not in _INTERNAL})
 
 
-def _qualified(namespace: str, name: str) -> str:
-    return f"{namespace.rstrip('/')}/{name}"
+def _count(node: Any, end: tuple[str, str]) -> int:
+    kind, name = end
+    return int(getattr(node, f"count_{kind}")(name))
 
 
-def sees_again(node: Any, nodes: frozenset[str], patience: float) -> bool:
-    """Whether a node that has entered the graph sees these within so many seconds. Polled, too."""
+def sees_again(node: Any, others: Mapping[tuple[str, str], int], patience: float) -> bool:
+    """Whether a node that has entered the graph sees as many ends of others as before. Polled, too.
+
+    Args:
+        node: that has nothing of its own there yet.
+        others: what `others_of` was.
+        patience: seconds at most.
+    """
     deadline = time.monotonic() + patience
-    while not nodes <= {_qualified(*one[::-1]) for one in node.get_node_names_and_namespaces()}:
+    while any(_count(node, end) < count for end, count in others.items()):
         if time.monotonic() >= deadline or not node.context.ok():
             return False
         time.sleep(_LOOK)

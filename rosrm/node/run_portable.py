@@ -290,7 +290,7 @@ class _Run:
         return missing
 
     def _enter(self, absence: Absence) -> int:
-        """Be in the graph, and see the neighbours again; returns how many entries it took.
+        """Be in the graph, and see the other ends again; returns how many entries it took.
 
         A neighbour answers the first word of a participant within 0.1 ms. Fast DDS 2.14 may not be
         ready to hear it then, and is told again only after the neighbour's period of 3 s: a new
@@ -304,7 +304,7 @@ class _Run:
             rclpy.init(args=without_parameter_files(self._args))
             self._node._portable_enter_again(absence)  # noqa: SLF001 - the other half of one thing
             last = entries == _ENTRIES or deadline - time.monotonic() <= _GREETED
-            if last or sees_again(self._node, absence.neighbours, _GREETED):
+            if last or sees_again(self._node, absence.others, _GREETED):
                 self._is_in = True
                 return entries
             self._node.destroy_node()

@@ -75,7 +75,7 @@ class Status:
         request: id of the newest request that it has taken up; "": none yet.
         fault: why that was refused, or why it has failed; "": neither.
         seconds: how long the steps of the last absence took: "leave"; "enter" the graph and see the
-            neighbours again, with "entries", how many it took; "join", until its peers are found.
+            other ends again, with "entries", how many it took; "join", until its peers are found.
         missing: peers that it had before it left, and did not find again in time.
     """
 

@@ -9,8 +9,9 @@ from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from std_msgs.msg import Int64
+from std_srvs.srv import Trigger
 
-from rosrm.node.absence import Absence, absence_of, await_peers, neighbours_of, peers_of, sees_again
+from rosrm.node.absence import Absence, absence_of, await_peers, others_of, peers_of, sees_again
 from tests.ros.nodes import RELIABLE
 
 
@@ -126,20 +127,24 @@ def test_missing_peers_are_named_when_patience_ends(node) -> None:
     assert await_peers(node, before, 0.02) == ("readers of /out: 0 of 2",)
 
 
-def test_neighbours_are_the_nodes_at_the_other_end(stage, node) -> None:
-    """Of the author's topics; neither the node itself, nor hidden nodes, nor anybody else."""
+def test_ends_of_others_are_counted(stage, node) -> None:
+    """On the author's topics and clients; neither the node's own, nor anybody else's."""
     node.create_publisher(Int64, "out", RELIABLE)
     node.create_subscription(Int64, "out", lambda _: None, RELIABLE)
     node.create_subscription(Int64, "in", lambda _: None, RELIABLE)
-    for name, topic in (("reader", "out"), ("_hidden", "out"), ("stranger", "elsewhere")):
-        other = stage.add(Node(name, context=stage.context, namespace="/far"))
-        other.create_subscription(Int64, f"/{topic}", lambda _: None, RELIABLE)
-    stage.plain.create_publisher(Int64, "in", RELIABLE)
-    expected = {"/far/reader", "/observer"}
-    stage.spin_until(lambda: neighbours_of(node) == expected, "both neighbours")
-
-
-def test_nodes_that_are_not_seen_again_end_the_wait(node) -> None:
-    """Who is seen is waited for no longer."""
-    assert sees_again(node, frozenset({"/first"}), 5.0)
-    assert not sees_again(node, frozenset({"/first", "/gone"}), 0.02)
+    node.create_client(Trigger, "poke")
+    other = stage.add(Node("other", context=stage.context))
+    other.create_subscription(Int64, "out", lambda _: None, RELIABLE)
+    other.create_subscription(Int64, "elsewhere", lambda _: None, RELIABLE)
+    other.create_publisher(Int64, "in", RELIABLE)
+    other.create_service(Trigger, "poke", lambda _, response: response)
+    expected = {
+        ("subscribers", "/out"): 1,
+        ("publishers", "/out"): 0,
+        ("publishers", "/in"): 1,
+        ("services", "/poke"): 1,
+    }
+    stage.spin_until(lambda: others_of(node) == expected, "the other node's ends")
+    stranger = stage.add(Node("stranger", context=stage.context))
+    assert sees_again(stranger, {**expected, ("subscribers", "/out"): 2}, 5.0)
+    assert not sees_again(stranger, {("subscribers", "/out"): 3}, 0.02)

@@ -323,11 +323,11 @@ def test_the_example_finds_its_memory_as_it_was(stage, start) -> None:
     stage.spin_until(lambda: heard and heard[-1].data[1] >= 2, "two passes")
     node.prepare("m1")
     passes = heard[-1].data[1]
-    node.resume("m1")
+    assert not node.resume("m1").missing
     stage.spin_until(lambda: heard[-1].data[1] >= passes + 2, "two passes after the move")
     assert {one.data[2] for one in heard if one.data[1]} == {zlib.crc32(filled(9_000_000))}
     counts = [one.data[0] for one in heard]
-    assert counts == list(range(counts[0], counts[0] + len(counts)))
+    assert counts == list(range(counts[0], counts[0] + len(counts))), counts
 
 
 # --- another address ---
