@@ -2,8 +2,8 @@
 
     python -m benchmarks.criu_desk '{"strategy": "criu", "mb": 10, "hops": 4}' ...
 
-For each of what it is given it starts a process, moves it `hops` times, and ends it. It prints one
-line of JSON for each hop: see `Hop`.
+For each of what it is given it starts a process, moves it `hops` times, and ends it; `options` are
+those of the strategy. It prints one line of JSON for each hop: see `Hop`.
 """
 
 from __future__ import annotations
@@ -130,9 +130,9 @@ class Desk:
     def __init__(self, ear: Ear, client: MasterClient) -> None:
         self._ear, self._client = ear, client
 
-    def play(self, strategy: str, mb: float, hops: int) -> None:
+    def play(self, strategy: str, mb: float, hops: int, options: Mapping[str, Any]) -> None:
         """Start a counter, move it to and fro, and end it."""
-        self._client.submit([_spec(strategy, mb)])
+        self._client.submit([_spec(strategy, mb, options)])
         self._wait("running")
         passes = 2 if strategy == "criu" else 0  # the second one began after the move
         self._ear.wait_for(int(RATE * _SETTLE), passes)
@@ -198,15 +198,15 @@ class Desk:
             self._client.spin(0.05)
 
 
-def _spec(strategy: str, mb: float) -> ProcessSpec:
+def _spec(strategy: str, mb: float, options: Mapping[str, Any]) -> ProcessSpec:
     module, arguments = "rosrm_examples.portable_counter", f"--mb {mb:g} --period {1 / RATE:g}"
     if strategy == "handoff":
         module, arguments = "benchmarks.handoff_nodes", f"count --rate {RATE:g}"
     return ProcessSpec(
         _NAME, module=module, arguments=tuple(arguments.split()), ros=True,
-        environment={"PYTHONPATH": str(_ROOT)}, migration=MigrationPolicy(strategy),
+        environment={"PYTHONPATH": str(_ROOT)}, needs={"memory": 100e6 + 2e6 * mb},
+        migration=MigrationPolicy(strategy, options=options),
         restart=RestartPolicy("on-failure", delay=0.5),
-        needs={"memory": 100e6 + 2e6 * mb},
     )  # fmt: skip
 
 
@@ -217,7 +217,8 @@ def main() -> None:
         with MasterClient.connect(RosSettings(), name="criu desk", timeout=_PATIENCE) as client:
             desk = Desk(ear, client)
             for asked in map(json.loads, sys.argv[1:]):
-                desk.play(asked["strategy"], asked["mb"], asked["hops"])
+                options = asked.get("options", {})
+                desk.play(asked["strategy"], asked["mb"], asked["hops"], options)
     finally:
         ear.close()
 

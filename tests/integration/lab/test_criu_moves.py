@@ -1,0 +1,70 @@
+"""A node moves by CRIU between hosts of different addresses, and over a network that is cut."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import pytest
+
+from benchmarks.criu import parts, play
+from rosrm.lab import DATA, GIB, HostPlan, Lab, uniform
+from tests.integration.lab.conftest import PATIENCE
+
+HOSTS = ("host1", "host2")
+
+
+@pytest.fixture
+def hosts(criu, name, tmp_path):
+    """Master and listener on a desk, and two hosts with a slave each."""
+    with (
+        Lab(name, [*uniform(2, disk=GIB), HostPlan("desk")]) as lab,
+        parts(lab, tmp_path),
+    ):
+        yield lab
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_a_node_counts_on_at_another_address(hosts):
+    """There and back: no count is heard twice, none of what it did is missing in its memory.
+
+    Then the destination is cut off while the image is on its way: the node goes on where it is.
+    """
+    slow = {"max_rate": 2_000_000, "transfer_timeout": 5.0}
+    asked = [
+        {"strategy": "criu", "mb": 1, "hops": 2},
+        {"strategy": "criu", "mb": 1, "hops": 1, "options": slow},
+    ]
+    hops = play(hosts, asked)
+    for _ in range(2):
+        hop = next(hops)
+        assert hop["end"] == "migrated", hop
+        assert hop["repeated"] == 0
+        assert len(hop["checksums"]) == 1
+    cutter = threading.Thread(target=cut_off_who_fetches, args=(hosts,))
+    cutter.start()
+    hop = next(hops)
+    cutter.join(PATIENCE)
+    assert hop["end"] == "stayed", hop
+    assert "criu_fetch on host" in hop["why"]
+    assert hop["repeated"] == 0
+    assert len(hop["checksums"]) == 1
+    for host in HOSTS:
+        hosts.heal(host)
+    assert next(hops, None) is None
+    for host in HOSTS:
+        left = hosts.outside(host, f"{DATA}/slave/images").rglob("*")
+        assert not [path.name for path in left if path.is_file()]
+
+
+def cut_off_who_fetches(lab: Lab) -> None:
+    """As soon as some of an image has come."""
+    deadline = time.monotonic() + PATIENCE
+    while time.monotonic() < deadline:
+        for host in HOSTS:
+            images = lab.outside(host, f"{DATA}/slave/images")
+            if any(images.glob(".rosrm-fetch-*/*/*")):
+                lab.cut(host)
+                return
+        time.sleep(0.01)
