@@ -21,6 +21,7 @@ from rosrm.core import migration, views
 from rosrm.core.model import HostDescription
 from rosrm.loading import HOOKS
 from rosrm_checkpoint.other_host import OtherHostOptions
+from rosrm_migration.criu import CriuOptions
 from rosrm_migration.handoff import HandoffOptions
 from rosrm_migration.relaunch import RelaunchOptions
 
@@ -78,7 +79,7 @@ def test_every_option_of_the_checkpoint_policy_is_documented():
     assert named == {field.name for field in fields(OtherHostOptions)}
 
 
-@pytest.mark.parametrize("options", [RelaunchOptions, HandoffOptions])
+@pytest.mark.parametrize("options", [RelaunchOptions, HandoffOptions, CriuOptions])
 def test_every_option_of_a_strategy_is_documented(options):
     """Of those that come with rosrm, in its own table."""
     text = section(page("configuration.md"), "Options of the strategies")
