@@ -147,3 +147,19 @@ def test_the_source_is_killed_in_its_dump(criu, scene):
     scene.kill("source")
     assert scene.end() == "stayed"
     scene.ear.forget()
+
+
+@pytest.mark.parametrize("moment", ["fetch", "restore"])
+def test_the_destination_s_host_is_switched_off(criu, scene, moment):
+    """Before the commit the source goes on, at the latest when that host counts as lost."""
+    scene.move(moment)
+    name = _OTHER[scene.source]
+    scene.cluster.switch_off(name)
+    deadline = time.monotonic() + 90.0
+    heard = len(scene.ear.counts)
+    while len(scene.ear.counts) < heard + 20:
+        assert time.monotonic() < deadline, scene._log()
+        scene.ear._executor.spin_once(0.1)
+    scene.cluster.start_slave(next(one for one in scene.cluster.hosts if one.host == name))
+    assert scene.end() == "stayed"
+    assert min(scene.ear.steps()) > 0
