@@ -106,7 +106,10 @@ class MigrationContract:
             assert plan_from_dict(json.loads(json.dumps(plan_to_dict(plan)))) == plan
 
     def test_a_shadow_is_released_after_the_commit(self) -> None:
-        """Its slave restarts it as its spec says, once it owns the name and not before."""
+        """Its slave restarts it as its spec says, once it owns the name and not before.
+
+        So it is with one that is restored from an image.
+        """
         for move in self.moves():
             plan = self.make().propose(move)
             commit = len(before_commit(plan))
@@ -152,7 +155,8 @@ class MigrationContract:
 
 def shadows(plan: Plan) -> Sequence[Start]:
     """The steps that start a destination in silence."""
-    return [step for step in plan.steps if isinstance(step, Start) and step.shadow]
+    starts = [step for step in plan.steps if isinstance(step, Start)]
+    return [step for step in starts if step.shadow or step.restored]
 
 
 def before_commit(plan: Plan) -> Sequence[Step]:

@@ -43,6 +43,21 @@ class TestHandoffAsInThePaper(MigrationContract):
         return [move for move in super().moves() if move.spec.migration.overlap]
 
 
+class TestCriu(MigrationContract):
+    offer = OFFERS["criu"]
+    spec = ProcessSpec("p", command=("true",), ros=True, restart=RestartPolicy("on-failure"))
+
+    def test_nothing_joins_before_the_commit(self):
+        """And the source is ended after that; until then it is called back where a step fails."""
+        plan = self.offer.create(self.offer.options()).propose(self.moves()[0])
+        at = {one.executor: n for n, one in enumerate(plan.steps) if isinstance(one, Execute)}
+        commit = next(n for n, one in enumerate(plan.steps) if isinstance(one, Commit))
+        assert at["criu_await_restored"] < commit < at["criu_join"] < at["criu_end"]
+        assert plan.steps[at["criu_checkpoint"]].undo.executor == "criu_go_on"
+        assert at["criu_introduce"] < at["criu_checkpoint"] < at["criu_fetch"]
+        assert plan.overlap == 0.0
+
+
 def test_each_shipped_strategy_is_here():
     """A strategy that is added to the plugin must be added here."""
     held = {contract.offer.name for contract in MigrationContract.__subclasses__()}
