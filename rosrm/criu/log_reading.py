@@ -7,7 +7,7 @@ from typing import Final
 
 #: `(00.004711)    123: Error (criu/sk-inet.c:42): inet: Can't bind inet socket back: ...`
 _ERROR: Final = re.compile(
-    r"^(?:\(\s*\d+\.\d+\)\s*)?(?:\d+:\s*)?Error\s*(?:\([^)]*\):?)?:?\s*(?P<said>.*\S)\s*$"
+    r"^(?:\(\s*\d+\.\d+\))?\s*(?:\d+:\s*)?Error\s*(?:\([^)]*\):?)?:?\s*(?P<said>.*\S)\s*$"
 )
 #: These stand beside every failure and say nothing of its cause.
 _EMPTY: Final = re.compile(

@@ -70,6 +70,18 @@ def is_alive(pid: int) -> bool:
     return stat is not None and stat.alive
 
 
+def is_gone(pid: int) -> bool:
+    """It has ended with all its threads, and nothing of it is open any more.
+
+    The first thread may wait to be reaped while others still end, and their sockets are bound.
+    """
+    try:
+        threads = sum(1 for _ in Path(f"/proc/{pid}/task").iterdir())
+    except OSError:
+        return True
+    return threads <= 1 and not is_alive(pid)
+
+
 def is_stopped(pid: int) -> bool:
     """By a signal, not by a debugger."""
     stat = read_stat(pid)

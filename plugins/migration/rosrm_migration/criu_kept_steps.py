@@ -125,7 +125,7 @@ def kill(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
         members = tree.tree(tree.root_of(pid))
         dumping.kill(pid)
         deadline = time.monotonic() + asked.timeout
-        while any(map(tree.is_alive, members)):
+        while not all(map(tree.is_gone, members)):
             if time.monotonic() > deadline:
                 raise CriuError(f"{asked.process}#{asked.source} does not end")
             time.sleep(_LOOK)
