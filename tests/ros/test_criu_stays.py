@@ -73,7 +73,7 @@ def stayed(cluster, ear) -> str:
 def test_a_host_without_a_criu_that_works_gets_nothing(
     which, reason, cluster, ear, running, request, monkeypatch, tmp_path
 ):
-    """The request is refused with the reason; it stands in the events and in `explain`, too."""
+    """The request is refused with the reason, which stands in the events since the host came."""
     program = tmp_path / "criu"
     if which != "none":
         program = Path(request.getfixturevalue("old")(which).command[-1])

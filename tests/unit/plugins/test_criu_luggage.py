@@ -1,0 +1,99 @@
+"""What a slave holds of moves by criu: steps that are asked for twice, and what is left behind."""
+
+from __future__ import annotations
+
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from itertools import count
+
+import pytest
+
+from rosrm.criu import outcome
+from rosrm.criu.outcome import Outcome
+from rosrm.criu.places import incoming, outgoing
+from rosrm.errors import CriuError
+from rosrm_migration import criu_luggage as luggage
+
+PATIENCE = 20.0
+_numbers = count(1_000_000)
+
+
+@pytest.fixture
+def number():
+    """Of an instance that no other test has."""
+    return next(_numbers)
+
+
+def test_a_step_that_is_asked_for_twice_is_done_once(number):
+    """Whoever asks while it is done, or later, gets the answer of the first."""
+    begun, may_end, done = threading.Event(), threading.Event(), []
+
+    def work():
+        begun.set()
+        assert may_end.wait(PATIENCE)
+        done.append(1)
+        return {"n": len(done)}
+
+    with ThreadPoolExecutor(2) as threads:
+        first = threads.submit(luggage.once, "step", number, work)
+        assert begun.wait(PATIENCE)
+        second = threads.submit(luggage.once, "step", number, work)
+        may_end.set()
+        assert first.result(PATIENCE) == second.result(PATIENCE) == {"n": 1}
+    assert luggage.once("step", number, work) == {"n": 1}
+    assert luggage.once("other step", number, work) == {"n": 2}
+
+
+def test_a_step_that_failed_is_done_anew(number):
+    def fails():
+        raise CriuError("no room")
+
+    with pytest.raises(CriuError, match="no room"):
+        luggage.once("step", number, fails)
+    luggage.after("step", number, 0.0)  # it is over
+    assert luggage.once("step", number, dict) == {}
+
+
+def test_a_step_under_way_is_waited_for_no_longer_than_is_said(number):
+    begun, may_end = threading.Event(), threading.Event()
+
+    def work():
+        begun.set()
+        assert may_end.wait(PATIENCE)
+        raise CriuError("it failed in the end")
+
+    with ThreadPoolExecutor(1) as threads:
+        going = threads.submit(luggage.once, "step", number, work)
+        assert begun.wait(PATIENCE)
+        with pytest.raises(CriuError, match=r"still under way after 0\.01 s"):
+            luggage.after("step", number, 0.01)
+        may_end.set()
+        luggage.after("step", number, PATIENCE)  # its failure is for who asked for it
+        with pytest.raises(CriuError, match="in the end"):
+            going.result(PATIENCE)
+
+
+def test_what_a_former_slave_has_left_goes(tmp_path, monkeypatch):
+    """What it offered, at once; what it fetched, after a time; what runs keeps what is its own."""
+    later = []
+    monkeypatch.setattr(luggage, "_later", lambda *call: later.append(call))
+    for place in (outgoing(tmp_path, 1), incoming(tmp_path, 2), incoming(tmp_path, 3)):
+        place.mkdir(parents=True)
+        (place / "manifest.json").touch()
+    luggage.sweep(tmp_path, ["p#3"])
+    assert not outgoing(tmp_path, 1).exists()
+    assert [directory for _, _, directory in later] == [incoming(tmp_path, 2)]
+    for _, do, directory in later:
+        do(directory)
+    assert not incoming(tmp_path, 2).exists()
+    assert incoming(tmp_path, 3).exists()
+
+
+@pytest.mark.parametrize(("reason", "stays"), [("", True), ("the image is damaged", False)])
+def test_an_image_goes_unless_a_process_was_restored_from_it(tmp_path, reason, stays):
+    """Of the other one, the program that holds the process disposes."""
+    directory = incoming(tmp_path, 1)
+    directory.mkdir(parents=True)
+    outcome.write(directory, Outcome(reason=reason, pid=7))
+    luggage.remove_unused(directory)
+    assert directory.exists() is stays
