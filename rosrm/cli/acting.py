@@ -1,4 +1,4 @@
-"""Commands that change something: submit, cancel, restart, migrate, cordon, uncordon, drain."""
+"""Commands that change something, from `submit` to `drain`."""
 
 # Each command imports what it needs when it runs, so that `rosrm --help` is quick.
 # ruff: noqa: PLC0415
@@ -12,6 +12,10 @@ import typer
 
 from rosrm.cli import connection
 from rosrm.cli.options import Domain, Host, Name, Names
+
+Wait = Annotated[
+    bool, typer.Option("--wait", help="Wait until it is done; exit 1 if it failed, and say why.")
+]
 
 
 def submit(
@@ -79,6 +83,31 @@ def migrate(
         typer.echo(client.migrate(name, to))
 
 
+def checkpoint(ctx: typer.Context, name: Name, wait: Wait = False, domain: Domain = None) -> None:
+    """Stop a process, with its memory in an image on its host.
+
+    `rosrm restore` has it go on from there.
+    """
+    _through_image(ctx, name, "checkpoint", domain, wait=wait)
+
+
+def restore(ctx: typer.Context, name: Name, wait: Wait = False, domain: Domain = None) -> None:
+    """Have a process go on from its image, where that lies."""
+    _through_image(ctx, name, "restore", domain, wait=wait)
+
+
+def _through_image(
+    ctx: typer.Context, name: str, action: str, domain: int | None, *, wait: bool
+) -> None:
+    from rosrm.cli.waiting import wait_for_image
+
+    with connection.master(ctx, domain) as client:
+        since = client.list().last_sequence if wait else 0
+        typer.echo(getattr(client, action)(name))
+        if wait and not wait_for_image(client, name, since):
+            raise typer.Exit(1)
+
+
 def cordon(ctx: typer.Context, host: Host, domain: Domain = None) -> None:
     """Give a host no new work."""
     _set_host(ctx, host, "cordon", domain)
@@ -99,4 +128,4 @@ def _set_host(ctx: typer.Context, host: str, action: str, domain: int | None) ->
         typer.echo(client.set_host_state(host, action))
 
 
-COMMANDS: Final = (submit, cancel, restart, migrate, cordon, uncordon, drain)
+COMMANDS: Final = (submit, cancel, restart, migrate, checkpoint, restore, cordon, uncordon, drain)

@@ -1,4 +1,4 @@
-"""`rosrm submit --wait`: watches processes until there is nothing more to wait for."""
+"""`--wait`: watches processes until there is nothing more to wait for."""
 
 from __future__ import annotations
 
@@ -22,6 +22,11 @@ if TYPE_CHECKING:
 PERIOD: Final = 0.5
 
 _FAILED: Final = frozenset({"failed", "cancelled", "stuck"})
+#: Kinds of events by which a checkpoint or a restore ends; whether it was done.
+_IMAGED: Final = {
+    "checkpointed": True, "restored": True, "checkpoint_failed": False, "restore_failed": False,
+    "cancelled": False,
+}  # fmt: skip
 _NOTEWORTHY: Final = _FAILED | {"set_aside", "unreachable"}
 
 
@@ -49,6 +54,28 @@ def wait_for(client: MasterClient, names: Sequence[str], longest: float) -> bool
         if not waiting or time.monotonic() >= deadline:
             _say_end(ours, waiting)
             return not waiting and all(row.state not in _FAILED for row in ours)
+        time.sleep(PERIOD)
+
+
+def wait_for_image(client: MasterClient, name: str, since: int) -> bool:
+    """Watch until a checkpoint or a restore of a process has come to its end, and say how.
+
+    Args:
+        client: of the master.
+        name: of the process.
+        since: sequence of the newest event before that was asked for.
+
+    Returns:
+        Whether it was done.
+    """
+    said: dict[str, str] = {}
+    while True:
+        view = client.list(processes=True, events=True, process=name, after=since)
+        for event in view.events:
+            if event.kind in _IMAGED:
+                typer.echo(event.message, err=not _IMAGED[event.kind])
+                return _IMAGED[event.kind]
+        _say_news([row for row in view.processes if row.name == name], said)
         time.sleep(PERIOD)
 
 

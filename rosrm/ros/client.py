@@ -242,6 +242,16 @@ class MasterClient:
         request = srv.Migrate.Request(process=name, host=host or "")
         return str(self._ask(srv.Migrate, names.MIGRATE, request).answer.message)
 
+    def checkpoint(self, name: str) -> str:
+        """Begin to dump a process into an image on its host, where it ends."""
+        request = srv.Checkpoint.Request(process=name)
+        return str(self._ask(srv.Checkpoint, names.CHECKPOINT, request).answer.message)
+
+    def restore(self, name: str) -> str:
+        """Begin to have a process go on from its image, where that lies."""
+        request = srv.Restore.Request(process=name)
+        return str(self._ask(srv.Restore, names.RESTORE, request).answer.message)
+
     def set_host_state(self, host: str, action: str) -> str:
         """Cordon, uncordon or drain a host."""
         request = srv.SetHostState.Request(host=host, action=action)

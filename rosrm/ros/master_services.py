@@ -86,6 +86,8 @@ class MasterServices:
             (srv.Cancel, names.CANCEL, _cancelled),
             (srv.Restart, names.RESTART, _restarted),
             (srv.Migrate, names.MIGRATE, _migrated),
+            (srv.Checkpoint, names.CHECKPOINT, _checkpointed),
+            (srv.Restore, names.RESTORE, _restored),
             (srv.SetHostState, names.SET_HOST_STATE, _host_set),
         ):
             offer(kind, path(name), self._as_event(kind, event))
@@ -249,6 +251,14 @@ def _restarted(request: srv.Restart.Request, token: int) -> happened.Event:
 
 def _migrated(request: srv.Migrate.Request, token: int) -> happened.Event:
     return happened.MigrationRequested(token, request.process, request.host or None)
+
+
+def _checkpointed(request: srv.Checkpoint.Request, token: int) -> happened.Event:
+    return happened.CheckpointRequested(token, request.process)
+
+
+def _restored(request: srv.Restore.Request, token: int) -> happened.Event:
+    return happened.RestoreRequested(token, request.process)
 
 
 def _host_set(request: srv.SetHostState.Request, token: int) -> happened.Event:

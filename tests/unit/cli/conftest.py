@@ -130,6 +130,14 @@ class FakeClient:
         self._note("migrate", name, host)
         return "moving"
 
+    def checkpoint(self, name):
+        self._note("checkpoint", name)
+        return f"{name}: it is being checkpointed"
+
+    def restore(self, name):
+        self._note("restore", name)
+        return f"{name}: it is being restored"
+
     def set_host_state(self, host, action):
         self._note(action, host)
         return f"{host}: {action}"

@@ -6,7 +6,7 @@ import pytest
 
 from rosrm.errors import NoMaster, Refused
 
-from .conftest import process
+from .conftest import event, process
 
 
 @pytest.fixture
@@ -26,6 +26,8 @@ def work(tmp_path):
         (["restart", "a"], ("restart", ["a"]), "restarted\n"),
         (["migrate", "a"], ("migrate", "a", None), "moving\n"),
         (["migrate", "a", "--to", "beta"], ("migrate", "a", "beta"), "moving\n"),
+        (["checkpoint", "a"], ("checkpoint", "a"), "a: it is being checkpointed\n"),
+        (["restore", "a"], ("restore", "a"), "a: it is being restored\n"),
         (["cordon", "alpha"], ("cordon", "alpha"), "alpha: cordon\n"),
         (["uncordon", "alpha"], ("uncordon", "alpha"), "alpha: uncordon\n"),
         (["drain", "alpha"], ("drain", "alpha"), "alpha: drain\n"),
@@ -36,6 +38,38 @@ def test_a_command_asks_the_master_and_prints_its_answer(rosrm, client, words, a
     assert (result.code, result.out, result.err) == (0, said, "")
     assert client.asked == [asked]
     assert client.closed
+
+
+@pytest.mark.parametrize(
+    ("action", "kind", "message", "code"),
+    [
+        ("checkpoint", "checkpointed", "a is checkpointed: its image is on alpha", 0),
+        ("checkpoint", "checkpoint_failed", "a runs on on alpha: it holds a pipe", 1),
+        ("restore", "restored", "a goes on from its image on alpha", 0),
+        ("restore", "restore_failed", "a stays checkpointed on alpha: a port is in use", 1),
+        ("restore", "cancelled", "a cancelled; its image is removed", 1),
+    ],
+)
+def test_wait_says_how_a_checkpoint_or_a_restore_ended(
+    rosrm, client, monkeypatch, action, kind, message, code
+):
+    """By the first such event after it was asked for; an older one says nothing of it."""
+    client.events = [event(1, kind, "a", message="of another time")]
+    client.processes = [process("a", "stuck", reason="alpha is lost")]
+
+    def later(seconds):
+        client.events += [
+            event(2, "migration_step", "a", message="a: step"),
+            event(3, kind, "b", message="b is none of ours"),
+            event(4, kind, "a", message=message),
+        ]
+
+    monkeypatch.setattr("rosrm.cli.waiting.time.sleep", later)
+    result = rosrm(action, "a", "--wait")
+    assert result.code == code
+    assert "a is stuck: alpha is lost" in result.err
+    assert message in (result.err if code else result.out)
+    assert "another time" not in result.out + result.err
 
 
 def test_submit_sends_every_process_of_the_file(rosrm, client, work):

@@ -21,6 +21,11 @@ RESTORE = """\
 (00.03) Error (criu/cr-restore.c:1536): 12012 exited, status=1
 (00.04) Error (criu/cr-restore.c:2613): Restoring FAILED.
 """
+#: The processes' own lines are indented there.
+WITHOUT_TIMES = """\
+Error (criu/util.c:1534): rlimit: Can't setup RLIMIT_NOFILE for self: Operation not permitted
+  1189: Error (criu/sk-inet.c:1059): inet: Can't bind inet socket: in use
+"""
 
 
 @pytest.mark.parametrize(
@@ -34,11 +39,7 @@ RESTORE = """\
                 "Unable to open fd=3 id=0x5",
             ),
         ),
-        (
-            "Error (criu/util.c:1534): rlimit: Can't setup RLIMIT_NOFILE for self: no\n"
-            "  1189: Error (criu/sk-inet.c:1059): inet: Can't bind inet socket: in use\n",
-            ("inet: Can't bind inet socket: in use",),  # a log without times has them indented
-        ),
+        (WITHOUT_TIMES, ("inet: Can't bind inet socket: in use",)),
         ("Error (criu/cr-restore.c:99): exited, status=1\n" * 2, ("exited, status=1",)),
         ("(00.1) Looks good.\nWarn (a.c:1): Error is a word\n", ()),
         ("", ()),

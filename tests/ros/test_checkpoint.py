@@ -1,0 +1,231 @@
+"""Processes that are checkpointed and restored on their host, and who listens to them meanwhile."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import time
+from collections.abc import Iterator
+from itertools import pairwise
+
+import pytest
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import QoSProfile
+from std_msgs.msg import Int64
+
+from rosrm.config.settings import MigrationSettings, ProcessDefaults
+from rosrm.core.model import ProcessSpec, RestartPolicy
+from rosrm.core.views import ProcessRow
+from rosrm.errors import Refused
+from tests.ros.clusters import MIB, PATIENCE, QUICK, alive, host, node, python, wait_until
+
+pytestmark = pytest.mark.timeout(240)
+
+#: Publishes one number after the other.
+COUNTER = """
+import rclpy
+from rclpy.qos import QoSProfile
+from std_msgs.msg import Int64
+rclpy.init()
+node = rclpy.create_node("unnamed")
+output, count = node.create_publisher(Int64, "count", QoSProfile(depth=1000)), 0
+def tick():
+    global count
+    count += 1
+    output.publish(Int64(data=count))
+timer = node.create_timer(0.02, tick)
+try:
+    rclpy.spin(node)
+except BaseException:
+    pass
+"""
+
+
+class Ear:
+    """Hears what is counted."""
+
+    def __init__(self, domain: int) -> None:
+        self._context = rclpy.Context()
+        self._context.init(domain_id=domain)
+        self._node = rclpy.create_node("ear", context=self._context)
+        self._node.create_subscription(Int64, "count", self._take, QoSProfile(depth=1000))
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        self.counts: list[int] = []
+
+    def _take(self, message: Int64) -> None:
+        self.counts.append(message.data)
+
+    def hear(self, more: int) -> None:
+        """So many counts more."""
+        wanted, deadline = len(self.counts) + more, time.monotonic() + PATIENCE
+        while len(self.counts) < wanted:
+            assert time.monotonic() < deadline, f"{len(self.counts)} counts of {wanted}"
+            self._executor.spin_once(0.1)
+
+    def listen(self, seconds: float) -> None:
+        """Whatever comes."""
+        deadline = time.monotonic() + seconds
+        while time.monotonic() < deadline:
+            self._executor.spin_once(0.05)
+
+    def close(self) -> None:
+        self._node.destroy_node()
+        self._context.try_shutdown()
+
+
+@pytest.fixture
+def cluster(make_shared):
+    """One host."""
+    return make_shared(
+        host("robot"),
+        migration=MigrationSettings(strategies={"relaunch": {}, "criu": {}}, automatic=False),
+        defaults=ProcessDefaults(needs={"memory": MIB}),
+    )  # fmt: skip
+
+
+@pytest.fixture
+def ear(cluster) -> Iterator[Ear]:
+    ear = Ear(cluster.domain)
+    yield ear
+    ear.close()
+
+
+def counter(**fields) -> ProcessSpec:
+    fields.setdefault("restart", RestartPolicy("on-failure", delay=0.1))
+    return node("counter", COUNTER, **fields)
+
+
+def ask(cluster, action: str, name: str) -> None:
+    """Once its host has said whether it can."""
+    deadline = time.monotonic() + PATIENCE
+    while True:
+        try:
+            getattr(cluster.client, action)(name)
+        except Refused as refusal:
+            if "not known yet" not in str(refusal) or time.monotonic() > deadline:
+                raise
+            cluster.client.spin(0.1)
+        else:
+            return
+
+
+def checkpoint(cluster, name: str) -> ProcessRow:
+    """Of a process whose pids are gone then."""
+    pid = cluster.process(name).pid
+    ask(cluster, "checkpoint", name)
+    row = cluster.wait(name, "checkpointed")
+    assert (row.host, row.reason, row.pid) == ("robot", "its image is on robot", 0)
+    assert not alive(pid)
+    return row
+
+
+def restore(cluster, name: str) -> None:
+    ask(cluster, "restore", name)
+    row = cluster.wait(name, "running", "checkpointed")
+    assert row.state == "running", row.reason
+
+
+def alone() -> None:
+    """Its participant is to speak UDP alone."""
+    if os.environ.get("FASTDDS_BUILTIN_TRANSPORTS") != "UDPv4":
+        pytest.skip("a network of its own, with UDPv4 alone, may not be made here")
+
+
+@pytest.mark.parametrize("away", [0.0, 5.0])
+def test_a_subscriber_hears_a_restored_node_go_on(criu, cluster, ear, away):
+    """By one each, twice in a row; who joins the graph meanwhile takes none of its ports."""
+    alone()
+    cluster.submit(counter())
+    cluster.wait("counter", "running")
+    ear.hear(50)
+    for _ in range(2):
+        checkpoint(cluster, "counter")
+        ear.listen(away)
+        other = Ear(cluster.domain)
+        restore(cluster, "counter")
+        ear.hear(50)
+        other.close()
+    assert ear.counts == list(range(ear.counts[0], ear.counts[-1] + 1))
+    cluster.cancel("counter")
+
+
+def test_a_restored_node_that_crashes_is_started_by_its_policy(criu, cluster, ear):
+    """It begins anew then: an image is for one life."""
+    alone()
+    cluster.submit(counter())
+    cluster.wait("counter", "running")
+    ear.hear(10)
+    checkpoint(cluster, "counter")
+    restore(cluster, "counter")
+    ear.hear(10)
+    os.kill(cluster.process("counter").pid, 9)
+    deadline = time.monotonic() + PATIENCE
+    while all(before < after for before, after in pairwise(ear.counts)):
+        assert time.monotonic() < deadline, "it did not begin anew"
+        ear.listen(0.1)
+    cluster.cancel("counter")
+
+
+def test_what_cannot_be_dumped_runs_on_and_says_why(criu, cluster, tmp_path):
+    """A Unix socket that is connected to a process outside of it."""
+    with socket.socket(socket.AF_UNIX) as server:
+        server.bind(str(tmp_path / "s"))
+        server.listen()
+        code = (
+            f"import socket, time\none = socket.socket(socket.AF_UNIX)\n"
+            f"one.connect({str(tmp_path / 's')!r})\ntime.sleep(1000)"
+        )
+        cluster.submit(python("tied", code))
+        cluster.wait("tied", "running")
+        server.settimeout(PATIENCE)
+        held, _ = server.accept()
+        pid = cluster.process("tied").pid
+        ask(cluster, "checkpoint", "tied")
+        event = cluster.wait_for_event("checkpoint_failed", process="tied")
+        assert "tied runs on on robot" in event.message
+        assert "is a Unix socket that is connected to" in event.message
+        assert cluster.wait("tied", "running").pid == pid
+        held.close()
+    cluster.cancel("tied")
+
+
+def test_an_image_outlives_slave_and_master(criu, cluster):
+    """It lies on its host, and its process waits there; cancelled, it is removed."""
+    count = "import time\nn = 0\nwhile True:\n    n += 1\n    print(n)\n    time.sleep(0.01)"
+    for name in ("plain", "unwanted"):
+        cluster.submit(python(name, count))
+        cluster.wait(name, "running")
+        cluster.wait_for_log(name, "20")
+        checkpoint(cluster, name)
+    for part in cluster.parts():
+        part.end(signal.SIGKILL)
+        part.process.wait(PATIENCE)
+    cluster.start_master()
+    cluster.reconnect()
+    cluster.start_slave(cluster.hosts[0])
+    cluster.wait_for_hosts()
+    restore(cluster, "plain")
+    cluster.wait_for_log("plain", "\n")
+    first = int(cluster.log("plain").split()[0])
+    assert first > 20, "it has begun anew"
+    images = cluster.directory / "hosts" / "robot" / "images"
+    assert list(images.glob("kept-*"))
+    cluster.cancel("unwanted", "plain")
+    wait_until(lambda: not list(images.glob("kept-*")), "the removal of the image")
+
+
+def test_without_criu_the_refusal_says_so(make_cluster, monkeypatch, tmp_path):
+    """And what to do; the process runs on."""
+    monkeypatch.setenv("ROSRM_CRIU", str(tmp_path / "none"))
+    cluster = make_cluster(
+        host("robot"), migration=MigrationSettings(strategies={"criu": {}}, automatic=False)
+    )
+    cluster.submit(ProcessSpec("p", command=("sleep", "1000"), stop=QUICK))
+    cluster.wait("p", "running")
+    with pytest.raises(Refused, match="criu does not work on robot: "):
+        ask(cluster, "checkpoint", "p")
+    assert cluster.process("p").state == "running"
+    cluster.cancel("p")
