@@ -44,7 +44,7 @@ Error (criu/util.c:1534): rlimit: Can't setup RLIMIT_NOFILE for self: Operation 
         ("(00.1) Looks good.\nWarn (a.c:1): Error is a word\n", ()),
         ("", ()),
     ],
-    ids=["socket", "restore", "nothing-better", "no-error", "empty"],
+    ids=["socket", "restore", "without-times", "nothing-better", "no-error", "empty"],
 )
 def test_the_first_causes_are_told_once_and_without_what_every_failure_says(log, expected):
     assert causes(log) == expected
