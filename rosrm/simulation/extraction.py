@@ -29,7 +29,8 @@ from rosrm.simulation.workload import Curve, HostPlan, Model, ProcessPlan, Workl
 
 #: Points of a memory curve that are kept.
 _POINTS: Final = 64
-#: Requests of people that are made again in a simulation.
+#: Requests of people that are made again in a simulation. Checkpoints and restores are not: nothing
+#: takes images there, and a process uses nothing meanwhile, which its curve shows.
 _REQUESTS: Final = (
     happened.CancelRequested, happened.RestartRequested, happened.MigrationRequested,
     happened.HostStateRequested,
