@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 import time
 from collections import deque
@@ -96,8 +97,8 @@ class Listener:
         self.say(status)
 
     def close(self) -> None:
-        """The process ends in good order."""
-        remove_status(self._directory)
+        """The process ends in good order: nobody is spoken to there any more."""
+        shutil.rmtree(self._directory, ignore_errors=True)
 
     def _read(self) -> Request | None:
         try:

@@ -29,6 +29,7 @@ from rosrm.portable import (
     await_left,
     control_directory,
     make_directory,
+    remove_directory,
     status_of,
 )
 from rosrm.transfer import Offer, Sender
@@ -116,9 +117,14 @@ def go_on(arguments: Answer) -> Answer:
 def end(arguments: Answer) -> Answer:
     """The destination owns the name: what is left of the source goes."""
     luggage.withdraw(_state(arguments), int(arguments["source"]))
-    pid = _pids(arguments).get(_instance(arguments, "source"))
-    if pid:
+    pid = _pids(arguments).get(_instance(arguments, "source"), 0)
+    if pid and tree.is_alive(pid):
+        control = _control_of(pid)
+        status = status_of(control)
         dumping.kill(pid)
+        # Where both hosts share it, it says by now that the node runs.
+        if status is not None and status.state is State.LEFT:
+            remove_directory(control)
     return {}
 
 

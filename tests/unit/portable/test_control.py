@@ -327,9 +327,10 @@ def test_a_node_whose_directory_is_gone_goes_on(directory, node, capfd) -> None:
 
 
 def test_an_orderly_end_leaves_no_portable_node(directory, node) -> None:
-    """Nobody can be asked any more."""
+    """Nobody can be asked any more, and nothing is left."""
     node.close()
     assert status_of(directory) is None
+    assert not directory.exists()
 
 
 def test_a_directory_is_readable_by_its_owner_alone(directory) -> None:
