@@ -8,6 +8,7 @@ the owner of the name      given up at once, where a standby can take over
 one that may be the owner  as the owner: the destination of a move that may be active, or the last
                            that is left of a process
 one that is cancelled      given up at once: nothing follows it
+is being restored          never: its memory is there alone
 any other                  given up at once: a former source, a shadow
 =========================  ======================================================================
 
@@ -23,6 +24,7 @@ import numpy as np
 
 from rosrm.core import coming_back, failover, handoffs, lifecycle
 from rosrm.core.hosts import Host, HostCondition
+from rosrm.core.migration import Aim
 from rosrm.core.processes import LeftBehind
 from rosrm.core.state import Instance, MasterState, Process, ProcessPhase, Wanted
 
@@ -74,6 +76,9 @@ def _is_given_up(state: MasterState, instance: Instance, now: float) -> bool:
     if process is None or process.wanted is Wanted.CANCEL:
         return True
     if now < state.in_company_since + state.settings.lease:
+        return False
+    run = state.runs.get(process.name)
+    if run is not None and run.aim is Aim.RESTORE and not run.committed:
         return False
     if process.owner not in (0, instance.id.number) and not _may_be_active(state, instance):
         return True

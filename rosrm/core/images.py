@@ -119,12 +119,16 @@ def drop(state: MasterState, process: Process, *numbers: int) -> None:
         numbers: of other instances under which it may lie on its host.
     """
     image = process.image
-    if image is None:
-        return
-    set_image(state, process, None)
-    state.images.unwanted[image.number] = Unwanted(
-        process.name, image.host, image.drop, (image.number, *numbers)
-    )
+    if image is not None:
+        set_image(state, process, None)
+        remove(state, process.name, image.host, image.drop, image.number, *numbers)
+
+
+def remove(
+    state: MasterState, process: str, host: str, drop: str, number: int, *numbers: int
+) -> None:
+    """Have an image removed from a host, as soon as that is heard; as the fields of `Unwanted`."""
+    state.images.unwanted[number] = Unwanted(process, host, drop, (number, *numbers))
     _save(state)
 
 

@@ -183,6 +183,20 @@ def commit_to_image(state: MasterState, process: Process, run: Run, step: Commit
     images.set_image(state, process, image)
 
 
+def leave_behind(state: MasterState, run: Run) -> bool:
+    """Whether a checkpoint that is undone can do without its host: nobody is there to go on.
+
+    What may lie there of an image is removed when the host is heard.
+    """
+    if run.aim is not Aim.CHECKPOINT or run.source.number not in run.ended:
+        return False
+    commit = run.plan.steps[run.commit_index]
+    if isinstance(commit, Commit):
+        number = run.source.number
+        images.remove(state, run.process, run.source_host.name, commit.image, number)
+    return True
+
+
 def _probed(source: Instance) -> dict[str, float]:
     """What it was seen to use of what its host has a probe for."""
     names = {resource.name for resource in source.host.description.resources}

@@ -25,7 +25,7 @@ from typing import Any
 from rosrm.core import abilities, handoffs, images, imaging, keeping, lifecycle
 from rosrm.core import events as happened
 from rosrm.core.hosts import HostCondition
-from rosrm.core.migration import Aim, AwaitReady, Commit, Configure, Start, Step, Stop
+from rosrm.core.migration import Aim, AwaitReady, Commit, Configure, Execute, Start, Step, Stop
 from rosrm.core.model import InstanceId, InstanceState
 from rosrm.core.runs import End
 from rosrm.core.state import MasterState, Process, ProcessPhase, Run, Wanted
@@ -158,6 +158,8 @@ def _commit(state: MasterState, run: Run, step: Commit, now: float) -> None:
 
 def _cannot_be_done(state: MasterState, run: Run, step: Step, now: float) -> bool:
     """Trying again would never help: the instance has ended, or its slot was given away."""
+    if isinstance(step, Execute) and run.undo is not None:
+        return imaging.leave_behind(state, run)
     if not isinstance(step, (Start, AwaitReady)):
         return False
     instance = state.instances.get(step.instance.number)

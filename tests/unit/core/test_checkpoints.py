@@ -429,6 +429,71 @@ def test_a_former_instance_that_comes_back_beside_its_image_is_killed() -> None:
     )
 
 
+@pytest.mark.parametrize("then", ["wait", "elsewhere", "stop"])
+def test_a_host_that_is_lost_before_the_source_has_ended_takes_nothing_with_it(then: Any) -> None:
+    """The image owns the name by then; the source is ended when its host is heard again."""
+    shelf = Shelf("a")
+    cluster = shelf.play(Machine("b", busy={"memory": 0.5}))
+    cluster.submit(process("p", host_loss=HostLossPolicy(then)))
+    shelf.trouble["kill"] = "no answer"
+    cluster.checkpoint("p")
+    shelf.machine.connected = False
+    cluster.wait(60.0)
+    assert (cluster.phase("p"), cluster.where("p"), shelf.images) == ("stuck", ["a"], {1})
+    shelf.trouble.clear()
+    shelf.machine.connected = True
+    cluster.register(shelf.machine)
+    cluster.wait(10.0)
+    assert (cluster.phase("p"), cluster.where("p"), shelf.images) == ("checkpointed", [], {1})
+
+
+@pytest.mark.parametrize("then", ["wait", "elsewhere", "stop"])
+def test_a_host_that_is_lost_in_a_restore_decides_when_it_is_back(then: Any) -> None:
+    """What went on there goes on; nothing is begun elsewhere meanwhile."""
+    shelf = Shelf("a")
+    cluster = shelf.play(Machine("b", busy={"memory": 0.5}))
+    cluster.submit(process("p", host_loss=HostLossPolicy(then)))
+    cluster.checkpoint("p")
+    shelf.trouble.update({"await": "no answer", "put_back": "no answer"})
+    cluster.restore("p")
+    number = shelf.machine.find("p").number
+    shelf.taken.pop(number)
+    shelf.alive.add(number)  # it is restored, and nobody has heard of it
+    shelf.machine.connected = False
+    cluster.wait(60.0)
+    assert (cluster.phase("p"), cluster.where("p")) == ("stuck", ["a"])
+    shelf.trouble.clear()
+    shelf.machine.connected = True
+    cluster.register(shelf.machine)
+    cluster.wait(10.0)
+    assert (cluster.phase("p"), cluster["p"].owner) == ("running", number)
+    assert cluster.where("p") == ["a"]
+    assert shelf.images == set()
+
+
+def test_a_host_that_is_lost_in_a_dump_does_not_keep_its_process_from_going_elsewhere() -> None:
+    """By its policy; what lies on the host goes when that is back, image and process."""
+    shelf = Shelf("a")
+    cluster = shelf.play(Machine("b", busy={"memory": 0.5}))
+    cluster.submit(process("p", host_loss=HostLossPolicy("elsewhere")))
+    freeze = shelf.machine.executors["freeze"]
+
+    def freeze_and_fall(arguments: Any) -> Any:
+        freeze(arguments)
+        shelf.trouble["thaw"] = "no answer"
+        shelf.machine.connected = False
+        raise RuntimeError("the disk is full")
+
+    shelf.machine.executors["freeze"] = freeze_and_fall
+    cluster.checkpoint("p")
+    cluster.wait(90.0)
+    assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a", "b"])
+    shelf.machine.connected = True
+    cluster.register(shelf.machine)
+    cluster.wait(2.0)
+    assert (cluster.where("p"), shelf.images) == (["b"], set())
+
+
 # --- kill of the master at every point --------------------------------------------------------
 
 
