@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import signal
 import socket
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from itertools import pairwise
@@ -13,10 +15,10 @@ import pytest
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile
-from std_msgs.msg import Int64
+from std_msgs.msg import Int64, Int64MultiArray
 
 from rosrm.config.settings import MigrationSettings, ProcessDefaults
-from rosrm.core.model import ProcessSpec, RestartPolicy
+from rosrm.core.model import MigrationPolicy, ProcessSpec, RestartPolicy
 from rosrm.core.views import ProcessRow
 from rosrm.errors import Refused
 from tests.ros.clusters import MIB, PATIENCE, QUICK, alive, host, node, python, wait_until
@@ -44,19 +46,20 @@ except BaseException:
 
 
 class Ear:
-    """Hears what is counted."""
+    """Hears what is counted: numbers, or arrays that begin with one."""
 
-    def __init__(self, domain: int) -> None:
+    def __init__(self, domain: int, kind: type = Int64) -> None:
         self._context = rclpy.Context()
         self._context.init(domain_id=domain)
         self._node = rclpy.create_node("ear", context=self._context)
-        self._node.create_subscription(Int64, "count", self._take, QoSProfile(depth=1000))
+        self._node.create_subscription(kind, "count", self._take, QoSProfile(depth=1000))
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
         self.counts: list[int] = []
 
-    def _take(self, message: Int64) -> None:
-        self.counts.append(message.data)
+    def _take(self, message: Int64 | Int64MultiArray) -> None:
+        told = message.data
+        self.counts.append(told if isinstance(message, Int64) else told[0])
 
     def hear(self, more: int) -> None:
         """So many counts more."""
@@ -167,6 +170,70 @@ def test_a_restored_node_that_crashes_is_started_by_its_policy(criu, cluster, ea
         assert time.monotonic() < deadline, "it did not begin anew"
         ear.listen(0.1)
     cluster.cancel("counter")
+
+
+def rosrm(cluster, *words: str) -> subprocess.CompletedProcess:
+    """The command, a participant of this very host."""
+    environment = {**os.environ, "ROS_DOMAIN_ID": str(cluster.domain), "COLUMNS": "200"}
+    return subprocess.run(
+        [sys.executable, "-m", "rosrm.cli", *words],
+        env=environment, text=True, capture_output=True, timeout=2 * PATIENCE, check=False,
+    )  # fmt: skip
+
+
+def test_the_commands_wait_until_it_is_done(criu, cluster, ear):
+    """They are participants on its host themselves, and take none of its ports."""
+    alone()
+    cluster.submit(counter())
+    cluster.wait("counter", "running")
+    ear.hear(20)
+    checkpoint(cluster, "counter")  # its host is known to be able
+    restore(cluster, "counter")
+    for action, said in (
+        ("checkpoint", "counter is checkpointed: its image is on robot"),
+        ("restore", "counter goes on from its image on robot"),
+    ):
+        done = rosrm(cluster, action, "counter", "--wait")
+        assert (done.returncode, said in done.stdout) == (0, True), done.stdout + done.stderr
+    ear.hear(20)
+    assert ear.counts == list(range(ear.counts[0], ear.counts[-1] + 1))
+    refused = rosrm(cluster, "restore", "counter", "--wait")
+    assert refused.returncode != 0
+    assert "only a checkpointed process is restored" in refused.stderr
+    cluster.cancel("counter")
+
+
+def test_a_portable_node_moves_on_after_a_restore(criu, make_shared):
+    """It is not asked to leave for a checkpoint, and can be for a move later."""
+    alone()
+    cluster = make_shared(
+        host("left"), host("right"),
+        migration=MigrationSettings(strategies={"criu": {}}, automatic=False),
+        defaults=ProcessDefaults(needs={"memory": MIB}),
+    )  # fmt: skip
+    ear = Ear(cluster.domain, Int64MultiArray)
+    try:
+        cluster.submit(
+            ProcessSpec(
+                "p", module="rosrm_examples.portable_counter", arguments=("--period", "0.02"),
+                ros=True, migration=MigrationPolicy("criu"), stop=QUICK,
+            )
+        )  # fmt: skip
+        here = cluster.wait("p", "running").host
+        ear.hear(20)
+        ask(cluster, "checkpoint", "p")
+        assert cluster.wait("p", "checkpointed").host == here
+        restore(cluster, "p")
+        ear.hear(20)
+        assert ear.counts == list(range(ear.counts[0], ear.counts[-1] + 1))
+        ask(cluster, "migrate", "p")
+        cluster.wait_for_event("migrated", process="p", timeout=2 * PATIENCE)
+        assert cluster.wait("p", "running").host != here
+        ear.hear(20)
+        assert all(before < after for before, after in pairwise(ear.counts))
+        cluster.cancel("p")
+    finally:
+        ear.close()
 
 
 def test_what_cannot_be_dumped_runs_on_and_says_why(criu, cluster, tmp_path):
