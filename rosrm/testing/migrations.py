@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import Any, ClassVar
 
 from rosrm.core.migration import (
+    Aim,
     Commit,
     Configure,
     Execute,
@@ -22,7 +23,7 @@ from rosrm.core.migration import (
 from rosrm.core.migration import plan_fault as fault_of
 from rosrm.core.model import EMPTY, InstanceId, ProcessSpec
 from rosrm.core.plans import plan_from_dict, plan_to_dict
-from rosrm.ports import MigrationOffer, MigrationStrategy
+from rosrm.ports import Imaging, MigrationOffer, MigrationStrategy
 
 
 class MigrationContract:
@@ -61,6 +62,22 @@ class MigrationContract:
         """One commit point, hosts of this move only, a time-out for every wait."""
         for move in self.moves():
             assert fault_of(self.make().propose(move), move) == ""
+
+    def test_checkpoints_and_restores_are_sound(self) -> None:
+        """Of a strategy that takes images: on one host, and owned by the image in between."""
+        strategy: object = self.make()
+        if not isinstance(strategy, Imaging):
+            return
+        for move in self.moves():
+            here = replace(move, destination_host=move.source_host)
+            for make, aim in (
+                (strategy.checkpoint, Aim.CHECKPOINT),
+                (strategy.restore, Aim.RESTORE),
+            ):
+                plan = make(here)
+                assert fault_of(plan, here, aim) == ""
+                assert make(here) == plan
+                assert plan_from_dict(json.loads(json.dumps(plan_to_dict(plan)))) == plan
 
     def test_is_pure(self) -> None:
         """The same move gives the same plan, also with another object of the strategy."""

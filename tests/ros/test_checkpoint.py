@@ -236,6 +236,20 @@ def test_a_portable_node_moves_on_after_a_restore(criu, make_shared):
         ear.close()
 
 
+def test_a_node_with_shared_memory_is_refused_with_what_to_set(criu, cluster, ear):
+    """Its peers would clear that away; it runs on."""
+    alone()
+    cluster.submit(counter(environment={"FASTDDS_BUILTIN_TRANSPORTS": "DEFAULT"}))
+    cluster.wait("counter", "running")
+    ear.hear(10)
+    ask(cluster, "checkpoint", "counter")
+    event = cluster.wait_for_event("checkpoint_failed", process="counter")
+    assert "its ROS participant has shared memory (/dev/shm/fastrtps_" in event.message
+    assert "`FASTDDS_BUILTIN_TRANSPORTS: UDPv4` in its `environment`" in event.message
+    ear.hear(10)
+    cluster.cancel("counter")
+
+
 def test_what_cannot_be_dumped_runs_on_and_says_why(criu, cluster, tmp_path):
     """A Unix socket that is connected to a process outside of it."""
     with socket.socket(socket.AF_UNIX) as server:
