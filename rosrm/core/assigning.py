@@ -43,7 +43,7 @@ def demand_to_move(
     amounts = larger(estimate.amounts, seen)
     guessed = {name for name in estimate.estimated if amounts[name] > seen.get(name, 0.0)}
     excluded = {
-        **process.excluded, **_unable(state, process, source), source: "it is there already",
+        **process.excluded, **unable(state, process, source), source: "it is there already",
     }  # fmt: skip
     return Demand(process.spec, amounts, frozenset(guessed), excluded, headroom)
 
@@ -56,7 +56,7 @@ def demand_to_restore(state: MasterState, process: Process, seen: Mapping[str, f
     return Demand(process.spec, amounts, frozenset(guessed))
 
 
-def _unable(state: MasterState, process: Process, source: str) -> dict[str, str]:
+def unable(state: MasterState, process: Process, source: str) -> dict[str, str]:
     """Hosts to which its strategy cannot move it, with the reason."""
     strategy = process.spec.migration.strategy or ""
     here = state.hosts.by_name[source]

@@ -7,8 +7,9 @@ those the one with the largest relief goes. When no host has room nothing moves.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Final
 
-from rosrm.core.assigning import demand_to_move, ranking_of
+from rosrm.core.assigning import demand_to_move, ranking_of, unable
 from rosrm.core.begin import begin_move, moves_under_way, why_immovable
 from rosrm.core.hosts import Host
 from rosrm.core.model import InstanceState
@@ -17,6 +18,8 @@ from rosrm.core.verdicts import decide, verdict_of
 
 #: Seconds between two records that nothing can be moved off a host.
 _TOLD_EVERY = 10.0
+#: Reasons against hosts that one answer names.
+_MOST_SAID: Final = 3
 
 
 def relieve_hosts(state: MasterState, now: float) -> None:
@@ -120,7 +123,7 @@ def try_move(
     ranking = ranking_of(state, demand)
     column = ranking.best() if host is None else host.column
     if column < 0:
-        return f"no host has room for {process.name}"
+        return f"no host has room for {process.name}{_and_why(state, process, source.host)}"
     destination = state.hosts.hosts[column]
     if not ranking.fits(column):
         why = verdict_of(ranking, column).reason
@@ -130,6 +133,15 @@ def try_move(
     if not reason:
         state.note_decision(process, decision, "migrated", now)
     return reason
+
+
+def _and_why(state: MasterState, process: Process, source: Host) -> str:
+    """What its strategy has against hosts, a few of them; "" for nothing."""
+    faults = unable(state, process, source.name)
+    faults.pop(source.name, None)
+    said = list(dict.fromkeys(faults.values()))
+    more = f" (and {len(said) - _MOST_SAID} more)" if len(said) > _MOST_SAID else ""
+    return "".join(f"; {fault}" for fault in said[:_MOST_SAID]) + more
 
 
 def _measured(source: Instance) -> Mapping[str, float]:

@@ -118,6 +118,10 @@ def test_where_it_does_not_work_nothing_goes():
     reply = cluster.migrate("p", "b")
     assert not reply.accepted
     assert "freezing does not work on b: CRIU 3.17 is too old" in reply.message
+    anywhere = cluster.migrate("p")
+    assert anywhere.message == (
+        "no host has room for p; freezing does not work on b: CRIU 3.17 is too old"
+    )
     assert "freezing does not work on b" in " ".join(cluster.told("strategy_absent"))
 
 
