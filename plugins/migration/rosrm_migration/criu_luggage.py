@@ -140,6 +140,11 @@ def take_fetcher(number: int) -> Fetcher | None:
         return _fetchers.pop(number, None)
 
 
+def close_soon(fetcher: Fetcher) -> None:
+    """End it; somebody stands still until the image is restored, and does not wait for that."""
+    _later(0.0, fetcher.close)
+
+
 def _dismiss(number: int, fetcher: Fetcher) -> None:
     with _changing:
         if _fetchers.get(number) is not fetcher:

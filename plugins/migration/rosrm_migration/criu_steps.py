@@ -216,11 +216,13 @@ def _fetch(arguments: Answer) -> Answer:
             f"the slave of {arguments['here']['host']} was started again in the midst of the move, "
             f"and the image is for the former one alone: ask for the move again"
         )
-    with fetcher:
+    try:
         fetched = fetcher.fetch(
             Offer.from_json(told["offer"]), directory, timeout=float(arguments["timeout"]),
             reserve=int(arguments["reserve"]),
         )  # fmt: skip
+    finally:
+        luggage.close_soon(fetcher)
     luggage.remove_unused_later(directory, float(arguments["keep"]))
     make_directory(control, uid)
     return {"seconds": {"transfer": fetched.seconds}, "received": fetched.received}
