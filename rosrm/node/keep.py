@@ -210,22 +210,22 @@ class _Writer:
         except OSError as error:
             self._not_written(error)
             return True
-        self._say("warning", f"not kept any more: {identity.keep} is a newer instance's")
+        self._warn(f"not kept any more: {identity.keep} is a newer instance's")
         return False
 
     def _written(self, sequence: int) -> None:
         if self._fault:
             self._fault = ""
-            self._say("info", f"kept again, up to cycle {sequence}")
+            # A line of code of its own: rclpy takes one severity from each, and raises at another.
+            self._member.node.get_logger().info(f"its state is kept again, up to cycle {sequence}")
 
     def _not_written(self, error: OSError) -> None:
         if self._fault != str(error):
             self._fault = str(error)
-            self._say(
-                "warning",
+            self._warn(
                 f"not kept: {error.strerror}, in {self._member.identity.keep}. This node goes on, "
-                f"and tries again with each newer state",
+                f"and tries again with each newer state"
             )
 
-    def _say(self, level: str, message: str) -> None:
-        getattr(self._member.node.get_logger(), level)(f"its state is {message}")
+    def _warn(self, message: str) -> None:
+        self._member.node.get_logger().warning(f"its state is {message}")

@@ -217,3 +217,15 @@ def test_who_is_followed_from_the_first_cycle_on_keeps_its_state_too(stage, tmp_
     stage.spin_until(lambda: marks and first.count >= 5, "five counts that somebody follows")
     at = first._rosrm.member.sequence
     stage.spin_until(lambda: kept_up_to(tmp_path, at), "a kept state")
+
+
+def test_once_there_is_room_again_every_state_is_kept_again(stage, tmp_path):
+    """Not only the first: the trouble is over, whatever was said of it."""
+    directory = tmp_path / "state"
+    directory.write_text("in the way")
+    node = stage.instance(Counter, 1, keep=directory)
+    stage.spin_until(lambda: node.count >= 20, "twenty counts")
+    directory.unlink()
+    stage.spin_until(lambda: kept_up_to(directory, 20), "a first state")
+    first = kept.newest_head(directory).sequence
+    stage.spin_until(lambda: kept_up_to(directory, first + 50), "states of later cycles")
