@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Final
 
+import numpy as np
+
 from rosrm.core import abilities
 from rosrm.core.commands import Assign
 from rosrm.core.hosts import HostCondition
@@ -16,6 +18,7 @@ from rosrm.core.state import MasterState, Process, ProcessPhase, larger
 from rosrm.core.verdicts import Decision, decide, refused_everywhere, why_never
 
 _PLUGIN_TOLD_EVERY: Final = 10.0
+_AWAY: Final = (HostCondition.EXPECTED, HostCondition.LOST)
 _STATE_MAY_COME: Final = "a host that may keep its state has not come back yet"
 _NOBODY: Final[frozenset[str]] = frozenset()
 
@@ -104,9 +107,9 @@ def place_waiting(state: MasterState, now: float) -> None:
 
 def _passed_over(state: MasterState, now: float) -> frozenset[str]:
     """Who is not placed yet, and holds nobody up who is behind."""
-    if not (state.hosts.condition == HostCondition.EXPECTED).any():
+    if not np.isin(state.hosts.condition, _AWAY).any():
         return _NOBODY
-    names = (name for name in state.queue if awaits_states(state, state.processes[name]))
+    names = (name for name in state.queue if awaits_states(state, state.processes[name], now))
     passed_over = frozenset(names)
     for name in passed_over:
         _tell_waits(state, state.processes[name], _STATE_MAY_COME, now)

@@ -61,14 +61,32 @@ def note_states(state: MasterState, host: Host, states: tuple[KeptState, ...], n
     state.keeping.holdings.replace(host.name, states, now)
 
 
-def awaits_states(state: MasterState, process: Process) -> bool:
-    """Hosts that may keep a state of a process have not come back since the master started.
+def awaits_states(state: MasterState, process: Process, now: float) -> bool:
+    """A host that keeps a state of a process, or may, is away, and may come back at any moment.
 
-    Started now it might begin from nothing beside its own state. Whoever has not come back when the
-    lease is over is lost.
+    Started now it might begin from nothing beside its own state. So it waits for hosts that have
+    not come back since the master started, until they are lost; and, where nobody else is in reach
+    who keeps its state, for a host that was lost beside its own, for one lease.
     """
-    expected = state.hosts.condition == HostCondition.EXPECTED
-    return process.spec.keeps_state and bool(expected.any())
+    if not process.spec.keeps_state:
+        return False
+    if (state.hosts.condition == HostCondition.EXPECTED).any():
+        return True
+    return not state.keeping.in_reach(process.name, process.born, state.hosts) and any(
+        _may_come_back(state, state.hosts.by_name[name], now)
+        for name in state.keeping.holdings.hosts_of(process.name, process.born)
+        if name in state.hosts.by_name and not _was_left_on(process, name)
+    )
+
+
+def _may_come_back(state: MasterState, host: Host, now: float) -> bool:
+    lost = state.hosts.condition_of(host) is HostCondition.LOST
+    return lost and now < host.lost_since + state.settings.lease
+
+
+def _was_left_on(process: Process, host: str) -> bool:
+    """Its own host is lost: that is why it waits, and alone no reason to wait longer."""
+    return process.left_behind is not None and process.left_behind.host == host
 
 
 def order_answered(state: MasterState, event: happened.OrderAnswered) -> bool:

@@ -377,3 +377,32 @@ def test_the_last_copy_may_vanish_while_processes_are_looked_at():
     cluster.wait(3.0)
     assert cluster.phase("p") == "running"
     assert policy.views[-1].size == 0
+
+
+def lost_with_its_copy() -> tuple[Cluster, str, str]:
+    """The host of a process is lost, and that which keeps the copy of its state, at once."""
+    cluster = running(Asked())
+    host, (keeper, left) = where(cluster), others(cluster)
+    keep(cluster, keeper, ("p", cluster["p"].owner, 4))
+    for name in (host, keeper):
+        cluster.machines[name].connected = False
+    cluster.wait(4.5)  # the lease is over, and another one has begun
+    assert cluster.queue() == ["p"]
+    assert "has not come back yet" in cluster["p"].reason
+    return cluster, keeper, left
+
+
+def test_when_the_copy_is_lost_too_its_host_may_come_back():
+    """A moment later, as from a cut: then the process goes on from its state."""
+    cluster, keeper, _ = lost_with_its_copy()
+    cluster.machines[keeper].connected = True
+    cluster.wait(1.0)
+    assert assigned(cluster).kept_on == (keeper,)
+
+
+def test_when_the_copy_stays_lost_it_begins_from_nothing():
+    """One lease later: nobody else can go on."""
+    cluster, _, left = lost_with_its_copy()
+    cluster.wait(3.0)
+    assert left in cluster.where("p")
+    assert assigned(cluster).kept_on == ()

@@ -181,7 +181,7 @@ class Play(RuleBasedStateMachine):
             chosen = state.processes[assign.assignment.instance.process]
             for name in state.queue:
                 waits = state.processes[name]
-                if awaits_states(state, waits):
+                if awaits_states(state, waits, self.cluster.now):
                     continue
                 ahead = (-waits.spec.priority, waits.order) < (-chosen.spec.priority, chosen.order)
                 alike = demand_of(state, waits).key[4:] == demand_of(state, chosen).key[4:]
