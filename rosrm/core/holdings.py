@@ -134,9 +134,16 @@ class Keeping:
         return self.next_order
 
     def in_reach(self, process: str, since: int, hosts: HostTable) -> tuple[str, ...]:
-        """Hosts that are heard and keep a state of an instance from a number on, newest first."""
+        """Hosts that are heard and keep a state of an instance from a number on, newest first.
+
+        Before them those that were to be given one, and have said nothing of it yet: it may have
+        come there since they spoke, and is newer than all else then.
+        """
+        known = self.holdings.hosts_of(process, since)
+        told = self.told.get(process)
+        asked = told.choice.hosts if told is not None and told.number >= since else ()
         return tuple(
             name
-            for name in self.holdings.hosts_of(process, since)
+            for name in (*(name for name in asked if name not in known), *known)
             if name in hosts.by_name and hosts.condition_of(hosts.by_name[name]) in _IN_REACH
         )

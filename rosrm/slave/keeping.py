@@ -288,8 +288,13 @@ class Keeping:
 
     def take_part(self, part: Part, answer: Callable[[str, str], None]) -> None:
         """A part of a state came from another host."""
-        take = partial(self._store.take, part, bounded=True)
-        self._in_thread(take, lambda outcome: answer(*outcome), _FAILED)
+
+        def taken(outcome: tuple[str, str]) -> None:
+            if part.is_last and not outcome[0]:
+                self._next_scan = 0.0  # the master may need it in the next moment
+            answer(*outcome)
+
+        self._in_thread(partial(self._store.take, part, bounded=True), taken, _FAILED)
 
     def read_part(
         self, process: str, age: tuple[int, int], offset: int, size: int,

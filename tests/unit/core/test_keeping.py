@@ -406,3 +406,16 @@ def test_when_the_copy_stays_lost_it_begins_from_nothing():
     cluster.wait(3.0)
     assert left in cluster.where("p")
     assert assigned(cluster).kept_on == ()
+
+
+def test_a_host_that_was_to_keep_the_state_is_asked_for_it_though_it_has_not_said_so():
+    """What came there since it spoke last is the newest there is."""
+    policy = Asked()
+    cluster = running(policy)
+    host, (keeper, stale) = where(cluster), others(cluster)
+    keep(cluster, stale, ("p", cluster["p"].owner, 1))
+    policy.answer = CheckpointChoice((keeper,))
+    cluster.wait(2.0)
+    cluster.machines[host].connected = False
+    cluster.wait(4.0)
+    assert assigned(cluster).kept_on == (keeper, stale)

@@ -310,6 +310,18 @@ def test_the_master_is_told_what_is_kept_when_it_changes(net):
     assert len(net.told["a"]) == before + 1
 
 
+def test_a_copy_that_has_come_is_told_at_once(net):
+    """Not with the next look: its process may be lost in the next moment."""
+    net.add("a").keep(P7, ["b"], 1.0)
+    net.add("b")
+    net.pass_time(0.05)  # the look that follows its start is over
+    net.write("a", 1)
+    net.until(lambda: net.age("b") == (7, 1), "the copy", step=0.01)
+    for _ in range(3):
+        net.pass_time(0.01)
+    assert [(one.instance, one.sequence) for one in net.told["b"][-1]] == [(P7, 1)]
+
+
 def test_what_lives_here_is_not_deleted(net):
     """An order that comes late does not take the state of a running process."""
     slave = net.add("a")
