@@ -211,6 +211,8 @@ def _slave_settings(host: str) -> dict[str, object]:
         # Without cpu: the processor is shared by all hosts, and a busy one would take no work.
         "probes": {"memory": {}, "disk": {}},
         "limits": {"memory": 0.8, "disk": 0.95},
+        # What one machine starts at a time, five hosts of a lab on one machine must not.
+        "max_starting": 2,
     }
 
 
