@@ -143,6 +143,12 @@ def remove_status(directory: Path) -> None:
         (directory / _STATUS).unlink()
 
 
+def remove_request(directory: Path) -> None:
+    """Nothing is asked."""
+    with contextlib.suppress(OSError):
+        (directory / _REQUEST).unlink()
+
+
 def _text(value: Any) -> str:
     if not isinstance(value, str):
         raise TypeError(f"{value!r} is no text")

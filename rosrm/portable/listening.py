@@ -17,6 +17,7 @@ from rosrm.portable.form import (
     Status,
     Want,
     read_request,
+    remove_request,
     remove_status,
     write_status,
 )
@@ -55,7 +56,7 @@ class Listener:
                 f"the control directory {directory} cannot be made: {error.strerror}"
             ) from None
         remove_status(directory)
-        self._seen = self._read()
+        remove_request(directory)  # nobody asks before there is a status
 
     def asked(self) -> Request | None:
         """What the node shall do now, as it stands; None: nothing new."""

@@ -129,11 +129,13 @@ class _Draft:
     def __init__(self, move: Move, options: CriuOptions) -> None:
         self._move = move
         self._options = options
-        #: Of both sides, by all steps: an attempt is known by the instance that it is to make.
+        #: For all steps. An attempt is known by its instances and its time: a master without its
+        #: former journal gives the same numbers once more.
         self._both: Mapping[str, Any] = {
             "process": move.spec.name,
             "source": move.source.number,
             "destination": move.destination.number,
+            "attempt": f"{move.source}-{move.destination.number}-{move.now}",
         }
 
     def plan(self) -> Plan:

@@ -67,6 +67,7 @@ def _execute(name: str, move: Move, timeout: float, undo: Step | None = None) ->
         "process": move.spec.name,
         "source": move.source.number,
         "destination": move.destination.number,
+        "attempt": f"{move.source}-{move.destination.number}-{move.now}",
         "timeout": timeout,
     }
     return Execute(name, move.source_host, arguments, timeout + _LONGER, undo)

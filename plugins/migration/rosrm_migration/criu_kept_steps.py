@@ -29,7 +29,7 @@ from rosrm_migration.criu_kept import KEEP, TAKE
 #: Sockets that keep the ports of processes that wait in their images, by the instance's number.
 _reserved: Final[dict[int, list[socket.socket]]] = {}
 #: Attempts that were turned back: a dump that is still to begin for one does not.
-_turned_back: Final[set[int]] = set()
+_turned_back: Final[set[str]] = set()
 _changing: Final = threading.Lock()
 #: CRIU's logs go with the image; what matters of them is in the message.
 _LOG: Final = re.compile(r" \((its )?log: [^)]*\)")
@@ -39,11 +39,12 @@ _LOOK: Final = 0.005
 
 @dataclass(frozen=True)
 class _Asked:
-    """What an executor is asked: of the instance `source`, in the attempt `destination`."""
+    """What an executor is asked: of the instance `source`, in an attempt."""
 
     process: str
     source: int
     destination: int
+    attempt: str
     timeout: float
     state: Path
     pids: Mapping[str, int]
@@ -54,8 +55,8 @@ class _Asked:
         here = arguments["here"]
         return cls(
             str(arguments["process"]), int(arguments["source"]), int(arguments["destination"]),
-            float(arguments["timeout"]), Path(here["state"]), here["pids"],
-            arguments.get("results", {}),
+            str(arguments["attempt"]), float(arguments["timeout"]), Path(here["state"]),
+            here["pids"], arguments.get("results", {}),
         )  # fmt: skip
 
     def pid(self, number: int) -> int:
@@ -70,7 +71,7 @@ class _Asked:
 def keep(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
     """Dump the process into an image; it stands still from then on."""
     asked = _Asked.of(arguments)
-    return luggage.once(KEEP, asked.destination, lambda: _keep(asked))
+    return luggage.once(KEEP, asked.attempt, lambda: _keep(asked))
 
 
 def _keep(asked: _Asked) -> Mapping[str, Any]:
@@ -87,7 +88,7 @@ def _keep(asked: _Asked) -> Mapping[str, Any]:
     directory, began = kept(asked.state, asked.source), time.monotonic()
     luggage.discard(directory)
     with _changing:
-        if asked.destination in _turned_back:
+        if asked.attempt in _turned_back:
             raise CriuError("the checkpoint was turned back meanwhile")
     try:
         manifest = dumping.dump(
@@ -108,8 +109,8 @@ def run_on(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
     """The checkpoint has failed: the process goes on, unless it has ended."""
     asked = _Asked.of(arguments)
     with _changing:
-        _turned_back.add(asked.destination)
-    luggage.after(KEEP, asked.destination, asked.timeout)
+        _turned_back.add(asked.attempt)
+    luggage.after(KEEP, asked.attempt, asked.timeout)
     _discard(asked.state, asked.source)
     pid = asked.pid(asked.source)
     if pid:

@@ -1,8 +1,8 @@
 """What a slave holds of moves by `criu`: images and the ends of transfers, which go by themselves.
 
 A master may ask for a step a second time, and turn a move back while a step is under way; a slave
-may be killed and be started again. So each thing is known by the number of an instance, and what
-nobody uses any more is removed after a time.
+may be killed and be started again. So steps are known by the attempt, and things by the number of
+an instance; what nobody uses any more is removed after a time.
 """
 
 from __future__ import annotations
@@ -29,25 +29,25 @@ _REMEMBERED: Final = 50
 _changing: Final = threading.Lock()
 _senders: Final[dict[int, Sender]] = {}
 _fetchers: Final[dict[int, Fetcher]] = {}
-_flights: Final[dict[tuple[str, int], Future[Answer]]] = {}
+_flights: Final[dict[tuple[str, str], Future[Answer]]] = {}
 
 
 # --- steps that are asked for twice -----------------------------------------------------------
 
 
-def once(step: str, number: int, work: Callable[[], Answer]) -> Answer:
+def once(step: str, attempt: str, work: Callable[[], Answer]) -> Answer:
     """Do a step; who asks for it again while it is done, or afterwards, gets the same answer.
 
     Args:
         step: its name.
-        number: of the instance that the move is to make.
+        attempt: of the move.
         work: the step. When it raises it is forgotten, and done anew when it is asked for again.
     """
     with _changing:
-        flight = _flights.get((step, number))
+        flight = _flights.get((step, attempt))
         is_ours = flight is None
         if flight is None:
-            flight = _flights[step, number] = Future()
+            flight = _flights[step, attempt] = Future()
             while len(_flights) > _REMEMBERED:
                 del _flights[next(iter(_flights))]
     if not is_ours:
@@ -56,17 +56,17 @@ def once(step: str, number: int, work: Callable[[], Answer]) -> Answer:
         answer = work()
     except BaseException as error:
         with _changing:
-            _flights.pop((step, number), None)
+            _flights.pop((step, attempt), None)
         flight.set_exception(error)
         raise
     flight.set_result(answer)
     return answer
 
 
-def after(step: str, number: int, timeout: float) -> None:
+def after(step: str, attempt: str, timeout: float) -> None:
     """Wait until a step that is under way is over; raises CriuError after so many seconds."""
     with _changing:
-        flight = _flights.get((step, number))
+        flight = _flights.get((step, attempt))
     if flight is None:
         return
     try:

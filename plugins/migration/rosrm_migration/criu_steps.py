@@ -38,8 +38,8 @@ from rosrm_migration.criu import CHECKPOINT, FETCH, INTRODUCE
 from rosrm_migration.criu_kept_steps import reserve_all
 from rosrm_migration.criu_luggage import Answer
 
-#: Destinations of moves that were turned back: a checkpoint under way for one goes no further.
-_turned_back: Final[set[int]] = set()
+#: Attempts that were turned back: a checkpoint under way for one goes no further.
+_turned_back: Final[set[str]] = set()
 _turning: Final = threading.Lock()
 #: CRIU's logs go with the image; what matters of them is in the message.
 _LOG: Final = re.compile(r" \((its )?log: [^)]*\)")
@@ -66,8 +66,7 @@ def checkpoint(arguments: Answer) -> Answer:
 
     It stands still from then on; whatever fails, it is asked to go on.
     """
-    destination = int(arguments["destination"])
-    return luggage.once(CHECKPOINT, destination, lambda: _checkpoint(arguments))
+    return luggage.once(CHECKPOINT, _attempt(arguments), lambda: _checkpoint(arguments))
 
 
 def _checkpoint(arguments: Answer) -> Answer:
@@ -98,10 +97,10 @@ def go_on(arguments: Answer) -> Answer:
 
     One that has ended meanwhile does not: its restart policy says what follows.
     """
-    destination, timeout = int(arguments["destination"]), float(arguments["timeout"])
+    attempt, timeout = _attempt(arguments), float(arguments["timeout"])
     with _turning:
-        _turned_back.add(destination)
-    luggage.after(CHECKPOINT, destination, timeout)
+        _turned_back.add(attempt)
+    luggage.after(CHECKPOINT, attempt, timeout)
     pid = _pids(arguments).get(_instance(arguments, "source"), 0)
     if not pid or not tree.is_alive(pid):
         luggage.withdraw(_state(arguments), int(arguments["source"]))
@@ -110,7 +109,7 @@ def go_on(arguments: Answer) -> Answer:
     before = status_of(control)
     if not _call_back(pid, control, arguments) or (before and before.state is State.RUNNING):
         return {}  # it had not left: what it does just now, it does to its end
-    status = await_joined(control, _attempt(arguments), timeout, tree.root_of(pid))
+    status = await_joined(control, attempt, timeout, tree.root_of(pid))
     return {"missing": list(status.missing)}
 
 
@@ -166,7 +165,7 @@ def _offer(sender: Sender, directory: Path, arguments: Answer) -> Offer:
 
 def _check_wanted(arguments: Answer) -> None:
     with _turning:
-        if int(arguments["destination"]) in _turned_back:
+        if _attempt(arguments) in _turned_back:
             raise CriuError("the move was turned back meanwhile")
 
 
@@ -200,7 +199,7 @@ def introduce(arguments: Answer) -> Answer:
 
 def fetch_image(arguments: Answer) -> Answer:
     """Bring the image here, for the start that follows."""
-    return luggage.once(FETCH, int(arguments["destination"]), lambda: _fetch(arguments))
+    return luggage.once(FETCH, _attempt(arguments), lambda: _fetch(arguments))
 
 
 def _fetch(arguments: Answer) -> Answer:
@@ -246,20 +245,24 @@ def join(arguments: Answer) -> Answer:
     """Have the node join the ROS graph here; one that never can is ended: its policy goes on."""
     attempt, timeout = _attempt(arguments), float(arguments["timeout"])
     pid = _pids(arguments).get(_instance(arguments, "destination"), 0)
-    if not pid or not tree.is_alive(pid):
-        return {"fault": "it has ended"}
-    root, began = tree.root_of(pid), time.monotonic()
-    control = _control_of(pid)
+    began = time.monotonic()
     try:
+        root, control = tree.root_of(pid), _control_of(pid)
         ask_resume(control, root, attempt)
         status = await_joined(control, attempt, timeout, root)
-    except PortableError as error:
-        found = status_of(control)
-        if found is None or found.state is not State.FAILED:
+    except (CriuError, PortableError) as error:
+        if not tree.is_alive(pid):
+            return {"fault": "it has ended"}
+        if not _has_failed(_control_of(pid)):
             raise
         dumping.kill(pid)
         return {"fault": str(error)}
     return {"seconds": _of_joining(status, began), "missing": list(status.missing)}
+
+
+def _has_failed(control: Path) -> bool:
+    found = status_of(control)
+    return found is not None and found.state is State.FAILED
 
 
 def _of_joining(status: Status, began: float) -> dict[str, float]:
@@ -271,8 +274,8 @@ def _of_joining(status: Status, began: float) -> dict[str, float]:
 
 
 def _attempt(arguments: Answer) -> str:
-    """Of this move, in what the node is asked: no other has this destination."""
-    return f"{arguments['process']}#{arguments['source']}-{arguments['destination']}"
+    """Of this move, in what the node is asked, too."""
+    return str(arguments["attempt"])
 
 
 def _state(arguments: Answer) -> Path:

@@ -50,7 +50,7 @@ class Slave:
     def ask(self, step: str, *, source: int = 1, destination: int = 2, **more: Any) -> Any:
         arguments = {
             "process": "p", "source": source, "destination": destination, "timeout": TIMEOUT,
-            "results": self.results, **more,
+            "attempt": f"p#{source}-{destination}", "results": self.results, **more,
             "here": {"host": "here", "state": str(self.state), "pids": self.pids},
         }  # fmt: skip
         answer = getattr(steps, step)(arguments)

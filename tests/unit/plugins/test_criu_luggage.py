@@ -15,16 +15,16 @@ from rosrm.errors import CriuError
 from rosrm_migration import criu_luggage as luggage
 
 PATIENCE = 20.0
-_numbers = count(1_000_000)
+_numbers = count()
 
 
 @pytest.fixture
-def number():
-    """Of an instance that no other test has."""
-    return next(_numbers)
+def attempt():
+    """One that no other test makes."""
+    return f"p#1-{next(_numbers)}"
 
 
-def test_a_step_that_is_asked_for_twice_is_done_once(number):
+def test_a_step_that_is_asked_for_twice_is_done_once(attempt):
     """Whoever asks while it is done, or later, gets the answer of the first."""
     begun, may_end, done = threading.Event(), threading.Event(), []
 
@@ -35,26 +35,26 @@ def test_a_step_that_is_asked_for_twice_is_done_once(number):
         return {"n": len(done)}
 
     with ThreadPoolExecutor(2) as threads:
-        first = threads.submit(luggage.once, "step", number, work)
+        first = threads.submit(luggage.once, "step", attempt, work)
         assert begun.wait(PATIENCE)
-        second = threads.submit(luggage.once, "step", number, work)
+        second = threads.submit(luggage.once, "step", attempt, work)
         may_end.set()
         assert first.result(PATIENCE) == second.result(PATIENCE) == {"n": 1}
-    assert luggage.once("step", number, work) == {"n": 1}
-    assert luggage.once("other step", number, work) == {"n": 2}
+    assert luggage.once("step", attempt, work) == {"n": 1}
+    assert luggage.once("other step", attempt, work) == {"n": 2}
 
 
-def test_a_step_that_failed_is_done_anew(number):
+def test_a_step_that_failed_is_done_anew(attempt):
     def fails():
         raise CriuError("no room")
 
     with pytest.raises(CriuError, match="no room"):
-        luggage.once("step", number, fails)
-    luggage.after("step", number, 0.0)  # it is over
-    assert luggage.once("step", number, dict) == {}
+        luggage.once("step", attempt, fails)
+    luggage.after("step", attempt, 0.0)  # it is over
+    assert luggage.once("step", attempt, dict) == {}
 
 
-def test_a_step_under_way_is_waited_for_no_longer_than_is_said(number):
+def test_a_step_under_way_is_waited_for_no_longer_than_is_said(attempt):
     begun, may_end = threading.Event(), threading.Event()
 
     def work():
@@ -63,12 +63,12 @@ def test_a_step_under_way_is_waited_for_no_longer_than_is_said(number):
         raise CriuError("it failed in the end")
 
     with ThreadPoolExecutor(1) as threads:
-        going = threads.submit(luggage.once, "step", number, work)
+        going = threads.submit(luggage.once, "step", attempt, work)
         assert begun.wait(PATIENCE)
         with pytest.raises(CriuError, match=r"still under way after 0\.01 s"):
-            luggage.after("step", number, 0.01)
+            luggage.after("step", attempt, 0.01)
         may_end.set()
-        luggage.after("step", number, PATIENCE)  # its failure is for who asked for it
+        luggage.after("step", attempt, PATIENCE)  # its failure is for who asked for it
         with pytest.raises(CriuError, match="in the end"):
             going.result(PATIENCE)
 

@@ -172,6 +172,16 @@ def test_what_an_earlier_process_was_asked_does_not_count(directory, node) -> No
     assert again.asked() is None
 
 
+def test_what_an_earlier_process_was_asked_can_be_asked_again(directory, node) -> None:
+    """A cluster whose journal was removed gives the same numbers once more."""
+    ask_prepare(directory, None, "m1")
+    leave(node)
+    again = Listener(directory)
+    again.say(Status(State.RUNNING))
+    ask_prepare(directory, None, "m1")
+    leave(again)
+
+
 def test_a_restored_node_finds_what_was_asked_at_the_same_path(directory, node) -> None:
     """The directory may be made anew, and the request lie there before the node runs again."""
     ask_prepare(directory, None, "m1")
