@@ -82,14 +82,22 @@ class Scene:
             cluster.start_master()
             return
         if victim in ("source", "destination"):
-            found = instances(cluster, NAME)
-            number = self._number if victim == "source" else max(found)
-            os.kill(found[number], signal.SIGKILL)
+            os.kill(self._pid_of(victim), signal.SIGKILL)
             return
         name = self.source if victim == "source's slave" else _OTHER[self.source]
         cluster.slaves[name].process.kill()
         cluster.slaves[name].process.wait(PATIENCE)
         cluster.start_slave(next(one for one in cluster.hosts if one.host == name))
+
+    def _pid_of(self, victim: str) -> int:
+        """The destination may not have been started yet."""
+        deadline = time.monotonic() + PATIENCE
+        while True:
+            found = instances(self.cluster, NAME)
+            number = self._number if victim == "source" else max(found)
+            if victim == "source" or number != self._number:
+                return found[number]
+            assert time.monotonic() < deadline, f"no {victim}: {found}"
 
     def end(self) -> str:
         """How the move has ended: "migrated" or "stayed"; one instance is there, and is heard."""
