@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from rosrm.core.migration import Commit, Execute, Move, Plan, SetRestart, Start, Step, Stop
-from rosrm.core.model import RestartPolicy
+from rosrm.core.model import Assignment, InstanceState, RestartPolicy
 from tests.unit.core.cluster import Cluster, StartFirstOrStopFirst
 from tests.unit.core.machine import Machine
 
@@ -53,6 +53,18 @@ class Freezer(StartFirstOrStopFirst):
         return Execute(name, move.source_host, arguments, PATIENCE, undo)
 
 
+class Holding(Machine):
+    """A machine on which nothing is restored without an image that was laid out for it."""
+
+    taken: dict[int, int]
+
+    def _launch(self, assignment: Assignment, now: float) -> None:
+        super()._launch(assignment, now)
+        instance = assignment.instance
+        if assignment.restored and instance in self.programs and instance.number not in self.taken:
+            self._end(instance, InstanceState.FAILED, now, code=125)
+
+
 class Shelf:
     """A machine with these executors, and its images.
 
@@ -63,6 +75,8 @@ class Shelf:
         frozen: instances that stand still.
         alive: restored instances that go on with their memory.
         trouble: by the name of an executor, why it fails.
+        mute: names of executors that do what they are asked, and fail then.
+        passing: each fails once.
         asked: names of the executors, in order.
     """
 
@@ -72,22 +86,32 @@ class Shelf:
         self.frozen: set[int] = set()
         self.alive: set[int] = set()
         self.trouble: dict[str, str] = {}
+        self.mute: set[str] = set()
+        self.passing = False
         self.asked: list[str] = []
         tasks = {
             "can_freeze": lambda _: {}, "freeze": self._freeze, "thaw": self._thaw,
             "kill": lambda _: {}, "take": self._take, "put_back": self._put_back,
             "await": self._await, "drop": self._drop,
         }  # fmt: skip
-        self.machine = Machine(
+        self.machine = Holding(
             name, executors={one: self._task(one, task) for one, task in tasks.items()}, **fields
         )
+        self.machine.taken = self.taken
 
     def _task(self, name: str, task: Any) -> Any:
         def execute(arguments: Mapping[str, Any]) -> Any:
             self.asked.append(name)
-            if name in self.trouble:
-                raise RuntimeError(self.trouble[name])
-            return task(arguments) or {}
+            trouble = self.trouble.get(name)
+            if trouble is not None:
+                if self.passing:
+                    del self.trouble[name]
+                raise RuntimeError(trouble)
+            answer = task(arguments) or {}
+            if name in self.mute:
+                self.mute -= {name} if self.passing else set()
+                raise RuntimeError("nothing was heard")
+            return answer
 
         return execute
 

@@ -1,0 +1,134 @@
+"""Checkpoints and restores with kills, cuts and failures in any order: the memory is in one place.
+
+The wires are prompt but for the cuts; what is killed is the master, in any turn of its own.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
+
+from tests.unit.core.cluster import Machine, process
+from tests.unit.core.shelf import Shelf
+from tests.unit.core.test_checkpoints import Killed, kill_at
+
+STEPS = ["freeze", "thaw", "kill", "take", "put_back", "await"]
+ACTIONS = st.sampled_from(["checkpoint", "restore"])
+
+
+class Life(RuleBasedStateMachine):
+    """The rules of the play; p has begun once, and must never begin anew."""
+
+    @initialize()
+    def begin(self) -> None:
+        self.shelf = Shelf("a")
+        self.shelf.passing = True
+        self.cluster = self.shelf.play("b")
+        self.cluster.machines["b"].connected = False
+        self.cluster.submit(process("p"))
+        assert self.cluster.where("p") == ["a"]
+        self.first = self.cluster["p"].owner
+
+    @property
+    def machine(self) -> Machine:
+        return self.shelf.machine
+
+    # --- what happens --------------------------------------------------------------------
+
+    @rule(action=ACTIONS)
+    def ask(self, action: str) -> None:
+        getattr(self.cluster, action)("p")
+
+    @rule(action=ACTIONS, turn=st.integers(1, 12), durable=st.booleans())
+    def ask_and_kill(self, action: str, turn: int, durable: bool) -> None:
+        self.killed_in(turn, durable, lambda: getattr(self.cluster, action)("p"))
+
+    @rule(turn=st.integers(1, 12), durable=st.booleans())
+    def wait_and_kill(self, turn: int, durable: bool) -> None:
+        self.killed_in(turn, durable, lambda: self.cluster.wait(1.0))
+
+    def killed_in(self, turn: int, durable: bool, what: Callable[[], object]) -> None:
+        live = kill_at(self.cluster, turn, durable=durable)
+        try:
+            what()
+        except Killed:
+            pass
+        else:
+            return
+        finally:
+            live()
+        self.cluster.restart_master()
+        self.cluster.wait(0.5)
+
+    @rule(step=st.sampled_from(STEPS))
+    def fail(self, step: str) -> None:
+        self.shelf.trouble[step] = "it fails"
+
+    @rule(step=st.sampled_from(STEPS))
+    def fail_afterwards(self, step: str) -> None:
+        self.shelf.mute.add(step)
+
+    @rule(seconds=st.sampled_from([0.5, 3.0, 60.0]), action=st.one_of(st.none(), ACTIONS))
+    def cut_for_a_while(self, seconds: float, action: str | None) -> None:
+        """Before whatever is asked for has arrived."""
+        self.machine.connected = False
+        if action is not None:
+            getattr(self.cluster, action)("p")
+        self.cluster.wait(seconds, tick=0.5)
+        self.machine.connected = True
+        self.cluster.register(self.machine)
+        self.cluster.wait(0.5)
+
+    @rule()
+    def restart_slave(self) -> None:
+        self.machine.connected = False
+        self.cluster.wait(1.5)  # its name is its former run's until that is silent
+        self.machine.restart_slave(self.cluster.now)
+        self.machine.connected = True
+        assert self.cluster.register(self.machine).accepted
+
+    @rule(seconds=st.sampled_from([0.5, 3.0, 12.0]))
+    def wait(self, seconds: float) -> None:
+        self.cluster.wait(seconds)
+
+    # --- what holds ----------------------------------------------------------------------
+
+    @invariant()
+    def its_memory_is_in_one_place(self) -> None:
+        """In one process that is awake; else in an image, whose process stands still or is gone."""
+        shelf = self.shelf
+        numbers = {one.number for one in self.machine.programs}
+        holds = set(shelf.taken)
+        whole = (numbers - shelf.frozen - holds) & (shelf.alive | {self.first})
+        assert numbers - shelf.frozen - holds == whole, "it has begun anew"
+        assert len(whole) <= 1, "it is there twice"
+        copies = len(shelf.images) + len(shelf.taken)
+        assert len(whole) + copies == 1, f"awake {whole}, images {shelf.images}, {shelf.taken}"
+
+    @invariant()
+    def it_is_neither_queued_nor_over(self) -> None:
+        """Its memory is there: nobody asked for another process."""
+        assert not self.cluster.queue()
+        assert not self.cluster["p"].phase.over
+
+    def teardown(self) -> None:
+        """When everything works again it comes to rest, and can be asked for the other."""
+        self.shelf.trouble.clear()
+        self.shelf.mute.clear()
+        for wanted, action in (("checkpointed", "checkpoint"), ("running", "restore")):
+            for _ in range(90):
+                self.cluster.wait(1.0, tick=0.5)
+                if "p" not in self.cluster.state.runs and self.cluster.phase("p") == wanted:
+                    break
+                getattr(self.cluster, action)("p")
+            assert self.cluster.phase("p") == wanted, self.cluster["p"].reason
+            self.its_memory_is_in_one_place()
+
+
+TestLife = Life.TestCase
+if os.environ.get("ROSRM_PLAY") != "long":  # each step is some seconds of the play
+    TestLife.settings = settings(max_examples=25, stateful_step_count=25)
