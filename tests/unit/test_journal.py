@@ -148,6 +148,7 @@ def test_a_damaged_log_costs_what_is_behind_the_damage(path) -> None:
         answered = int(writer.stdout.readline())
     writer.kill()
     writer.wait(30)
+    answered += sum(line.endswith("\n") for line in writer.stdout)  # on a busy machine it wrote on
     writer.stdout.close()
     log = path.with_name("journal.sqlite-wal")
     raw = bytearray(log.read_bytes())
