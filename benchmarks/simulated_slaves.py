@@ -40,6 +40,7 @@ from rosrm.core.model import (
     InstanceId,
     InstanceState,
     InstanceStatus,
+    KeptState,
     ResourceDescription,
     RestartPolicy,
 )
@@ -158,6 +159,10 @@ class SimulatedSlave:
     def statuses(self) -> Sequence[InstanceStatus]:
         """All that this slave holds."""
         return self._state.statuses()
+
+    def kept_states(self) -> Sequence[KeptState]:
+        """None: its processes have no state."""
+        return ()
 
     # ruff: noqa: ARG002 - the endpoint calls them so, with or without a process
 
