@@ -293,8 +293,12 @@ class SlaveRuntime:
         ready = [one for one in wanted if self._keeping.prepare(one, self._prepared)]
         if ready:
             self._start(ready)
-        # Until it runs nobody else says so, and the master would take it back.
-        waiting = [self._state.held[one.instance].status for one in wanted if one not in ready]
+        # A state may take its time to come. Until it runs nobody else says so, and the master would
+        # take it back.
+        waiting = [
+            self._state.held[one.instance].status
+            for one in wanted if one not in ready and one.kept_on
+        ]  # fmt: skip
         if waiting:
             self._endpoint.publish_statuses(waiting, complete=False)
 
