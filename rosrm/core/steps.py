@@ -10,7 +10,7 @@ from typing import Any, Final
 from rosrm.core import handoffs, lifecycle
 from rosrm.core.commands import Order
 from rosrm.core.handoffs import DONE
-from rosrm.core.hosts import Host
+from rosrm.core.hosts import Host, HostCondition
 from rosrm.core.migration import (
     AwaitReady,
     AwaitReleased,
@@ -198,7 +198,11 @@ def _(step: Commit, state: MasterState, run: Run, now: float) -> str | None:
 @outcome_of.register
 def _(step: Execute, state: MasterState, run: Run, now: float) -> str | None:
     if run.answer is None:
-        return None
+        host = state.hosts.by_name[step.host]
+        gone = state.hosts.condition_of(host) is HostCondition.LOST
+        # Who stands still meanwhile is not to wait for a time-out that may be long. On a way that
+        # has to be gone to its end, the host is waited for.
+        return f"{step.host} is lost" if gone and run.undo is None and not run.committed else None
     accepted, message = run.answer
     return DONE if accepted else f"{step.executor} failed on {step.host}: {message}"
 

@@ -446,6 +446,36 @@ def test_an_executor_is_asked_again_when_its_slave_was_started_again() -> None:
     assert (cluster.phase("p"), cluster.where("p")) == ("running", ["b"])
 
 
+def test_an_executor_on_a_lost_host_is_not_waited_for() -> None:
+    """Its time-out may be long, and the source stand still: it turns back when the host is lost."""
+
+    def fetching(move: Move) -> Plan:
+        undo = Execute("go_on", move.source_host, {}, 5.0)
+        return Plan(
+            (
+                Execute("dump", move.source_host, {}, 5.0, undo=undo),
+                Execute("fetch", move.destination_host, {}, 600.0),
+                Start(move.destination, move.destination_host, 5.0, restored=True),
+                Commit(),
+                Stop(move.source, move.source_host, 5.0),
+            )
+        )
+
+    done: list[Any] = []
+    cluster = Cluster(
+        Machine("a", executors={"dump": lambda _: {}, "go_on": done.append}),
+        Machine("b", busy={"memory": 0.5}), strategies={"strange": Strange(fetching)},
+    )  # fmt: skip
+    cluster.submit(process("p", migration=MigrationPolicy("strange")))
+    cluster.machines["b"].connected = False
+    assert cluster.migrate("p").accepted
+    cluster.wait(5.0)
+    assert (done, cluster.phase("p")) == ([], "migrating")
+    cluster.wait(10.0)
+    assert len(done) == 1
+    assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
+
+
 def test_a_new_instance_that_is_to_settle_runs_beside_the_old_one() -> None:
     """The others have to find it."""
 
