@@ -245,13 +245,13 @@ def join(arguments: Answer) -> Answer:
     """Have the node join the ROS graph here; one that never can is ended: its policy goes on."""
     attempt, timeout = _attempt(arguments), float(arguments["timeout"])
     pid = _pids(arguments).get(_instance(arguments, "destination"), 0)
-    began = time.monotonic()
+    root, began = tree.root_of(pid), time.monotonic()
     try:
-        root, control = tree.root_of(pid), _control_of(pid)
+        control = _control_of(pid)
         ask_resume(control, root, attempt)
         status = await_joined(control, attempt, timeout, root)
     except (CriuError, PortableError) as error:
-        if not tree.is_alive(pid):
+        if not (tree.is_alive(root) and tree.is_alive(pid)):
             return {"fault": "it has ended"}
         if not _has_failed(_control_of(pid)):
             raise
