@@ -167,12 +167,10 @@ def test_the_destination_s_host_is_switched_off(criu, scene, moment):
     scene.move(moment)
     name = _OTHER[scene.source]
     scene.cluster.switch_off(name)
-    deadline = time.monotonic() + 90.0
-    heard = len(scene.ear.counts)
-    while len(scene.ear.counts) < heard + 20:
-        assert time.monotonic() < deadline, scene._log()
-        scene.ear._executor.spin_once(0.1)
+    scene.ear.hear(20, 90.0)
+    before = scene.cluster.client.list().last_sequence
     scene.cluster.start_slave(next(one for one in scene.cluster.hosts if one.host == name))
+    scene.cluster.wait_for_event("host_registered", host=name, after=before)
     # Its next slave gives the image two minutes: it cannot know that the move has ended.
     assert scene.end(but=name) == "stayed"
     assert min(scene.ear.steps()) > 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from itertools import pairwise
 from pathlib import Path
@@ -10,6 +11,7 @@ import psutil
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile
+from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import Int64MultiArray
 
 from rosrm.core.model import MigrationPolicy, ProcessSpec, RestartPolicy
@@ -21,17 +23,21 @@ NAME = "portable_counter"
 
 
 class Ear:
-    """Hears what portable counters count."""
+    """Hears what portable counters count, in a thread of its own."""
 
     def __init__(self, domain: int) -> None:
         self._context = rclpy.Context()
-        self._context.init(domain_id=domain)
+        rclpy.init(
+            context=self._context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO
+        )
         self._node = rclpy.create_node("ear", context=self._context)
         self._node.create_subscription(Int64MultiArray, "count", self._take, QoSProfile(depth=1000))
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
         self.counts: list[int] = []
         self.checksums: set[int] = set()
+        self._thread = threading.Thread(target=self._executor.spin, daemon=True)
+        self._thread.start()
 
     def _take(self, message: Int64MultiArray) -> None:
         count, passes, checksum = message.data
@@ -39,16 +45,16 @@ class Ear:
         if passes:
             self.checksums.add(checksum)
 
-    def hear(self, more: int) -> None:
-        """So many counts more."""
-        wanted, deadline = len(self.counts) + more, time.monotonic() + PATIENCE
+    def hear(self, more: int, patience: float = PATIENCE) -> None:
+        """So many counts more, within so many seconds."""
+        wanted, deadline = len(self.counts) + more, time.monotonic() + patience
         while len(self.counts) < wanted:
             assert time.monotonic() < deadline, f"{len(self.counts)} counts of {wanted}"
-            self._executor.spin_once(0.1)
+            time.sleep(0.01)
 
     def steps(self) -> list[int]:
         """From each count to the next one."""
-        return [after - before for before, after in pairwise(self.counts)]
+        return [after - before for before, after in pairwise(list(self.counts))]
 
     def forget(self) -> None:
         """Another counter begins."""
@@ -56,6 +62,8 @@ class Ear:
         self.checksums.clear()
 
     def close(self) -> None:
+        self._executor.shutdown()
+        self._thread.join(5.0)
         self._node.destroy_node()
         self._context.try_shutdown()
 
