@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import signal
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
@@ -146,14 +147,15 @@ class LocalCluster:
         Returns:
             When that was, unix time.
         """
+        pids = {host: part.process.pid for host, part in self.slaves.items()}
         slave = self.slaves.pop(name).process
-        mark = str(self.directory / "hosts" / name / "supervisor")
-        pids = [slave.pid, *(pid for pid in _processes_with(mark) if pid != os.getpid())]
         at = time.time()
-        for number in (signal.SIGSTOP, signal.SIGKILL):
-            for pid in pids:
-                with contextlib.suppress(ProcessLookupError):
-                    os.kill(pid, number)
+        stopped: set[int] = set()
+        # Who is stopped starts nobody: in the end a look finds no more.
+        while found := _processes_of(self.directory / "hosts", name, pids) - stopped:
+            _send(found, signal.SIGSTOP)
+            stopped |= found
+        _send(stopped, signal.SIGKILL)
         slave.wait(_END)
         return at
 
@@ -252,18 +254,40 @@ class LocalCluster:
         self.close()
 
 
-def _processes_with(mark: str) -> list[int]:
-    """Pids of those whose command line or environment names this; of other users none."""
-    return [
-        process.pid
-        for process in psutil.process_iter(["cmdline", "environ"])
-        if any(
-            mark in word
-            for word in (
-                *(process.info["cmdline"] or ()), *(process.info["environ"] or {}).values()
-            )
-        )
-    ]  # fmt: skip
+def _processes_of(hosts: Path, name: str, slaves: Mapping[str, int]) -> set[int]:
+    """Pids of a host's slave and supervisor, and of all below them; of other users none.
+
+    A process whose supervisor was killed is known by its environment. One that was restored here
+    has the environment of where it began, so whom it is below comes first.
+
+    Args:
+        hosts: the directory that holds those of the hosts.
+        name: of the host.
+        slaves: pid of each host's slave.
+    """
+    parents: dict[int, int] = {}
+    host_of = {pid: host for host, pid in slaves.items()}
+    mark = re.compile(re.escape(f"{hosts}/") + "([^/]+)/supervisor")
+    for process in psutil.process_iter(["ppid", "cmdline", "environ"]):
+        info = process.info
+        parents[process.pid] = info["ppid"]
+        words = "\0".join((*(info["cmdline"] or ()), *(info["environ"] or {}).values()))
+        if process.pid != os.getpid() and (found := mark.search(words)):
+            host_of.setdefault(process.pid, found[1])
+
+    def is_here(pid: int) -> bool:
+        host = None
+        while pid in parents:
+            host, pid = host_of.get(pid, host), parents[pid]
+        return host == name
+
+    return {pid for pid in parents if is_here(pid)}
+
+
+def _send(pids: Iterable[int], number: signal.Signals) -> None:
+    for pid in pids:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, number)
 
 
 def _end_all(parts: Sequence[Part]) -> None:

@@ -69,8 +69,7 @@ def test_killed_at_resume(scene, victim):
     """The destination has given up for good: the source goes on; nothing is lost or repeated."""
     scene.move(
         *scene.source_held(),
-        ("says ABORT", scene.let_go("source")),
-        ("says RESUME", scene.kill(victim)),
+        ("says RESUME", all_of(scene.kill(victim), scene.let_go("source"))),
     )
     assert scene.end(victim) == "stayed"
     assert scene.is_gapless(), scene.outputs

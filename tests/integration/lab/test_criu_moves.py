@@ -47,7 +47,8 @@ def test_a_node_counts_on_at_another_address(hosts):
     hop = next(hops)
     cutter.join(PATIENCE)
     assert hop["end"] == "stayed", hop
-    assert "criu_fetch on host" in hop["why"]
+    # On a busy machine the host counts as lost before the fetch has given up.
+    assert "criu_fetch on host" in hop["why"] or "is lost" in hop["why"], hop
     assert hop["repeated"] == 0
     assert len(hop["checksums"]) == 1
     for host in HOSTS:
