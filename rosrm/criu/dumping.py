@@ -43,6 +43,7 @@ def dump(
     timeout: float,
     process: str = "",
     instance: int = 0,
+    checksums: bool = True,
 ) -> Manifest:
     """Dump the tree of a process, and say what is in the image.
 
@@ -58,6 +59,8 @@ def dump(
             many times what it needs (half a second for each GiB, and the time to write that).
         process: its name, for the manifest.
         instance: its number, likewise.
+        checksums: make those of the files, which reads the image once more: for an image that is
+            to lie on a disk. What goes to another host at once needs none.
 
     Raises:
         CriuError: what cannot be dumped, or what failed; the process runs as before.
@@ -78,6 +81,11 @@ def dump(
             process, instance, platform.node(), time.time(), criu.version, platform.release(),
             platform.machine(), tree.inner_pid(root), (), (), "", _shelter(pid), "",
         ))  # fmt: skip
+        if leave == "running" and not was_stopped:
+            resume(pid)  # the checksums are of files alone: it need not stand still for them
+        if checksums:
+            made = image.file_checksums(directory, manifest.sizes)
+            manifest = replace(manifest, checksums=made)
         image.write(directory, manifest)
     except BaseException as error:
         image.remove(directory, logs=False)
@@ -87,8 +95,6 @@ def dump(
         raise CriuError(_told(directory, error) + outcome) from None
     if leave == "killed":
         kill(pid)
-    elif leave == "running" and not was_stopped:
-        resume(pid)
     return manifest
 
 

@@ -11,15 +11,18 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Mapping
+import zlib
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Final
 
 from rosrm.errors import CriuError
 
-#: Another one is refused.
-FORMAT: Final = 1
+#: What is written; another one is refused, but for the one before it.
+FORMAT: Final = 2
+#: Its manifest has neither checksums of the files nor one of its own.
+_WITHOUT_CHECKSUMS: Final = 1
 
 MANIFEST: Final = "manifest.json"
 PAGES: Final = "criu"
@@ -29,6 +32,8 @@ RESTORE_LOG: Final = "restore.log"
 
 #: Bytes that stay free on the file system of an image.
 _SPARE: Final = 16 << 20
+#: Bytes of a file that are in memory at a time for its checksum.
+_PIECE: Final = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -87,6 +92,7 @@ class Manifest:
         files: that were open.
         mapped: files that were mapped.
         sizes: bytes of each file below the image but the manifest.
+        checksums: CRC-32 of each of them; empty: none were made.
     """
 
     process: str
@@ -105,6 +111,7 @@ class Manifest:
     files: tuple[HeldFile, ...] = ()
     mapped: tuple[MappedFile, ...] = ()
     sizes: Mapping[str, int] = field(default_factory=dict)
+    checksums: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def size(self) -> int:
@@ -145,9 +152,24 @@ def file_sizes(directory: Path) -> dict[str, int]:
     return sizes
 
 
+def file_checksums(directory: Path, names: Iterable[str]) -> dict[str, int]:
+    """CRC-32 of files of an image, by their paths below it; raises OSError."""
+    return {name: _checksum_of_file(directory / name) for name in names}
+
+
+def _checksum_of_file(path: Path) -> int:
+    checksum, piece = 0, memoryview(bytearray(_PIECE))
+    with path.open("rb", buffering=0) as file:
+        while count := file.readinto(piece):
+            checksum = zlib.crc32(piece[:count], checksum)
+    return checksum
+
+
 def write(directory: Path, manifest: Manifest) -> None:
     """Write the manifest, which makes the image complete."""
-    text = json.dumps({"format": FORMAT, **asdict(manifest)}, indent=1)
+    values = asdict(manifest)
+    own = _checksum_of_values(values)
+    text = json.dumps({"format": FORMAT, "checksum": own, **values}, indent=1)
     new = directory / f"{MANIFEST}.new"
     new.touch(mode=0o600)
     new.write_text(text, encoding="utf-8")
@@ -172,7 +194,8 @@ def read(directory: Path) -> Manifest:
     try:
         values = json.loads(text)
         written = values.pop("format", None)
-        manifest = _manifest(values) if written == FORMAT else None
+        known = written in (FORMAT, _WITHOUT_CHECKSUMS)
+        manifest = _manifest(_whole(values, written)) if known else None
     except KeyError as error:
         raise CriuError(f"the image {directory} is damaged: {MANIFEST}: no {error}") from None
     except (ValueError, TypeError, AttributeError) as error:
@@ -190,11 +213,48 @@ def _check_files(directory: Path, manifest: Manifest) -> None:
         try:
             found = (directory / name).lstat().st_size
         except OSError as error:
-            raise CriuError(f"the image {directory} is damaged: {name}: {error.strerror}") from None
+            raise CriuError(
+                f"the image {directory} is damaged: {name}: {error.strerror}{_advice(manifest)}"
+            ) from None
         if found != size:
             raise CriuError(
                 f"the image {directory} is damaged: {name} has {found} bytes instead of {size}"
+                f"{_advice(manifest)}"
             )
+
+
+def check_contents(directory: Path, manifest: Manifest) -> None:
+    """Compare each file with its checksum, where there are some; it reads the whole image.
+
+    Args:
+        directory: of the image.
+        manifest: as it was read.
+
+    Raises:
+        CriuError: which file has changed, or cannot be read.
+    """
+    for name, checksum in manifest.checksums.items():
+        try:
+            found = _checksum_of_file(directory / name)
+        except OSError as error:
+            raise CriuError(
+                f"the image {directory} is damaged: {name}: {error.strerror}{_advice(manifest)}"
+            ) from None
+        if found != checksum:
+            raise CriuError(
+                f"the image {directory} is damaged: {name} has changed since it was written "
+                f"(CRC-32 {found:08x} instead of {checksum:08x}){_advice(manifest)}"
+            )
+
+
+def _advice(manifest: Manifest) -> str:
+    """An image without checksums is one of a move: its process is still there."""
+    if not manifest.checksums:
+        return ""
+    return (
+        f". What it held is lost: `rosrm restart {manifest.process or 'NAME'}` lets the process "
+        f"begin anew"
+    )
 
 
 def remove(directory: Path, *, logs: bool = True) -> None:
@@ -215,16 +275,29 @@ def remove(directory: Path, *, logs: bool = True) -> None:
 _KINDS: Final[Mapping[str, type]] = {"str": str, "int": int, "float": float, "bool": bool}
 
 
+def _whole(values: dict[str, Any], written: int) -> dict[str, Any]:
+    """What a manifest says, if that is what was written; in the format before nothing tells."""
+    if written == _WITHOUT_CHECKSUMS:
+        return {**values, "checksums": {}}
+    own = values.pop("checksum")
+    if own != _checksum_of_values(values):
+        raise ValueError("it has changed since it was written")
+    return values
+
+
+def _checksum_of_values(values: dict[str, Any]) -> int:
+    """The same for what was read as for what was written."""
+    return zlib.crc32(json.dumps(values, sort_keys=True).encode())
+
+
 def _manifest(values: dict[str, Any]) -> Manifest:
     values["ids"] = tuple(_all(int, values, "ids"))
     values["logs"] = tuple(_all(str, values, "logs"))
     values["files"] = tuple(_plain(HeldFile, one) for one in _all(dict, values, "files"))
     values["mapped"] = tuple(_plain(MappedFile, one) for one in _all(dict, values, "mapped"))
-    sizes = values["sizes"]
-    if not isinstance(sizes, dict) or not all(type(size) is int for size in sizes.values()):
-        raise TypeError("sizes: not a number for each file")
+    sizes, checksums = _numbers(values, "sizes"), _numbers(values, "checksums")
     manifest: Manifest = _plain(Manifest, values)
-    names = [*sizes, *(one.copy for one in manifest.files)]
+    names = [*sizes, *checksums, *(one.copy for one in manifest.files)]
     for name in names:
         if name.startswith("/") or ".." in name.split("/"):
             raise ValueError(f"{name!r} does not lie in the image")
@@ -235,6 +308,13 @@ def _all(kind: type, values: dict[str, Any], name: str) -> list[Any]:
     found = values[name]
     if not isinstance(found, list) or not all(type(one) is kind for one in found):
         raise TypeError(f"{name}: not a list of {kind.__name__}")
+    return found
+
+
+def _numbers(values: dict[str, Any], name: str) -> dict[str, int]:
+    found = values[name]
+    if not isinstance(found, dict) or not all(type(one) is int for one in found.values()):
+        raise TypeError(f"{name}: not a number for each file")
     return found
 
 

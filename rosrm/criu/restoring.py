@@ -86,7 +86,15 @@ def _check_file(file: HeldFile | MappedFile, here: str, holds: str) -> None:
 
 
 def prepare(directory: Path, manifest: Manifest) -> None:
-    """Put back the files that follow, make those that only grow, and LTTng's; raises CriuError."""
+    """Put back the files that follow, make those that only grow, and LTTng's.
+
+    Nothing is touched before the whole image was compared with its checksums: a file that follows
+    is put over what lies there, and CRIU restores other memory as readily as the right one.
+
+    Raises:
+        CriuError: the image is damaged, or what cannot be put back.
+    """
+    image.check_contents(directory, manifest)
     for mapped in manifest.mapped:
         if mapped.path.startswith(_TRACING) and not Path(mapped.path).exists():
             _make_tracing_file(mapped)

@@ -8,12 +8,14 @@ import signal
 import socket
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from rosrm.core.model import RestartPolicy
 from rosrm.criu import dumping, image, restoring, tree
+from rosrm.criu.image import MappedFile
 from rosrm.errors import CriuError
 from tests.criu_kit import TIMEOUT, eventually
 from tests.integration.supervisor.conftest import Host
@@ -211,6 +213,19 @@ def test_it_runs_on_after_a_dump_that_leaves_it_running(theatre, counter):
     theatre.dump(counter, leave="running")
     counter.counts()
     assert counter.numbers() == list(range(1, counter.numbers()[-1] + 1))
+
+
+def test_it_does_not_stand_still_for_the_checksums(theatre, counter, monkeypatch):
+    """Of a large image they take as long as the dump; a process that runs on is not held up."""
+    make = image.file_checksums
+
+    def make_while_it_counts(directory, names):
+        counter.counts()
+        return make(directory, names)
+
+    monkeypatch.setattr(image, "file_checksums", make_while_it_counts)
+    theatre.dump(counter, leave="running")
+    assert theatre.manifest.checksums.keys() == theatre.manifest.sizes.keys()
 
 
 def test_it_stands_still_until_it_is_resumed(theatre, counter):
@@ -574,10 +589,49 @@ def test_a_damaged_image_is_refused(theatre, counter):
     assert wanted in json.loads((directory / "hold.json").read_text())["reason"]
 
 
+@pytest.mark.parametrize("pattern", ["criu/pages-1.img", "criu/pstree.img", "files/*"])
+def test_a_flipped_byte_is_refused(theatre, pattern):
+    """The size is the same. Neither has CRIU begun, nor was a file put over what lies there."""
+    actor = theatre.start(f"import sys; sys.stdout = open('count', 'w')\n{COUNTER}")
+    count = theatre.work / "count"
+    eventually(lambda: count.exists() and count.read_text().count("\n") > 2, "its file")
+    directory = theatre.dump(actor)
+    count.write_text("of somebody else")
+    [damaged] = directory.glob(pattern)
+    flip_a_bit(damaged)
+    hold = theatre.hold(directory)
+    assert hold.process.wait(TIMEOUT) == 125
+    wanted = f"{directory} is damaged: {damaged.relative_to(directory)} has changed since"
+    assert wanted in hold.log.read_text()
+    assert wanted in json.loads((directory / "hold.json").read_text())["reason"]
+    assert not (directory / "restore.log").exists()
+    assert count.read_text() == "of somebody else"
+
+
+def flip_a_bit(path: Path) -> None:
+    """In the middle of a file."""
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+
+
+def test_an_image_without_checksums_is_restored_all_the_same(theatre, counter):
+    """As one that has just come from another host: the transfer has a checksum of its own."""
+    directory = theatre.folder / "image"
+    manifest = dumping.dump(
+        theatre.criu, counter.pid, directory, leave="killed", timeout=TIMEOUT, checksums=False
+    )
+    counter.process.wait(TIMEOUT)
+    assert manifest.checksums == {}
+    restored = theatre.restore(directory)
+    restored.counts()
+    numbers = counter.numbers() + restored.numbers()
+    assert numbers == list(range(1, numbers[-1] + 1))
+
+
 def changed(directory: Path, **values: object) -> None:
     """Another manifest."""
-    path = directory / "manifest.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), **values}))
+    image.write(directory, replace(image.read(directory), **values))
 
 
 @pytest.mark.parametrize(
@@ -586,13 +640,10 @@ def changed(directory: Path, **values: object) -> None:
         ({"working_directory": "/no/such"}, "the working directory /no/such .* is missing on"),
         ({"interpreter": "/no/python"}, "the program /no/python .* is missing on"),
         ({"machine": "vax"}, "made on vax"),
-        ({"mapped": [{"path": "/no/lib.so", "size": 1, "mode": 420}]}, "/no/lib.so, which"),
-        ({"mapped": [{"path": "/etc/hostname", "size": 1, "mode": 420}]}, "another one .* of 1"),
-        ({"format": 2}, "has format 2; this rosrm reads format 1"),
-        ({"pid": "one"}, "damaged: manifest.json: pid is 'one'"),
-        ({"sizes": {"../secret": 1}}, "'../secret' does not lie in the image"),
+        ({"mapped": (MappedFile("/no/lib.so", 1, 0o644),)}, "/no/lib.so, which"),
+        ({"mapped": (MappedFile("/etc/hostname", 1, 0o644),)}, "another one .* of 1"),
     ],
-)  # fmt: skip
+)
 def test_what_is_missing_here_is_named(theatre, counter, values, said):
     """Before CRIU begins: the path, and the host."""
     directory = theatre.dump(counter)
@@ -632,7 +683,7 @@ def test_what_tracing_maps_is_made_where_it_is_missing(theatre, counter):
     """LTTng's shared memory, which every ROS process maps, has no content."""
     directory = theatre.dump(counter)
     path = Path(f"/dev/shm/lttng-ust-wait-rosrm-test-{os.getpid()}")
-    changed(directory, mapped=[{"path": str(path), "size": 4096, "mode": 0o640}])
+    changed(directory, mapped=(MappedFile(str(path), 4096, 0o640),))
     try:
         theatre.restore(directory)
         status = path.stat()

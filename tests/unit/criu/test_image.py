@@ -1,0 +1,178 @@
+"""The manifest of an image says whether each file, and it itself, is what was written."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rosrm.criu import image
+from rosrm.criu.image import HeldFile, Manifest, MappedFile
+from rosrm.errors import CriuError
+
+#: A large file of pages, a small one of CRIU's, and one that follows the process.
+FILES: Mapping[str, bytes] = {
+    "criu/pages-1.img": bytes(range(256)) * 16, "criu/pstree.img": b"magicnum\x0c\0\0\0\x08\x01",
+    "files/0": b"1\n2\n3\n",
+}  # fmt: skip
+
+MANIFEST = Manifest(
+    "brain", 3, "robot", 1700000000.25, "4.2.1", "6.18.0", "x86_64", 4711, (4711, 4712),
+    ("/a/\udc80.log",), "/a", "", "/usr/bin/python3",
+    (HeldFile("/a/count", 6, 0o644, False, "files/0"),), (MappedFile("/lib/c.so", 9, 0o755),),
+)  # fmt: skip
+
+
+@contextmanager
+def written(
+    files: Mapping[str, bytes] = FILES, manifest: Manifest = MANIFEST, *, checksums: bool = True
+) -> Iterator[Path]:
+    """The directory of a complete image."""
+    with tempfile.TemporaryDirectory() as folder:
+        directory = Path(folder, "image")
+        image.create(directory)
+        (directory / image.COPIES).mkdir()
+        for name, content in files.items():
+            (directory / name).write_bytes(content)
+        made = image.file_checksums(directory, files) if checksums else {}
+        sizes = image.file_sizes(directory)
+        image.write(directory, replace(manifest, sizes=sizes, checksums=made))
+        yield directory
+
+
+def checked(directory: Path) -> Manifest:
+    """As the hold looks at it before CRIU begins."""
+    manifest = image.read(directory)
+    image.check_contents(directory, manifest)
+    return manifest
+
+
+@given(
+    st.text(min_size=1), st.floats(0, 1e12), st.lists(st.integers(1, 1 << 22)),
+    st.lists(st.text(min_size=1)),
+)  # fmt: skip
+def test_a_manifest_is_read_as_it_was_written(process, made_at, ids, logs):
+    """Whatever names and numbers are in it: its own checksum fits."""
+    told = replace(MANIFEST, process=process, made_at=made_at, ids=tuple(ids), logs=tuple(logs))
+    with written({}, told) as directory:
+        assert checked(directory) == told
+
+
+def test_a_whole_image_passes():
+    """Each file has its checksum."""
+    with written() as directory:
+        manifest = checked(directory)
+        assert manifest.checksums == {name: zlib.crc32(data) for name, data in FILES.items()}
+        assert manifest.sizes == {name: len(data) for name, data in FILES.items()}
+
+
+def test_a_file_of_many_pieces_has_the_checksum_of_the_whole(monkeypatch):
+    """A file is read in bounded pieces, the last of which is shorter."""
+    monkeypatch.setattr(image, "_PIECE", 100)
+    with written() as directory:
+        assert checked(directory).checksums["criu/pages-1.img"] == zlib.crc32(
+            FILES["criu/pages-1.img"]
+        )
+
+
+@given(st.data(), st.sampled_from(sorted(FILES)), st.integers(0, 7))
+def test_any_flipped_bit_of_a_file_is_named(data, name, bit):
+    """Where the size is the same only the checksum tells; it says which file, and what to do."""
+    position = data.draw(st.integers(0, len(FILES[name]) - 1))
+    with written() as directory:
+        changed = bytearray(FILES[name])
+        changed[position] ^= 1 << bit
+        (directory / name).write_bytes(changed)
+        wanted = f"{directory} is damaged: {name} has changed .* `rosrm restart brain`"
+        with pytest.raises(CriuError, match=wanted):
+            checked(directory)
+
+
+def test_a_file_that_has_gone_since_is_named():
+    """Between the look at the sizes and that at the contents, or where the disk cannot read it."""
+    with written() as directory:
+        manifest = image.read(directory)
+        (directory / "criu/pstree.img").unlink()
+        with pytest.raises(CriuError, match=r"damaged: criu/pstree\.img: No such file"):
+            image.check_contents(directory, manifest)
+
+
+def test_a_wrong_size_says_what_to_do():
+    """As a wrong checksum does."""
+    with written() as directory:
+        (directory / "files/0").write_bytes(b"1\n")
+        with pytest.raises(CriuError, match=r"2 bytes instead of 6.* `rosrm restart brain`"):
+            checked(directory)
+
+
+@given(st.data(), st.integers(1, 255))
+def test_a_changed_byte_of_the_manifest_changes_nothing_or_is_refused(data, difference):
+    """A path or a pid that were others would restore another process than was dumped."""
+    with written() as directory:
+        path, before = directory / image.MANIFEST, checked(directory)
+        changed = bytearray(path.read_bytes())
+        changed[data.draw(st.integers(0, len(changed) - 1))] ^= difference
+        path.write_bytes(changed)
+        with suppress(CriuError):
+            assert checked(directory) == before
+
+
+def test_without_checksums_sizes_alone_are_looked_at():
+    """An image of a move is read once less on each host; the transfer has a checksum."""
+    with written(checksums=False) as directory:
+        assert checked(directory).checksums == {}
+        (directory / "criu/pstree.img").unlink()
+        with pytest.raises(CriuError, match=r"pstree\.img: No such file or directory$"):
+            checked(directory)
+
+
+def as_before(directory: Path, **values: object) -> None:
+    """A manifest of format 1, which had no checksums, with some other values."""
+    told: dict[str, Any] = asdict(image.read(directory))
+    del told["checksums"]
+    (directory / image.MANIFEST).write_text(json.dumps({"format": 1, **told, **values}))
+
+
+def test_an_old_manifest_is_read():
+    """What was checkpointed before there were checksums can be restored."""
+    with written() as directory:
+        before = checked(directory)
+        as_before(directory)
+        assert checked(directory) == replace(before, checksums={})
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({"format": 3}, "has format 3; this rosrm reads format 2"),
+        ({"format": 2}, "damaged: manifest.json: no 'checksum'"),
+        ({"format": 2, "checksum": 7}, "damaged: manifest.json: it has changed since"),
+        ({"checksum": 7}, "damaged: manifest.json: .*'checksum'"),
+        ({"pid": "one"}, "damaged: manifest.json: pid is 'one'"),
+        ({"sizes": {"criu/x": "1"}}, "sizes: not a number for each file"),
+        ({"sizes": {"../secret": 1}}, "'../secret' does not lie in the image"),
+    ],
+)
+def test_a_manifest_of_another_form_is_refused(values, said):
+    """One sentence says what is wrong in it."""
+    with written() as directory:
+        as_before(directory, **values)
+        with pytest.raises(CriuError, match=said):
+            image.read(directory)
+
+
+def test_checksums_lie_in_the_image_too():
+    """Nothing beside it is ever read."""
+    with written() as directory:
+        image.write(directory, replace(image.read(directory), checksums={"../secret": 1}))
+        with pytest.raises(CriuError, match=r"'\.\./secret' does not lie in"):
+            image.read(directory)
