@@ -15,11 +15,11 @@ from pathlib import Path
 
 import pytest
 
-from rosrm.config.settings import LivenessSettings, MigrationSettings, ProcessDefaults
+from rosrm.config.settings import LivenessSettings
 from rosrm.criu import outcome
 from tests.faults.watching import instances
-from tests.ros.clusters import MIB, PATIENCE, host
-from tests.ros.portable_kit import NAME, Ear, ask, counter, nothing_left
+from tests.ros.clusters import PATIENCE
+from tests.ros.portable_kit import NAME, Ear, ask, counter, nothing_left, two_hosts
 
 pytestmark = pytest.mark.timeout(180)
 
@@ -32,12 +32,7 @@ class Scene:
     """A counter that is moved to and fro."""
 
     def __init__(self, make) -> None:
-        strategies = {"relaunch": {}, "criu": {}}
-        self.cluster = make(
-            host("left"), host("right"), liveness=LivenessSettings(),
-            migration=MigrationSettings(strategies=strategies, automatic=False),
-            defaults=ProcessDefaults(needs={"memory": MIB}),
-        )  # fmt: skip
+        self.cluster = two_hosts(make, liveness=LivenessSettings())
         self.ear = Ear(self.cluster.domain)
         self.cluster.submit(counter(options={"max_rate": _SLOWLY}))
         self._source = self._number = 0

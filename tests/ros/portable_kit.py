@@ -14,12 +14,22 @@ from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import Int64MultiArray
 
+from rosrm.config.settings import MigrationSettings, ProcessDefaults
 from rosrm.core.model import MigrationPolicy, ProcessSpec, RestartPolicy
 from rosrm.criu import outcome, tree
 from rosrm.errors import Refused
-from tests.ros.clusters import PATIENCE, QUICK, Cluster, wait_until
+from tests.ros.clusters import MIB, PATIENCE, QUICK, Cluster, Make, host, wait_until
 
 NAME = "portable_counter"
+
+
+def two_hosts(make: Make, **settings) -> Cluster:
+    """`left` and `right`; nothing moves by itself."""
+    return make(
+        host("left"), host("right"),
+        migration=MigrationSettings(strategies={"relaunch": {}, "criu": {}}, automatic=False),
+        defaults=ProcessDefaults(needs={"memory": MIB}), **settings,
+    )  # fmt: skip
 
 
 class Ear:
@@ -82,18 +92,18 @@ def counter(*arguments: str, **fields) -> ProcessSpec:
     )  # fmt: skip
 
 
-def ask(cluster: Cluster, host: str | None = None, name: str = NAME) -> str:
+def ask(cluster: Cluster, to: str | None = None, name: str = NAME) -> str:
     """Ask for a move, as soon as the hosts have said whether they can; why it is refused, or ""."""
     deadline = time.monotonic() + PATIENCE
-    while "not known yet" in (refusal := _asked(cluster, host, name)):
+    while "not known yet" in (refusal := _asked(cluster, to, name)):
         assert time.monotonic() < deadline, refusal
         cluster.client.spin(0.1)
     return refusal
 
 
-def _asked(cluster: Cluster, host: str | None, name: str) -> str:
+def _asked(cluster: Cluster, to: str | None, name: str) -> str:
     try:
-        cluster.client.migrate(name, host)
+        cluster.client.migrate(name, to)
     except Refused as refusal:
         return str(refusal)
     return ""

@@ -4,20 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from rosrm.config.settings import MigrationSettings, ProcessDefaults
 from rosrm.core.model import Health
-from tests.ros.clusters import MIB, host
-from tests.ros.portable_kit import NAME, Ear, ask, counter, nothing_left
+from tests.ros.portable_kit import NAME, Ear, ask, counter, nothing_left, two_hosts
 
 
 @pytest.fixture(scope="module")
 def cluster(make_shared):
-    """Two hosts; nothing moves by itself."""
-    return make_shared(
-        host("left"), host("right"),
-        migration=MigrationSettings(strategies={"relaunch": {}, "criu": {}}, automatic=False),
-        defaults=ProcessDefaults(needs={"memory": MIB}),
-    )  # fmt: skip
+    return two_hosts(make_shared)
 
 
 @pytest.fixture

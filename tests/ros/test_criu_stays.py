@@ -11,22 +11,16 @@ from pathlib import Path
 
 import pytest
 
-from rosrm.config.settings import MigrationSettings, ProcessDefaults
 from tests.integration.criu.conftest import old, older  # noqa: F401 - fixtures
-from tests.ros.clusters import MIB, PATIENCE, host, node
-from tests.ros.portable_kit import NAME, Ear, ask, counter, nothing_left
+from tests.ros.clusters import PATIENCE, host, node
+from tests.ros.portable_kit import NAME, Ear, ask, counter, nothing_left, two_hosts
 
 TROUBLED = str(Path(__file__).parent / "programs/troubled.py")
 
 
 @pytest.fixture(scope="module")
 def cluster(make_shared):
-    """Two hosts; nothing moves by itself."""
-    return make_shared(
-        host("left"), host("right"),
-        migration=MigrationSettings(strategies={"relaunch": {}, "criu": {}}, automatic=False),
-        defaults=ProcessDefaults(needs={"memory": MIB}),
-    )  # fmt: skip
+    return two_hosts(make_shared)
 
 
 @pytest.fixture
