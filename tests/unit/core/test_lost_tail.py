@@ -60,6 +60,23 @@ def told(cluster: Cluster) -> list:
     return [record for record in cluster.records if record.kind == "journal_behind"]
 
 
+def lost_with_p_on_b(cluster: Cluster) -> Loss:
+    """By what will be left of the journal `p` is queued, and both hosts take no work."""
+    cluster.set_host("a", "cordon")
+    cluster.set_host("b", "cordon")
+    cluster.submit(process("p"))
+    loss = Loss(cluster)
+    cluster.set_host("b", "uncordon")
+    assert cluster.where("p") == ["b"]
+    return loss
+
+
+def waits(cluster: Cluster) -> None:
+    """`p` is given to nobody, and runs where it was started in what is lost."""
+    assert cluster.where("p") == ["b"]
+    assert "all hosts must be heard first" in cluster["p"].reason
+
+
 def test_it_is_said_once_with_how_much(cluster) -> None:
     """The first host tells; a second one that knows no more is no news, one that knows more is."""
     loss = Loss(cluster)
@@ -88,19 +105,13 @@ def test_a_whole_journal_is_not_suspected(cluster) -> None:
 
 def test_what_was_started_in_what_is_lost_is_never_there_twice(cluster) -> None:
     """It is queued by what is left, and runs on a host that is heard later: that one ends first."""
-    cluster.set_host("a", "cordon")
-    cluster.set_host("b", "cordon")
-    cluster.submit(process("p"))
-    loss = Loss(cluster)
-    cluster.set_host("b", "uncordon")
-    assert cluster.where("p") == ["b"]
+    loss = lost_with_p_on_b(cluster)
     loss.strike()
     loss.come_back("a", loss.seen)
     cluster.set_host("a", "uncordon")
     for _ in range(20):
         cluster.wait(0.1)
-        assert cluster.where("p") == ["b"]
-        assert "all hosts must be heard first" in cluster["p"].reason
+        waits(cluster)
     loss.come_back("b", loss.seen)
     for _ in range(20):
         assert len(cluster.where("p")) <= 1
@@ -113,18 +124,12 @@ def test_what_was_started_in_what_is_lost_is_never_there_twice(cluster) -> None:
 @pytest.mark.parametrize("there", [True, False])
 def test_after_a_fall_of_the_machine_all_known_hosts_are_heard_first(cluster, there) -> None:
     """Though nobody has seen more than there is; a host that stays away holds it for a lease."""
-    cluster.set_host("a", "cordon")
-    cluster.set_host("b", "cordon")
-    cluster.submit(process("p"))
-    loss = Loss(cluster)
-    cluster.set_host("b", "uncordon")
-    assert cluster.where("p") == ["b"]
+    loss = lost_with_p_on_b(cluster)
     loss.strike(fell=True)
     loss.come_back("a", 0)
     cluster.set_host("a", "uncordon")
     cluster.wait(2.0)
-    assert cluster.where("p") == ["b"]
-    assert "all hosts must be heard first" in cluster["p"].reason
+    waits(cluster)
     cluster.machines["b"].connected = there
     if there:
         loss.come_back("b", 0)
@@ -138,18 +143,13 @@ def test_after_a_fall_of_the_machine_all_known_hosts_are_heard_first(cluster, th
 
 def test_a_master_that_is_killed_while_it_waits_forgets_nothing_of_it(cluster) -> None:
     """After a fall of the machine: the next one waits for the same hosts, and then no more."""
-    cluster.set_host("a", "cordon")
-    cluster.set_host("b", "cordon")
-    cluster.submit(process("p"))
-    loss = Loss(cluster)
-    cluster.set_host("b", "uncordon")
+    loss = lost_with_p_on_b(cluster)
     loss.strike(fell=True)
     kill_again(cluster)
     loss.come_back("a", 0)
     cluster.set_host("a", "uncordon")
     cluster.wait(2.0)
-    assert cluster.where("p") == ["b"]
-    assert "all hosts must be heard first" in cluster["p"].reason
+    waits(cluster)
     loss.come_back("b", 0)
     cluster.wait(1.0)
     assert len(cluster.where("p")) == 1
@@ -174,19 +174,14 @@ def test_nothing_is_waited_for_twice(cluster) -> None:
 
 def test_what_one_host_knew_to_be_lost_counts_for_the_next_master_too(cluster) -> None:
     """That host has seen no more than there is now; the others are still to be heard."""
-    cluster.set_host("a", "cordon")
-    cluster.set_host("b", "cordon")
-    cluster.submit(process("p"))
-    loss = Loss(cluster)
-    cluster.set_host("b", "uncordon")
+    loss = lost_with_p_on_b(cluster)
     loss.strike()
     loss.come_back("a", loss.seen)
     kill_again(cluster)
     loss.come_back("a", 0)
     cluster.set_host("a", "uncordon")
     cluster.wait(2.0)
-    assert cluster.where("p") == ["b"]
-    assert "all hosts must be heard first" in cluster["p"].reason
+    waits(cluster)
     cluster.machines["b"].connected = False
     cluster.wait(LEASE)
     assert "a" in cluster.where("p")
