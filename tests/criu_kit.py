@@ -29,6 +29,19 @@ from rosrm.errors import CriuError
 #: Seconds for whatever a busy machine needs; nothing waits so long when all goes well.
 TIMEOUT = 60.0
 
+#: What a host tells of itself and its CRIU (`rosrm.criu.fitting.FACTS`).
+HOST_FACTS = {
+    "version": "4.2.1",
+    "kernel": "6.18.44",
+    "machine": "x86_64",
+    "cpu": "avx avx2 sse2",
+    "uid": "1000",
+    "all_users": "no",
+    "python": "/usr/bin/python3.12",
+    "python_version": "3.12.3",
+    "libc": "glibc 2.39",
+}
+
 
 @functools.cache
 def _found() -> tuple[Criu | None, str]:

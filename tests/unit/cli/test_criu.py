@@ -9,18 +9,7 @@ import pytest
 from rosrm.criu.probe import Ability
 from rosrm.criu.program import Criu
 from rosrm.errors import CriuError
-
-FACTS = {
-    "version": "4.2.1",
-    "kernel": "6.18.44",
-    "machine": "x86_64",
-    "cpu": "avx avx2 sse2",
-    "uid": "1000",
-    "all_users": "no",
-    "python": "/usr/bin/python3.12",
-    "python_version": "3.12.3",
-    "libc": "glibc 2.39",
-}
+from tests.criu_kit import HOST_FACTS
 
 
 @pytest.fixture
@@ -33,7 +22,7 @@ def here(monkeypatch):
                 raise CriuError(missing)
             return Criu((f"{prefix}/bin/criu",), version)
 
-        able = Ability(not reason, reason, {**FACTS, "version": version})
+        able = Ability(not reason, reason, {**HOST_FACTS, "version": version})
         monkeypatch.setattr("rosrm.criu.program.find", find)
         monkeypatch.setattr("rosrm.criu.probe.probe", lambda criu: able)
 
@@ -81,7 +70,7 @@ def test_as_json_it_has_all_that_a_program_needs(rosrm, here):
         "program": "/opt/criu/bin/criu",
         "works": False,
         "reason": "no",
-        "facts": {**FACTS, "version": "4.1.1"},
+        "facts": {**HOST_FACTS, "version": "4.1.1"},
     }
 
 

@@ -7,18 +7,7 @@ import pytest
 from rosrm.criu.facts import facts_of, features
 from rosrm.criu.fitting import FACTS, mismatch
 from rosrm.criu.program import Criu
-
-HERE = {
-    "version": "4.2.1",
-    "kernel": "6.18.44",
-    "machine": "x86_64",
-    "cpu": "avx avx2 sse2",
-    "uid": "1000",
-    "all_users": "no",
-    "python": "/usr/bin/python3.12",
-    "python_version": "3.12.3",
-    "libc": "glibc 2.39",
-}
+from tests.criu_kit import HOST_FACTS as HERE
 
 
 def test_a_host_like_the_source_takes_its_images():
