@@ -86,6 +86,7 @@ def open_files(
         image: its directory.
     """
     found: dict[str, HeldFile] = {}
+    copies = 0
     for one in descriptors(pids):
         known = found.get(one.target)
         if one.target in leave_out or one.target.startswith(_OF_THE_KERNEL):
@@ -96,7 +97,8 @@ def open_files(
         grows = bool(one.flags & os.O_APPEND) and one.flags & os.O_ACCMODE == os.O_WRONLY
         copy = known.copy if known else ""
         if one.writes and not copy and _lies_below(one.target, directory):
-            copy = _copy(one, status.st_size, image, len(found))
+            copy = _copy(one, status.st_size, image, copies)
+            copies += bool(copy)
         found[one.target] = HeldFile(
             one.target, status.st_size, stat.S_IMODE(status.st_mode),
             grows and (known is None or known.grows), copy,

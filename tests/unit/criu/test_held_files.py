@@ -1,0 +1,47 @@
+"""Which of the files that a process holds open follow it: those of this one."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from pathlib import Path
+
+import pytest
+
+from rosrm.criu import held_files, image
+from rosrm.criu.image import HeldFile
+
+
+@pytest.fixture
+def work(tmp_path):
+    """The working directory."""
+    (tmp_path / "work").mkdir()
+    return tmp_path / "work"
+
+
+@pytest.fixture
+def directory(tmp_path):
+    """An empty image."""
+    image.create(tmp_path / "image")
+    return tmp_path / "image"
+
+
+def held(directory: Path, working_directory: object) -> dict[str, HeldFile]:
+    """What this process holds open, by path."""
+    found = held_files.open_files([os.getpid()], (), str(working_directory), directory)
+    return {one.path: one for one in found}
+
+
+def test_each_file_that_follows_has_a_copy_of_its_own(work, directory):
+    """Also where one of them was seen first by a descriptor that only reads it."""
+    (work / "a").write_text("of a")
+    with contextlib.ExitStack() as files:
+        for name, mode in (("a", "r"), ("a", "r+"), ("b", "w")):
+            file = files.enter_context((work / name).open(mode))
+            if name == "b":
+                file.write("of b")
+                file.flush()
+        found = held(directory, work)
+    for name in "ab":
+        copy = found[str(work / name)].copy
+        assert (directory / copy).read_text() == f"of {name}"
