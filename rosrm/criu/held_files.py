@@ -77,7 +77,8 @@ def open_files(
 ) -> tuple[HeldFile, ...]:
     """Note what they hold open, and copy what follows into an image; they must stand still.
 
-    A file follows that one of them may write to and that lies below its working directory.
+    A file follows that one of them may write to and that lies below its working directory. Where
+    that is the root directory, which holds everybody's files, none does.
 
     Args:
         pids: the processes.
@@ -153,4 +154,5 @@ def _seen_by(pid: int, path: str) -> Path:
 
 
 def _lies_below(path: str, directory: str) -> bool:
-    return path.startswith(directory.rstrip("/") + "/")
+    """Not of the root directory: all that a process writes anywhere lies below that one."""
+    return directory != "/" and path.startswith(f"{directory}/")

@@ -45,3 +45,10 @@ def test_each_file_that_follows_has_a_copy_of_its_own(work, directory):
     for name in "ab":
         copy = found[str(work / name)].copy
         assert (directory / copy).read_text() == f"of {name}"
+
+
+def test_nothing_follows_a_process_that_works_in_the_root_directory(work, directory):
+    """All files lie below it; what it wrote elsewhere is not the process's own."""
+    with (work / "a").open("w"):
+        assert held(directory, "/")[str(work / "a")].copy == ""
+        assert held(directory, work)[str(work / "a")].copy
