@@ -51,9 +51,9 @@ def test_the_street_is_mapped_truly() -> None:
     assert np.linalg.norm(turned) < np.radians(1)
 
 
-def test_mapping_may_start_anywhere_and_fast() -> None:
+def test_mapping_may_start_anywhere_and_fast(street) -> None:
     """With no motion known yet, 20 m/s are found at once, wherever on the street it starts."""
-    drive = load_drive("street:60")
+    drive = street(60)
     assert drive.truth is not None
     for start in range(0, 56, 4):
         slam = Slam()
@@ -64,9 +64,9 @@ def test_mapping_may_start_anywhere_and_fast() -> None:
 
 
 @pytest.mark.parametrize("at", [0, 1, 2, 7])
-def test_a_restored_slam_goes_on_to_the_last_bit(at: int) -> None:
+def test_a_restored_slam_goes_on_to_the_last_bit(street, at: int) -> None:
     """Saved after any scan and restored, it gives the very trajectory and map of the original."""
-    drive = load_drive("street:12")
+    drive = street(12)
     settings = SlamSettings(cells=(3.0, 1.5), strides=(3, 2), keyframe_m=2.5, cloud_voxel_m=0.4)
     whole = Slam(settings)
     expected = go_on(whole, drive)
@@ -78,9 +78,9 @@ def test_a_restored_slam_goes_on_to_the_last_bit(at: int) -> None:
     assert after.times == whole.times
 
 
-def test_a_saved_state_stays_what_it_was() -> None:
+def test_a_saved_state_stays_what_it_was(street) -> None:
     """The original goes on without changing the state that was taken from it."""
-    drive = load_drive("street:8")
+    drive = street(8)
     slam = Slam()
     go_on(slam, drive.part(0, 4))
     state = slam.state()
@@ -90,9 +90,9 @@ def test_a_saved_state_stays_what_it_was() -> None:
     assert all(np.array_equal(state[name], kept[name]) for name in kept)
 
 
-def test_the_state_without_the_map_is_small_and_nearly_as_good() -> None:
+def test_the_state_without_the_map_is_small_and_nearly_as_good(street) -> None:
     """Pose and motion alone let the drive go on within 0.1 m, with the last scan as a new map."""
-    drive = load_drive("street:20")
+    drive = street(20)
     scans = list(drive.scans())
     expected = go_on(Slam(), drive)
     before = Slam()
@@ -111,9 +111,9 @@ def test_a_state_of_another_format_is_refused() -> None:
         Slam.from_state({**Slam().state(), "format": np.array(2)})
 
 
-def test_points_that_are_not_finite_are_left_out() -> None:
+def test_points_that_are_not_finite_are_left_out(street) -> None:
     """A sensor's NaN for 'no echo' changes nothing."""
-    drive = load_drive("street:3")
+    drive = street(3)
     clean, dirty = Slam(), Slam()
     for points, t in zip(drive.scans(), drive.times, strict=True):
         clean.add_scan(points, t)
@@ -129,9 +129,9 @@ def test_a_scan_from_the_past_is_refused() -> None:
         slam.add_scan(np.zeros((0, 3)), 5.0)
 
 
-def test_a_scan_without_points_goes_on_as_before() -> None:
+def test_a_scan_without_points_goes_on_as_before(street) -> None:
     """An empty scan is no trouble: the pose is the predicted one."""
-    drive = load_drive("street:3")
+    drive = street(3)
     slam = Slam()
     poses = go_on(slam, drive)
     ahead = slam.add_scan(np.zeros((0, 3)), 2 * drive.times[2] - drive.times[1])
