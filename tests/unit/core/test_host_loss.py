@@ -48,9 +48,9 @@ def on_a(spec: ProcessSpec, *others: str, **settings: Any) -> Cluster:
 
 
 def test_by_default_a_process_waits_for_its_host() -> None:
-    """However long: it may well run on."""
+    """However long, here ten leases: it may well run on."""
     cluster = on_a(process("p"), "b")
-    lose(cluster, "a", seconds=600.0)
+    lose(cluster, "a", seconds=100.0)
     assert (cluster.phase("p"), cluster["p"].reason) == ("unreachable", "a is lost")
     back(cluster, "a")
     assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])

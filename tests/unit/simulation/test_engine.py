@@ -239,7 +239,7 @@ def test_every_process_is_somewhere_exactly_once(hosts, plans):
     assert np.all((up >= 0.0) | np.isnan(up))
 
 
-@settings(max_examples=10)
+@settings(max_examples=5)
 @given(hosts=HOSTS, plans=PLANS)
 def test_the_same_workload_gives_the_same_run(hosts, plans):
     one, other = (run(*built(hosts, plans), until=60.0) for _ in range(2))
