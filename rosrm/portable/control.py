@@ -16,6 +16,7 @@ from typing import Final
 from rosrm.errors import PortableError
 from rosrm.portable.form import (
     SIGNAL,
+    VARIABLE,
     Request,
     State,
     Status,
@@ -44,6 +45,18 @@ def control_directory(token: str, uid: int) -> Path:
     if not token or "/" in token or token.startswith("."):
         raise PortableError(f"{token!r} cannot name a control directory: a plain file name can")
     return control_root(uid) / token
+
+
+def directory_of(pid: int) -> Path | None:
+    """Where the node of a process is spoken to, as it was told at its start; None: nowhere.
+
+    Raises:
+        OSError: it has ended, or is not ours to look at.
+    """
+    mark = f"{VARIABLE}=".encode()
+    variables = Path(f"/proc/{pid}/environ").read_bytes().split(b"\0")
+    named = next((word[len(mark) :] for word in variables if word.startswith(mark)), b"")
+    return Path(os.fsdecode(named)) if named else None
 
 
 def make_directory(directory: Path, uid: int | None = None, gid: int | None = None) -> None:
@@ -192,6 +205,15 @@ def _ask(directory: Path, pid: int | None, request: Request) -> None:
             os.kill(pid, SIGNAL)
         except OSError as error:
             raise PortableError(f"process {pid} cannot be woken: {error.strerror}") from None
+
+
+def listens(pid: int) -> bool:
+    """Whether a process waits to be asked; one that has ended does not."""
+    try:
+        _check_catches(pid)
+    except PortableError:
+        return False
+    return True
 
 
 def _check_catches(pid: int) -> None:

@@ -9,6 +9,8 @@ from typing import Any, Final
 from rosrm.core.model import InstanceId
 from rosrm.core.slave import Held, Look, LookedAt, Watch
 from rosrm.criu import tree
+from rosrm.errors import PortableError
+from rosrm.portable import State, directory_of, status_of
 from rosrm.ros.graph import GraphWatch
 from rosrm.ros.health import HealthEar
 from rosrm.ros.participant import Participant
@@ -50,7 +52,7 @@ class HealthWatch:
             self._ears.pop(run).close()
         for instance, held in watched.items():
             watch = held.watched
-            if watch is not None:
+            if watch is not None and not _is_away(held.status.pid):
                 look = self._look(instance, held.status.pid, watch, now)
                 yield LookedAt(instance, held.status.pid, look)
 
@@ -84,3 +86,13 @@ class HealthWatch:
             name = f"{self._participant.node.get_name()}_health"
             self._node = self._participant.unwatched_node(name)
         return HealthEar(self._node, self._graph, watch, now)
+
+
+def _is_away(leader: int) -> bool:
+    """A portable node has left the ROS graph for a move or a checkpoint: nothing is to be heard."""
+    try:
+        control = directory_of(tree.root_of(leader))
+        status = None if control is None else status_of(control)
+    except (OSError, PortableError):  # it has ended, or cannot be looked at: it is judged as ever
+        return False
+    return status is not None and status.state in (State.LEAVING, State.LEFT, State.JOINING)
