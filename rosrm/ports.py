@@ -15,8 +15,8 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 import numpy.typing as npt
 
-from rosrm.core.migration import Move, Plan
-from rosrm.core.model import EMPTY, ProcessSpec, Reading, ResourceDescription
+from rosrm.core.migration import Execute, Move, Plan
+from rosrm.core.model import EMPTY, InstanceId, ProcessSpec, Reading, ResourceDescription
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
@@ -235,6 +235,28 @@ class Imaging(Protocol):
         """
 
 
+@runtime_checkable
+class PeriodicImaging(Protocol):
+    """A migration strategy that dumps a process which then goes on, for its start after a crash."""
+
+    def checkpoint_every(self, spec: ProcessSpec) -> float:
+        """Seconds from one dump to the next, as the process asks for them; 0.0: none. Pure."""
+
+    def periodic(self, spec: ProcessSpec, instance: InstanceId, host: str, now: int) -> Execute:
+        """The step that dumps an instance and lets it go on. Pure.
+
+        Its answer may have `size` (bytes) and `seconds` (of each part, by its name). Whatever
+        fails, the process goes on. `now` is unix time, whole seconds.
+        """
+
+    @property
+    def discard(self) -> str:
+        """The executor that removes such images of instances that have ended from its host.
+
+        Without arguments; it does not come for each of them, and may come in vain.
+        """
+
+
 @dataclass(frozen=True)
 class MigrationOffer:
     """Registers a migration strategy; the fields are as in `ProbeOffer`.
@@ -295,6 +317,33 @@ class CheckpointPolicy(Protocol):
 
     def choose(self, process: CheckpointView) -> CheckpointChoice | None:
         """Where to keep it from now on; None: as before. Asked about once a second."""
+
+
+@dataclass(frozen=True)
+class MemoryView:
+    """What a checkpoint policy may know of a process that asks for periodic checkpoints.
+
+    Attributes:
+        spec: as submitted.
+        host: where it runs.
+        asked: seconds from one checkpoint of its memory to the next, as it asks for them.
+        size: bytes of the last one; 0: there is none yet.
+        pause: seconds for which the process stood still for it.
+    """
+
+    spec: ProcessSpec
+    host: str
+    asked: float
+    size: int
+    pause: float
+
+
+@runtime_checkable
+class MemoryPacing(Protocol):
+    """A checkpoint policy that has the memory of processes dumped, too."""
+
+    def pace(self, process: MemoryView) -> float | None:
+        """Seconds from the last checkpoint of its memory to the next one; None: none is made."""
 
 
 @dataclass(frozen=True)

@@ -89,18 +89,22 @@ def install(
 def check(prefix: Prefix = None, as_json: AsJson = False) -> None:
     """Try it here: dump and restore a process, and say what works and what does not.
 
-    The exit code is 0 only if it works.
+    The exit code is 0 only if it works, and images can be sent.
     """
     from rosrm.cli import json_forms
     from rosrm.criu.program import default_prefix
+    from rosrm.transfer import missing
 
     found, able = _tried((prefix or default_prefix()).absolute())
+    lacking = missing()
     if as_json:
-        json_forms.show({"program": found.command[0] if found else None, **asdict(able)})
+        program = found.command[0] if found else None
+        json_forms.show({"program": program, "no_transfer": lacking, **asdict(able)})
     else:
-        for good, what, said in _lines(found, able):
+        sent = (not lacking, "to other hosts", lacking or "images can be sent and fetched")
+        for good, what, said in [*_lines(found, able), sent]:
             typer.echo(f"{'ok' if good else 'NO':4}{what:18}{said}")
-    if not able.works:
+    if lacking or not able.works:
         raise typer.Exit(1)
 
 

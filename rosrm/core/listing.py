@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Final
 
+from rosrm.core import periodic
 from rosrm.core.assigning import decide_now
 from rosrm.core.hosts import Host, HostCondition
 from rosrm.core.images import reason_of
@@ -91,6 +92,7 @@ def explanation(state: MasterState, name: str, now: float) -> Mapping[str, Any] 
         "reason": _reason(state, process, row.queue_position),
         "decision": None if decision is None else {**decision, "elapsed": age},
         "kept": _kept(state, process, now),
+        "checkpoint": periodic.of_process(state, process, now),
         "history": [
             {"elapsed": now - at, "kind": kind, "message": message}
             for at, kind, message in process.history

@@ -212,6 +212,11 @@ class ProcessSpec:
         return self.ros_node and self.migration.strategy == "criu"
 
     @property
+    def checkpointed(self) -> bool:
+        """Whether its node asks for periodic checkpoints, to start from the last after a crash."""
+        return self.portable and bool(self.migration.options.get("checkpoint_every"))
+
+    @property
     def ros_node(self) -> bool:
         """Whether it is a ROS node, by its own word or as an executable of a ROS package."""
         return self.ros or self.package is not None

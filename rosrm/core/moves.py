@@ -22,7 +22,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from rosrm.core import abilities, handoffs, images, imaging, keeping, lifecycle
+from rosrm.core import abilities, handoffs, images, imaging, keeping, lifecycle, periodic
 from rosrm.core import events as happened
 from rosrm.core.hosts import HostCondition
 from rosrm.core.migration import Aim, AwaitReady, Commit, Configure, Execute, Start, Step, Stop
@@ -51,9 +51,12 @@ def advance_all(state: MasterState, now: float) -> None:
 
 def order_answered(state: MasterState, event: happened.OrderAnswered, now: float) -> None:
     """A slave took an order, refused it, or did not answer in time."""
-    if keeping.order_answered(state, event) or abilities.order_answered(state, event, now):
-        return
-    if images.order_answered(state, event, now):
+    if (
+        periodic.order_answered(state, event, now)
+        or keeping.order_answered(state, event)
+        or abilities.order_answered(state, event, now)
+        or images.order_answered(state, event, now)
+    ):
         return
     name = state.runs_by_order.pop(event.order, None)
     run = state.runs.get(name) if name is not None else None

@@ -18,6 +18,7 @@ from rosrm.core.hosts import Host, HostTable
 from rosrm.core.images import Images
 from rosrm.core.model import EMPTY, Assignment, InstanceId, ProcessSpec
 from rosrm.core.needs import LearnedNeeds
+from rosrm.core.periodic import Periodic
 from rosrm.core.placement import Demand, NamedPolicy, Ranking
 from rosrm.core.processes import Instance, Process, ProcessPhase, Wanted
 from rosrm.core.queue import Queue
@@ -112,6 +113,7 @@ class MasterState:
         self.keeping = Keeping()
         self.abilities = Abilities()
         self.images = Images()
+        self.periodic = Periodic()
         self.next_order = 1
         self.next_instance = 1
         self.reserved_instances = 1

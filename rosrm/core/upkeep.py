@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from rosrm.core import abilities, images, keeping, lost_tail
+from rosrm.core import abilities, images, keeping, lost_tail, periodic
 from rosrm.core import events as happened
 from rosrm.core.assigning import reconsider_set_aside
 from rosrm.core.charges import settle_charge
@@ -39,6 +39,7 @@ def time_passed(state: MasterState, event: happened.TimePassed, now: float) -> N
     images.review(state, now)
     relieve_hosts(state, now)
     keeping.review(state, now)
+    periodic.review(state, now)
     reconsider_set_aside(state, now)
     state.forget_oldest()
 

@@ -29,3 +29,14 @@ def kept_numbers(state: Path) -> list[int]:
     """Of the instances of which there is such an image."""
     names = [path.name.removeprefix("kept-") for path in (state / "images").glob("kept-*")]
     return sorted(int(name) for name in names if name.isdigit())
+
+
+def periodic(state: Path, number: int) -> Path:
+    """The images of an instance that goes on: see `rosrm.criu.periodic`."""
+    return state / "images" / f"periodic-{number}"
+
+
+def periodic_numbers(state: Path) -> list[int]:
+    """Of the instances of which there are such images."""
+    names = [path.name.removeprefix("periodic-") for path in (state / "images").glob("periodic-*")]
+    return sorted(int(name) for name in names if name.isdigit())

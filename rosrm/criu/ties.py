@@ -36,9 +36,9 @@ def outward(pids: Iterable[int]) -> str:
     """
     inside = list(pids)
     for pid in inside:
-        tracer = _tracer(pid)
-        if tracer:
-            return f"pid {pid} ({program(pid)}) is held by pid {tracer} ({program(tracer)})"
+        holder = tracer(pid)
+        if holder:
+            return f"pid {pid} ({program(pid)}) is held by pid {holder} ({program(holder)})"
     held = [one for one in descriptors(inside) if one.target.startswith(("pipe:", "socket:"))]
     for one in _half_pipes(held):
         other = _holder_outside(one.target, inside)
@@ -54,7 +54,7 @@ def outward(pids: Iterable[int]) -> str:
     return ""
 
 
-def _tracer(pid: int) -> int:
+def tracer(pid: int) -> int:
     """Who follows it by ptrace, as a debugger does; 0: nobody."""
     try:
         lines = Path(f"/proc/{pid}/status").read_text(errors="replace").splitlines()

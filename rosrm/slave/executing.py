@@ -24,7 +24,8 @@ class Here:
     Attributes:
         host: its name.
         state: the slave's directory.
-        pids: of the leaders of the instances, by `process#number`.
+        pids: of the leaders of the instances, by `process#number`; 0 of one that is to be started,
+            at first or again.
     """
 
     host: str
@@ -34,7 +35,10 @@ class Here:
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
         live = {instance: pid for instance, pid in self.pids.items() if pid}
-        return {"host": self.host, "state": str(self.state), "pids": live}
+        return {
+            "host": self.host, "state": str(self.state), "pids": live,
+            "instances": list(self.pids),
+        }  # fmt: skip
 
 
 def execute(

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
 from rosrm.core.model import Assignment, ProcessSpec, RestartPolicy
-from rosrm.criu import outcome
-from rosrm.criu.places import incoming
+from rosrm.criu import again, outcome
+from rosrm.criu.places import incoming, periodic
 from rosrm.criu.program import find
 from rosrm.errors import CriuError, LaunchError
 from rosrm.slave import ament_index
@@ -53,10 +53,9 @@ def launch_order(
         arguments = join_arguments(spec.arguments, ros)
     else:
         arguments = list(spec.arguments)
-    argv = (*command, *arguments)
     return LaunchOrder(
         instance=assignment.instance,
-        argv=_restoring(assignment, argv, python, images) if assignment.restored else argv,
+        argv=_by_way_of_images(assignment, (*command, *arguments), python, images),
         environment=environment,
         working_directory=_working_directory(spec),
         # One that ended in a move is never started again: the source is there, and may go on.
@@ -67,18 +66,27 @@ def launch_order(
     )
 
 
-def _restoring(
-    assignment: Assignment, argv: Sequence[str], python: str, images: Path
+def _by_way_of_images(
+    assignment: Assignment, argv: tuple[str, ...], python: str, images: Path
 ) -> tuple[str, ...]:
-    """The program that restores the instance and holds it."""
+    """The program that restores the instance and holds it, where there is an image, or will be."""
+    checkpointed = assignment.spec.checkpointed
+    if not (checkpointed or assignment.restored):
+        return argv
+    number = assignment.instance.number
     try:
-        criu = find()
+        criu = Path(find().command[-1])
     except CriuError as error:
+        if not assignment.restored:
+            return argv
         raise LaunchError(f"{assignment.instance} cannot be restored: {error}") from None
-    return outcome.command(
-        python, incoming(images, assignment.instance.number), criu=Path(criu.command[-1]),
-        remove=True, timeout=_RESTORE, then=argv,
-    )  # fmt: skip
+    if checkpointed:
+        argv = again.command(python, periodic(images, number), argv, criu=criu, timeout=_RESTORE)
+    if assignment.restored:
+        argv = outcome.command(
+            python, incoming(images, number), criu=criu, remove=True, timeout=_RESTORE, then=argv
+        )
+    return argv
 
 
 def _working_directory(spec: ProcessSpec) -> str | None:

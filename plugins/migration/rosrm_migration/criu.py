@@ -9,13 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from math import inf
 from typing import Any, Final
 
-from rosrm.config.units import Bytes, PositiveSeconds
+from rosrm.config.units import Bytes, PositiveSeconds, Seconds
 from rosrm.core.migration import Commit, Execute, Move, Plan, SetRestart, Start, Stop
-from rosrm.core.model import ProcessSpec, RestartPolicy
+from rosrm.core.model import InstanceId, ProcessSpec
 from rosrm.criu.fitting import mismatch
+from rosrm_migration.criu_building import execute, suspend
 from rosrm_migration.criu_kept import checkpoint_plan, restore_plan
+from rosrm_migration.criu_periodic import SWEEP, periodic_step
 from rosrm_migration.options import check_seconds, options_of
 
 #: Under which it is selected.
@@ -29,8 +32,6 @@ FETCH: Final = "criu_fetch"
 AWAIT_RESTORED: Final = "criu_await_restored"
 JOIN: Final = "criu_join"
 END: Final = "criu_end"
-
-_NEVER: Final = RestartPolicy("never")
 
 
 @dataclass(frozen=True)
@@ -49,6 +50,7 @@ class CriuOptions:
         max_rate: bytes a second that the image may take of the network; 0: all that there is. The
             default leaves something of a gigabit to others.
         reserve: bytes that stay free where the image goes to.
+        checkpoint_every: seconds from one periodic checkpoint to the next, of one process; 0: none.
     """
 
     start_timeout: PositiveSeconds = 10.0
@@ -59,6 +61,7 @@ class CriuOptions:
     join_timeout: PositiveSeconds = 20.0
     max_rate: Bytes = 100_000_000
     reserve: Bytes = 256 << 20
+    checkpoint_every: Seconds = 0.0
 
     def __post_init__(self) -> None:
         """Refuse a wait that is no time, and a rate that is none."""
@@ -70,12 +73,21 @@ class CriuOptions:
             raise ValueError(f"max_rate is {self.max_rate} bytes/s; allowed: 0 (no bound) or more")
         if self.reserve < 0:
             raise ValueError(f"reserve is {self.reserve} bytes; allowed: 0 or more")
+        if not 0.0 <= self.checkpoint_every < inf:
+            raise ValueError(
+                f"checkpoint_every is {self.checkpoint_every:g} s; allowed: 0 (none) or more"
+            )
 
 
 class Criu:
     """Plans a move of the whole memory."""
 
     def __init__(self, options: CriuOptions) -> None:
+        if options.checkpoint_every:
+            raise ValueError(
+                "checkpoint_every is not for all processes: name it in the work file, below the "
+                "`migration` of each that shall stand still for it"
+            )
         self._options = options
 
     @property
@@ -85,6 +97,10 @@ class Criu:
 
     def host_fault(self, source: Mapping[str, str], destination: Mapping[str, str]) -> str:
         """Why an image of one host cannot be restored on another one; "": it can."""
+        if source.get("host") != destination.get("host"):
+            for one in (source, destination):
+                if one.get("no_transfer"):
+                    return f"no image can be sent to or from {one['host']}: {one['no_transfer']}"
         return mismatch(source, destination)
 
     def spec_fault(self, spec: ProcessSpec) -> str:
@@ -118,6 +134,19 @@ class Criu:
         """Restore it where its image lies."""
         return restore_plan(move, self._options_for(move.spec))
 
+    def checkpoint_every(self, spec: ProcessSpec) -> float:
+        """As its own options say."""
+        return options_of(spec, self._options).checkpoint_every if spec.checkpointed else 0.0
+
+    def periodic(self, spec: ProcessSpec, instance: InstanceId, host: str, now: int) -> Execute:
+        """Have the node leave, dump it, and have it join again."""
+        return periodic_step(spec, instance, host, now, options_of(spec, self._options))
+
+    @property
+    def discard(self) -> str:
+        """The executor that removes what has no use any more."""
+        return SWEEP
+
     def _options_for(self, spec: ProcessSpec) -> CriuOptions:
         """Its own where it moves so; those of another strategy mean something else."""
         return options_of(spec, self._options) if spec.migration.strategy == NAME else self._options
@@ -129,21 +158,13 @@ class _Draft:
     def __init__(self, move: Move, options: CriuOptions) -> None:
         self._move = move
         self._options = options
-        #: For all steps. An attempt is known by its instances and its time: a master without its
-        #: former journal gives the same numbers once more.
-        self._both: Mapping[str, Any] = {
-            "process": move.spec.name,
-            "source": move.source.number,
-            "destination": move.destination.number,
-            "attempt": f"{move.source}-{move.destination.number}-{move.now}",
-        }
 
     def plan(self) -> Plan:
         move, options = self._move, self._options
         stop_there = Stop(move.destination, move.destination_host, move.spec.stop.timeout)
         return Plan(
             (
-                self._suspend(),
+                suspend(move, options.start_timeout),
                 self._introduce(),
                 self._checkpoint(),
                 self._fetch(),
@@ -162,12 +183,6 @@ class _Draft:
                 Stop(move.source, move.source_host, move.spec.stop.timeout),
             )
         )  # fmt: skip
-
-    def _suspend(self) -> SetRestart:
-        """A source that its slave started again by itself would be active beside its successor."""
-        move, seconds = self._move, self._options.start_timeout
-        give_back = SetRestart(move.source, move.source_host, move.spec.restart, seconds)
-        return SetRestart(move.source, move.source_host, _NEVER, seconds, undo=give_back)
 
     # What is got ready at the destination, and what is fetched, has no undo: that would wait for a
     # host that may be lost, and the source with it. Both go by themselves after a while.
@@ -204,18 +219,9 @@ class _Draft:
     def _here(
         self, executor: str, timeout: float, undo: Execute | None = None, **arguments: Any
     ) -> Execute:
-        host = self._move.source_host
-        return Execute(
-            executor, host, {**self._both, "timeout": timeout, **arguments}, _longer(timeout), undo
-        )
+        move = self._move
+        return execute(move, move.source_host, executor, timeout, undo, **arguments)
 
     def _there(self, executor: str, timeout: float, **arguments: Any) -> Execute:
-        host = self._move.destination_host
-        return Execute(
-            executor, host, {**self._both, "timeout": timeout, **arguments}, _longer(timeout)
-        )
-
-
-def _longer(timeout: float) -> float:
-    """The executor's own time-out comes first: it knows what it waited for."""
-    return timeout + 5.0
+        move = self._move
+        return execute(move, move.destination_host, executor, timeout, **arguments)

@@ -8,14 +8,12 @@ is there again, whatever fails on the way leaves the image as it was.
 from __future__ import annotations
 
 import os
-import re
 import shutil
 import signal
 import socket
 import threading
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -24,45 +22,14 @@ from rosrm.criu.places import incoming, kept, kept_numbers, ports_of_kept
 from rosrm.criu.program import find
 from rosrm.errors import CriuError
 from rosrm_migration import criu_luggage as luggage
+from rosrm_migration.criu_asked import Asked, check_wanted, turn_back, without_log_names
 from rosrm_migration.criu_kept import KEEP, TAKE
 
 #: Sockets that keep the ports of processes that wait in their images, by the instance's number.
 _reserved: Final[dict[int, list[socket.socket]]] = {}
-#: Attempts that were turned back: a dump that is still to begin for one does not.
-_turned_back: Final[set[str]] = set()
 _changing: Final = threading.Lock()
-#: CRIU's logs go with the image; what matters of them is in the message.
-_LOG: Final = re.compile(r" \((its )?log: [^)]*\)")
 #: Seconds between two looks at what nothing tells of.
 _LOOK: Final = 0.005
-
-
-@dataclass(frozen=True)
-class _Asked:
-    """What an executor is asked: of the instance `source`, in an attempt."""
-
-    process: str
-    source: int
-    destination: int
-    attempt: str
-    timeout: float
-    state: Path
-    pids: Mapping[str, int]
-    results: Mapping[str, Any]
-
-    @classmethod
-    def of(cls, arguments: Mapping[str, Any]) -> _Asked:
-        here = arguments["here"]
-        return cls(
-            str(arguments["process"]), int(arguments["source"]), int(arguments["destination"]),
-            str(arguments["attempt"]), float(arguments["timeout"]), Path(here["state"]),
-            here["pids"], arguments.get("results", {}),
-        )  # fmt: skip
-
-    def pid(self, number: int) -> int:
-        """Of the leader of an instance that runs here; 0: it does not."""
-        pid = self.pids.get(f"{self.process}#{number}", 0)
-        return pid if pid and tree.is_alive(pid) else 0
 
 
 # --- checkpoint -------------------------------------------------------------------------------
@@ -70,14 +37,17 @@ class _Asked:
 
 def keep(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
     """Dump the process into an image; it stands still from then on."""
-    asked = _Asked.of(arguments)
+    asked = Asked.of(arguments)
     return luggage.once(KEEP, asked.attempt, lambda: _keep(asked))
 
 
-def _keep(asked: _Asked) -> Mapping[str, Any]:
-    pid = asked.pid(asked.source)
-    if not pid:
-        raise CriuError(f"{asked.process}#{asked.source} does not run here")
+def _keep(asked: Asked) -> Mapping[str, Any]:
+    with luggage.alone(asked.source, asked.timeout):
+        return _keep_alone(asked)
+
+
+def _keep_alone(asked: Asked) -> Mapping[str, Any]:
+    pid = asked.leader(asked.source)
     root = tree.root_of(pid)
     if tree.is_stopped(root):  # by an earlier asking, whose slave was killed
         dumping.resume(pid)
@@ -87,29 +57,25 @@ def _keep(asked: _Asked) -> Mapping[str, Any]:
         raise CriuError(f"{asked.process} cannot be checkpointed: {trouble}")
     directory, began = kept(asked.state, asked.source), time.monotonic()
     luggage.discard(directory)
-    with _changing:
-        if asked.attempt in _turned_back:
-            raise CriuError("the checkpoint was turned back meanwhile")
+    check_wanted(asked.attempt)
     try:
-        manifest = dumping.dump(
-            find(), pid, directory, leave="stopped", timeout=asked.timeout,
-            process=asked.process, instance=asked.source,
-        )  # fmt: skip
+        with without_log_names():
+            manifest = dumping.dump(
+                find(), pid, directory, leave="stopped", timeout=asked.timeout,
+                process=asked.process, instance=asked.source,
+            )  # fmt: skip
         udp_ports.write(ports_of_kept(asked.state, asked.source), udp_ports.bound(pids))
-    except Exception as error:
+    except BaseException:  # whatever it was, the process goes on and nothing is left behind
         _discard(asked.state, asked.source)
-        if not isinstance(error, CriuError):
-            dumping.resume(pid)
-            raise
-        raise CriuError(_LOG.sub("", str(error))) from None
+        dumping.resume(pid)
+        raise
     return {"size": manifest.size, "seconds": {"dump": time.monotonic() - began}}
 
 
 def run_on(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
     """The checkpoint has failed: the process goes on, unless it has ended."""
-    asked = _Asked.of(arguments)
-    with _changing:
-        _turned_back.add(asked.attempt)
+    asked = Asked.of(arguments)
+    turn_back(asked.attempt)
     luggage.after(KEEP, asked.attempt, asked.timeout)
     _discard(asked.state, asked.source)
     pid = asked.pid(asked.source)
@@ -120,7 +86,7 @@ def run_on(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
 
 def kill(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
     """The image owns the name: the process ends at once, and its ports are kept for it."""
-    asked = _Asked.of(arguments)
+    asked = Asked.of(arguments)
     pid = asked.pid(asked.source)
     if pid:
         members = tree.tree(tree.root_of(pid))
@@ -139,7 +105,7 @@ def kill(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
 
 def take(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
     """Lay the image out for the start that follows."""
-    asked = _Asked.of(arguments)
+    asked = Asked.of(arguments)
     if asked.pid(asked.destination):
         return {"taken": True}  # by an earlier asking: it is being restored
     source, target = kept(asked.state, asked.source), incoming(asked.state, asked.destination)
@@ -163,7 +129,7 @@ def _link(source: str, target: str) -> None:
 
 def await_kept(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
     """Wait until the image is a process again; it is used up then."""
-    asked = _Asked.of(arguments)
+    asked = Asked.of(arguments)
     found = _wait(asked, asked.pid(asked.destination))
     _discard(asked.state, asked.source)
     return {"seconds": {"restore": found.seconds}}
@@ -174,7 +140,7 @@ def put_back(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
 
     A restore under way is waited for: it is not ended while it may succeed.
     """
-    asked = _Asked.of(arguments)
+    asked = Asked.of(arguments)
     directory = incoming(asked.state, asked.destination)
     if not directory.exists():
         gone = not kept(asked.state, asked.source).exists()
@@ -192,14 +158,12 @@ def put_back(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
     return {"active": True}
 
 
-def _wait(asked: _Asked, pid: int) -> outcome.Outcome:
-    try:
+def _wait(asked: Asked, pid: int) -> outcome.Outcome:
+    with without_log_names():
         return outcome.wait(
             incoming(asked.state, asked.destination), timeout=asked.timeout,
             ended=lambda: not pid or not tree.is_alive(pid),
         )  # fmt: skip
-    except CriuError as error:
-        raise CriuError(_LOG.sub("", str(error))) from None
 
 
 # --- both -------------------------------------------------------------------------------------

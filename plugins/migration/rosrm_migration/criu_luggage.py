@@ -7,9 +7,11 @@ an instance; what nobody uses any more is removed after a time.
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 import threading
-from collections.abc import Callable, Iterable, Mapping
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, Final
@@ -30,6 +32,7 @@ _changing: Final = threading.Lock()
 _senders: Final[dict[int, Sender]] = {}
 _fetchers: Final[dict[int, Fetcher]] = {}
 _flights: Final[dict[tuple[str, str], Future[Answer]]] = {}
+_dumping: Final[defaultdict[int, threading.Lock]] = defaultdict(threading.Lock)
 
 
 # --- steps that are asked for twice -----------------------------------------------------------
@@ -73,6 +76,29 @@ def after(step: str, attempt: str, timeout: float) -> None:
         flight.exception(timeout)
     except TimeoutError:
         raise CriuError(f"{step} is still under way after {timeout:g} s") from None
+
+
+@contextlib.contextmanager
+def alone(number: int, timeout: float) -> Iterator[None]:
+    """Nobody else dumps an instance meanwhile.
+
+    Raises:
+        CriuError: somebody does, for longer than so many seconds.
+    """
+    with _changing:
+        lock = _dumping[number]
+    if not lock.acquire(timeout=timeout):
+        raise CriuError(f"another dump of it is still under way after {timeout:g} s")
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def is_busy(number: int) -> bool:
+    """Whether an instance is being dumped for this slave."""
+    with _changing:
+        return _dumping[number].locked()
 
 
 # --- the source -------------------------------------------------------------------------------

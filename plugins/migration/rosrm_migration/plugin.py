@@ -8,12 +8,13 @@ from typing import Any, Final
 
 from rosrm.hookspecs import hookimpl
 from rosrm.ports import MigrationOffer
-from rosrm_migration import criu, criu_kept
+from rosrm_migration import criu, criu_kept, criu_periodic
 from rosrm_migration.criu import Criu, CriuOptions
 from rosrm_migration.handoff import WATCH, Handoff, HandoffOptions, watch
 from rosrm_migration.relaunch import Relaunch, RelaunchOptions
 
 _KEPT: Final = "rosrm_migration.criu_kept_steps"
+_PERIODIC: Final = "rosrm_migration.criu_periodic_steps"
 
 
 @hookimpl
@@ -57,6 +58,8 @@ def register_migration_strategies() -> Sequence[MigrationOffer]:
                 criu_kept.PUT_BACK: _when_asked("put_back", _KEPT),
                 criu_kept.AWAIT_KEPT: _when_asked("await_kept", _KEPT),
                 criu_kept.DROP: _when_asked("drop", _KEPT),
+                criu_periodic.DUMP: _when_asked("dump", _PERIODIC),
+                criu_periodic.SWEEP: _when_asked("sweep", _PERIODIC),
             },
         ),
     ]

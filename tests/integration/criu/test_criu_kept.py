@@ -14,6 +14,7 @@ import pytest
 from rosrm.criu import image, outcome, tree
 from rosrm.criu.places import incoming, kept, kept_numbers, ports_of_kept
 from rosrm.errors import CriuError
+from rosrm_migration import criu_asked
 from rosrm_migration import criu_kept_steps as steps
 from rosrm_migration import criu_luggage as luggage
 from tests.criu_kit import TIMEOUT, eventually
@@ -74,7 +75,7 @@ class Slave:
 def slave(theatre, tmp_path):
     """A slave that was just started: it has no attempt in mind."""
     luggage._flights.clear()
-    steps._turned_back.clear()
+    criu_asked._turned_back.clear()
     return Slave(theatre, tmp_path / "state")
 
 
@@ -209,6 +210,23 @@ def test_an_undone_restore_leaves_the_image_as_it_was(slave, counter):
     restored.counts()
     assert before + restored.numbers() == list(range(1, restored.numbers()[-1] + 1))
     slave.end(restored)
+
+
+def test_an_image_that_changed_on_the_disk_is_not_restored(slave, counter):
+    """One flipped bit in the memory of the process: it says what to do, and touches nothing."""
+    checkpointed(slave, counter)
+    pages = kept(slave.state, 1) / image.PAGES / "pages-1.img"
+    content = bytearray(pages.read_bytes())
+    content[len(content) // 2] ^= 1
+    pages.write_bytes(content)
+    slave.ask("take")
+    failed = slave.hold()
+    with pytest.raises(CriuError, match=r"damaged: criu/pages-1\.img .* `rosrm restart p`"):
+        slave.ask("await_kept")
+    failed.process.wait(TIMEOUT)
+    assert slave.ask("put_back") == {}
+    assert kept_numbers(slave.state) == [1]
+    steps.drop({"numbers": [1], "here": {"state": str(slave.state)}})
 
 
 def test_a_restored_process_is_not_put_back(slave, counter):

@@ -41,7 +41,17 @@ def test_one_that_works_is_told_line_by_line(rosrm, here):
         "ok  dump and restore  a process with a UDP socket was dumped, restored and went on",
         "ok  kernel            6.18.44 on x86_64",
         f"ok  same elsewhere    {python}, 3 processor features",
+        "ok  to other hosts    images can be sent and fetched",
     ]
+
+
+def test_without_the_libraries_of_a_transfer_no_image_can_be_sent(rosrm, here, monkeypatch):
+    """A host where CRIU works is no host to move to or from without them."""
+    here()
+    monkeypatch.setattr("rosrm.transfer.missing", lambda: "aiohttp is not installed: pip ...")
+    result = rosrm("criu", "check")
+    assert result.code == 1
+    assert result.out.splitlines()[-1] == "NO  to other hosts    aiohttp is not installed: pip ..."
 
 
 def test_one_that_does_not_is_told_with_what_to_do(rosrm, here):
@@ -59,7 +69,7 @@ def test_none_is_told_in_one_line(rosrm, here):
     result = rosrm("criu", "check")
     assert (result.code, result.err) == (1, "")
     said = "there is no CRIU here. `rosrm criu install` brings one"
-    assert result.out == f"NO  program           {said}\n"
+    assert result.out.splitlines()[0] == f"NO  program           {said}"
 
 
 def test_as_json_it_has_all_that_a_program_needs(rosrm, here):
@@ -69,6 +79,7 @@ def test_as_json_it_has_all_that_a_program_needs(rosrm, here):
     assert json.loads(result.out) == {
         "program": "/opt/criu/bin/criu",
         "works": False,
+        "no_transfer": "",
         "reason": "no",
         "facts": {**HOST_FACTS, "version": "4.1.1"},
     }
@@ -77,5 +88,7 @@ def test_as_json_it_has_all_that_a_program_needs(rosrm, here):
 def test_as_json_there_is_no_program_where_there_is_none(rosrm, here):
     here(missing="none")
     result = rosrm("criu", "check", "--json")
-    expected = {"program": None, "works": False, "reason": "none", "facts": {}}
+    expected = {
+        "program": None, "works": False, "no_transfer": "", "reason": "none", "facts": {}
+    }  # fmt: skip
     assert json.loads(result.out) == expected

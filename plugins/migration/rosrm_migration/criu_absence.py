@@ -1,0 +1,82 @@
+"""Has a portable node leave the ROS graph, and come back where it stands still."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rosrm.criu import dumping, tree
+from rosrm.errors import CriuError
+from rosrm.portable import (
+    State,
+    ask_prepare,
+    ask_resume,
+    await_left,
+    directory_of,
+    listens,
+    make_directory,
+    status_of,
+)
+from rosrm_migration.criu_asked import check_wanted
+
+
+def leave(pid: int, control: Path, attempt: str, timeout: float) -> float:
+    """Have it leave, so that it can be dumped; returns the seconds that it says it took.
+
+    Args:
+        pid: of the instance's leader.
+        control: directory in which the node is spoken to.
+        attempt: by which it is asked.
+        timeout: seconds.
+
+    Raises:
+        CriuError, PortableError: it does not leave.
+    """
+    root = tree.root_of(pid)
+    if tree.is_stopped(root):  # an earlier asking of this very step has dumped it
+        dumping.resume(pid)
+    check_wanted(attempt)
+    ask_prepare(control, root, attempt)
+    return await_left(control, attempt, timeout, root).seconds.get("leave", 0.0)
+
+
+def call_back(pid: int, control: Path, attempt: str) -> bool:
+    """Let it go on where it stands still, and ask it to join; that is not waited for.
+
+    False: it listens to nobody, so it is no portable node, and never was asked to leave.
+
+    Raises:
+        PortableError: it cannot be asked now, as where the disk is full.
+    """
+    dumping.resume(pid)
+    root = tree.root_of(pid)
+    if not listens(root):
+        return False
+    if not control.exists():  # a copy of it that has ended took it along, where hosts share /tmp
+        make_directory(control, owner_of(pid))
+    ask_resume(control, root, attempt)
+    return True
+
+
+def has_failed(control: Path) -> bool:
+    """Whether the node says that it can never join again."""
+    found = status_of(control)
+    return found is not None and found.state is State.FAILED
+
+
+def control_of(pid: int) -> Path:
+    """Where the node is spoken to: it was told at its start, and keeps it through a move."""
+    try:
+        found = directory_of(tree.root_of(pid))
+    except OSError as error:
+        raise CriuError(f"process {pid} cannot be looked at: {error.strerror}") from None
+    if found is None:
+        raise CriuError(
+            f"process {pid} was not started to be moved by criu: restart it, with "
+            f"`migration: criu` in its file"
+        )
+    return found
+
+
+def owner_of(pid: int) -> int:
+    """The user whom the process belongs to."""
+    return Path(f"/proc/{tree.root_of(pid)}").stat().st_uid

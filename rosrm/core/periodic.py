@@ -1,0 +1,243 @@
+"""Periodic checkpoints: dumps of processes that go on, and start from the newest after a crash.
+
+==================================  ==========================================================
+what is seen                        what is ordered
+==================================  ==========================================================
+a process asks for them, and runs   `execute` of its strategy's step, at the policy's pace
+that fails                          it is said once, and tried again at the same pace
+an instance of such a one is gone   its images are removed from its host
+==================================  ==========================================================
+
+Nothing of it is durable. The slave that dumps a process lets it go on by itself, whoever is there;
+and its supervisor starts it from its image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from math import inf
+from typing import TYPE_CHECKING, Any, Final
+
+from rosrm.core import abilities
+from rosrm.core import events as happened
+from rosrm.core.commands import Order
+from rosrm.core.hosts import Host, HostCondition
+from rosrm.core.processes import Instance, Process, ProcessPhase
+from rosrm.ports import MemoryPacing, MemoryView, PeriodicImaging
+
+if TYPE_CHECKING:
+    from rosrm.core.state import MasterState
+
+#: Seconds between two looks.
+_LOOK_EVERY: Final = 1.0
+#: Seconds for a removal.
+_PATIENCE: Final = 30.0
+#: Numbers of the orders are apart from those of all else: a record that is replayed without the
+#: plugins must not number its orders otherwise.
+_BEFORE_FIRST: Final = 1 << 42
+
+
+@dataclass(slots=True)
+class Dumped:
+    """What is known of the checkpoints of one instance.
+
+    Attributes:
+        process, host: names.
+        discard: the executor that removes its images.
+        since: time of the last one, or since when the first is due.
+        made: there is one.
+        size: its bytes.
+        pause: seconds for which the process stood still.
+        order: by which one is made just now; 0: none is.
+        trouble: why there is none, or no newer one.
+    """
+
+    process: str
+    host: str
+    discard: str
+    since: float
+    made: bool = False
+    size: int = 0
+    pause: float = 0.0
+    order: int = 0
+    trouble: str = ""
+
+
+@dataclass(slots=True)
+class Periodic:
+    """All of them, by the number of the instance.
+
+    Attributes:
+        looked: time of the last look.
+        last_order: that was given.
+    """
+
+    of: dict[int, Dumped] = field(default_factory=dict)
+    looked: float = -inf
+    last_order: int = _BEFORE_FIRST
+
+
+def review(state: MasterState, now: float) -> None:
+    """Once a second: have dumped what is due, and removed what is over."""
+    known = state.periodic
+    if now - known.looked < _LOOK_EVERY:
+        return
+    known.looked = now
+    for number in [number for number in known.of if number not in state.instances]:
+        _remove(state, known.of.pop(number))
+    if any(isinstance(one, PeriodicImaging) for one in state.strategies.values()):
+        for process in state.processes.values():
+            if process.spec.checkpointed:
+                _review(state, process, now)
+
+
+def order_answered(state: MasterState, event: happened.OrderAnswered, now: float) -> bool:
+    """Whether the answer was to an order of this module; it is noted then."""
+    if event.order <= _BEFORE_FIRST:
+        return False
+    for dumped in state.periodic.of.values():
+        if dumped.order == event.order:
+            _note(state, dumped, event, now)
+    return True
+
+
+def of_process(state: MasterState, process: Process, now: float) -> Mapping[str, Any] | None:
+    """The newest checkpoint of the instance that owns the name, for people; None: none is asked."""
+    dumped = state.periodic.of.get(process.owner)
+    if dumped is None:
+        return None
+    elapsed = now - dumped.since if dumped.made else None
+    return {
+        "elapsed": elapsed, "size": dumped.size, "pause": dumped.pause, "trouble": dumped.trouble,
+    }  # fmt: skip
+
+
+# --- what is due ------------------------------------------------------------------------------
+
+
+def _review(state: MasterState, process: Process, now: float) -> None:
+    strategy: object = state.strategies.get(process.spec.migration.strategy or "")
+    owner = state.instances.get(process.owner)
+    if owner is None or not isinstance(strategy, PeriodicImaging):
+        return
+    number, host = process.owner, owner.host
+    dumped = state.periodic.of.setdefault(
+        number, Dumped(process.name, host.name, strategy.discard, now)
+    )
+    if dumped.order or not _may_be_dumped(state, process, owner):
+        return
+    pace, trouble = _pace(state, process, strategy, host, dumped)
+    if pace is not None:
+        if now < dumped.since + pace:
+            return
+        trouble = abilities.fault(state, process.spec.migration.strategy or "", host, host)
+    if pace is None or trouble:
+        _say_trouble(state, dumped, trouble, now)
+    else:
+        _order(state, process, strategy, owner, dumped, now)
+
+
+def _may_be_dumped(state: MasterState, process: Process, owner: Instance) -> bool:
+    """Nobody else is at it, and its host is heard."""
+    return (
+        process.phase is ProcessPhase.RUNNING
+        and owner.runs
+        and not owner.stopping
+        and process.name not in state.runs
+        and state.hosts.condition_of(owner.host) is HostCondition.UP
+    )
+
+
+def _pace(
+    state: MasterState, process: Process, strategy: PeriodicImaging, host: Host, dumped: Dumped
+) -> tuple[float | None, str]:
+    """Seconds from one to the next, None for none, and what is wrong with that."""
+    policy, name = state.keeping.policy, state.keeping.policy_name
+    if policy is None:
+        return None, "no checkpoint policy is selected: name one in the cluster's file"
+    if not isinstance(policy, MemoryPacing):
+        return None, f"the checkpoint policy {name!r} makes none of memory"
+    try:
+        asked = strategy.checkpoint_every(process.spec)
+        if not asked > 0.0:
+            return None, ""
+        view = MemoryView(process.spec, host.name, asked, dumped.size, dumped.pause)
+        pace = policy.pace(view)
+    except Exception as error:  # noqa: BLE001 - a third party's code: anything may come
+        return None, f"{name!r} sets no pace: {type(error).__name__}: {error}"
+    if pace is not None and not 0.0 < pace < inf:
+        return None, f"{name!r} wants one every {pace} s; allowed: more than 0"
+    return pace, ""
+
+
+def _order(
+    state: MasterState, process: Process, strategy: PeriodicImaging, owner: Instance,
+    dumped: Dumped, now: float,
+) -> None:  # fmt: skip
+    try:
+        step = strategy.periodic(process.spec, owner.id, owner.host.name, int(state.wall))
+    except Exception as error:  # noqa: BLE001 - a third party's code: anything may come
+        _say_trouble(state, dumped, f"{type(error).__name__}: {error}", now)
+        return
+    state.periodic.last_order += 1
+    dumped.order = state.periodic.last_order
+    state.emit(
+        Order(
+            dumped.order, owner.host.host_id, "execute", executor=step.executor,
+            arguments=step.arguments, timeout=step.timeout,
+        )
+    )  # fmt: skip
+
+
+# --- what came of it --------------------------------------------------------------------------
+
+
+def _note(state: MasterState, dumped: Dumped, event: happened.OrderAnswered, now: float) -> None:
+    dumped.order, dumped.since = 0, now
+    if not event.accepted:
+        _say_trouble(state, dumped, event.message or event.code, now)
+        return
+    result = event.result or {}
+    dumped.size = int(_number(result.get("size")))
+    parts = result.get("seconds")
+    dumped.pause = sum(map(_number, parts.values())) if isinstance(parts, Mapping) else 0.0
+    told = dumped.made and not dumped.trouble
+    dumped.made, dumped.trouble = True, ""
+    if not told:
+        state.record(
+            now, "periodic_checkpoint",
+            f"{dumped.process} starts from its memory of now if it crashes: {dumped.size} bytes, "
+            f"dumped in {dumped.pause:.2f} s, and again from time to time",
+            process=dumped.process, host=dumped.host,
+            facts={"size": dumped.size, "seconds": parts or {}},
+        )  # fmt: skip
+
+
+def _number(value: Any) -> float:
+    return float(value) if isinstance(value, int | float) else 0.0
+
+
+def _say_trouble(state: MasterState, dumped: Dumped, trouble: str, now: float) -> None:
+    """Once, until something else is the matter."""
+    if not trouble or trouble == dumped.trouble:
+        return
+    dumped.trouble = trouble
+    state.record(
+        now, "periodic_failed", f"the memory of {dumped.process} is not dumped: {trouble}",
+        process=dumped.process, host=dumped.host,
+    )  # fmt: skip
+
+
+def _remove(state: MasterState, dumped: Dumped) -> None:
+    """A host that is not heard removes them when it registers."""
+    host = state.hosts.by_name.get(dumped.host)
+    if host is None or state.hosts.condition_of(host) is not HostCondition.UP:
+        return
+    state.periodic.last_order += 1
+    state.emit(
+        Order(
+            state.periodic.last_order, host.host_id, "execute", executor=dumped.discard,
+            timeout=_PATIENCE,
+        )
+    )  # fmt: skip

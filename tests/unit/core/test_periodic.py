@@ -1,0 +1,213 @@
+"""Periodic checkpoints in the core: who is asked for one, when, and what follows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import pytest
+
+from rosrm.core.model import MigrationPolicy, ProcessSpec, Readiness, RestartPolicy
+from rosrm.ports import CheckpointChoice, CheckpointView, MemoryView
+from rosrm_migration.criu import Criu, CriuOptions
+from tests.criu_kit import HOST_FACTS
+from tests.unit.core.cluster import Cluster, process
+from tests.unit.core.machine import Machine
+
+
+class Pacing:
+    """A checkpoint policy that does as it is told, and remembers what it was asked."""
+
+    def __init__(self) -> None:
+        self.answer: Any = None
+        self.views: list[MemoryView] = []
+
+    def choose(self, process: CheckpointView) -> CheckpointChoice | None:
+        return None
+
+    def pace(self, process: MemoryView) -> float | None:
+        self.views.append(process)
+        if isinstance(self.answer, Exception):
+            raise self.answer
+        return process.asked if self.answer is None else self.answer
+
+
+class Host:
+    """A machine on which CRIU works; it remembers when it was asked for what."""
+
+    def __init__(self, name: str = "a") -> None:
+        self.dumps: list[Mapping[str, Any]] = []
+        self.sweeps = 0
+        self.answer: Any = {"size": 5000, "seconds": {"prepare": 0.1, "dump": 0.2, "join": 0.3}}
+        executors = {
+            "criu_ability": lambda _: {**HOST_FACTS, "host": name, "no_transfer": ""},
+            "criu_dump": self._dump, "criu_sweep": self._sweep,
+        }  # fmt: skip
+        self.machine = Machine(name, executors=executors)
+
+    def _dump(self, arguments: Mapping[str, Any]) -> Any:
+        self.dumps.append(arguments)
+        if isinstance(self.answer, Exception):
+            raise self.answer
+        return self.answer
+
+    def _sweep(self, arguments: Mapping[str, Any]) -> Any:
+        self.sweeps += 1
+        return {}
+
+
+def portable(every: Any = 10.0, **fields: Any) -> ProcessSpec:
+    options = {} if every is None else {"checkpoint_every": every}
+    return process(
+        "p", ros=True, readiness=Readiness("running"), restart=RestartPolicy("on-failure"),
+        migration=MigrationPolicy("criu", options=options), **fields,
+    )  # fmt: skip
+
+
+def running(policy: Any, *hosts: Host, spec: ProcessSpec | None = None) -> Cluster:
+    """A portable node that has run for a second."""
+    machines = [host.machine for host in hosts]
+    cluster = Cluster(*machines, strategies={"criu": Criu(CriuOptions())})
+    cluster.state.keeping.policy, cluster.state.keeping.policy_name = policy, "pacing"
+    cluster.submit(spec or portable())
+    cluster.wait(1.0)
+    assert cluster.phase("p") == "running"
+    return cluster
+
+
+def test_it_is_asked_for_at_the_pace_that_the_process_wants():
+    """The first after one period, each for an absence of its own."""
+    host = Host()
+    cluster = running(Pacing(), host)
+    cluster.wait(8.0)
+    assert host.dumps == []
+    cluster.wait(23.0)
+    number = cluster["p"].owner
+    assert [dump["source"] for dump in host.dumps] in ([number] * 2, [number] * 3)
+    assert len({dump["attempt"] for dump in host.dumps}) == len(host.dumps)
+
+
+def test_the_policy_hears_what_the_last_one_cost():
+    """And may have longer pauses."""
+    host, policy = Host(), Pacing()
+    cluster = running(policy, host)
+    cluster.wait(12.0)
+    assert policy.views[0] == MemoryView(cluster["p"].spec, "a", 10.0, 0, 0.0)
+    assert policy.views[-1].size == 5000
+    assert policy.views[-1].pause == pytest.approx(0.6)
+    policy.answer = 1000.0
+    made = len(host.dumps)
+    cluster.wait(100.0)
+    assert len(host.dumps) == made
+
+
+@pytest.mark.parametrize("spec", [portable(None), portable(0.0)])
+def test_who_does_not_ask_has_none(spec):
+    """To stand still for one is not for everybody."""
+    host = Host()
+    cluster = running(Pacing(), host, spec=spec)
+    cluster.wait(60.0)
+    assert host.dumps == []
+    assert cluster.told("periodic_failed") == []
+
+
+def test_the_first_one_is_told_and_explained():
+    """Not each one: they are many."""
+    host = Host()
+    cluster = running(Pacing(), host)
+    cluster.wait(60.0)
+    (said,) = cluster.told("periodic_checkpoint")
+    assert "5000 bytes, dumped in 0.60 s" in said
+    told = cluster.explain("p")["checkpoint"]
+    assert (told["size"], told["trouble"]) == (5000, "")
+    assert 0.0 <= told["elapsed"] <= 11.0
+
+
+def test_what_fails_is_said_once_and_tried_again():
+    """And when it works again, that is said too."""
+    host = Host()
+    host.answer = RuntimeError("no room")
+    cluster = running(Pacing(), host)
+    cluster.wait(45.0)
+    assert len(host.dumps) >= 3
+    assert cluster.told("periodic_failed") == ["the memory of p is not dumped: no room"]
+    assert cluster.explain("p")["checkpoint"]["trouble"] == "no room"
+    host.answer = {"size": 1, "seconds": {}}
+    cluster.wait(12.0)
+    assert len(cluster.told("periodic_checkpoint")) == 1
+    assert cluster.explain("p")["checkpoint"]["trouble"] == ""
+
+
+@pytest.mark.parametrize(
+    ("policy", "reason"),
+    [
+        (None, "no checkpoint policy is selected"),
+        (object(), "'pacing' makes none of memory"),
+    ],
+)
+def test_a_policy_without_a_pace_makes_none(policy, reason):
+    """The process asks in vain, and is told why."""
+    host = Host()
+    cluster = running(policy, host)
+    cluster.wait(30.0)
+    assert host.dumps == []
+    (said,) = cluster.told("periodic_failed")
+    assert reason in said
+
+
+@pytest.mark.parametrize("answer", [ValueError("oops"), 0.0, -1.0, float("nan"), float("inf")])
+def test_a_policy_that_makes_no_sense_harms_nobody(answer):
+    """It is named, and the process runs on without."""
+    host, policy = Host(), Pacing()
+    policy.answer = answer
+    cluster = running(policy, host)
+    cluster.wait(30.0)
+    assert host.dumps == []
+    (said,) = cluster.told("periodic_failed")
+    assert "'pacing'" in said
+    assert cluster.phase("p") == "running"
+
+
+def test_where_criu_does_not_work_there_are_none():
+    """With the host's own reason."""
+    machine = Machine("a")
+    cluster = Cluster(machine, strategies={"criu": Criu(CriuOptions())})
+    cluster.state.keeping.policy = Pacing()
+    cluster.submit(portable())
+    cluster.wait(30.0)
+    (said,) = cluster.told("periodic_failed")
+    assert "criu does not work on a" in said
+
+
+def test_none_while_it_moves_is_stopped_or_unheard():
+    """Who is at work on it is not disturbed."""
+    host = Host()
+    cluster = running(Pacing(), host)
+    host.machine.connected = False
+    cluster.wait(30.0)
+    assert host.dumps == []
+
+
+def test_the_images_of_an_instance_go_with_it():
+    """As soon as it has ended, its host is asked to look."""
+    host = Host()
+    cluster = running(Pacing(), host)
+    cluster.wait(12.0)
+    before = host.sweeps
+    cluster.cancel("p")
+    cluster.wait(5.0)
+    assert cluster.phase("p") == "cancelled"
+    assert host.sweeps == before + 1
+
+
+def test_a_restarted_master_goes_on():
+    """It knows of none any more, and asks for the next one."""
+    host = Host()
+    cluster = running(Pacing(), host)
+    cluster.wait(12.0)
+    made = len(host.dumps)
+    cluster.restart_master()
+    cluster.state.keeping.policy = Pacing()
+    cluster.wait(30.0)
+    assert len(host.dumps) > made
+    assert len({dump["attempt"] for dump in host.dumps}) == len(host.dumps)

@@ -1,0 +1,136 @@
+"""Periodic images: which one counts, how often it is used, and what runs where there is none."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+from rosrm.criu import again, periodic
+from rosrm.criu.periodic import Rejoin
+from rosrm.errors import CriuError
+
+REJOIN = Rejoin("/tmp/rosrm-0/portable/x", "p#1-periodic-1", 0)
+
+
+@pytest.fixture
+def parent(tmp_path):
+    return tmp_path / "periodic-1"
+
+
+def image(parent):
+    """One that is dumped, and does not count yet."""
+    slot = periodic.new_slot(parent)
+    slot.mkdir(parents=True)
+    (slot / "manifest.json").write_text("{}")
+    return slot
+
+
+def test_the_newest_complete_image_counts(parent):
+    """Not one that is still being dumped; the one before goes when the next is complete."""
+    assert periodic.newest(parent) is None
+    first = image(parent)
+    assert periodic.newest(parent) is None
+    periodic.complete(first, REJOIN)
+    second = image(parent)
+    assert periodic.newest(parent) == (first, REJOIN)
+    periodic.complete(second, REJOIN)
+    assert periodic.newest(parent) == (second, REJOIN)
+    assert not first.exists()
+
+
+def test_an_image_is_started_from_twice_at_most(parent):
+    """Who crashes again and again for what it remembers begins anew; a newer image counts again."""
+    slot = image(parent)
+    periodic.complete(slot, REJOIN)
+    assert [periodic.newest(parent) is not None for _ in range(4)] == [True, True, False, False]
+    newer = image(parent)
+    periodic.complete(newer, REJOIN)
+    assert periodic.newest(parent) == (newer, REJOIN)
+
+
+def test_what_a_dump_has_left_goes(parent):
+    """The image that counts stays."""
+    whole = image(parent)
+    periodic.complete(whole, REJOIN)
+    torn = image(parent)
+    periodic.discard_unfinished(parent)
+    assert (whole.exists(), torn.exists()) == (True, False)
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", '{"control": "/x"}'])
+def test_a_damaged_one_is_named(parent, content):
+    """It cannot be told how its node would join."""
+    slot = image(parent)
+    (slot / "rejoin.json").write_text(content)
+    with pytest.raises(CriuError, match="is damaged: rejoin"):
+        periodic.newest(parent)
+
+
+def test_numbers_grow(parent):
+    """The tenth is newer than the ninth."""
+    for _ in range(10):
+        slot = image(parent)
+        periodic.complete(slot, REJOIN)
+    assert slot.name == "10"
+    assert periodic.newest(parent) == (slot, REJOIN)
+
+
+# --- the program that starts a process ----------------------------------------------------------
+
+
+def start(parent, *then):
+    words = again.command(sys.executable, parent, then, criu=parent / "criu", timeout=5.0)
+    return subprocess.run(words, check=False, capture_output=True, text=True, timeout=60)
+
+
+def test_without_an_image_it_is_the_process_itself(parent):
+    """Same pid, environment, exit code and Python's signals as by default."""
+    program = (
+        "import os, signal, sys\n"
+        "print(signal.getsignal(signal.SIGINT), os.environ['HOME'])\nsys.exit(7)"
+    )
+    done = start(parent, sys.executable, "-c", program)
+    assert done.returncode == 7
+    assert "default_int_handler" in done.stdout
+    assert done.stderr == ""
+
+
+def test_sigpipe_ends_it_as_ever(parent):
+    """A Python ignores it, and what it becomes would, too."""
+    done = start(parent, "sh", "-c", "kill -PIPE $$; echo went on")
+    assert (done.returncode, done.stdout) == (-13, "")
+
+
+def test_an_image_that_is_damaged_is_said_and_the_process_begins_anew(parent):
+    """As it would have without any."""
+    slot = image(parent)
+    (slot / "rejoin.json").write_text("{")
+    done = start(parent, "echo", "anew")
+    assert (done.returncode, done.stdout) == (0, "anew\n")
+    assert "not started from its periodic image, but anew" in done.stderr
+
+
+def test_a_program_that_is_missing_is_named(parent):
+    """In the log, with an exit code."""
+    done = start(parent, "/nonesuch")
+    assert (done.returncode, done.stderr) == (
+        1, "/nonesuch cannot be started: No such file or directory\n",
+    )  # fmt: skip
+
+
+def test_it_asks_the_node_to_join_before_it_is_restored(parent, tmp_path):
+    """The request lies there; that there is no CRIU here is said by who restores."""
+    control = tmp_path / "control"
+    slot = image(parent)
+    periodic.complete(slot, Rejoin(str(control), "p#1-periodic-1", os.geteuid()))
+    done = start(parent, "echo", "anew")
+    assert done.returncode == 125
+    assert "not restored" in done.stderr
+    request = json.loads((control / "request").read_text())
+    assert (request["id"], request["want"]) == ("p#1-periodic-1", "join")
+    assert start(parent, "echo", "anew").returncode == 125
+    assert start(parent, "echo", "anew").stdout == "anew\n"
