@@ -66,8 +66,10 @@ def main() -> None:
     words, then = _split(sys.argv[1:])
     options = _options(words)
     directory = Path(options.directory).absolute()
-    if then and _was_restored(directory):
-        _start_anew(then)
+    if (then or options.remove) and _was_restored(directory):
+        if options.remove:
+            image.remove(directory)  # what a SIGKILL has left of it
+        _start_anew(directory, then)
     # What comes while it is restored waits for it; SIGKILL alone does not.
     signal.pthread_sigmask(signal.SIG_BLOCK, _PASSED_ON)
     try:
@@ -101,15 +103,18 @@ def _options(words: list[str]) -> argparse.Namespace:
 
 
 def _was_restored(directory: Path) -> bool:
-    """An earlier life of ours told so, or has cleared up behind itself."""
+    """An earlier life of ours told so. That there is no image says nothing: others remove it."""
     with contextlib.suppress(CriuError):
         told = outcome.read(directory)
-        return not directory.exists() if told is None else not told.reason
+        return told is not None and not told.reason
     return False
 
 
-def _start_anew(command: list[str]) -> NoReturn:
+def _start_anew(directory: Path, command: list[str]) -> NoReturn:
     """Become the program itself: it was restored, has ended, and an image is for one life."""
+    if not command:
+        sys.stderr.write(f"not restored: the image {directory} was restored before\n")
+        sys.exit(FAILED)
     for number in (signal.SIGPIPE, signal.SIGXFSZ, signal.SIGINT):  # Python's own ways
         signal.signal(number, signal.SIG_DFL)
     try:
@@ -146,19 +151,13 @@ class _Restore:
         return pid
 
     def tell(self, pid: int, *, namespace: bool) -> None:
-        """That it is done."""
+        """That it is done: first so that everybody knows, for ever, and then the image may go."""
         seconds = round(time.monotonic() - self.began, 3)
         told = Outcome(pid=pid, inner_pid=self.manifest.pid, namespace=namespace, seconds=seconds)
         outcome.write(self.directory, told)
         if self.remove:
-            image.remove(self.directory)
-
-    def clean(self) -> None:
-        """What is left of the image, after the end of the process."""
-        if self.remove:
-            with contextlib.suppress(OSError):
-                (self.directory / outcome.FILE).unlink()
-                self.directory.rmdir()
+            with contextlib.suppress(OSError):  # the process lives, and the next start tries again
+                image.remove(self.directory)
 
 
 def _reopened_log() -> int:
@@ -204,7 +203,6 @@ def _hold_namespace(restore: _Restore) -> NoReturn:
         restore.tell(root, namespace=True)
         _attend(root, init)
         last = said.readline()
-    restore.clean()
     _end_as(int(last) if last else int(signal.SIGKILL))
 
 
@@ -274,7 +272,6 @@ def _hold_child(restore: _Restore) -> NoReturn:
     os.write(guarding, b"ended")
     with contextlib.suppress(ChildProcessError):  # it was reaped already: somebody killed it
         os.waitpid(guard, 0)
-    restore.clean()
     _end_as(status)
 
 

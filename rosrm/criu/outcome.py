@@ -54,12 +54,12 @@ def command(
         python: an interpreter.
         directory: of the image; an absolute path.
         criu: the program.
-        remove: the image goes as soon as the process is restored; what is left of the directory
-            goes at the end of the process.
+        remove: the image goes as soon as the process is restored. The directory stays, with what
+            was told: whoever looks later, however short that life was, sees that it was used up.
         timeout: seconds for the restore.
         then: the process's own command line, which runs when this is started again after the end of
-            the restored process: an image is for one life. Nobody else may remove the directory
-            before: that it is gone says that there was one.
+            the restored process: an image is for one life. What was told says that there was one,
+            so the directory has to stay as long as the instance may be started again.
     """
     program = str(Path(__file__).resolve().with_name("hold.py"))
     words = [python, "-I", "-S", program, str(directory), f"--criu={criu}", f"--timeout={timeout}"]
