@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import shutil
 import subprocess
@@ -54,13 +55,15 @@ def older() -> Callable[[str], Path]:
 
     def of(suite: str) -> Path:
         place = OLDER / suite
-        if not (place / "tree").is_dir():
-            OLDER.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryDirectory(dir=OLDER) as new:
-                _fetch(suite, Path(new))
-                shutil.rmtree(place, ignore_errors=True)
-                Path(new, suite).rename(place)
-            installing.bound(place / "tree")
+        OLDER.mkdir(parents=True, exist_ok=True)
+        with (OLDER / "lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)  # another worker may be fetching it
+            if not (place / "tree").is_dir():
+                with tempfile.TemporaryDirectory(dir=OLDER) as new:
+                    _fetch(suite, Path(new))
+                    shutil.rmtree(place, ignore_errors=True)
+                    Path(new, suite).rename(place)
+                installing.bound(place / "tree")
         return place
 
     return of
