@@ -80,6 +80,8 @@ def test_colcon_build_works(tmp_path: Path) -> None:
     environment["PATH"] = f"{Path(sys.prefix) / 'bin'}:{environment['PATH']}"
     # What sourcing an installed ROS 2 does.
     environment["AMENT_PREFIX_PATH"] = environment["CMAKE_PREFIX_PATH"] = sys.prefix
+    # Else colcon lets make wait while the machine is busy, and with that for itself.
+    environment["MAKEFLAGS"] = f"-j{os.cpu_count()}"
     against_wheels = tmp_path / "src" / PACKAGE.name / "cmake" / "ros_wheels.cmake"
 
     built = subprocess.run(
