@@ -23,8 +23,14 @@ LAYERS = ("unit", "contract", "integration", "ros", "faults")
 
 #: Workers of the folders whose tests share nothing but the load of the machine. Where there is a
 #: ROS graph, each worker has a network of its own, if it may; the tests of a file share a cluster.
+#: The files with the most tests come first, or those that take long (tests/conftest.py).
 _BY_FILE = ["-n", "2", "--dist", "loadfile"]
-WORKERS = {"unit": ["-n", "2"], "ros": _BY_FILE, "faults": _BY_FILE}
+WORKERS = {
+    "unit": ["-n", "2"],
+    "integration": _BY_FILE,
+    "ros": [*_BY_FILE, "--no-loadscope-reorder"],
+    "faults": _BY_FILE,
+}
 
 # Of pytest's exit statuses:
 INTERRUPTED = 2

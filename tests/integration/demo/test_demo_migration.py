@@ -21,10 +21,11 @@ def start(tmp_path: Path) -> Iterator[Start]:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(240)
 @pytest.mark.parametrize("state", ["full", "pose"])
 def test_the_slam_moves_in_mid_drive(start: Start, state: str) -> None:
     run = start("--drive", "street:60", "--rate", "0.3", "--state", state)
-    status, output, errors = run.end(seconds=110.0)
+    status, output, errors = run.end(seconds=180.0)
     assert (status, errors) == (0, ""), output
     run.check_clean()
 
