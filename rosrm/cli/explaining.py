@@ -29,6 +29,8 @@ def _parts(story: Mapping[str, Any]) -> Iterator[RenderableType]:
     yield _headline(story)
     if story.get("kept"):
         yield _kept(story["kept"])
+    if story.get("checkpoint"):
+        yield _checkpoint(story["checkpoint"])
     decision = story.get("decision")
     if decision:
         yield Text()
@@ -65,6 +67,18 @@ def _kept(kept: list[Mapping[str, Any]]) -> Text:
         for one in kept
     ]
     return Text(f"Its state is kept on {', '.join(places)}.")
+
+
+def _checkpoint(told: Mapping[str, Any]) -> Text:
+    """The newest periodic checkpoint, and what is wrong with the next."""
+    if told["elapsed"] is None:
+        text = "There is no checkpoint of its memory yet"
+    else:
+        text = (
+            f"The last checkpoint of its memory was made {formats.duration(told['elapsed'])} ago "
+            f"({formats.size(told['size'])}, away for {told['pause']:.1f} s)"
+        )
+    return Text(f"{text}: {told['trouble']}" if told["trouble"] else f"{text}.")
 
 
 def _sentence(decision: Mapping[str, Any]) -> Text:

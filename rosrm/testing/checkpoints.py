@@ -8,7 +8,13 @@ from dataclasses import replace
 from typing import Any, ClassVar
 
 from rosrm.core.model import EMPTY, MigrationPolicy, ProcessSpec
-from rosrm.ports import CheckpointOffer, CheckpointPolicy, CheckpointView
+from rosrm.ports import (
+    CheckpointOffer,
+    CheckpointPolicy,
+    CheckpointView,
+    MemoryPacing,
+    MemoryView,
+)
 
 
 class CheckpointContract:
@@ -70,3 +76,16 @@ class CheckpointContract:
                 kept = replace(view, age=0.1, kept_on=choice.hosts)
                 again = self.make().choose(kept)
                 assert again is None or set(again.hosts) == set(choice.hosts)
+
+    def test_sets_a_pace_for_dumps_of_memory(self) -> None:
+        """Of a policy that does: seconds, more than none, the same for the same view, or none."""
+        policy: object = self.make()
+        twin: object = self.make()
+        if not (isinstance(policy, MemoryPacing) and isinstance(twin, MemoryPacing)):
+            return
+        for asked in (0.5, 60.0):
+            for size, pause in ((0, 0.0), (1 << 30, 8.0)):
+                view = MemoryView(self.spec, "h0", asked, size, pause)
+                pace = policy.pace(view)
+                assert pace is None or 0.0 < pace < math.inf
+                assert policy.pace(view) == pace == twin.pace(view)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from math import inf
 from typing import Any, ClassVar
 
 from rosrm.core.migration import (
@@ -23,7 +24,7 @@ from rosrm.core.migration import (
 from rosrm.core.migration import plan_fault as fault_of
 from rosrm.core.model import EMPTY, InstanceId, ProcessSpec
 from rosrm.core.plans import plan_from_dict, plan_to_dict
-from rosrm.ports import Imaging, MigrationOffer, MigrationStrategy
+from rosrm.ports import Imaging, MigrationOffer, MigrationStrategy, PeriodicImaging
 
 
 class MigrationContract:
@@ -78,6 +79,24 @@ class MigrationContract:
                 assert fault_of(plan, here, aim) == ""
                 assert make(here) == plan
                 assert plan_from_dict(json.loads(json.dumps(plan_to_dict(plan)))) == plan
+
+    def test_periodic_checkpoints_are_sound(self) -> None:
+        """Of a strategy that makes them: a step on the instance's host, each time another one."""
+        strategy: object = self.make()
+        if not isinstance(strategy, PeriodicImaging):
+            return
+        assert strategy.checkpoint_every(self.spec) >= 0.0
+        assert {strategy.discard} <= self.offer.executors.keys()
+        instance = InstanceId(self.spec.name, 1)
+        first, again, later = (
+            strategy.periodic(self.spec, instance, "a", now) for now in (1, 1, 2)
+        )
+        assert first == again != later
+        for step in (first, later):
+            assert step.executor in self.offer.executors
+            assert (step.host, step.undo) == ("a", None)
+            assert 0.0 < step.timeout < inf
+            json.dumps(dict(step.arguments))
 
     def test_is_pure(self) -> None:
         """The same move gives the same plan, also with another object of the strategy."""

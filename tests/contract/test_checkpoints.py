@@ -4,7 +4,7 @@ from dataclasses import replace
 from typing import ClassVar
 
 from rosrm.core.model import ProcessSpec
-from rosrm.ports import CheckpointChoice, CheckpointView
+from rosrm.ports import CheckpointChoice, CheckpointView, MemoryView
 from rosrm.testing import CheckpointContract
 from rosrm_checkpoint import plugin
 from rosrm_checkpoint.other_host import OtherHost, OtherHostOptions
@@ -65,3 +65,12 @@ def test_processes_are_spread_over_the_hosts():
         counts[choose(view(f"p{number}")).hosts[0]] += 1
     assert counts.pop("h0") == 0
     assert min(counts.values()) > 50
+
+
+def test_a_process_that_stood_still_for_long_runs_for_longer():
+    """Twenty times as long; a quick one is dumped as often as it asks."""
+    policy = OtherHost(OtherHostOptions())
+    spec = ProcessSpec("p", command=("true",))
+    assert policy.pace(MemoryView(spec, "h0", 60.0, 0, 0.0)) == 60.0
+    assert policy.pace(MemoryView(spec, "h0", 60.0, 1000, 0.5)) == 60.0
+    assert policy.pace(MemoryView(spec, "h0", 60.0, 1000, 9.0)) == 180.0

@@ -193,6 +193,20 @@ def test_explain_says_where_a_state_is_kept(rosrm, client, monkeypatch):
     assert lines[1] == "Its state is kept on beta (cycle 120, 5.0 MB, 0.4 s ago)."
 
 
+@pytest.mark.parametrize(
+    ("told", "line"),
+    [
+        ({"elapsed": 12.0, "size": 34_000_000, "pause": 0.84, "trouble": ""},
+         "The last checkpoint of its memory was made 12 s ago (34.0 MB, away for 0.8 s)."),
+        ({"elapsed": None, "size": 0, "pause": 0.0, "trouble": "no room"},
+         "There is no checkpoint of its memory yet: no room"),
+    ],
+)  # fmt: skip
+def test_explain_says_when_memory_was_dumped(rosrm, client, monkeypatch, told, line):
+    monkeypatch.setattr(client, "explain", lambda name: {**STORY, "checkpoint": told})
+    assert line in rosrm("explain", "talker").out.splitlines()
+
+
 def test_explain_of_a_process_without_a_decision(rosrm, client, monkeypatch):
     story = {**STORY, "decision": None, "history": [], "host": "", "state": "queued"}
     monkeypatch.setattr(client, "explain", lambda name: {**story, "reason": "2 before it"})
