@@ -41,22 +41,26 @@ def demand_of(state: MasterState, process: Process) -> Demand:
 def demand_to_move(
     state: MasterState, process: Process, seen: Mapping[str, float], source: str, headroom: float
 ) -> Demand:
-    """What decides where a running process may go on: what it was seen to use is no guess."""
-    estimate = state.learned.estimate(process.spec, state.settings.default_needs)
-    amounts = larger(estimate.amounts, seen)
-    guessed = {name for name in estimate.estimated if amounts[name] > seen.get(name, 0.0)}
+    """What decides where a running process may go on."""
     excluded = {
         **process.excluded, **unable(state, process, source), source: "it is there already",
     }  # fmt: skip
-    return Demand(process.spec, amounts, frozenset(guessed), excluded, headroom)
+    return Demand(process.spec, *_amounts(state, process, seen), excluded, headroom)
 
 
 def demand_to_restore(state: MasterState, process: Process, seen: Mapping[str, float]) -> Demand:
     """What its host must have for a process that goes on from an image that lies there."""
+    return Demand(process.spec, *_amounts(state, process, seen))
+
+
+def _amounts(
+    state: MasterState, process: Process, seen: Mapping[str, float]
+) -> tuple[Mapping[str, float], frozenset[str]]:
+    """What it needs of each resource, and which of that is a guess: what was seen is none."""
     estimate = state.learned.estimate(process.spec, state.settings.default_needs)
     amounts = larger(estimate.amounts, seen)
     guessed = {name for name in estimate.estimated if amounts[name] > seen.get(name, 0.0)}
-    return Demand(process.spec, amounts, frozenset(guessed))
+    return amounts, frozenset(guessed)
 
 
 def unable(state: MasterState, process: Process, source: str) -> dict[str, str]:
