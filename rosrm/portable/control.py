@@ -7,13 +7,12 @@ move: at another host the very same path has to exist (`make_directory`) before 
 from __future__ import annotations
 
 import os
-import shutil
-import stat
 import time
 from pathlib import Path
 from typing import Final
 
 from rosrm.errors import PortableError
+from rosrm.portable.directory import make, remove
 from rosrm.portable.form import (
     SIGNAL,
     VARIABLE,
@@ -22,6 +21,7 @@ from rosrm.portable.form import (
     Status,
     Want,
     read_status,
+    remove_request,
     remove_status,
     write_request,
 )
@@ -59,48 +59,36 @@ def directory_of(pid: int) -> Path | None:
     return Path(os.fsdecode(named)) if named else None
 
 
-def make_directory(directory: Path, uid: int | None = None, gid: int | None = None) -> None:
+def make_directory(directory: Path, uid: int | None = None) -> None:
     """Make a control directory, before a process starts or is restored; nothing of it remains.
 
     Args:
-        directory: absolute; readable by its owner alone.
-        uid, gid: whose it is to be; None: our own.
+        directory: absolute; readable by its owner alone. Of another user it has to be one of
+            `control_directory`: a process says by itself where it is spoken to.
+        uid: whose it is to be; None: our own.
 
     Raises:
         PortableError: it cannot be made, or is somebody else's.
     """
     owner = os.geteuid() if uid is None else uid
-    missing = [one for one in (directory, *directory.parents) if not one.exists()]
+    if owner != os.geteuid() and directory != control_directory(directory.name, owner):
+        raise PortableError(
+            f"{directory} is no control directory of user {owner}: these are in "
+            f"{control_root(owner)}"
+        )
     try:
-        for one in reversed(missing):
-            one.mkdir(mode=0o700)
-            if uid is not None and uid != os.geteuid():
-                os.chown(one, uid, -1 if gid is None else gid)
-        _check_owner(directory, owner)
+        make(directory, owner)
     except OSError as error:
         raise PortableError(
             f"the control directory {directory} cannot be made: {error.strerror}"
         ) from None
     remove_status(directory)
-    (directory / "request").unlink(missing_ok=True)
-
-
-def _check_owner(directory: Path, owner: int) -> None:
-    """Who may write there could have a node leave: nobody but its owner and root may."""
-    trusted = {0, owner, os.geteuid()}
-    for one in (directory, *directory.parents):
-        state = one.lstat()
-        open_to_all = state.st_mode & stat.S_IWOTH and not state.st_mode & stat.S_ISVTX
-        if state.st_uid not in trusted or open_to_all or not stat.S_ISDIR(state.st_mode):
-            raise PortableError(
-                f"{one} is no directory, of user {state.st_uid}, or open to all; a node of user "
-                f"{owner} is asked to move only where nobody else writes: remove it, or mend it"
-            )
+    remove_request(directory)  # nobody asks before there is a status
 
 
 def remove_directory(directory: Path) -> None:
     """Nobody is spoken to there any more."""
-    shutil.rmtree(directory, ignore_errors=True)
+    remove(directory)
 
 
 def status_of(directory: Path) -> Status | None:

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from rosrm.errors import PortableError
+from rosrm.portable.directory import opened
 
 #: Names the control directory in the environment of a process.
 VARIABLE: Final = "ROSRM_PORTABLE"
@@ -34,6 +35,8 @@ FORMAT: Final = 1
 _REQUEST: Final = "request"
 _STATUS: Final = "status"
 _LARGEST: Final = 1 << 16
+_NEW: Final = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+_PRESENT: Final = os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
 class Want(Enum):
@@ -88,7 +91,7 @@ class Status:
 
 def write_request(directory: Path, request: Request) -> None:
     """Ask; raises `OSError`."""
-    _write(directory / _REQUEST, {"id": request.id, "want": request.want.value})
+    _write(directory, _REQUEST, {"id": request.id, "want": request.want.value})
 
 
 def read_request(directory: Path) -> Request | None:
@@ -97,7 +100,7 @@ def read_request(directory: Path) -> Request | None:
     Raises:
         PortableError: what lies there is no request.
     """
-    found = _read(directory / _REQUEST)
+    found = _read(directory, _REQUEST)
     if found is None:
         return None
     try:
@@ -115,7 +118,7 @@ def write_status(directory: Path, status: Status) -> None:
         "seconds": dict(status.seconds),
         "missing": list(status.missing),
     }
-    _write(directory / _STATUS, content)
+    _write(directory, _STATUS, content)
 
 
 def read_status(directory: Path) -> Status | None:
@@ -124,7 +127,7 @@ def read_status(directory: Path) -> Status | None:
     Raises:
         PortableError: what lies there is no status.
     """
-    found = _read(directory / _STATUS)
+    found = _read(directory, _STATUS)
     if found is None:
         return None
     try:
@@ -139,14 +142,17 @@ def read_status(directory: Path) -> Status | None:
 
 def remove_status(directory: Path) -> None:
     """No node stands here any more."""
-    with contextlib.suppress(OSError):
-        (directory / _STATUS).unlink()
+    _remove(directory, _STATUS)
 
 
 def remove_request(directory: Path) -> None:
     """Nothing is asked."""
-    with contextlib.suppress(OSError):
-        (directory / _REQUEST).unlink()
+    _remove(directory, _REQUEST)
+
+
+def _remove(directory: Path, name: str) -> None:
+    with contextlib.suppress(OSError), opened(directory) as place:
+        os.unlink(name, dir_fd=place)
 
 
 def _text(value: Any) -> str:
@@ -155,17 +161,24 @@ def _text(value: Any) -> str:
     return value
 
 
-def _write(path: Path, content: Mapping[str, Any]) -> None:
+def _write(directory: Path, name: str, content: Mapping[str, Any]) -> None:
     """Replace a file as a whole: who reads it finds the old one or the new one."""
-    beside = path.with_name(f".{path.name}.new")
-    beside.write_text(json.dumps({"format": FORMAT, **content}), encoding="utf-8")
-    beside.replace(path)
+    beside = f".{name}.new"
+    with opened(directory) as place:
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(beside, dir_fd=place)  # whatever it was, it is not written through
+        with os.fdopen(os.open(beside, _NEW, 0o666, dir_fd=place), "w", encoding="utf-8") as file:
+            json.dump({"format": FORMAT, **content}, file)
+        os.replace(beside, name, src_dir_fd=place, dst_dir_fd=place)
 
 
-def _read(path: Path) -> dict[str, Any] | None:
+def _read(directory: Path, name: str) -> dict[str, Any] | None:
+    path = directory / name
     try:
         # Whatever somebody put there, it neither blocks nor fills the memory.
-        with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
+        with opened(directory) as place:
+            descriptor = os.open(name, _PRESENT, dir_fd=place)
+        with os.fdopen(descriptor, "rb") as file:
             data = file.read(_LARGEST + 1)
     except (FileNotFoundError, NotADirectoryError):
         return None

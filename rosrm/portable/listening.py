@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import sys
 import time
 from collections import deque
@@ -11,14 +10,13 @@ from pathlib import Path
 from typing import Final
 
 from rosrm.errors import PortableError
+from rosrm.portable.control import make_directory, remove_directory
 from rosrm.portable.form import (
     Request,
     State,
     Status,
     Want,
     read_request,
-    remove_request,
-    remove_status,
     write_status,
 )
 
@@ -36,7 +34,7 @@ class Listener:
             earlier one counts.
 
     Raises:
-        PortableError: it cannot be used.
+        PortableError: it cannot be used, or others could write there.
 
     Attributes:
         status: as it was said last.
@@ -49,14 +47,7 @@ class Listener:
         self._fault = ""
         self._said = 0.0
         self.status = Status(State.JOINING)
-        try:
-            directory.mkdir(mode=0o700, parents=True, exist_ok=True)
-        except OSError as error:
-            raise PortableError(
-                f"the control directory {directory} cannot be made: {error.strerror}"
-            ) from None
-        remove_status(directory)
-        remove_request(directory)  # nobody asks before there is a status
+        make_directory(directory)
 
     def asked(self) -> Request | None:
         """What the node shall do now, as it stands; None: nothing new."""
@@ -99,7 +90,7 @@ class Listener:
 
     def close(self) -> None:
         """The process ends in good order: nobody is spoken to there any more."""
-        shutil.rmtree(self._directory, ignore_errors=True)
+        remove_directory(self._directory)
 
     def _read(self) -> Request | None:
         try:

@@ -1,0 +1,161 @@
+"""A control directory may be another user's: whatever links that one puts there, none is followed.
+
+The slave may be root. Each test does what a user could, with real files.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from rosrm.errors import PortableError
+from rosrm.portable import (
+    Request,
+    State,
+    Status,
+    Want,
+    ask_resume,
+    control,
+    control_directory,
+    make_directory,
+    remove_directory,
+    status_of,
+)
+from rosrm.portable.form import write_request, write_status
+from rosrm.portable.listening import Listener
+
+#: A user who owns nothing.
+NOBODY = 65534
+
+
+@pytest.fixture
+def precious(tmp_path):
+    """A file of ours, which no user may change, and the directory that it is in."""
+    (tmp_path / "etc").mkdir()
+    file = tmp_path / "etc" / "precious"
+    file.write_text("ours")
+    return file
+
+
+@pytest.fixture
+def directory(tmp_path):
+    """A control directory."""
+    make_directory(tmp_path / "user" / "c")
+    return tmp_path / "user" / "c"
+
+
+@pytest.fixture
+def of_nobody(tmp_path, monkeypatch):
+    """A control directory of another user, which is not made yet; root alone can make it."""
+    if os.geteuid() != 0:
+        pytest.skip("only root can give a directory to another user")
+    monkeypatch.setattr(control, "control_root", lambda uid: tmp_path / f"rosrm-{uid}" / "portable")
+    return control_directory("c", NOBODY)
+
+
+def unchanged(precious: Path) -> bool:
+    """It is as it was, and alone."""
+    return (
+        precious.read_text() == "ours"
+        and precious.stat().st_uid == precious.parent.stat().st_uid == os.geteuid()
+        and list(precious.parent.iterdir()) == [precious]
+    )
+
+
+@pytest.mark.parametrize("name", ["request", ".request.new", "status", ".status.new"])
+def test_what_is_written_goes_through_no_link(directory, precious, name) -> None:
+    """The link is replaced; neither what it led to, nor a second name of a file, is written to."""
+    for make in (os.symlink, os.link):
+        (directory / name).unlink(missing_ok=True)
+        make(precious, directory / name)
+        write_request(directory, Request("m1", Want.LEAVE))
+        write_status(directory, Status(State.RUNNING))
+        assert unchanged(precious)
+        assert status_of(directory) == Status(State.RUNNING)
+
+
+def test_nothing_is_written_where_a_link_leads(directory, precious) -> None:
+    """Neither in place of the directory, nor of one above it; it is said."""
+    for link in (directory, directory.parent):
+        there = link.rename(link.with_name(f"{link.name}-there"))
+        for leads_to in (precious.parent, there):
+            link.symlink_to(leads_to)
+            with pytest.raises(PortableError, match="cannot be written: Not a directory"):
+                ask_resume(directory, None, "m1")
+            link.unlink()
+        there.rename(link)
+    assert unchanged(precious)
+
+
+def test_what_is_read_is_no_link(directory, precious) -> None:
+    """Of another user's files nothing shows, not even whether they are there."""
+    (directory / "status").symlink_to(precious)
+    with pytest.raises(PortableError, match="status cannot be read"):
+        status_of(directory)
+
+
+def test_a_directory_is_not_made_where_a_link_leads(tmp_path, precious) -> None:
+    """It is refused before anything is made there, and the link is named."""
+    (tmp_path / "portable").symlink_to(precious.parent)
+    with pytest.raises(PortableError, match=f"{tmp_path / 'portable'} is no directory"):
+        make_directory(tmp_path / "portable" / "c")
+    assert unchanged(precious)
+
+
+def test_a_directory_is_removed_through_no_link(tmp_path, directory, precious) -> None:
+    """What a link leads to stays, in the directory's place and above it; so does what is in it."""
+    (directory / "status").symlink_to(precious)
+    remove_directory(directory)
+    assert not directory.exists()
+    directory.symlink_to(precious.parent)
+    remove_directory(directory)
+    (tmp_path / "above").symlink_to(tmp_path)
+    remove_directory(tmp_path / "above" / "etc")
+    assert unchanged(precious)
+
+
+def test_a_node_makes_its_directory_as_carefully(tmp_path, precious) -> None:
+    """One that anybody could write to is refused: who can write there, can have it leave."""
+    (tmp_path / "open").mkdir()
+    (tmp_path / "open").chmod(0o777)
+    with pytest.raises(PortableError, match="open to all"):
+        Listener(tmp_path / "open" / "c")
+    (tmp_path / "portable").symlink_to(precious.parent)
+    with pytest.raises(PortableError, match="is no directory"):
+        Listener(tmp_path / "portable" / "c")
+    assert unchanged(precious)
+
+
+def test_another_users_directory_is_given_to_that_user(of_nobody) -> None:
+    """With all that had to be made above it; what was there stays whose it is."""
+    make_directory(of_nobody, NOBODY)
+    make_directory(of_nobody, NOBODY)
+    made = (of_nobody, of_nobody.parent, of_nobody.parent.parent)
+    assert [one.stat().st_uid for one in made] == [NOBODY] * 3
+    assert made[-1].parent.stat().st_uid == 0
+
+
+def test_nothing_else_is_given_to_a_user(of_nobody, precious, monkeypatch) -> None:
+    """Who has put a link in the place of a new directory at once does not get what it leads to."""
+    mkdir = os.mkdir
+
+    def mkdir_and_swap(path, *arguments, **named) -> None:
+        mkdir(path, *arguments, **named)
+        if os.fspath(path).endswith("c"):
+            made = named.get("dir_fd")
+            os.rename(path, "moved", src_dir_fd=made, dst_dir_fd=made)
+            os.symlink(precious, path, dir_fd=made)
+
+    monkeypatch.setattr(os, "mkdir", mkdir_and_swap)
+    with pytest.raises(PortableError, match="is no directory"):
+        make_directory(of_nobody, NOBODY)
+    assert unchanged(precious)
+
+
+def test_a_user_gets_no_directory_elsewhere(of_nobody, precious) -> None:
+    """A process says by itself where it is spoken to: that may be anywhere."""
+    with pytest.raises(PortableError, match=r"no control directory of user 65534"):
+        make_directory(precious.parent / "cron.d", NOBODY)
+    assert unchanged(precious)
