@@ -275,7 +275,10 @@ def test_what_cannot_be_dumped_runs_on_and_says_why(criu, cluster, tmp_path):
 
 def test_an_image_outlives_slave_and_master(criu, cluster):
     """It lies on its host, and its process waits there; cancelled, it is removed."""
-    count = "import time\nn = 0\nwhile True:\n    n += 1\n    print(n)\n    time.sleep(0.01)"
+    count = (
+        "import time\nn = 0\n"
+        "while True:\n    n += 1\n    print(n, flush=True)\n    time.sleep(0.01)\n"
+    )
     for name in ("plain", "unwanted"):
         cluster.submit(python(name, count))
         cluster.wait(name, "running")

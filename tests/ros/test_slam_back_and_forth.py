@@ -5,21 +5,23 @@ from __future__ import annotations
 import json
 import sys
 import time
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 
 import pytest
 
 from rosrm.config.settings import MigrationSettings
 from rosrm.core.model import Kind, MigrationPolicy, ProcessSpec
+from rosrm.errors import Refused
 from rosrm_examples.drives import Drive, default_drive
 from rosrm_examples.map_part import load_parts
 from rosrm_examples.migration_results import LiveRun, differences, summarise, unmigrated_poses
 from rosrm_examples.observer import Observer
-from tests.ros.clusters import PATIENCE, host, wait_until
+from tests.ros.clusters import host, wait_until
 
 MOVES = 10
-#: Seconds that the drive takes: so much is needed for ten moves, one after another.
+#: Seconds that the drive takes, if nobody ends it: so much is needed for ten moves, one after
+#: another, on a busy machine.
 LONG_S = 90.0
 
 
@@ -46,7 +48,10 @@ def player(drive: Drive, hz: float, report: Path) -> ProcessSpec:
 @pytest.mark.slow
 @pytest.mark.timeout(400)
 def test_ten_moves_in_one_drive_lose_no_scan(make_cluster, drive) -> None:
-    """Every scan is mapped once, and the trajectory is that of the SLAM that stays where it is."""
+    """Every scan is mapped once, and the trajectory is that of the SLAM that stays where it is.
+
+    The drive ends soon after the last move.
+    """
     cluster = make_cluster(
         host("left"), host("right"),
         migration=MigrationSettings(strategies={"handoff": {}}, automatic=False),
@@ -62,16 +67,21 @@ def test_ten_moves_in_one_drive_lose_no_scan(make_cluster, drive) -> None:
         for moves in range(1, MOVES + 1):
             move(cluster, moves)
             assert cluster.process("player").state == "running", "the drive was over too early"
-        assert cluster.ended("player", timeout=LONG_S + PATIENCE).state == "finished"
-        wait_until(lambda: len(observer.heard) >= len(drive), "all scans are mapped")
+        enough = min(len(observer.heard) + 3, len(drive))
+        wait_until(lambda: len(observer.heard) >= enough, "scans are mapped after the last move")
+        with suppress(Refused):  # it was at its end anyway
+            cluster.client.cancel(["player"])
+        cluster.ended("player")
+        sent = json.loads(report.read_text())["scans_sent"]
+        wait_until(lambda: len(observer.heard) >= sent, "all scans are mapped")
         time.sleep(1.0)  # one more would be one too many
         heard = list(observer.heard)
     cluster.cancel("slam")
-    sent = json.loads(report.read_text())["scans_sent"]
-    run = LiveRun(drive, sent, heard, load_parts(out), 1.0 / hz)
-    summary = summarise(run, unmigrated_poses(drive), cluster.process("slam").migrations)
+    driven = drive.part(0, sent)
+    run = LiveRun(driven, sent, heard, load_parts(out), 1.0 / hz)
+    summary = summarise(run, unmigrated_poses(driven), cluster.process("slam").migrations)
     assert differences(summary, "full", migrations=MOVES) == [], summary
-    assert (summary["scans_sent"], summary["scans_processed"]) == (len(drive), len(drive))
+    assert (summary["scans_sent"], summary["scans_processed"]) == (sent, sent)
 
 
 def move(cluster, moves: int) -> None:
