@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from rosrm.config.settings import LivenessSettings
 from rosrm.core.model import RestartPolicy
 from tests.ros.clusters import (
     PATIENCE,
@@ -315,12 +316,16 @@ def test_both_killed_at_once(make_cluster) -> None:
     assert (after.pid, after.number) == (before.pid, before.number)
 
 
+#: Who comes up without what hosts have seen of its journal gives no work for a lease.
+SHORTLY = LivenessSettings(lease=3.0)
+
+
 def test_a_lost_journal(make_cluster) -> None:
     """Moved away, as the message about a damaged one advises, it leaves the master with nothing.
 
     What ran is stopped as unknown, and the same slaves take new work under the same names.
     """
-    cluster = make_cluster(host("h0"))
+    cluster = make_cluster(host("h0"), liveness=SHORTLY)
     cluster.submit(service("p"))
     before = cluster.wait("p", "running")
     end(cluster.master, signal.SIGKILL)
@@ -347,7 +352,7 @@ def test_a_lost_journal(make_cluster) -> None:
 @pytest.mark.parametrize("epoch", [1, 2])
 def test_a_lost_journal_of_a_master_that_is_back_at_once(make_cluster, epoch) -> None:
     """The slave hears no silence, and the same epoch or an older one: it registers anew."""
-    cluster = make_cluster(host("h0"))
+    cluster = make_cluster(host("h0"), liveness=SHORTLY)
     for _ in range(1, epoch):
         end(cluster.master, signal.SIGKILL)
         cluster.reconnect()
