@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -137,33 +138,39 @@ def test_a_ros_node_moves_under_its_own_name(cluster) -> None:
     cluster.cancel("walker")
 
 
-@pytest.mark.parametrize("overlap", [True, False], ids=["start first", "stop first"])
-def test_a_destination_that_never_gets_ready_changes_nothing(cluster, overlap) -> None:
-    """The process stays, or is started again, where it was; what was begun is undone and said."""
-    name = "loyal_first" if overlap else "loyal_after"
-    # A node at home; where a marker says so, one that never comes into the graph.
-    marker = cluster.directory / f"{name}-home"
+def loyal(name: str, home: Path, *, overlap: bool):
+    """A node; where a file says that its home is elsewhere, one that never comes into the graph."""
     code = (
         "import os, sys, time\n"
-        f"if os.path.exists({str(marker)!r}) and os.environ['ROSRM_HOST'] != "
-        f"open({str(marker)!r}).read(): time.sleep(1000)\n"
+        f"if os.path.exists({str(home)!r}) and os.environ['ROSRM_HOST'] != "
+        f"open({str(home)!r}).read(): time.sleep(1000)\n"
     )
-    cluster.submit(
-        node(
-            name, code + NODE, readiness=Readiness(timeout=12.0),  # at home it has to be in time
-            migration=MigrationPolicy("relaunch", overlap=overlap),
-        )
+    return node(
+        name, code + NODE, readiness=Readiness(timeout=12.0),  # at home it has to be in time
+        migration=MigrationPolicy("relaunch", overlap=overlap),
     )  # fmt: skip
-    before = cluster.wait(name, "running")
-    marker.write_text(before.host)
-    cluster.client.migrate(name)
-    stayed = cluster.wait_for_event("stayed", process=name, timeout=60.0)
-    assert stayed.host == before.host
-    after = cluster.wait(name, "running")
-    assert after.host == before.host
-    assert after.migrations == 0
-    assert (after.pid == before.pid) == overlap
-    cluster.cancel(name)
+
+
+def test_a_destination_that_never_gets_ready_changes_nothing(cluster) -> None:
+    """The process stays, or is started again, where it was; what was begun is undone and said.
+
+    Two at once: one that starts there first, and one that stops here first.
+    """
+    overlaps = {"loyal_first": True, "loyal_after": False}
+    homes = {name: cluster.directory / f"{name}-home" for name in overlaps}
+    cluster.submit(*(loyal(name, homes[name], overlap=overlaps[name]) for name in overlaps))
+    before = {name: cluster.wait(name, "running") for name in overlaps}
+    for name, row in before.items():
+        homes[name].write_text(row.host)
+        cluster.client.migrate(name)
+    for name, row in before.items():
+        stayed = cluster.wait_for_event("stayed", process=name, timeout=60.0)
+        assert stayed.host == row.host
+        after = cluster.wait(name, "running")
+        assert after.host == row.host
+        assert after.migrations == 0
+        assert (after.pid == row.pid) == overlaps[name]
+    cluster.cancel(*overlaps)
 
 
 def test_what_cannot_move_is_refused(cluster) -> None:
