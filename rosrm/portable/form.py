@@ -109,6 +109,15 @@ def read_request(directory: Path) -> Request | None:
         raise PortableError(f"{directory / _REQUEST} is no request: {error!r}") from None
 
 
+def edition_of_request(directory: Path) -> tuple[int, ...]:
+    """Another one for each request that is written; (): there is none. It opens no file."""
+    try:
+        found = os.lstat(directory / _REQUEST)
+    except OSError:
+        return ()
+    return (found.st_ino, found.st_mtime_ns, found.st_size)
+
+
 def write_status(directory: Path, status: Status) -> None:
     """Say how a node stands; raises `OSError`."""
     content = {

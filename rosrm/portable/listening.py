@@ -16,6 +16,7 @@ from rosrm.portable.form import (
     State,
     Status,
     Want,
+    edition_of_request,
     read_request,
     write_status,
 )
@@ -44,6 +45,7 @@ class Listener:
         self._directory = directory
         self._over: deque[str] = deque(maxlen=_REMEMBERED)
         self._seen: Request | None = None
+        self._edition: tuple[int, ...] = ()
         self._fault = ""
         self._said = 0.0
         self.status = Status(State.JOINING)
@@ -93,11 +95,21 @@ class Listener:
         remove_directory(self._directory)
 
     def _read(self) -> Request | None:
+        """What is asked; None: nothing that was not read before.
+
+        A node that is away looks often, and may be dumped meanwhile. What it has open then has to
+        lie at the other host too, and this file does not.
+        """
+        edition = edition_of_request(self._directory)
+        if edition == self._edition:
+            return None
         try:
-            return read_request(self._directory)
+            found = read_request(self._directory)
         except PortableError as error:
             self._complain(str(error))
             return None
+        self._edition = edition
+        return found
 
     def _complain(self, fault: str) -> None:
         """Once, in the log of the process: there may be no ROS just now."""

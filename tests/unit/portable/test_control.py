@@ -284,6 +284,17 @@ def test_the_time_out_of_joining_says_how_it_stands(directory, node) -> None:
 # --- the files ---
 
 
+def test_a_node_that_waits_opens_nothing(directory, node, monkeypatch) -> None:
+    """It may be dumped at any moment, and what it has open then has to lie at the other host."""
+    ask_prepare(directory, None, "m1")
+    leave(node)
+    with monkeypatch.context() as waiting:
+        waiting.setattr(os, "open", lambda *_, **__: pytest.fail("a file was opened"))
+        assert node.asked() is None
+    ask_resume(directory, None, "m1")
+    assert join(node) == Request("m1", Want.JOIN)
+
+
 @pytest.mark.parametrize(
     "content",
     [b"", b"{", b"[]", b'{"format": 2}', b'{"format": 1}', b"\xff",
