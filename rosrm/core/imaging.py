@@ -13,13 +13,13 @@ from rosrm.core import abilities, images
 from rosrm.core.assigning import demand_to_restore, ranking_of
 from rosrm.core.begin import destination_node, proposed, why_busy
 from rosrm.core.hosts import Host
-from rosrm.core.migration import Aim, Commit, Move
+from rosrm.core.migration import Aim, Commit, Execute, Move
 from rosrm.core.model import InstanceId
 from rosrm.core.placement import Ranking
 from rosrm.core.processes import Image, Instance, Process, ProcessPhase, Wanted
 from rosrm.core.runs import Run
 from rosrm.core.state import MasterState
-from rosrm.core.steps import title
+from rosrm.core.steps import nobody_there, title
 from rosrm.core.verdicts import verdict_of
 from rosrm.ports import Imaging
 
@@ -183,18 +183,31 @@ def commit_to_image(state: MasterState, process: Process, run: Run, step: Commit
     images.set_image(state, process, image)
 
 
-def leave_behind(state: MasterState, run: Run) -> bool:
-    """Whether a checkpoint that is undone can do without its host: nobody is there to go on.
+def leave_behind(state: MasterState, run: Run, step: Execute) -> bool:
+    """Whether a plan that may not stop goes on without an executor: nobody is there to need it.
 
-    What may lie there of an image is removed when the host is heard.
+    What stood still there, or waited to be told to go on, still does if it is there at all. So it
+    is not taken back when its host is heard: it is ended then.
     """
-    if run.aim is not Aim.CHECKPOINT or run.source.number not in run.ended:
+    if run.aim is Aim.CHECKPOINT:
+        if run.undo is None or run.source.number not in run.ended:
+            return False
+        _remove_unmade(state, run)
+    elif not nobody_there(state, run, step):
         return False
+    process = state.processes[run.process]
+    if process.left_behind is not None and process.left_behind.host == step.host:
+        process.left_behind = None
+        state.save(process)
+    return True
+
+
+def _remove_unmade(state: MasterState, run: Run) -> None:
+    """What may lie on its host of an image that nobody waits for."""
     commit = run.plan.steps[run.commit_index]
     if isinstance(commit, Commit):
         number = run.source.number
         images.remove(state, run.process, run.source_host.name, commit.image, number)
-    return True
 
 
 def _probed(source: Instance) -> dict[str, float]:

@@ -8,7 +8,8 @@ forward   fails, no commit    the undo of every step so far, newest first
 forward   fails, committed    it is tried again; the process is shown as stuck until it is done
 back      is done             the next undo; after the last, the source goes on
 back      fails               it is tried again; the process is shown as stuck until it is done
-any       cannot be done      it is left out: an instance that has ended never starts again
+any       cannot be done      it is left out: an instance that has ended never starts again, and
+                              what an executor had to do for one whose host is lost has no use
 back      destination active  forward to the commit: in a handoff it decides itself; of a restore
                               an executor has found that it goes on
 ========  ==================  ==============================================================
@@ -161,8 +162,8 @@ def _commit(state: MasterState, run: Run, step: Commit, now: float) -> None:
 
 def _cannot_be_done(state: MasterState, run: Run, step: Step, now: float) -> bool:
     """Trying again would never help: the instance has ended, or its slot was given away."""
-    if isinstance(step, Execute) and run.undo is not None:
-        return imaging.leave_behind(state, run)
+    if isinstance(step, Execute):
+        return imaging.leave_behind(state, run, step)
     if not isinstance(step, (Start, AwaitReady)):
         return False
     instance = state.instances.get(step.instance.number)

@@ -12,6 +12,7 @@ from rosrm.core.commands import Order
 from rosrm.core.handoffs import DONE
 from rosrm.core.hosts import Host, HostCondition
 from rosrm.core.migration import (
+    Aim,
     AwaitReady,
     AwaitReleased,
     Commit,
@@ -25,11 +26,22 @@ from rosrm.core.migration import (
 from rosrm.core.model import InstanceState
 from rosrm.core.state import MasterState, Run
 
-__all__ = ["DONE", "give_order", "give_order_again", "outcome_of", "timed_out", "title"]
+__all__ = [
+    "DONE",
+    "give_order",
+    "give_order_again",
+    "nobody_there",
+    "note_result",
+    "outcome_of",
+    "timed_out",
+    "title",
+]
 
 _WORDS: Final = {
     Start: "start", AwaitReady: "await ready", AwaitReleased: "await released", Stop: "stop",
 }  # fmt: skip
+#: Of a host that answers nothing, and may never do so again.
+_AWAY: Final = {HostCondition.LOST: "is lost", HostCondition.LEFT: "has left"}
 
 
 def give_order(state: MasterState, run: Run, step: Step, now: float) -> None:
@@ -198,13 +210,24 @@ def _(step: Commit, state: MasterState, run: Run, now: float) -> str | None:
 @outcome_of.register
 def _(step: Execute, state: MasterState, run: Run, now: float) -> str | None:
     if run.answer is None:
-        host = state.hosts.by_name[step.host]
-        gone = state.hosts.condition_of(host) is HostCondition.LOST
+        away = _AWAY.get(state.hosts.condition_of(state.hosts.by_name[step.host]), "")
         # Who stands still meanwhile is not to wait for a time-out that may be long. On a way that
-        # has to be gone to its end, the host is waited for.
-        return f"{step.host} is lost" if gone and run.undo is None and not run.committed else None
+        # has to be gone to its end, the host is waited for as long as somebody is there.
+        turns = run.undo is None and not run.committed
+        return f"{step.host} {away}" if away and (turns or nobody_there(state, run, step)) else None
     accepted, message = run.answer
     return DONE if accepted else f"{step.executor} failed on {step.host}: {message}"
+
+
+def nobody_there(state: MasterState, run: Run, step: Execute) -> bool:
+    """Whether a host is away, and the instances of a move that it held have ended or count as lost.
+
+    An executor of it could do nothing for them, and its host may never come back.
+    """
+    host = state.hosts.by_name[step.host]
+    if run.aim is not Aim.MOVE or state.hosts.condition_of(host) not in _AWAY:
+        return False
+    return all(one.host is not host for one in state.instances_of(state.processes[run.process]))
 
 
 def title(step: Step) -> str:

@@ -200,8 +200,9 @@ class Machine:
             self.tell(slave.LaunchRefused(instance, reason), now)
             return
         self.pids += 1
-        node = Node(instance, assignment.shadow, self.quirks[instance.process])
-        restart = RestartPolicy() if assignment.shadow else assignment.spec.restart
+        silent = assignment.shadow or assignment.restored
+        node = Node(instance, silent, self.quirks[instance.process])
+        restart = RestartPolicy() if silent else assignment.spec.restart
         self.programs[instance] = Program(assignment, node, restart, pid=self.pids)
         status = InstanceStatus(instance, InstanceState.RUNNING, pid=self.pids)
         self._supervisor_says(status, now)

@@ -29,6 +29,7 @@ class Node:
     """One run of a node.
 
     Attributes:
+        shadow: it begins in silence, as the shadow of a handoff does, and what is restored.
         quirks: shared with its machine, so that they may change while it runs.
         handoff: number of the destination of the handoff that it takes part in; 0: none.
         heard: of the other node in this handoff.
@@ -102,7 +103,7 @@ class Node:
             self._maybe_silent()
         elif phase is HandoffPhase.RESUME:
             self.resumed = True
-            self._be_active()
+            self.wake()
             if "no resume" not in self.quirks:
                 self.say(ReportPhase.RESUMED)
 
@@ -152,10 +153,10 @@ class Node:
             self._become_active()
 
     def _become_active(self) -> None:
-        self._be_active()
+        self.wake()
         self.say(ReportPhase.ACTIVE)
 
-    def _be_active(self) -> None:
+    def wake(self) -> None:
         """The promise of all this: no other is, at this very moment."""
         self.active = True
         if self.air is not None and self.instance.number not in self.air.left:

@@ -1,0 +1,124 @@
+"""Hosts whose slaves have the executors of `criu`: nodes stand still, go on and join on a table."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from rosrm.core import events as happened
+from rosrm.core.commands import Order
+from rosrm.core.model import InstanceId, InstanceState
+from rosrm.criu.fitting import FACTS
+from rosrm_migration.criu import (
+    ABILITY,
+    AWAIT_RESTORED,
+    CHECKPOINT,
+    END,
+    FETCH,
+    GO_ON,
+    INTRODUCE,
+    JOIN,
+    Criu,
+    CriuOptions,
+)
+from tests.unit.core.machine import Machine
+from tests.unit.core.nodes import Node
+
+_ALIKE = {name: "yes" if name == "all_users" else "4.2" for name in FACTS}
+
+
+def by_criu(seconds: float = 2.0) -> Criu:
+    """The shipped strategy; each part of a move has so long."""
+    names = ("start", "leave", "dump", "transfer", "restore", "join")
+    return Criu(CriuOptions(**{f"{name}_timeout": seconds for name in names}))
+
+
+@dataclass
+class Portable(Machine):
+    """A machine that takes part in moves by `criu`.
+
+    Attributes:
+        asked: names of the executors, in order.
+        befalls: by the name of an executor, what happens once, just before it does its work.
+        mute: names of executors whose answers nobody hears.
+        stand_still: instances that were dumped, with the attempt for which they were.
+    """
+
+    asked: list[str] = field(default_factory=list)
+    befalls: dict[str, Callable[[], None]] = field(default_factory=dict)
+    mute: set[str] = field(default_factory=set)
+    stand_still: dict[int, str] = field(default_factory=dict)
+    _turned_back: set[str] = field(default_factory=set)
+    _now: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.executors |= {
+            ABILITY: lambda _: _ALIKE, INTRODUCE: lambda _: {}, FETCH: lambda _: {},
+            CHECKPOINT: self._checkpoint, GO_ON: self._go_on, END: self._end_source,
+            AWAIT_RESTORED: self._await_restored, JOIN: self._join,
+        }  # fmt: skip
+
+    def obey(self, order: Order, now: float) -> happened.OrderAnswered:
+        """As any order; an answer that nobody hears is none."""
+        self._now = now
+        self.asked += [order.executor] if order.executor else []
+        self.befalls.pop(order.executor, lambda: None)()
+        answer = super().obey(order, now)
+        if self.connected and order.executor not in self.mute:
+            return answer
+        return happened.OrderAnswered(order.order, accepted=False, code="timeout")
+
+    def lose_power(self) -> None:
+        """Everything here ends at once, and nobody hears of it."""
+        self.connected = False
+        self.programs.clear()
+        self.ends.clear()
+        self.stand_still.clear()
+
+    def _node(self, arguments: Mapping[str, Any], role: str) -> Node | None:
+        program = self.programs.get(InstanceId(arguments["process"], arguments[role]))
+        return None if program is None else program.node
+
+    # --- the source ----------------------------------------------------------------------
+
+    def _checkpoint(self, arguments: Mapping[str, Any]) -> Any:
+        node = self._node(arguments, "source")
+        if arguments["attempt"] in self._turned_back or node is None:
+            raise RuntimeError("it was turned back meanwhile, or has ended")
+        node.active = False
+        self.stand_still[node.instance.number] = arguments["attempt"]
+        return {"offer": "of an image"}
+
+    def _go_on(self, arguments: Mapping[str, Any]) -> Any:
+        self._turned_back.add(arguments["attempt"])
+        node = self._node(arguments, "source")
+        if node is None:
+            return {"fault": "it has ended"}
+        number = node.instance.number
+        if self.stand_still.get(number) == arguments["attempt"]:
+            del self.stand_still[number]
+            node.wake()
+        return {}
+
+    def _end_source(self, arguments: Mapping[str, Any]) -> Any:
+        node = self._node(arguments, "source")
+        if node is not None:
+            self._end(node.instance, InstanceState.FAILED, self._now, signal=9)
+        return {}
+
+    # --- the destination -----------------------------------------------------------------
+
+    def _await_restored(self, arguments: Mapping[str, Any]) -> Any:
+        if self._node(arguments, "destination") is None:
+            raise RuntimeError("it has ended")
+        return {}
+
+    def _join(self, arguments: Mapping[str, Any]) -> Any:
+        node = self._node(arguments, "destination")
+        if node is None:
+            return {"fault": "it has ended"}
+        if node.instance.number not in self.stand_still:  # else it is on its way again
+            node.wake()
+        return {}
