@@ -1,4 +1,4 @@
-"""A scoring policy that does not come back is ended, named, and left alone for a while."""
+"""A policy that does not come back is ended, named, and left alone for a while."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ import time
 
 import pytest
 
-from rosrm.master.policy_guard import GuardedPolicy
+from rosrm.master.policy_guard import Deadline, GuardedScoring, guarded_checkpoints
+from rosrm.ports import MemoryPacing
 
 
 class Policy:
@@ -24,7 +25,8 @@ class Policy:
 
 def guarded(act, **options):
     policy = Policy(act)
-    return GuardedPolicy("slow", policy, **{"deadline": 0.1, "pause": 0.3, **options}), policy
+    deadline = Deadline(**{"seconds": 0.1, "pause": 0.3, **options})
+    return GuardedScoring(policy, deadline), policy
 
 
 def spin():
@@ -72,3 +74,40 @@ def test_one_that_hung_is_left_alone_for_a_while() -> None:
     time.sleep(1.05)
     assert guard.score(None, None) == "scores"
     assert policy.asked == 2
+
+
+class Checkpoints:
+    """A checkpoint policy that does as a test says."""
+
+    def __init__(self, act):
+        self.act = act
+
+    def choose(self, process):
+        return self.act()
+
+
+class Paced(Checkpoints):
+    """One that has memory dumped, too."""
+
+    def pace(self, process):
+        return self.act()
+
+
+def test_each_policy_has_its_own_deadline() -> None:
+    """One that was late does not keep another from being asked, or from being ended."""
+    scoring, _ = guarded(spin)
+    late = guarded_checkpoints(Checkpoints(spin), Deadline(0.1, 30.0))
+    good = guarded_checkpoints(Checkpoints(lambda: "choice"), Deadline(0.1, 30.0))
+    for ask in (lambda: scoring.score(None, None), lambda: late.choose(None)):
+        with pytest.raises(TimeoutError):
+            ask()
+        assert good.choose(None) == "choice"
+
+
+def test_a_guarded_policy_can_do_what_it_could() -> None:
+    """The core asks by what it has; each call is guarded."""
+    assert not isinstance(guarded_checkpoints(Checkpoints(spin), Deadline()), MemoryPacing)
+    paced = guarded_checkpoints(Paced(spin), Deadline(0.1, 30.0))
+    assert isinstance(paced, MemoryPacing)
+    with pytest.raises(TimeoutError):
+        paced.pace(None)
