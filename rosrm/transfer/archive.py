@@ -7,6 +7,7 @@ alone: neither owners nor times, and every mode is 0600 or 0700.
 
 from __future__ import annotations
 
+import hashlib
 import os
 import stat
 import tarfile
@@ -20,6 +21,9 @@ from rosrm.transfer.form import DIGEST_SIZE, new_digest
 
 #: Bytes that are read at a time.
 PIECE: Final = 1 << 18
+#: Bytes from one remembered state of the checksum to the next: at most so many are read once more
+#: to go on, which takes a fraction of a second.
+MARK: Final = 64 << 20
 _BLOCK: Final = tarfile.BLOCKSIZE
 _END: Final = bytes(2 * _BLOCK)
 
@@ -40,6 +44,18 @@ class _Entry:
     @property
     def padding(self) -> int:
         return -self.size % _BLOCK
+
+    @property
+    def length(self) -> int:
+        return len(self.head()) + self.size + self.padding
+
+
+@dataclass(frozen=True)
+class _Mark:
+    """The checksum of all before a byte of the archive."""
+
+    position: int
+    digest: hashlib.blake2b
 
 
 class Archive:
@@ -66,44 +82,56 @@ class Archive:
         files = [entry for entry in self._entries if not entry.is_directory]
         self.size = sum(entry.size for entry in files)
         self.files = len(files)
-        self.length = len(_END) + sum(
-            len(entry.head()) + entry.size + entry.padding for entry in self._entries
-        )
+        self.length = len(_END) + sum(entry.length for entry in self._entries)
+        self._marks = [_Mark(0, new_digest())]
 
     def pieces(self, start: int = 0) -> Iterator[bytes]:
-        """Archive and checksum from a byte on; what comes before is read all the same, for it.
+        """Archive and checksum from a byte on.
+
+        Of what comes before, which an earlier reading has given, at most `MARK` bytes are read once
+        more, for the checksum.
 
         Raises:
             TransferError: a file has changed, or is gone.
         """
-        digest = new_digest()
-        position = 0
-        for piece in self._archive():
+        self._marks = [mark for mark in self._marks if mark.position <= start]
+        position, digest = self._marks[-1].position, self._marks[-1].digest.copy()
+        for piece in self._archive(position):
             digest.update(piece)
             skip = max(0, start - position)
             position += len(piece)
+            if position >= self._marks[-1].position + MARK:
+                self._marks.append(_Mark(position, digest.copy()))
             if skip < len(piece):
                 yield piece[skip:]
         assert position == self.length
         yield digest.digest()[max(0, start - position) : DIGEST_SIZE]
 
-    def _archive(self) -> Iterator[bytes]:
+    def _archive(self, start: int) -> Iterator[bytes]:
+        """Without the checksum, from a byte on."""
         for entry in self._entries:
-            yield entry.head()
-            if not entry.is_directory:
-                yield from self._content(entry)
-                if entry.padding:
-                    yield bytes(entry.padding)
-        yield _END
+            if start < entry.length:
+                yield from self._entry(entry, max(0, start))
+            start -= entry.length
+        yield _END[max(0, start) :]
 
-    def _content(self, entry: _Entry) -> Iterator[bytes]:
+    def _entry(self, entry: _Entry, start: int) -> Iterator[bytes]:
+        head = entry.head()
+        yield head[start:]
+        start -= len(head)
+        if not entry.is_directory and start < max(1, entry.size):
+            yield from self._content(entry, max(0, start))
+        start -= entry.size
+        yield bytes(entry.padding)[max(0, start) :]
+
+    def _content(self, entry: _Entry, start: int) -> Iterator[bytes]:
         path = self._directory / entry.name
         try:
             descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
             with os.fdopen(descriptor, "rb", buffering=0) as file:
-                left = entry.size
-                if os.fstat(descriptor).st_size != left:
+                if os.fstat(descriptor).st_size != entry.size:
                     raise TransferError(f"{path} has changed since it was offered")
+                left = entry.size - file.seek(start)
                 while left:
                     piece = file.read(min(PIECE, left))
                     if not piece:

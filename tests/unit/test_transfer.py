@@ -14,11 +14,12 @@ import tempfile
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from rosrm.errors import TransferError
 from rosrm.transfer import Offer, starting
+from rosrm.transfer import archive as archive_module
 from rosrm.transfer.addresses import nearest_first, own_addresses
 from rosrm.transfer.archive import Archive
 from rosrm.transfer.form import DIGEST_SIZE, new_digest
@@ -119,6 +120,33 @@ def test_a_stream_goes_on_from_any_byte(archived, data):
     archive, whole = archived
     start = data.draw(st.integers(0, len(whole)))
     assert b"".join(archive.pieces(start)) == whole[start:]
+
+
+@given(st.lists(st.floats(0, 1), min_size=1, max_size=5))
+@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_a_stream_goes_on_again_and_again(archived, monkeypatch, shares):
+    """Wherever it broke each time, and whatever was marked on the way: all of it is the same."""
+    monkeypatch.setattr(archive_module, "MARK", 5000)
+    monkeypatch.setattr(archive_module, "PIECE", 700)
+    archive, whole = archived
+    for share in shares:
+        start = int(share * len(whole))
+        assert b"".join(archive.pieces(start)) == whole[start:]
+
+
+def test_what_came_long_before_is_not_read_again(tmp_path, monkeypatch):
+    """Else a large directory is silent for as long as that takes, and given up. It could change."""
+    monkeypatch.setattr(archive_module, "MARK", 100_000)
+    monkeypatch.setattr(archive_module, "PIECE", 10_000)
+    for name in ("a", "b"):
+        (tmp_path / name).write_bytes(os.urandom(1_000_000))
+    archive = Archive(tmp_path)
+    whole = b"".join(archive.pieces())
+    (tmp_path / "a").write_bytes(bytes(1_000_000))
+    with (tmp_path / "b").open("r+b") as file:
+        file.write(bytes(700_000))
+    for start in (1_850_000, 1_950_000, len(whole) - 1):
+        assert b"".join(archive.pieces(start)) == whole[start:]
 
 
 def test_a_directory_with_something_else_than_files_is_not_offered(tmp_path):
