@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from contextlib import closing
+
 import pytest
 
 from rosrm.loopback import enter_private_network
 from tests.ros.clusters import STEADY, clusters
 from tests.ros.nodes import Stage
+from tests.ros.portable_kit import Ear
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -27,6 +30,13 @@ def make_shared(tmp_path_factory):
     """Makes clusters that the tests of a module share."""
     with clusters(lambda: tmp_path_factory.mktemp("c"), liveness=STEADY) as make:
         yield make
+
+
+@pytest.fixture
+def ear(cluster):
+    """Hears the portable counters in the cluster of a module."""
+    with closing(Ear(cluster.domain)) as ear:
+        yield ear
 
 
 @pytest.fixture

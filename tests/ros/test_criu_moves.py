@@ -5,19 +5,12 @@ from __future__ import annotations
 import pytest
 
 from rosrm.core.model import Health
-from tests.ros.portable_kit import NAME, Ear, ask, counter, nothing_left, two_hosts
+from tests.ros.portable_kit import NAME, ask, counter, nothing_left, two_hosts
 
 
 @pytest.fixture(scope="module")
 def cluster(make_shared):
     return two_hosts(make_shared)
-
-
-@pytest.fixture
-def ear(cluster):
-    ear = Ear(cluster.domain)
-    yield ear
-    ear.close()
 
 
 def moved(cluster, times: int):

@@ -13,7 +13,7 @@ import pytest
 
 from tests.integration.criu.conftest import old, older  # noqa: F401 - fixtures
 from tests.ros.clusters import PATIENCE, host, node
-from tests.ros.portable_kit import NAME, Ear, ask, counter, nothing_left, two_hosts
+from tests.ros.portable_kit import NAME, ask, counter, nothing_left, two_hosts
 
 TROUBLED = str(Path(__file__).parent / "programs/troubled.py")
 
@@ -21,13 +21,6 @@ TROUBLED = str(Path(__file__).parent / "programs/troubled.py")
 @pytest.fixture(scope="module")
 def cluster(make_shared):
     return two_hosts(make_shared)
-
-
-@pytest.fixture
-def ear(cluster):
-    ear = Ear(cluster.domain)
-    yield ear
-    ear.close()
 
 
 @pytest.fixture
