@@ -17,8 +17,10 @@ _NAMESPACES: Final = {
     "mnt": "--mount", "pid": "--pid", "net": "--net", "ipc": "--ipc", "uts": "--uts",
     "cgroup": "--cgroup",
 }  # fmt: skip
-#: Names the program that holds a restored process, in its command line.
+#: Names the program that holds a restored process, in its command line, and the one that may become
+#: it, or else the process itself.
 HOLD: Final = "rosrm/criu/hold.py"
+_AGAIN: Final = "rosrm/criu/again.py"
 
 
 def children(pid: int) -> list[int]:
@@ -57,11 +59,20 @@ def root_of(leader: int) -> int:
 
 def is_hold(pid: int) -> bool:
     """It runs the program that holds a restored process."""
+    return _runs(pid, HOLD)
+
+
+def may_hold(pid: int) -> bool:
+    """It does, or may do so in a moment."""
+    return _runs(pid, HOLD, _AGAIN)
+
+
+def _runs(pid: int, *programs: str) -> bool:
     try:
-        words = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
+        words = os.fsdecode(Path(f"/proc/{pid}/cmdline").read_bytes()).split("\0")
     except OSError:
         return False
-    return any(word.endswith(HOLD.encode()) for word in words[1:5])
+    return any(word.endswith(programs) for word in words[1:5])
 
 
 def is_alive(pid: int) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
@@ -64,22 +63,8 @@ class HealthWatch:
         ear = self._ears.get((instance, pid))
         if ear is None:
             ear = self._ears[instance, pid] = self._listen(watch, now)
-        heard, trouble = ear.topic(self._pids(pid), now)
+        heard, trouble = ear.topic(self._sessions.known_as(pid), now)
         return Look(stopped, heard, trouble, ear.state(now))
-
-    def _pids(self, leader: int) -> tuple[int, ...]:
-        """Of the processes of an instance; of those that were restored, as they see themselves.
-
-        That is what Fast DDS writes into the names of endpoints.
-        """
-        members = self._sessions.members(leader)
-        if not tree.is_hold(leader):
-            return members
-        own = []
-        for pid in members:
-            with contextlib.suppress(OSError):  # it has ended meanwhile
-                own.append(tree.inner_pid(pid))
-        return (*members, *own)
 
     def _listen(self, watch: Watch, now: float) -> HealthEar:
         if self._node is None:

@@ -236,7 +236,7 @@ class SlaveRuntime:
     def _look_at_graph(self, awaited: Mapping[InstanceId, core.Held]) -> None:
         for instance, held in awaited.items():
             before = self._graph_before.get(instance, frozenset())
-            pids = self._sessions.members(held.status.pid)
+            pids = self._sessions.known_as(held.status.pid)
             if held.awaited and self._graph.sees(held.awaited.node_name, pids, before):
                 self.take(core.SeenInGraph(instance))
 

@@ -8,13 +8,14 @@ restored from an image has a session of its own below the program that holds it,
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from rosrm.criu.tree import is_hold, tree
+from rosrm.criu.tree import inner_pid, is_hold, may_hold, tree
 
 _TICKS: Final = float(os.sysconf("SC_CLK_TCK"))
 _PAGE: Final = os.sysconf("SC_PAGE_SIZE")
@@ -68,6 +69,20 @@ class SessionTable:
         """The known processes of one session, its leader first; () where it is not known."""
         return self._members.get(leader, ())
 
+    def known_as(self, leader: int) -> tuple[int, ...]:
+        """As `members`; those that were restored also by the pids that they see themselves.
+
+        These are what Fast DDS writes into the names of endpoints.
+        """
+        members = self.members(leader)
+        if leader not in self._holds or not is_hold(leader):
+            return members
+        own = []
+        for pid in members:
+            with contextlib.suppress(OSError):  # it has ended meanwhile
+                own.append(inner_pid(pid))
+        return (*members, *own)
+
     def add(self, leader: int) -> None:
         """A session has begun; its leader counts at once.
 
@@ -75,7 +90,7 @@ class SessionTable:
             leader: pid, which is also the session id.
         """
         self._members[leader] = (leader,)
-        if is_hold(leader):
+        if may_hold(leader):
             self._holds.add(leader)
         self._collect_pids()
 
