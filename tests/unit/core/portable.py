@@ -34,6 +34,13 @@ def by_criu(seconds: float = 2.0) -> Criu:
     return Criu(CriuOptions(**{f"{name}_timeout": seconds for name in names}))
 
 
+class Everywhere:
+    """As `criu` on hosts of which nobody has to be asked first."""
+
+    def __init__(self, seconds: float) -> None:
+        self.propose = by_criu(seconds).propose
+
+
 @dataclass
 class Portable(Machine):
     """A machine that takes part in moves by `criu`.
@@ -41,7 +48,7 @@ class Portable(Machine):
     Attributes:
         asked: names of the executors, in order.
         befalls: by the name of an executor, what happens once, just before it does its work.
-        mute: names of executors whose answers nobody hears.
+        mute: names of executors whose next answer nobody hears.
         stand_still: instances that were dumped, with the attempt for which they were.
     """
 
@@ -68,14 +75,21 @@ class Portable(Machine):
         answer = super().obey(order, now)
         if self.connected and order.executor not in self.mute:
             return answer
+        self.mute.discard(order.executor)
         return happened.OrderAnswered(order.order, accepted=False, code="timeout")
 
-    def lose_power(self) -> None:
-        """Everything here ends at once, and nobody hears of it."""
+    def lose_power(self, now: float) -> None:
+        """Everything here ends at once, and nobody hears of it; another slave comes up later."""
         self.connected = False
         self.programs.clear()
         self.ends.clear()
         self.stand_still.clear()
+        self.restart_slave(now)
+
+    def restart_slave(self, now: float) -> None:
+        """As any slave; which attempts were given up only the former one knew."""
+        super().restart_slave(now)
+        self._turned_back.clear()
 
     def _node(self, arguments: Mapping[str, Any], role: str) -> Node | None:
         program = self.programs.get(InstanceId(arguments["process"], arguments[role]))

@@ -33,6 +33,7 @@ from rosrm.core.state import ProcessPhase, Wanted
 from rosrm.ports import CheckpointChoice, CheckpointView
 from tests.unit.core.cluster import MIB, Cluster, HandOver, Machine, StartFirstOrStopFirst
 from tests.unit.core.nodes import QUIRKS, Node
+from tests.unit.core.portable import Everywhere, Portable
 
 NAMES = [f"p{i}" for i in range(5)]
 TWINS = [f"{name}x" for name in NAMES]
@@ -43,7 +44,7 @@ LABELLED = "c"
 names = st.sampled_from([*NAMES[:1] * 4, *NAMES[:2] * 2, *NAMES])
 hosts = st.sampled_from(HOSTS)
 ways = st.sampled_from(
-    ["overlap", "stop first", "handoff", "handoff, restarted", "handoff, standby"]
+    ["overlap", "stop first", "handoff", "handoff, restarted", "handoff, standby", "criu"]
 )
 losses = st.sampled_from(["wait", "wait", "elsewhere", "elsewhere", "stop"])
 chance = st.booleans()
@@ -58,7 +59,8 @@ def spec(
     loss: str = "wait",
 ) -> ProcessSpec:  # fmt: skip
     """One of a few sorts of process."""
-    strategy = "handoff" if moves.startswith("handoff") else "relaunch"
+    word = moves.partition(",")[0]
+    strategy = word if word in ("handoff", "criu") else "relaunch"
     migration = MigrationPolicy(strategy, overlap=moves == "overlap") if moves else None
     restart = RestartPolicy("on-failure" if moves == "handoff, restarted" else "never")
     standby = StandbyPolicy(wanted=moves == "handoff, standby" and kind != "job")
@@ -97,12 +99,13 @@ class Play(RuleBasedStateMachine):
             strategies={
                 "relaunch": StartFirstOrStopFirst(timeout=3.0),
                 "handoff": HandOver(timeout=3.0),
+                "criu": Everywhere(seconds=1.0),
             },
         )  # fmt: skip
         self.cluster.state.keeping.policy = OneOther()
         for name in HOSTS:
             labels = {"arm": "yes"} if name == LABELLED else {}
-            machine = Machine(
+            machine = Portable(
                 name, memory=1000 * MIB, cpu=4.0, labels=labels,
                 max_processes=slots if name == "b" else 0,
             )  # fmt: skip
@@ -309,17 +312,14 @@ class Play(RuleBasedStateMachine):
 
     # --- nodes ---------------------------------------------------------------------------
 
-    def nodes(self) -> list[tuple[Machine, Node]]:
-        """Those of processes that move with their state."""
+    def nodes(self, *strategies: str) -> list[tuple[Machine, Node]]:
+        """Those of processes that move by these strategies; with their state, if none are named."""
         return [
             (machine, node)
             for machine, node in self.cluster.air.nodes()
-            if self.is_stateful(machine, node)
+            if machine.programs[node.instance].assignment.spec.migration.strategy
+            in (strategies or ("handoff",))
         ]
-
-    def is_stateful(self, machine: Machine, node: Node) -> bool:
-        spec = machine.programs[node.instance].assignment.spec
-        return spec.migration.strategy == "handoff"
 
     @precondition(lambda self: self.nodes())
     @rule(which=which_one, what=st.sampled_from([*QUIRKS, "none"]))
@@ -787,13 +787,15 @@ class Play(RuleBasedStateMachine):
             ]
             overlap = all(one.spec.migration.overlap and one.spec.migration.strategy
                           for one in running)  # fmt: skip
-            shadows = {one.migration.strategy for one in (o.spec for o in running)} == {"handoff"}
-            most = 2 if overlap or shadows else 1
+            strategies = {one.spec.migration.strategy for one in running}
+            silent = strategies in ({"handoff"}, {"criu"})  # all but one of them, see below
+            most = 2 if overlap or silent else 1
             most += any(one.spec.standby.wanted for one in running)
             assert len(running) <= most, [str(one.instance) for one in running]
-        for name in {node.instance.process for _, node in self.nodes()}:
+        moved = self.nodes("handoff", "criu")
+        for name in {node.instance.process for _, node in moved}:
             active = [
-                node for _, node in self.nodes()
+                node for _, node in moved
                 if node.instance.process == name and node.instance.number not in left
             ]  # fmt: skip
             assert sum(node.active for node in active) <= 1, [str(one.instance) for one in active]
