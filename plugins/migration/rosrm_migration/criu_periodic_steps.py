@@ -72,7 +72,7 @@ def _dump_away(asked: Asked, pid: int, control: Path, slot: Path) -> tuple[Manif
         left = time.monotonic()
         with without_log_names():
             manifest = dumping.dump(
-                find(), pid, slot, leave="stopped", timeout=_seconds(asked, "dump"),
+                find(), pid, slot, leave="running", timeout=_seconds(asked, "dump"),
                 process=asked.process, instance=asked.source,
             )  # fmt: skip
     finally:
