@@ -162,16 +162,32 @@ def test_a_source_that_is_waited_for_and_has_ended_starts_anew() -> None:
 
 
 def test_a_source_s_host_that_is_silent_for_a_while_is_waited_for() -> None:
-    """It may be called back: nothing is given up before it counts as lost."""
+    """Its node is called back then: nothing is given up before the host counts as lost."""
     cluster = story("elsewhere")
     first = cluster["p"].owner
+
+    def fail(arguments: Any) -> None:
+        raise OSError("the transfer was cut")
+
+    host(cluster, "b").executors[FETCH] = fail
     move_and_lose(cluster, FETCH, of="b", lost="a", heard=True)
-    host(cluster, "b").befalls[FETCH] = lambda: None
-    wait(cluster, LEASE - 4.0)
+    wait(cluster, LEASE - 3.0)
     back(cluster, "a")
     assert not cluster.told("given_up")
-    assert heard(cluster) == ["b"] or cluster["p"].owner == first
-    runs_alone(cluster, "a", "b")
+    runs_alone(cluster, "a")
+    assert cluster["p"].owner == first
+
+
+def test_the_end_of_a_source_whose_host_is_silent_for_a_while_is_waited_for() -> None:
+    """The node runs at the destination meanwhile."""
+    cluster = story("elsewhere")
+    move_and_lose(cluster, JOIN, of="b", lost="a", heard=True)
+    wait(cluster, LEASE - 3.0)
+    assert ("p" in cluster.state.runs, heard(cluster)) == (True, ["b"])
+    back(cluster, "a")
+    assert not cluster.told("given_up")
+    runs_alone(cluster, "b")
+    nothing_else(cluster)
 
 
 def test_the_delay_of_its_policy_is_kept() -> None:
