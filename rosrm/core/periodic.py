@@ -50,6 +50,7 @@ class Dumped:
         size: its bytes.
         pause: seconds for which the process stood still.
         order: by which one is made just now; 0: none is.
+        asked: incarnation of the slave that was ordered so.
         trouble: why there is none, or no newer one.
     """
 
@@ -61,6 +62,7 @@ class Dumped:
     size: int = 0
     pause: float = 0.0
     order: int = 0
+    asked: int = 0
     trouble: str = ""
 
 
@@ -125,6 +127,8 @@ def _review(state: MasterState, process: Process, now: float) -> None:
     dumped = state.periodic.of.setdefault(
         number, Dumped(process.name, host.name, strategy.discard, now)
     )
+    if dumped.order and dumped.asked != host.description.incarnation:
+        dumped.order, dumped.since = 0, now  # it ended with the slave that was at it
     if dumped.order or not _may_be_dumped(state, process, owner):
         return
     pace, trouble = _pace(state, process, strategy, host, dumped)
@@ -181,7 +185,7 @@ def _order(
         _say_trouble(state, dumped, f"{type(error).__name__}: {error}", now)
         return
     state.periodic.last_order += 1
-    dumped.order = state.periodic.last_order
+    dumped.order, dumped.asked = state.periodic.last_order, owner.host.description.incarnation
     state.emit(
         Order(
             dumped.order, owner.host.host_id, "execute", executor=step.executor,

@@ -68,7 +68,7 @@ def test_processes_are_spread_over_the_hosts():
 
 
 def test_a_process_that_stood_still_for_long_runs_for_longer():
-    """Twenty times as long; a quick one is dumped as often as it asks."""
+    """So that it is away for 5 % of the time; a quick one is dumped as often as it asks."""
     policy = OtherHost(OtherHostOptions())
     spec = ProcessSpec("p", command=("true",))
     assert policy.pace(MemoryView(spec, "h0", 60.0, 0, 0.0)) == 60.0

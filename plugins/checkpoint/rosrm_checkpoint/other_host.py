@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import zlib
 from dataclasses import dataclass
-from typing import Final
 
-from rosrm.config.units import PositiveCount, PositiveSeconds
+from rosrm.config.units import Fraction, PositiveCount, PositiveSeconds
 from rosrm.ports import CheckpointChoice, CheckpointView, MemoryView
-
-#: Times the pause for a dump of its memory that a process goes on before the next: 5 % of the time.
-_WORTH: Final = 20.0
 
 
 @dataclass(frozen=True)
@@ -21,11 +17,18 @@ class OtherHostOptions:
         every: seconds between two transfers to a host, at least.
         copies: hosts that keep a state, beside the process's own.
         apart_by: label in which they are to differ from it, as far as such hosts are up; "": none.
+        away: part of its time that a process may be away for checkpoints of its memory, at most.
     """
 
     every: PositiveSeconds = 1.0
     copies: PositiveCount = 1
     apart_by: str = ""
+    away: Fraction = 0.05
+
+    def __post_init__(self) -> None:
+        """Refuse a part that leaves no time for one."""
+        if not 0.0 < self.away <= 1.0:
+            raise ValueError(f"away is {self.away:g}; allowed: more than 0, at most 1")
 
 
 class OtherHost:
@@ -47,7 +50,7 @@ class OtherHost:
 
     def pace(self, process: MemoryView) -> float:
         """As the process asks, but no faster than it can be borne."""
-        return max(process.asked, _WORTH * process.pause)
+        return max(process.asked, process.pause / self._options.away)
 
     def _rank(self, name: str, process: CheckpointView) -> tuple[bool, int, int]:
         """Lower goes first."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping
 from typing import Any
 
@@ -211,3 +212,25 @@ def test_a_restarted_master_goes_on():
     cluster.wait(30.0)
     assert len(host.dumps) > made
     assert len({dump["attempt"] for dump in host.dumps}) == len(host.dumps)
+
+
+class Lossy(deque):
+    """Orders on their way, of which those for a dump get lost."""
+
+    def append(self, order: Any) -> None:
+        if order.executor != "criu_dump":
+            super().append(order)
+
+
+def test_one_that_ended_with_its_slave_is_not_waited_for():
+    """The next slave is asked at the same pace, though no answer ever comes."""
+    host = Host()
+    cluster = running(Pacing(), host)
+    host.machine.ordered = Lossy()
+    cluster.wait(20.0)
+    assert (host.dumps, len(cluster.orders("execute"))) == ([], 2)
+    host.machine.ordered = deque()
+    host.machine.restart_slave(cluster.now)
+    cluster.register(host.machine)
+    cluster.wait(15.0)
+    assert len(host.dumps) == 1
