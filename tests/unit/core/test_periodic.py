@@ -230,6 +230,9 @@ def test_one_that_ended_with_its_slave_is_not_waited_for():
     cluster.wait(20.0)
     assert (host.dumps, len(cluster.orders("execute"))) == ([], 2)
     host.machine.ordered = deque()
+    host.machine.connected = False
+    cluster.wait(1.5)  # else its name is still taken
+    host.machine.connected = True
     host.machine.restart_slave(cluster.now)
     cluster.register(host.machine)
     cluster.wait(15.0)
