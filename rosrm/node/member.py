@@ -342,15 +342,17 @@ class Member:
         """Nanoseconds until each timer is due, in the order of creation; -1: cancelled."""
         return [timer.due_ns() for timer in self.timers]
 
-    def become_active(self, timers_due: list[float | None], announce: Callable[[], None]) -> None:
+    def become_active(
+        self, timers_due: list[float | None], announce: Callable[[], None],
+        settle: Callable[[], None] | None = None,
+    ) -> None:  # fmt: skip
         """Go on: first say so, then serve what was kept.
 
         Args:
             timers_due: seconds until each timer is due, negative where it is late; None: it was
                 cancelled. Timers beyond the list start now.
             announce: called at once, as serving may take long.
-
-        Timers and services go on after the first slice of what was kept.
+            settle: called after the first slice of what was kept, when timers and services go on.
         """
         self.mode = Mode.ACTIVE
         self._gate.is_open = True
@@ -362,6 +364,8 @@ class Member:
             self._start_timers(timers_due, time.monotonic() - begun)
             for opening in self._openings:
                 opening.open()
+            if settle is not None:
+                settle()
 
         self._replay.begin(after_first=go_on)
 
