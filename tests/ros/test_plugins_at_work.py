@@ -128,9 +128,15 @@ def probes(*names: str) -> dict:
     return {"memory": {}, "cpu": {}, **{name: {} for name in names}}
 
 
-def test_a_third_party_s_probe_is_read(make_cluster, third_party) -> None:
+@pytest.fixture(scope="module")
+def cluster(make_shared, third_party):
+    """One host with all of these probes, and a limit on the one that works."""
+    names = ("battery", "fails", "sleeps", "nan_probe", "absent_one", "broken_one")
+    return make_shared(host("h0", probes=probes(*names), limits={"battery": 0.5}))
+
+
+def test_a_third_party_s_probe_is_read(cluster) -> None:
     """Its resource is one like any other: with a limit, in the rows, in what a process needs."""
-    cluster = make_cluster(host("h0", probes=probes("battery"), limits={"battery": 0.5}))
 
     def shown(view) -> bool:
         battery = next(r for row in view.hosts for r in row.resources if r.name == "battery")
@@ -145,34 +151,36 @@ def test_a_third_party_s_probe_is_read(make_cluster, third_party) -> None:
 
 
 @pytest.mark.parametrize("name", ["fails", "sleeps", "nan_probe"])
-def test_a_probe_that_fails_is_stale_never_zero(make_cluster, third_party, name) -> None:
+def test_a_probe_that_fails_is_stale_never_zero(cluster, name) -> None:
     """Without a limit on it the host works on; with one it takes nothing until it is mended."""
-    cluster = make_cluster(host("h0", probes=probes(name)))
-    assert cluster.run(job("works", "true"))[0].state == "finished"
+    works, waits, limited = f"works-{name}", f"waits-{name}", f"limited-{name}"
+    assert cluster.run(job(works, "true"))[0].state == "finished"
     wait_until(lambda: name in cluster.log_of("h0"), f"a word of h0 about {name}")
     assert "Traceback" not in cluster.log_of("h0")
 
-    cluster.start_slave(host("h1", probes=probes(name), limits={name: 0.9}))
+    part = cluster.start_slave(host(limited, probes=probes(name), limits={name: 0.9}))
 
     def stale(view) -> bool:
-        rows = [row for row in view.hosts if row.description.name == "h1"]
+        rows = [row for row in view.hosts if row.description.name == limited]
         return any(r.stale and r.usage > 0.0 for row in rows for r in row.resources)
 
-    cluster.wait_until(f"{name} stale on h1", stale)
+    cluster.wait_until(f"{name} stale on {limited}", stale)
     cluster.client.set_host_state("h0", "cordon")
-    cluster.submit(job("waits", "true"))
+    cluster.submit(job(waits, "true"))
     deadline = time.monotonic() + 1.0
     while time.monotonic() < deadline:
         cluster.client.spin(0.1)
-        assert cluster.process("waits").state in ("queued", "set_aside")
-    assert not cluster.host("h1").accepting
-    cluster.cancel("waits")
+        assert cluster.process(waits).state in ("queued", "set_aside")
+    assert not cluster.host(limited).accepting
+    cluster.cancel(waits)
+    cluster.client.set_host_state("h0", "uncordon")
+    part.end()
+    assert part.process.wait(PATIENCE) == 0
 
 
-def test_a_probe_that_is_absent_or_broken_is_listed(make_cluster, third_party) -> None:
+def test_a_probe_that_is_absent_or_broken_is_listed(cluster) -> None:
     """With its reason; the host works with the others."""
-    cluster = make_cluster(host("h0", probes=probes("absent_one", "broken_one")))
-    rows = {row.name: row for row in cluster.client.list(plugins=True).plugins if row.host}
+    rows = {row.name: row for row in cluster.client.list(plugins=True).plugins if row.host == "h0"}
     assert (rows["absent_one"].state, rows["absent_one"].reason) == (
         "absent", "no such hardware here",
     )  # fmt: skip
@@ -201,9 +209,8 @@ def test_a_strategy_that_gives_no_plan(make_cluster, third_party) -> None:
 # --- at start ---------------------------------------------------------------------------------
 
 
-def test_a_plugin_that_does_not_import_is_listed_as_broken(make_cluster, third_party) -> None:
+def test_a_plugin_that_does_not_import_is_listed_as_broken(cluster) -> None:
     """With what is missing; everything else works."""
-    cluster = make_cluster(host("h0"))
     broken = [row for row in cluster.client.list(plugins=True).plugins if row.state == "broken"]
     assert any("no_such_module_at_all" in row.reason for row in broken)
 
