@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import signal
 import socket
 from pathlib import Path
 from typing import Any
@@ -52,7 +53,10 @@ class Slave:
         arguments = {
             "process": "p", "source": source, "destination": destination, "timeout": TIMEOUT,
             "attempt": f"p#{source}-{destination}", "results": self.results, **more,
-            "here": {"host": "here", "state": str(self.state), "pids": self.pids},
+            "here": {
+                "host": "here", "state": str(self.state), "pids": self.pids,
+                "instances": list(self.pids),
+            },
         }  # fmt: skip
         answer = getattr(steps, step)(arguments)
         json.dumps(answer)
@@ -242,6 +246,18 @@ def test_a_restored_process_is_not_put_back(slave, counter):
     slave.end(restored)
     shutil.rmtree(incoming(slave.state, 2), ignore_errors=True)
     assert slave.ask("put_back") == {"active": True}
+
+
+def test_a_restored_process_that_ended_at_once_is_not_put_back(slave, counter):
+    """Its image was used up, however short its life was: it is not restored a second time."""
+    checkpointed(slave, counter)
+    slave.ask("take")
+    restored = slave.hold()
+    eventually(lambda: outcome.read(incoming(slave.state, 2)), "the restore")
+    os.kill(tree.root_of(restored.pid), signal.SIGKILL)
+    restored.process.wait(TIMEOUT)
+    assert slave.ask("put_back") == {"active": True}
+    nothing_left(slave)
 
 
 def test_a_slave_that_was_started_again_keeps_the_ports(slave, counter):
