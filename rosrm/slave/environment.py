@@ -47,6 +47,8 @@ class Whereabouts:
         keep_every: seconds by which a kept state may be behind.
         portable: directory below which portable nodes are asked to leave and to join; it has the
             same path on all hosts. None: none is asked.
+        slave: number by chance of this run of it: who is of another cluster of the same name, and
+            shares that directory, is spoken to apart.
     """
 
     host: str
@@ -55,6 +57,7 @@ class Whereabouts:
     kept: Path | None = None
     keep_every: float = 1.0
     portable: Path | None = None
+    slave: int = 0
 
 
 def kept_directory(kept: Path, process: str) -> Path:
@@ -90,7 +93,7 @@ def process_environment(
         environment[KEEP] = str(kept_directory(where.kept, spec.name))
         environment[KEEP_EVERY] = f"{where.keep_every:g}"
     if spec.portable and where.portable is not None:
-        own = token(f"{where.cluster} {assignment.instance}")
+        own = token(f"{assignment.instance} {where.cluster} {where.slave:x}")
         environment[PORTABLE] = str(where.portable / own)
     environment["PYTHONUNBUFFERED"] = "1"
     environment.update(spec.environment)

@@ -82,6 +82,7 @@ class SlaveRuntime:
 
     def __init__(self, config: HostConfig, registry: Registry) -> None:
         self._config = config
+        self._incarnation = _random_number()
         self._stopping = ""
         self._left = False
         self._shutting_down = False
@@ -151,7 +152,7 @@ class SlaveRuntime:
     def _description(self, absent: Mapping[str, str]) -> HostDescription:
         config = self._config
         return HostDescription(
-            name=config.host, incarnation=_random_number(), hostname=socket.gethostname(),
+            name=config.host, incarnation=self._incarnation, hostname=socket.gethostname(),
             pid=os.getpid(), software_version=__version__, labels=config.labels,
             resources=tuple(self._sampler.resources), max_processes=config.max_processes,
             period=config.period, executors=tuple(self._executors), absent=absent,
@@ -324,6 +325,7 @@ class SlaveRuntime:
             self._kept,
             self._config.keep.every,
             control_root(os.geteuid()),
+            self._incarnation,
         )
         for assignment in assignments:
             held = self._state.held[assignment.instance]

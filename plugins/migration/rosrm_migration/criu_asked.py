@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import re
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -32,6 +32,7 @@ class Asked:
         host: name of this one.
         state: directory of its slave.
         pids: of the leaders of the instances that run here, by `process#number`.
+        instances: so named, all that have not ended here.
         results: what the executors of earlier steps have answered, by their names.
         arguments: all that was told.
     """
@@ -44,6 +45,7 @@ class Asked:
     host: str
     state: Path
     pids: Mapping[str, int]
+    instances: Sequence[str]
     results: Mapping[str, Any]
     arguments: Mapping[str, Any]
 
@@ -54,7 +56,8 @@ class Asked:
         return cls(
             str(arguments["process"]), int(arguments["source"]), int(arguments["destination"]),
             str(arguments["attempt"]), float(arguments["timeout"]), str(here["host"]),
-            Path(here["state"]), here["pids"], arguments.get("results", {}), arguments,
+            Path(here["state"]), here["pids"], here["instances"], arguments.get("results", {}),
+            arguments,
         )  # fmt: skip
 
     def pid(self, number: int) -> int:

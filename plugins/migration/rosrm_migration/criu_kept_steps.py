@@ -111,6 +111,7 @@ def take(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
     source, target = kept(asked.state, asked.source), incoming(asked.state, asked.destination)
     image.read(source)
     luggage.discard(target)
+    luggage.forget_restored(asked.state, asked.instances)
     try:
         target.mkdir(mode=0o700)
         shutil.copytree(source, target, copy_function=_link, dirs_exist_ok=True)

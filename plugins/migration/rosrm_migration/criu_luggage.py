@@ -186,12 +186,16 @@ def remove_unused_later(directory: Path, keep: float) -> None:
 
 def remove_unused(directory: Path) -> None:
     """Remove an image unless a process was restored from it."""
+    if not _was_restored(directory):
+        discard(directory)
+
+
+def _was_restored(directory: Path) -> bool:
     try:
         told = outcome.read(directory)
     except CriuError:
-        told = None
-    if told is None or told.reason:
-        discard(directory)
+        return False
+    return told is not None and not told.reason
 
 
 # --- both -------------------------------------------------------------------------------------
@@ -207,16 +211,34 @@ def sweep(state: Path, instances: Iterable[str]) -> None:
 
     Args:
         state: of the slave.
-        instances: `process#number` of each that runs here.
+        instances: `process#number` of each that has not ended here.
     """
-    here = {int(one.rpartition("#")[2]) for one in instances}
     with _changing:
         for number in _numbers(state, "out"):
             if number not in _senders:
                 discard(outgoing(state, number))
+    forget_restored(state, instances)
+    here = set(map(number_of, instances))
     for number in _numbers(state, "in"):
         if number not in here:
             remove_unused_later(incoming(state, number), _LEFT_BEHIND)
+
+
+def forget_restored(state: Path, instances: Iterable[str]) -> None:
+    """Remove what says of instances that were restored, and have ended, that they were.
+
+    Their supervisor needs it to start them again, and nobody afterwards. As `sweep`.
+    """
+    here = set(map(number_of, instances))
+    for number in _numbers(state, "in"):
+        directory = incoming(state, number)
+        if number not in here and _was_restored(directory):
+            discard(directory)
+
+
+def number_of(instance: str) -> int:
+    """Of `process#number`."""
+    return int(instance.rpartition("#")[2])
 
 
 def _numbers(state: Path, way: str) -> list[int]:

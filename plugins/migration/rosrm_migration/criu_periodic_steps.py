@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
-from rosrm.criu import dumping, periodic, places, ties, tree
+from rosrm.criu import dumping, image, periodic, places, ties, tree
 from rosrm.criu.image import Manifest
 from rosrm.criu.periodic import Rejoin
 from rosrm.criu.program import find
@@ -49,6 +50,8 @@ def _dump(asked: Asked) -> Mapping[str, Any]:
         manifest, left = _dump_away(asked, pid, control, slot)
         dumped = time.monotonic()
         status = await_joined(control, asked.attempt, _seconds(asked, "join"), root)
+        joined = time.monotonic()
+        _add_checksums(slot, manifest)
     except BaseException:  # whatever it was: the image is of no use
         shutil.rmtree(slot, ignore_errors=True)
         if has_failed(control):  # it can never join: its policy goes on, from the image before
@@ -60,7 +63,7 @@ def _dump(asked: Asked) -> Mapping[str, Any]:
     return {
         "size": manifest.size, "missing": list(status.missing),
         "seconds": {
-            "prepare": left - began, "dump": dumped - left, "join": time.monotonic() - dumped,
+            "prepare": left - began, "dump": dumped - left, "join": joined - dumped,
         },
     }  # fmt: skip
 
@@ -73,11 +76,17 @@ def _dump_away(asked: Asked, pid: int, control: Path, slot: Path) -> tuple[Manif
         with without_log_names():
             manifest = dumping.dump(
                 find(), pid, slot, leave="running", timeout=_seconds(asked, "dump"),
-                process=asked.process, instance=asked.source,
+                process=asked.process, instance=asked.source, checksums=False,
             )  # fmt: skip
     finally:
         call_back(pid, control, asked.attempt)
     return manifest, left
+
+
+def _add_checksums(slot: Path, manifest: Manifest) -> None:
+    """It reads the whole image: nobody is away for that."""
+    checksums = image.file_checksums(slot, manifest.sizes)
+    image.write(slot, replace(manifest, checksums=checksums))
 
 
 def _seconds(asked: Asked, part: str) -> float:
@@ -90,7 +99,7 @@ def _seconds(asked: Asked, part: str) -> float:
 def sweep(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
     """Remove the images of instances that have ended."""
     here = arguments["here"]
-    state, living = Path(here["state"]), set(_numbers(here["instances"]))
+    state, living = Path(here["state"]), set(map(luggage.number_of, here["instances"]))
     for number in places.periodic_numbers(state):
         if number not in living:
             luggage.discard(places.periodic(state, number))
@@ -108,7 +117,7 @@ def call_back_all(state: Path, pids: Mapping[str, int]) -> None:
         CriuError: one of them is still being dumped.
     """
     for instance, pid in pids.items():
-        (number,) = _numbers([instance])
+        number = luggage.number_of(instance)
         away = places.periodic(state, number) / _AWAY
         if away.exists() and not luggage.is_busy(number):
             _await_end_of_dump(instance, pid)
@@ -125,7 +134,3 @@ def _await_end_of_dump(instance: str, pid: int) -> None:
                 f"{instance} is still being dumped after {_PATIENCE:g} s, by process {tracer}"
             )
         time.sleep(_LOOK)
-
-
-def _numbers(instances: Iterable[str]) -> list[int]:
-    return [int(one.rpartition("#")[2]) for one in instances]

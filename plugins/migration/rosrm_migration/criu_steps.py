@@ -39,10 +39,11 @@ def say_ability(arguments: Answer) -> Answer:
 
     A slave is asked for it when it has registered: what one before it has left, goes.
     """
-    state, pids = Path(arguments["here"]["state"]), arguments["here"]["pids"]
-    luggage.sweep(state, pids)
+    here = arguments["here"]
+    state = Path(here["state"])
+    luggage.sweep(state, here["instances"])
     criu_periodic_steps.sweep(arguments)
-    criu_periodic_steps.call_back_all(state, pids)
+    criu_periodic_steps.call_back_all(state, here["pids"])
     reserve_all(state)
     found = ability()
     if not found.works:
@@ -180,6 +181,7 @@ def _fetch(asked: Asked) -> Answer:
         raise PortableError(f"{control} is no control directory of user {uid}")
     directory = incoming(asked.state, asked.destination)
     luggage.discard(directory)
+    luggage.forget_restored(asked.state, asked.instances)
     fetcher = luggage.take_fetcher(asked.destination)
     if fetcher is None:
         raise CriuError(

@@ -337,15 +337,18 @@ def test_a_node_is_told_by_which_name_it_is_known():
 
 
 def test_a_portable_node_is_told_where_it_is_asked_to_leave(tmp_path):
-    """Each instance of each cluster has a directory of its own; others are told nothing."""
+    """Each instance has a directory of its own; others are told nothing.
+
+    Nor is it that of another cluster, not even of the same name.
+    """
     where = replace(HERE, portable=tmp_path)
     moves = {"migration": MigrationPolicy(strategy="criu"), "ros": True}
     made = process_environment(assignment(command=("x",), **moves), {}, where)
-    other = process_environment(
-        assignment(command=("x",), **moves), {}, replace(where, cluster="other")
-    )
-    assert Path(made["ROSRM_PORTABLE"]).parent == Path(other["ROSRM_PORTABLE"]).parent == tmp_path
-    assert made["ROSRM_PORTABLE"] != other["ROSRM_PORTABLE"]
+    for elsewhere in (replace(where, cluster="other"), replace(where, slave=7)):
+        other = process_environment(assignment(command=("x",), **moves), {}, elsewhere)
+        for told in (made, other):
+            assert Path(told["ROSRM_PORTABLE"]).parent == tmp_path
+        assert made["ROSRM_PORTABLE"] != other["ROSRM_PORTABLE"]
     assert "ROSRM_PORTABLE" not in process_environment(assignment(command=("x",)), made, where)
 
 
