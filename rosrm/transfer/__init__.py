@@ -16,7 +16,7 @@ docs/decisions/0025-image-transfer.md says why it is as it is.
 """
 
 from rosrm.transfer.form import Fetched, Offer, Sent
-from rosrm.transfer.starting import DEFAULT_RATE, DEFAULT_RESERVE, Fetcher, Sender, fetch, missing
+from rosrm.transfer.starting import DEFAULT_RATE, DEFAULT_RESERVE, Fetcher, Sender, missing
 
 __all__ = [
     "DEFAULT_RATE",
@@ -26,6 +26,5 @@ __all__ = [
     "Offer",
     "Sender",
     "Sent",
-    "fetch",
     "missing",
 ]

@@ -1,9 +1,9 @@
 """The process of one transfer: `python -m rosrm.transfer send` or `… fetch`.
 
 It reads a line of JSON from standard input, works, and answers with lines of JSON on standard
-output. Before that it may be asked whether it is ready, and before it fetches for the certificate
-that it will show. It ends when standard input does: so it outlives neither its work nor who started
-it.
+output. Before that it may be asked whether it is ready, and before it fetches it is asked for the
+certificate that it will show. It ends when standard input does: so it outlives neither its work nor
+who started it.
 """
 
 from __future__ import annotations
@@ -79,6 +79,7 @@ async def _serve(asked: dict[str, Any]) -> Mapping[str, Any]:
 
 
 def _fetch(asked: dict[str, Any]) -> Mapping[str, Any]:
+    from rosrm.transfer.certificate import new_identity  # noqa: PLC0415
     from rosrm.transfer.receiving import receive  # noqa: PLC0415
 
     def stop(*_: object) -> None:
@@ -89,16 +90,14 @@ def _fetch(asked: dict[str, Any]) -> Mapping[str, Any]:
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
 
     signal.signal(signal.SIGTERM, stop)
-    identity = None
-    if "introduce" in asked:
-        from rosrm.transfer.certificate import new_identity  # noqa: PLC0415
-
-        identity = new_identity()
-        _say({"certificate": identity.certificate})
-        line = sys.stdin.readline()
-        if not line:
-            raise TransferError("the fetch was stopped before it began")
-        asked = json.loads(line)
+    if "introduce" not in asked:
+        raise TransferError("the destination was not introduced: nobody would speak with it")
+    identity = new_identity()
+    _say({"certificate": identity.certificate})
+    line = sys.stdin.readline()
+    if not line:
+        raise TransferError("the fetch was stopped before it began")
+    asked = json.loads(line)
     threading.Thread(target=_stop_when_input_ends, daemon=True).start()
     offer, target = Offer.from_json(asked.pop("offer")), Path(asked.pop("target"))
     return receive(offer, target, **asked, identity=identity, before_placing=ignore).as_json()

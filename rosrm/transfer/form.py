@@ -45,8 +45,7 @@ class Offer:
         files: how many there are.
         length: bytes of the archive, uncompressed: what has to have room.
         seconds: that it stands from when it was made.
-        to: SHA-256 of the certificate of the only destination that may fetch it; "": whoever has
-            the token.
+        to: SHA-256 of the certificate of the only destination that may fetch it.
         digest: how the archive's checksum is computed.
         version: of this description and of the stream.
     """
@@ -59,7 +58,7 @@ class Offer:
     files: int
     length: int
     seconds: float
-    to: str = ""
+    to: str
     digest: str = DIGEST
     version: int = VERSION
 
@@ -94,8 +93,8 @@ class Offer:
             and 0 < self.port < 1 << 16
             and type(self.seconds) in (int, float)
             and self.digest == DIGEST
-            and bool(not self.to or _HEX.fullmatch(self.to))
-            and bool(self.addresses and self.token and _HEX.fullmatch(self.fingerprint))
+            and bool(self.addresses and self.token)
+            and bool(_HEX.fullmatch(self.fingerprint) and _HEX.fullmatch(self.to))
             and all(map(_is_address, self.addresses))
         )
 

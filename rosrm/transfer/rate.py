@@ -1,4 +1,4 @@
-"""Paces what is sent or read, so that others have the rest of the network. Pure."""
+"""Paces what is sent, so that others have the rest of the network. Pure."""
 
 from __future__ import annotations
 

@@ -23,8 +23,8 @@ _ROUNDING: Final = 4096
 
 
 def receive(
-    offer: Offer, target: Path, *, timeout: float, max_rate: float, reserve: int,
-    identity: Identity | None, before_placing: Callable[[], None],
+    offer: Offer, target: Path, *, timeout: float, reserve: int, identity: Identity,
+    before_placing: Callable[[], None],
 ) -> Fetched:  # fmt: skip
     """Fetch a directory.
 
@@ -32,20 +32,19 @@ def receive(
         offer: of the source.
         target: where it shall be; nothing may be there.
         timeout: seconds for all of it.
-        max_rate: bytes a second that are read, as compressed; 0: there is no bound.
         reserve: bytes that stay free on the file system.
-        identity: that the source was told of, if it was.
+        identity: that the source was told of.
         before_placing: called when all is here and whole, before the target appears.
 
     Raises:
         TransferError: it cannot be had, or not whole; nothing of it is left.
     """
     began = time.monotonic()
-    if offer.to and (identity is None or identity.fingerprint != offer.to):
+    if identity.fingerprint != offer.to:
         raise TransferError("what is offered is for another destination than this one")
     with contextlib.closing(Landing(target)) as landing:
         landing.require(offer.length + offer.files * _ROUNDING, reserve)
-        stream = Stream(offer, timeout=timeout, max_rate=max_rate, identity=identity)
+        stream = Stream(offer, timeout=timeout, identity=identity)
         with contextlib.closing(stream):
             try:
                 files = unpack(stream, landing.path)

@@ -5,7 +5,7 @@
 
 Both with `Authorization: Bearer TOKEN` and a number that the reader has drawn (`Rosrm-Reader`). The
 first reader that brings the token is the only one: it may go on where its connection broke, and
-nobody else begins again. Where the destination has introduced itself, no other is spoken with.
+nobody else begins again. No other than the destination that was introduced is spoken with.
 """
 
 from __future__ import annotations
@@ -138,14 +138,13 @@ def _context(identity: Identity, to: str) -> ssl.SSLContext:
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.minimum_version = ssl.TLSVersion.TLSv1_3
     identity.load_into(context)
-    if to:
-        context.verify_mode = ssl.CERT_REQUIRED
-        context.load_verify_locations(cadata=to)
+    context.verify_mode = ssl.CERT_REQUIRED
+    context.load_verify_locations(cadata=to)
     return context
 
 
 async def serve(
-    directory: Path, *, seconds: float, max_rate: float, loopback: bool, to: str,
+    directory: Path, *, seconds: float, max_rate: float, to: str,
     announce: Callable[[Offer], None], withdrawn: asyncio.Event,
 ) -> Sent:  # fmt: skip
     """Offer a directory, and wait until that is over.
@@ -154,8 +153,7 @@ async def serve(
         directory: all of it is offered, as it is now.
         seconds: after which the offer ends.
         max_rate: bytes a second that go out, as compressed; 0: there is no bound.
-        loopback: listen for this host alone.
-        to: the certificate of the only one who may fetch it, in PEM; "": whoever has the token.
+        to: the certificate of the only one who may fetch it, in PEM.
         announce: told of the offer once it can be fetched.
         withdrawn: set to end it.
 
@@ -164,7 +162,7 @@ async def serve(
     """
     archive = Archive(directory)
     try:
-        only = fingerprint_of(to) if to else ""
+        only = fingerprint_of(to)
     except ValueError:
         raise TransferError("what came as the destination's certificate is none") from None
     identity = new_identity()
@@ -175,11 +173,11 @@ async def serve(
     runner = web.AppRunner(application, access_log=None, shutdown_timeout=_FAREWELL)
     await runner.setup()
     try:
-        listener = socket.create_server((_LOOPBACK if loopback else "", 0))
+        listener = socket.create_server(("", 0))
         await web.SockSite(runner, listener, ssl_context=_context(identity, to)).start()
         announce(
             Offer(
-                addresses=(_LOOPBACK,) if loopback else own_addresses() or (_LOOPBACK,),
+                addresses=own_addresses() or (_LOOPBACK,),
                 port=listener.getsockname()[1],
                 fingerprint=identity.fingerprint,
                 token=token,

@@ -140,18 +140,15 @@ class Sender(_End):
         self._sent: Sent | None = None
 
     def offer(
-        self, directory: Path, *, seconds: float, max_rate: float = DEFAULT_RATE,
-        to: str = "", loopback: bool = False,
-    ) -> Offer:  # fmt: skip
+        self, directory: Path, *, seconds: float, to: str, max_rate: float = DEFAULT_RATE
+    ) -> Offer:
         """Offer a directory, once.
 
         Args:
             directory: of files and directories; it stays, and must not change meanwhile.
             seconds: after which the offer ends.
+            to: what the destination's `Fetcher.introduce` said: it alone may fetch.
             max_rate: bytes a second that go out, as compressed; 0: there is no bound.
-            to: what the destination's `Fetcher.introduce` said: it alone may fetch then; "":
-                whoever brings the offer's token.
-            loopback: to this host alone.
 
         Raises:
             TransferError: the directory cannot be offered.
@@ -159,7 +156,7 @@ class Sender(_End):
         self._begin()
         asked = {
             "directory": str(directory.absolute()), "seconds": seconds, "max_rate": max_rate,
-            "loopback": loopback, "to": to,
+            "to": to,
         }  # fmt: skip
         return Offer.from_json(self._ask(asked, _START))
 
@@ -204,16 +201,16 @@ class Fetcher(_End):
         return str(self._ask({"introduce": True}, _START)["certificate"])
 
     def fetch(
-        self, offer: Offer, target: Path, *, timeout: float, max_rate: float = 0.0,
-        reserve: int = DEFAULT_RESERVE,
-    ) -> Fetched:  # fmt: skip
+        self, offer: Offer, target: Path, *, timeout: float, reserve: int = DEFAULT_RESERVE
+    ) -> Fetched:
         """Fetch what a source offers; for the owner alone (0700, 0600), or nothing of it.
+
+        The source was told of this end by what `introduce` gave.
 
         Args:
             offer: as the source has made it.
             target: where the directory shall be; nothing may be there.
             timeout: seconds for all of it.
-            max_rate: bytes a second that are read, as compressed; 0: the source's bound alone.
             reserve: bytes that stay free on the file system of the target.
 
         Raises:
@@ -222,19 +219,10 @@ class Fetcher(_End):
         self._begin()
         asked = {
             "offer": offer.as_json(), "target": str(target.absolute()), "timeout": timeout,
-            "max_rate": max_rate, "reserve": reserve,
+            "reserve": reserve,
         }  # fmt: skip
         return Fetched(**self._ask(asked, timeout + _START))
 
     def close(self) -> None:
         """Stop it; a fetch under way raises `TransferError` and leaves nothing."""
         self._end()
-
-
-def fetch(
-    offer: Offer, target: Path, *, timeout: float, max_rate: float = 0.0,
-    reserve: int = DEFAULT_RESERVE,
-) -> Fetched:  # fmt: skip
-    """Fetch a directory, as `Fetcher.fetch`, by a process that is started for it."""
-    with Fetcher() as fetcher:
-        return fetcher.fetch(offer, target, timeout=timeout, max_rate=max_rate, reserve=reserve)

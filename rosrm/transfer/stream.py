@@ -15,7 +15,6 @@ from urllib3.exceptions import HTTPError, NewConnectionError, SSLError
 from rosrm.errors import TransferError
 from rosrm.transfer.addresses import nearest_first
 from rosrm.transfer.form import DIGEST_SIZE, READER_HEADER, Offer, new_digest
-from rosrm.transfer.rate import Pace
 from rosrm.transfer.zstd import ZstdDecompressor, ZstdError
 
 if TYPE_CHECKING:
@@ -47,8 +46,7 @@ class Stream:
     Args:
         offer: of the source.
         timeout: seconds for all of it.
-        max_rate: bytes a second that are read, as compressed; 0: there is no bound.
-        identity: to show to the source; None: it was told of none.
+        identity: to show to the source, which was told of it.
 
     Attributes:
         address: of the source, once it was reached.
@@ -56,13 +54,10 @@ class Stream:
         resumed: times that a broken connection was made again.
     """
 
-    def __init__(
-        self, offer: Offer, *, timeout: float, max_rate: float, identity: Identity | None
-    ) -> None:
+    def __init__(self, offer: Offer, *, timeout: float, identity: Identity) -> None:
         self._offer = offer
         self._timeout = timeout
         self._deadline = time.monotonic() + timeout
-        self._pace = Pace(max_rate)
         self._context = _context(identity)
         self._addresses = list(nearest_first(offer.addresses))
         self._headers = {
@@ -165,7 +160,6 @@ class Stream:
         if not packed:
             raise _Broken("the stream ended too soon")
         self.received += len(packed)
-        time.sleep(self._pace.wait(len(packed), time.monotonic()))
         return packed
 
     def _connect(self) -> None:
@@ -234,13 +228,12 @@ class Stream:
         )
 
 
-def _context(identity: Identity | None) -> ssl.SSLContext:
+def _context(identity: Identity) -> ssl.SSLContext:
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.minimum_version = ssl.TLSVersion.TLSv1_3
     context.check_hostname = False  # urllib3 compares the fingerprint before it says anything
     context.verify_mode = ssl.CERT_NONE
-    if identity is not None:
-        identity.load_into(context)
+    identity.load_into(context)
     return context
 
 

@@ -27,7 +27,9 @@ from rosrm.transfer.landing import Landing
 from rosrm.transfer.rate import Pace
 from rosrm.transfer.unpacking import unpack
 
-OFFER = Offer(("10.0.0.2", "127.0.0.1"), 4711, "ab" * 32, "secret-token", 10, 2, 2560, 30.0)
+OFFER = Offer(
+    ("10.0.0.2", "127.0.0.1"), 4711, "ab" * 32, "secret-token", 10, 2, 2560, 30.0, to="cd" * 32
+)
 
 # --- offers -----------------------------------------------------------------------------------
 
@@ -58,6 +60,7 @@ def test_the_token_is_in_no_representation():
         ({"seconds": "long"}, "values"),
         ({"digest": "md5"}, "values"),
         ({"to": "AB"}, "values"),
+        ({"to": ""}, "values"),
         ({"to": None}, "values"),
         ({"more": 1}, "fields"),
     ],

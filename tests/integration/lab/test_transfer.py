@@ -25,7 +25,7 @@ directory.mkdir()
 content = os.urandom(int(sys.argv[2]))
 (directory / "pages").write_bytes(content)
 with Sender() as sender:
-    offer = sender.offer(directory, seconds=120.0, max_rate=3e6)
+    offer = sender.offer(directory, seconds=120.0, max_rate=3e6, to=sys.argv[3])
     print(json.dumps([offer.as_json(), hashlib.sha256(content).hexdigest()]), flush=True)
     print(json.dumps(sender.wait(120.0).as_json()), flush=True)
 """
@@ -33,11 +33,13 @@ _DESTINATION = """
 import hashlib, json, sys
 from pathlib import Path
 from rosrm.errors import TransferError
-from rosrm.transfer import Offer, fetch
+from rosrm.transfer import Fetcher, Offer
 target = Path(sys.argv[1])
+fetcher = Fetcher()
+print(json.dumps(fetcher.introduce()), flush=True)
 try:
-    offer = Offer.from_json(json.loads(sys.argv[2]))
-    fetched = fetch(offer, target, timeout=float(sys.argv[3]), reserve=0).as_json()
+    offer = Offer.from_json(json.loads(sys.stdin.readline()))
+    fetched = fetcher.fetch(offer, target, timeout=float(sys.argv[2]), reserve=0).as_json()
     digest = hashlib.sha256((target / "pages").read_bytes()).hexdigest()
 except TransferError as error:
     fetched, digest = {"error": str(error)}, ""
@@ -55,13 +57,17 @@ class Move:
     def __init__(self, lab, *, timeout: float) -> None:
         self.lab = lab
         self.target = f"{DATA}/tmp/target"
-        command = [sys.executable, "-c", _SOURCE, f"{DATA}/tmp/source", str(SIZE)]
-        self.source = lab.popen("host1", command, limited=False, stdout=subprocess.PIPE)
+        self.destination = self._run("host2", _DESTINATION, self.target, str(timeout))
+        certificate = json.loads(self.destination.stdout.readline())
+        self.source = self._run("host1", _SOURCE, f"{DATA}/tmp/source", str(SIZE), certificate)
         self.offer, self.digest = json.loads(self.source.stdout.readline())
-        command = [
-            sys.executable, "-c", _DESTINATION, self.target, json.dumps(self.offer), str(timeout)
-        ]  # fmt: skip
-        self.destination = lab.popen("host2", command, limited=False, stdout=subprocess.PIPE)
+        self.destination.stdin.write(json.dumps(self.offer).encode() + b"\n")
+        self.destination.stdin.flush()
+
+    def _run(self, host: str, code: str, *arguments: str) -> subprocess.Popen:
+        command = [sys.executable, "-c", code, *arguments]
+        pipe = subprocess.PIPE
+        return self.lab.popen(host, command, limited=False, stdin=pipe, stdout=pipe)
 
     def wait_until_it_flows(self) -> None:
         place = self.lab.outside("host2", f"{DATA}/tmp")

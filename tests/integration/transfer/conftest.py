@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from rosrm.transfer import Sender
-from tests.integration.transfer.trees import fill
+from rosrm.transfer import Fetcher, Sender
+from tests.integration.transfer.trees import Destination, fill
 
 
 @pytest.fixture
@@ -25,3 +25,14 @@ def target(tmp_path):
 def sender():
     with Sender() as sender:
         yield sender
+
+
+@pytest.fixture
+def fetcher():
+    with Fetcher() as fetcher:
+        yield fetcher
+
+
+@pytest.fixture
+def destination():
+    return Destination()

@@ -12,14 +12,14 @@ from pathlib import Path
 import pytest
 
 from rosrm.errors import TransferError
-from rosrm.transfer import Fetcher, Offer, Sender, Sent, fetch
+from rosrm.transfer import Fetcher, Offer, Sender, Sent
 from tests.integration.transfer.trees import PATIENCE, digests, listens, nothing_left, slowly, until
 
 
-def test_a_fetch_that_is_killed_leaves_no_half_target(source, target, sender):
+def test_a_fetch_that_is_killed_leaves_no_half_target(source, target, sender, fetcher, destination):
     """What it leaves is hidden, and removed by the next fetch beside it."""
-    offer = slowly(sender, source)
-    with Fetcher() as fetcher, ThreadPoolExecutor() as threads:
+    offer = slowly(sender, source, fetcher.introduce())
+    with ThreadPoolExecutor() as threads:
         going = threads.submit(fetcher.fetch, offer, target, timeout=PATIENCE)
         until("something has come", lambda: list(target.parent.glob(".rosrm-fetch-*/*")))
         fetcher._process.kill()
@@ -29,15 +29,17 @@ def test_a_fetch_that_is_killed_leaves_no_half_target(source, target, sender):
     assert len(list(target.parent.iterdir())) == 1
 
     with Sender() as again:
-        fetch(again.offer(source, seconds=PATIENCE), target, timeout=PATIENCE)
+        offer = again.offer(source, seconds=PATIENCE, to=destination.certificate)
+        destination.fetch(offer, target)
     assert [path.name for path in target.parent.iterdir()] == ["target"]
     assert digests(target) == digests(source)
 
 
-def test_a_fetch_can_be_stopped(source, target, sender):
+def test_a_fetch_can_be_stopped(source, target, sender, fetcher):
     """From another thread; nothing is left."""
-    with Fetcher() as fetcher, ThreadPoolExecutor() as threads:
-        going = threads.submit(fetcher.fetch, slowly(sender, source), target, timeout=PATIENCE)
+    offer = slowly(sender, source, fetcher.introduce())
+    with ThreadPoolExecutor() as threads:
+        going = threads.submit(fetcher.fetch, offer, target, timeout=PATIENCE)
         until("something has come", lambda: list(target.parent.glob(".rosrm-fetch-*/*")))
         fetcher.close()
         with pytest.raises(TransferError, match="stopped before all had come"):
@@ -45,9 +47,9 @@ def test_a_fetch_can_be_stopped(source, target, sender):
     assert nothing_left(target)
 
 
-def test_an_offer_can_be_withdrawn_in_mid_transfer(source, target, sender):
-    offer = slowly(sender, source)
-    with Fetcher() as fetcher, ThreadPoolExecutor() as threads:
+def test_an_offer_can_be_withdrawn_in_mid_transfer(source, target, sender, fetcher):
+    offer = slowly(sender, source, fetcher.introduce())
+    with ThreadPoolExecutor() as threads:
         going = threads.submit(fetcher.fetch, offer, target, timeout=PATIENCE)
         until("something has come", lambda: list(target.parent.glob(".rosrm-fetch-*/*")))
         assert sender.close().outcome == "withdrawn"
@@ -58,10 +60,10 @@ def test_an_offer_can_be_withdrawn_in_mid_transfer(source, target, sender):
 
 
 def test_what_was_stopped_before_it_began_says_so(source, target, sender):
-    offer = sender.offer(source, seconds=PATIENCE)
     fetcher = Fetcher()
+    offer = sender.offer(source, seconds=PATIENCE, to=fetcher.introduce())
     fetcher.close()
-    with pytest.raises(TransferError, match="ended with status 0 and no answer"):
+    with pytest.raises(TransferError, match="stopped before it began"):
         fetcher.fetch(offer, target, timeout=PATIENCE)
 
 
@@ -70,7 +72,8 @@ import json, sys, time
 from pathlib import Path
 from rosrm.transfer import Sender
 sender = Sender()
-print(json.dumps(sender.offer(Path(sys.argv[1]), seconds=600.0, max_rate=500e3).as_json()))
+offer = sender.offer(Path(sys.argv[1]), seconds=600.0, max_rate=500e3, to=sys.argv[2])
+print(json.dumps(offer.as_json()))
 print(sender._process.pid, flush=True)
 time.sleep(600)
 """
@@ -79,19 +82,20 @@ import json, sys
 from pathlib import Path
 from rosrm.transfer import Fetcher, Offer
 fetcher = Fetcher()
-print(fetcher._process.pid, flush=True)
-fetcher.fetch(Offer.from_json(json.loads(sys.argv[1])), Path(sys.argv[2]), timeout=600.0)
+print(json.dumps([fetcher._process.pid, fetcher.introduce()]), flush=True)
+offer = Offer.from_json(json.loads(sys.stdin.readline()))
+fetcher.fetch(offer, Path(sys.argv[1]), timeout=600.0)
 """
 
 
 def start(code: str, *arguments: object) -> subprocess.Popen:
     command = [sys.executable, "-c", code, *map(str, arguments)]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
 
-def test_an_offer_ends_with_the_process_that_made_it(source):
+def test_an_offer_ends_with_the_process_that_made_it(source, destination):
     """However that ends."""
-    with start(_OFFERS, source) as owner:
+    with start(_OFFERS, source, destination.certificate) as owner:
         offer = Offer.from_json(json.loads(owner.stdout.readline()))
         serving = Path(f"/proc/{owner.stdout.readline().strip()}")
         assert listens(offer.port)
@@ -102,8 +106,11 @@ def test_an_offer_ends_with_the_process_that_made_it(source):
 
 def test_a_fetch_ends_with_the_process_that_asked_for_it(source, target, sender):
     """However that ends; nothing is left."""
-    with start(_FETCHES, json.dumps(slowly(sender, source).as_json()), target) as owner:
-        fetching = Path(f"/proc/{owner.stdout.readline().strip()}")
+    with start(_FETCHES, target) as owner:
+        pid, certificate = json.loads(owner.stdout.readline())
+        fetching = Path(f"/proc/{pid}")
+        owner.stdin.write(json.dumps(slowly(sender, source, certificate).as_json()) + "\n")
+        owner.stdin.flush()
         until("something has come", lambda: list(target.parent.glob(".rosrm-fetch-*/*")))
         owner.kill()
         until("its process has ended", lambda: not fetching.exists() or is_dead(fetching))
@@ -118,21 +125,29 @@ def is_dead(process: Path) -> bool:
         return True
 
 
-def test_a_sender_that_is_killed_says_so(source, sender):
-    sender.offer(source, seconds=PATIENCE)
+def test_a_sender_that_is_killed_says_so(source, sender, destination):
+    sender.offer(source, seconds=PATIENCE, to=destination.certificate)
     sender._process.kill()
     assert sender.wait(PATIENCE) == Sent("failed", 0)
 
 
-def test_closing_twice_and_from_several_threads_does_no_harm(source):
+def test_closing_twice_and_from_several_threads_does_no_harm(source, destination):
     sender = Sender()
-    sender.offer(source, seconds=PATIENCE)
+    sender.offer(source, seconds=PATIENCE, to=destination.certificate)
     threads = [threading.Thread(target=sender.close) for _ in range(4)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join(PATIENCE)
     assert sender.close() == Sent("withdrawn", 0)
+
+
+def test_a_destination_that_was_not_introduced_fetches_nothing(source, target, sender, destination):
+    """Nobody would speak with it, so it says so at once."""
+    offer = sender.offer(source, seconds=PATIENCE, to=destination.certificate)
+    with Fetcher() as fetcher, pytest.raises(TransferError, match="was not introduced"):
+        fetcher.fetch(offer, target, timeout=PATIENCE)
+    assert nothing_left(target)
 
 
 def test_an_end_that_is_ready_works_as_any_other(source, target):

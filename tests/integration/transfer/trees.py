@@ -9,10 +9,35 @@ import socket
 import time
 from pathlib import Path
 
-from rosrm.transfer import Offer, Sender
+from rosrm.transfer import DEFAULT_RESERVE, Fetched, Offer, Sender
+from rosrm.transfer.certificate import new_identity
+from rosrm.transfer.receiving import receive
 
 #: Generous: a busy machine may take its time.
 PATIENCE = 60.0
+
+
+class Destination:
+    """Fetches in this process, as often as a test wants to, as the one that was introduced.
+
+    Attributes:
+        certificate: for the source.
+        fingerprint: of it.
+    """
+
+    def __init__(self) -> None:
+        self._identity = new_identity()
+        self.certificate = self._identity.certificate
+        self.fingerprint = self._identity.fingerprint
+
+    def fetch(
+        self, offer: Offer, target: Path, *, timeout: float = PATIENCE,
+        reserve: int = DEFAULT_RESERVE,
+    ) -> Fetched:  # fmt: skip
+        return receive(
+            offer, target, timeout=timeout, reserve=reserve, identity=self._identity,
+            before_placing=lambda: None,
+        )  # fmt: skip
 
 
 def fill(directory: Path, *, megabytes: int, random_share: float = 1.0) -> None:
@@ -57,5 +82,5 @@ def nothing_left(target: Path) -> bool:
     return not target.parent.exists() or list(target.parent.iterdir()) == []
 
 
-def slowly(sender: Sender, source: Path) -> Offer:
-    return sender.offer(source, seconds=PATIENCE, max_rate=500e3)
+def slowly(sender: Sender, source: Path, to: str) -> Offer:
+    return sender.offer(source, seconds=PATIENCE, to=to, max_rate=500e3)
