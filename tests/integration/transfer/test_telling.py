@@ -1,0 +1,48 @@
+"""What an end of a transfer says last is said whole, whoever ends it meanwhile."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+from tests.ros.clusters import PATIENCE, wait_until
+
+
+def test_a_fetch_that_is_ended_while_it_tells_its_fault_tells_it() -> None:
+    """Who has read it closes the process's input, which ends it: that is no fault of its own."""
+    heard, said = os.pipe()
+    with subprocess.Popen(
+        [sys.executable, "-m", "rosrm.transfer", "fetch"],
+        stdin=subprocess.PIPE, stdout=said, stderr=subprocess.PIPE,
+    ) as fetch, os.fdopen(heard) as answers:  # fmt: skip
+        assert fetch.stdin is not None
+        assert fetch.stderr is not None
+        fetch.stdin.write(b'{"introduce": true}\n')
+        fetch.stdin.flush()
+        assert "certificate" in json.loads(answers.readline())
+        filled = fill(said)
+        os.close(said)
+        fetch.stdin.close()  # it was stopped before it began: that is the fault
+        waits_in = Path(f"/proc/{fetch.pid}/wchan")
+        wait_until(lambda: "pipe_write" in waits_in.read_text(), "it is about to tell")
+        fetch.send_signal(signal.SIGTERM)
+        told = answers.read()[filled:]
+        assert fetch.wait(PATIENCE) == 1
+        assert json.loads(told) == {"error": "the fetch was stopped before it began"}
+        assert fetch.stderr.read() == b""
+
+
+def fill(pipe: int) -> int:
+    """Leave no room in a pipe; how many bytes that took."""
+    # Opened anew: else whoever has the other end would not be made to wait either.
+    another, filled = os.open(f"/proc/self/fd/{pipe}", os.O_WRONLY | os.O_NONBLOCK), 0
+    with contextlib.suppress(BlockingIOError):
+        while True:
+            filled += os.write(another, b" " * 4096)
+    os.close(another)
+    return filled
