@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 
 from rosrm.config.settings import LivenessSettings
+from rosrm.core.model import HostLossPolicy
 from rosrm.criu import outcome
 from tests.faults.watching import instances
 from tests.ros.clusters import PATIENCE
@@ -29,12 +30,18 @@ _SLOWLY = 4_000_000
 
 
 class Scene:
-    """A counter that is moved to and fro."""
+    """A counter that is moved to and fro.
 
-    def __init__(self, make) -> None:
-        self.cluster = two_hosts(make, liveness=LivenessSettings())
+    Args:
+        make: makes a cluster.
+        lease: seconds of silence after which a host is lost.
+        fields: of the counter's spec.
+    """
+
+    def __init__(self, make, lease: float = LivenessSettings().lease, **fields) -> None:
+        self.cluster = two_hosts(make, liveness=LivenessSettings(lease=lease))
         self.ear = Ear(self.cluster.domain)
-        self.cluster.submit(counter(options={"max_rate": _SLOWLY}))
+        self.cluster.submit(counter(options={"max_rate": _SLOWLY}, **fields))
         self._source = self._number = 0
         self.source = ""
 
@@ -112,6 +119,18 @@ class Scene:
         nothing_left(self.cluster, but=but)
         return ends[0]
 
+    def switch_off(self, victim: str) -> str:
+        """The host of the source or of the destination loses its power; its name."""
+        name = self.source if victim == "source" else _OTHER[self.source]
+        self.cluster.switch_off(name)
+        return name
+
+    def switch_on(self, name: str) -> None:
+        """It comes back with nothing; only what lay on its disk is there."""
+        before = self.cluster.client.list().last_sequence
+        self.cluster.start_slave(next(one for one in self.cluster.hosts if one.host == name))
+        self.cluster.wait_for_event("host_registered", host=name, after=before)
+
     def _ends(self) -> list[str]:
         events = self.cluster.events(process=NAME, after=self._before)
         return [event.kind for event in events if event.kind in ("migrated", "stayed")]
@@ -123,6 +142,14 @@ class Scene:
 @pytest.fixture(scope="module")
 def scene(make_shared):
     one = Scene(make_shared)
+    yield one
+    one.close()
+
+
+@pytest.fixture(scope="module")
+def restless(make_shared):
+    """As `scene`, but when its host is lost, which is soon, the counter goes to the other one."""
+    one = Scene(make_shared, lease=4.0, host_loss=HostLossPolicy("elsewhere"))
     yield one
     one.close()
 
@@ -160,12 +187,30 @@ def test_the_source_is_killed_in_its_dump(criu, scene):
 def test_the_destination_s_host_is_switched_off(criu, scene, moment):
     """Before the commit the source goes on, at the latest when that host counts as lost."""
     scene.move(moment)
-    name = _OTHER[scene.source]
-    scene.cluster.switch_off(name)
+    name = scene.switch_off("destination")
     scene.ear.hear(20, 90.0)
-    before = scene.cluster.client.list().last_sequence
-    scene.cluster.start_slave(next(one for one in scene.cluster.hosts if one.host == name))
-    scene.cluster.wait_for_event("host_registered", host=name, after=before)
+    scene.switch_on(name)
     # Its next slave gives the image two minutes: it cannot know that the move has ended.
     assert scene.end(but=name) == "stayed"
     assert min(scene.ear.steps()) > 0
+
+
+@pytest.mark.parametrize(
+    ("victim", "moment"), [("source", "fetch"), ("source", "restore"), ("destination", "join")]
+)
+def test_a_host_is_switched_off_whose_process_does_not_wait_for_it(criu, restless, victim, moment):
+    """No move is stuck for it: one counter is heard from the other host, and stays the only one."""
+    scene = restless
+    scene.move(moment)
+    name = scene.switch_off(victim)
+    scene.ear.forget()
+    scene.ear.hear(50, 90.0)
+    row = scene.cluster.wait(NAME, "running")
+    assert row.host == _OTHER[name]
+    assert not scene.cluster.events("migration_stuck", process=NAME)
+    scene.switch_on(name)
+    # Its next slave gives what was fetched there two minutes.
+    scene.end(but=name)
+    assert scene.cluster.wait(NAME, "running").number == row.number
+    assert min(scene.ear.steps()) > 0
+    scene.ear.forget()
