@@ -154,10 +154,12 @@ class _Restore:
         """That it is done: first so that everybody knows, for ever, and then the image may go."""
         seconds = round(time.monotonic() - self.began, 3)
         told = Outcome(pid=pid, inner_pid=self.manifest.pid, namespace=namespace, seconds=seconds)
-        outcome.write(self.directory, told)
-        if self.remove:
-            with contextlib.suppress(OSError):  # the process lives, and the next start tries again
+        try:
+            outcome.write(self.directory, told)
+            if self.remove:
                 image.remove(self.directory)
+        except OSError as error:  # the process lives; who waits for the word has a time-out
+            sys.stderr.write(f"restored, but {self.directory} cannot be written: {error}\n")
 
 
 def _reopened_log() -> int:

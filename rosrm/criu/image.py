@@ -27,6 +27,8 @@ _WITHOUT_CHECKSUMS: Final = 1
 MANIFEST: Final = "manifest.json"
 PAGES: Final = "criu"
 COPIES: Final = "files"
+#: While it is restored: as `PAGES`, with the paths of this host.
+HERE: Final = f"{PAGES}.here"
 DUMP_LOG: Final = "dump.log"
 RESTORE_LOG: Final = "restore.log"
 
@@ -266,7 +268,7 @@ def remove(directory: Path, *, logs: bool = True) -> None:
     """
     for name in (MANIFEST, f"{MANIFEST}.new", *((DUMP_LOG, RESTORE_LOG) if logs else ())):
         (directory / name).unlink(missing_ok=True)
-    for name in (PAGES, COPIES):
+    for name in (PAGES, COPIES, HERE):
         shutil.rmtree(directory / name, ignore_errors=True)
 
 

@@ -19,6 +19,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final
 
+from rosrm.criu.image import HERE
 from rosrm.errors import CriuError
 
 _FILES: Final = "files.img"
@@ -52,7 +53,7 @@ def images(directory: Path, old: str, new: str) -> Iterator[Path]:
     if not old or not new or old == new:
         yield directory
         return
-    beside = directory.with_name(f"{directory.name}.here")
+    beside = directory.with_name(HERE)
     shutil.rmtree(beside, ignore_errors=True)
     beside.mkdir(mode=0o700)
     try:

@@ -114,10 +114,26 @@ def _put_back(directory: Path, held: HeldFile) -> None:
         return
     target.parent.mkdir(parents=True, exist_ok=True)
     if held.copy:
-        shutil.copyfile(directory / held.copy, target)
-        target.chmod(held.mode)
+        _replace(directory / held.copy, target, held.mode)
     else:
         target.touch(mode=held.mode)
+
+
+def _replace(source: Path, target: Path, mode: int) -> None:
+    """Put a copy in the place of a file, whose owner it gets; no link there is followed.
+
+    Whoever owns the folder could have root write anywhere else.
+    """
+    new = target.with_name(f".{target.name}.rosrm")
+    new.unlink(missing_ok=True)
+    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+    with source.open("rb") as copy, os.fdopen(os.open(new, flags, 0o600), "wb") as file:
+        shutil.copyfileobj(copy, file)
+        if os.geteuid() == 0:
+            before = (target if target.exists() else target.parent).lstat()
+            os.fchown(file.fileno(), before.st_uid, before.st_gid)
+        os.fchmod(file.fileno(), mode)
+    new.replace(target)
 
 
 def _make_tracing_file(mapped: MappedFile) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from rosrm.criu import dumping, tree
@@ -11,6 +12,7 @@ from rosrm.portable import (
     ask_prepare,
     ask_resume,
     await_left,
+    control_directory,
     directory_of,
     listens,
     make_directory,
@@ -74,6 +76,10 @@ def control_of(pid: int) -> Path:
             f"process {pid} was not started to be moved by criu: restart it, with "
             f"`migration: criu` in its file"
         )
+    owner = owner_of(pid)
+    # The environment is the process's own: who writes there for another user chooses the place.
+    if owner != os.geteuid() and found != control_directory(found.name, owner):
+        raise CriuError(f"process {pid} of user {owner} names {found}: that is no place for it")
     return found
 
 

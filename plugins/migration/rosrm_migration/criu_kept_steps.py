@@ -108,6 +108,8 @@ def take(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
     asked = Asked.of(arguments)
     if asked.pid(asked.destination):
         return {"taken": True}  # by an earlier asking: it is being restored
+    if luggage.was_restored(incoming(asked.state, asked.destination)):
+        return {"taken": True}  # likewise, and it has ended since: an image is for one life
     source, target = kept(asked.state, asked.source), incoming(asked.state, asked.destination)
     image.read(source)
     luggage.discard(target)
@@ -115,6 +117,7 @@ def take(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
     try:
         target.mkdir(mode=0o700)
         shutil.copytree(source, target, copy_function=_link, dirs_exist_ok=True)
+        luggage.note_origin(target, asked.source)
     except (OSError, shutil.Error) as error:
         luggage.discard(target)
         raise CriuError(f"the image {source} cannot be laid out as {target}: {error}") from None

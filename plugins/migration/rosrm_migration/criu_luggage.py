@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from rosrm.criu import outcome
-from rosrm.criu.places import incoming, outgoing
+from rosrm.criu.places import incoming, kept, outgoing
 from rosrm.errors import CriuError
 from rosrm.transfer import Fetcher, Sender
 
@@ -27,6 +27,9 @@ Answer = Mapping[str, Any]
 _LEFT_BEHIND: Final = 120.0
 #: Steps whose answers are remembered; far more than there are moves at a time.
 _REMEMBERED: Final = 50
+
+#: Below an image that was laid out to be restored: of which instance it is kept.
+_ORIGIN: Final = "of"
 
 _changing: Final = threading.Lock()
 _senders: Final[dict[int, Sender]] = {}
@@ -186,11 +189,12 @@ def remove_unused_later(directory: Path, keep: float) -> None:
 
 def remove_unused(directory: Path) -> None:
     """Remove an image unless a process was restored from it."""
-    if not _was_restored(directory):
+    if not was_restored(directory):
         discard(directory)
 
 
-def _was_restored(directory: Path) -> bool:
+def was_restored(directory: Path) -> bool:
+    """Whether an image has become a process, which may have ended since."""
     try:
         told = outcome.read(directory)
     except CriuError:
@@ -227,13 +231,27 @@ def sweep(state: Path, instances: Iterable[str]) -> None:
 def forget_restored(state: Path, instances: Iterable[str]) -> None:
     """Remove what says of instances that were restored, and have ended, that they were.
 
-    Their supervisor needs it to start them again, and nobody afterwards. As `sweep`.
+    Their supervisor needs it to start them again; so does who asks whether a kept image was used
+    up, as long as that lies there. As `sweep`.
     """
     here = set(map(number_of, instances))
     for number in _numbers(state, "in"):
         directory = incoming(state, number)
-        if number not in here and _was_restored(directory):
+        if number not in here and was_restored(directory) and not _is_awaited(state, directory):
             discard(directory)
+
+
+def note_origin(directory: Path, number: int) -> None:
+    """An image was laid out from that which is kept of an instance."""
+    (directory / _ORIGIN).write_text(str(number), encoding="utf-8")
+
+
+def _is_awaited(state: Path, directory: Path) -> bool:
+    try:
+        origin = int((directory / _ORIGIN).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return kept(state, origin).exists()
 
 
 def number_of(instance: str) -> int:

@@ -260,6 +260,21 @@ def test_a_restored_process_that_ended_at_once_is_not_put_back(slave, counter):
     nothing_left(slave)
 
 
+def test_that_it_was_restored_is_known_as_long_as_its_image_is_kept(slave, counter):
+    """A slave clears up meanwhile, and a late word to lay the image out does it no second time."""
+    checkpointed(slave, counter)
+    slave.ask("take")
+    restored = slave.hold()
+    eventually(lambda: outcome.read(incoming(slave.state, 2)), "the restore")
+    slave.end(restored)
+    luggage.sweep(slave.state, [])
+    assert slave.ask("take") == {"taken": True}
+    assert not (incoming(slave.state, 2) / image.MANIFEST).exists()
+    assert slave.ask("put_back") == {"active": True}
+    luggage.sweep(slave.state, [])
+    assert not incoming(slave.state, 2).exists()
+
+
 def test_a_slave_that_was_started_again_keeps_the_ports(slave, counter):
     """Of each process that waits in an image here; a dropped one's are anybody's."""
     checkpointed(slave, counter)
