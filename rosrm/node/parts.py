@@ -47,6 +47,7 @@ class Part:
         self._data: bytes | None = None
         self._published: PartKey | None = None
         self._restored: PartKey | None = None
+        self._refused = ""
         self.retained = False
         self.publisher: Any = None
 
@@ -74,9 +75,12 @@ class Part:
         """Save it, if it has changed; otherwise as `publish`."""
         try:
             data = self._saved(largest)
-        except StateError:
+        except StateError as error:
             self._key = self._data = None  # "unchanged" would speak of what nobody has
+            self._refused = self._refused or str(error)
             raise
+        if data is not None:
+            self._refused = ""
         if data is not None:
             key = part_key(data)
             if key != self._key or self._data is None:
@@ -99,6 +103,8 @@ class Part:
 
     def _check(self, message: Any) -> None:
         if message is None and self._key is None:
+            if self._refused:
+                raise StateError(self._refused)  # it is still what it was then
             raise StateError(
                 f"saving {self.topic} returned None (unchanged) before it had returned any state"
             )

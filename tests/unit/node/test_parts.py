@@ -1,0 +1,39 @@
+"""What is said of a state that cannot be saved."""
+
+from __future__ import annotations
+
+import pytest
+from std_msgs.msg import Int64, String
+
+from rosrm.node.parts import Part, StateError
+
+
+def part(*answers):
+    """One whose author's function answers so, in turn."""
+    left = iter(answers)
+    return Part("/state", Int64, lambda: next(left), lambda message: None)
+
+
+def test_what_was_wrong_is_said_again_while_nothing_has_changed():
+    """Not that it was never saved: who hears of it a second time hears the cause."""
+    one = part(Int64(data=7), None, None)
+    for _ in range(3):
+        with pytest.raises(StateError, match="has 12 bytes, more than the 4"):
+            one.refresh(4)
+
+
+def test_a_state_that_is_well_again_may_be_unchanged():
+    """And a new fault is its own."""
+    one = part(String(), Int64(data=7), None, String())
+    with pytest.raises(StateError, match="returned a String"):
+        one.refresh(100)
+    one.refresh(100)
+    one.refresh(100)
+    with pytest.raises(StateError, match="returned a String"):
+        one.refresh(100)
+
+
+def test_unchanged_before_anything_was_saved_is_a_fault():
+    """It speaks of what nobody has."""
+    with pytest.raises(StateError, match="before it had returned any state"):
+        part(None).refresh(100)
