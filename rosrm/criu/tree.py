@@ -63,16 +63,23 @@ def is_hold(pid: int) -> bool:
 
 
 def may_hold(pid: int) -> bool:
-    """It does, or may do so in a moment."""
-    return _runs(pid, HOLD, _AGAIN)
+    """It does, or may do so in a moment.
+
+    One that was spawned just now has no command line yet: it may be anything.
+    """
+    return _words(pid) == [""] or _runs(pid, HOLD, _AGAIN)
 
 
 def _runs(pid: int, *programs: str) -> bool:
+    return any(word.endswith(programs) for word in _words(pid)[1:5])
+
+
+def _words(pid: int) -> list[str]:
+    """Its command line; [""] in the middle of an execve, [] where there is no such process."""
     try:
-        words = os.fsdecode(Path(f"/proc/{pid}/cmdline").read_bytes()).split("\0")
+        return os.fsdecode(Path(f"/proc/{pid}/cmdline").read_bytes()).split("\0")
     except OSError:
-        return False
-    return any(word.endswith(programs) for word in words[1:5])
+        return []
 
 
 def is_alive(pid: int) -> bool:

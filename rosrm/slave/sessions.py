@@ -146,8 +146,11 @@ class SessionTable:
                 continue
             if leader != pid and leader in found:
                 found[leader].append(pid)
-        for leader in self._holds:
-            found[leader] = tree(leader)
+        for leader in tuple(self._holds):
+            if is_hold(leader):
+                found[leader] = tree(leader)
+            elif not may_hold(leader):
+                self._holds.discard(leader)
         self._members = {leader: tuple(pids) for leader, pids in found.items()}
         self._collect_pids()
 

@@ -1,0 +1,72 @@
+"""What the table of sessions knows of programs that hold a restored process; no CRIU is needed."""
+
+import os
+import sys
+import time
+
+import pytest
+
+from rosrm.slave.sessions import SessionTable
+
+#: It has a child in a session of its own, and waits for it.
+PROGRAM = """
+import subprocess
+subprocess.run(["sleep", "60"], start_new_session=True)
+"""
+ROUNDS = 5
+PATIENCE = 30.0
+
+
+@pytest.fixture
+def spawn(tmp_path):
+    """Starts the program under a name, and ends it and its child afterwards."""
+    pids = []
+
+    def start(name):
+        program = tmp_path / name
+        program.parent.mkdir(parents=True, exist_ok=True)
+        program.write_text(PROGRAM)
+        words = [sys.executable, "-I", "-S", str(program)]
+        pids.append(os.posix_spawn(sys.executable, words, os.environ))
+        return pids[-1]
+
+    yield start
+    for pid in pids:
+        os.kill(child_of(pid), 9)
+        os.waitpid(pid, 0)
+
+
+def child_of(pid):
+    end = time.monotonic() + PATIENCE
+    while time.monotonic() < end:
+        with open(f"/proc/{pid}/task/{pid}/children") as file:  # noqa: PTH123 - one read
+            found = file.read().split()
+        if found:
+            child = int(found[0])
+            if os.getsid(child) == child:
+                return child
+        time.sleep(0.01)
+    raise AssertionError(f"process {pid} has no child in a session of its own")
+
+
+def test_a_hold_is_known_as_one_however_early_it_was_added(spawn):
+    """A process that was spawned just now has no command line yet, for most of the tries."""
+    table = SessionTable()
+    for _ in range(ROUNDS):
+        hold = spawn("rosrm/criu/hold.py")
+        table.add(hold)
+        child = child_of(hold)
+        table.refresh(0.0)
+        assert table.members(hold) == (hold, child)
+        assert child in table.known_as(hold)
+
+
+def test_of_any_other_program_a_daemon_is_no_member(spawn):
+    """However early it was added, too."""
+    table = SessionTable()
+    for _ in range(ROUNDS):
+        other = spawn("other.py")
+        table.add(other)
+        child_of(other)
+        table.refresh(0.0)
+        assert table.members(other) == (other,)
