@@ -167,7 +167,7 @@ def test_the_next_run_of_the_slave_watches_on(cluster) -> None:
 
 def test_a_healthy_node_is_never_ended(cluster) -> None:
     """It was watched all the while, by two runs of the slave, and for a while longer here."""
-    until = time.monotonic() + 4 * SOON
+    until = time.monotonic() + 2 * SOON
     while time.monotonic() < until:
         cluster.client.spin(0.2)
     row = cluster.process("healthy")
@@ -214,7 +214,7 @@ def test_a_node_that_was_moved_is_watched_where_it_is_now(make_cluster) -> None:
     cluster.wait_for_event("migrated", process="moved")
     after = cluster.wait("moved", "running")
     assert after.host != before.host
-    until = time.monotonic() + 3 * SOON
+    until = time.monotonic() + 2 * SOON
     while time.monotonic() < until:
         cluster.client.spin(0.2)
     assert cluster.process("moved").restarts == 0
