@@ -6,6 +6,7 @@ queue; a job that has completed meanwhile has completed. Where something has, it
 
 from __future__ import annotations
 
+from rosrm.core.commands import Order
 from rosrm.core.hosts import Host
 from rosrm.core.model import InstanceId, InstanceState, InstanceStatus
 from rosrm.core.processes import LeftBehind
@@ -50,6 +51,9 @@ def _take_back(
         process=process.name, host=host.name, facts={"number": left.number},
     )  # fmt: skip
     state.save(process)
+    # A move that was under way when its host was lost had told the slave not to restart it.
+    restart = process.spec.restart
+    state.emit(Order(state.order_id(), host.host_id, "set_restart", instance.id, restart=restart))
 
 
 def has_successor(state: MasterState, status: InstanceStatus) -> bool:

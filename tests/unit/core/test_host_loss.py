@@ -6,16 +6,19 @@ from typing import Any
 
 import pytest
 
+from rosrm.core import slave
 from rosrm.core.model import (
     HostLossPolicy,
     InstanceState,
     IsolationPolicy,
     ProcessSpec,
+    RestartPolicy,
     StandbyPolicy,
     StopPolicy,
 )
 from rosrm.core.settings import CoreSettings
 from tests.unit.core.cluster import Cluster, job, movable, process
+from tests.unit.core.machine import Machine
 
 ELSEWHERE = HostLossPolicy("elsewhere")
 
@@ -300,6 +303,20 @@ def test_what_its_host_has_fenced_starts_again(then: str, phase: str) -> None:
     machine._end(machine.find("p"), InstanceState.FENCED, cluster.now, signal=9)
     cluster.settle()
     assert cluster.phase("p") == phase
+
+
+def test_what_is_taken_back_is_restarted_as_its_spec_says() -> None:
+    """A move that was under way when its host was lost had told its slave not to."""
+    cluster = on_a(process("p", restart=RestartPolicy("on-failure"), host_loss=ELSEWHERE))
+    cluster.add(Machine("b", busy={"memory": 0.9}))  # somebody is heard, who has no room
+    cluster.wait(11.0)
+    a = cluster.machines["a"]
+    a.tell(slave.RestartPolicySet(a.find("p"), RestartPolicy("never")), cluster.now)
+    lose(cluster, "a")
+    assert cluster.phase("p") == "queued"
+    back(cluster, "a")
+    assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
+    assert [one.restart for one in cluster.orders("set_restart")] == [RestartPolicy("on-failure")]
 
 
 def test_what_was_cancelled_out_of_sight_is_not_taken_back() -> None:
