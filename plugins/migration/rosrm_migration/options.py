@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from math import inf
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_type_hints
 
 from rosrm.config.plain import from_plain, to_plain
+from rosrm.config.units import Quantity
 from rosrm.core.model import ProcessSpec
 
 T = TypeVar("T")
@@ -15,14 +17,34 @@ def options_of(spec: ProcessSpec, cluster: T) -> T:
     """What holds for one process.
 
     Args:
-        spec: its `migration.options` are given by name.
+        spec: its `migration.options` are given by name, as the work file has them: who submits it
+            may have no plugin that knows what is measured by them.
         cluster: the strategy's options for all processes.
 
     Raises:
         ValueError: for an unknown option, or a value that makes no sense.
     """
     given = spec.migration.options
-    return from_plain(type(cluster), {**to_plain(cluster), **given}) if given else cluster
+    if not given:
+        return cluster
+    wanted = type(cluster)
+    return from_plain(wanted, {**to_plain(cluster), **_in_base_units(wanted, given)})
+
+
+def _in_base_units(wanted: type[Any], given: Mapping[str, Any]) -> dict[str, Any]:
+    """With a number for "5s" and the like."""
+    hints = get_type_hints(wanted, include_extras=True)
+    return {name: _number(name, hints.get(name), value) for name, value in given.items()}
+
+
+def _number(name: str, hint: Any, value: Any) -> Any:
+    for mark in getattr(hint, "__metadata__", ()):
+        if isinstance(mark, Quantity) and isinstance(value, str):
+            try:
+                return mark.parse(value)
+            except ValueError as error:
+                raise ValueError(f"{name}: {error}") from None
+    return value
 
 
 def check_seconds(options: Any, *names: str) -> None:

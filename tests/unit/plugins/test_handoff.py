@@ -87,7 +87,7 @@ def test_a_state_below_the_nodes_own_name_stays_there_under_the_alias() -> None:
     [
         ({"fast": True}, "unknown fast"),
         ({"ready_timeout": -1.0}, "ready_timeout is -1 s"),
-        ({"ready_timeout": "soon"}, "ready_timeout: float is wanted, not 'soon'"),
+        ({"ready_timeout": "soon"}, "ready_timeout: 'soon' is not a number, or text"),
         ({"protocol": "mine"}, "protocol 'mine'; allowed: rosrm, paper"),
         ({"protocol": "paper"}, "names the topic"),
         ({**PAPER, "state": "counter/state"}, "state is 'counter/state'"),

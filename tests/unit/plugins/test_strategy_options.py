@@ -1,0 +1,28 @@
+"""A process's own options of a strategy, as a work file has them."""
+
+from __future__ import annotations
+
+import pytest
+
+from rosrm.core.model import MigrationPolicy, ProcessSpec
+from rosrm_migration.criu import CriuOptions
+from rosrm_migration.options import options_of
+
+
+def options(**given: object) -> CriuOptions:
+    """Over those of a cluster."""
+    spec = ProcessSpec("p", migration=MigrationPolicy("criu", options=given))
+    return options_of(spec, CriuOptions(dump_timeout=7.0))
+
+
+def test_units_are_understood_where_whoever_submits_has_no_plugin() -> None:
+    """`rosrm submit` sends what the file says; `rosrm config check` has looked at it, or nobody."""
+    assert options(checkpoint_every="1min", max_rate="20MB", reserve=5) == CriuOptions(
+        dump_timeout=7.0, checkpoint_every=60.0, max_rate=20_000_000, reserve=5
+    )
+
+
+def test_an_unknown_unit_is_refused_with_the_name_of_the_option() -> None:
+    """And with what is allowed."""
+    with pytest.raises(ValueError, match=r"leave_timeout: unknown unit 'sec'.*Allowed: us, ms"):
+        options(leave_timeout="3sec")
