@@ -264,6 +264,8 @@ class MigrationOffer:
     Attributes:
         executors: what the open step of its plans may name; each runs on a slave with the step's
             arguments (a JSON object) and answers with one.
+        own_options: what can be set for one process, where that is more than for all: a dataclass
+            that derives from `options`.
     """
 
     name: str
@@ -273,6 +275,7 @@ class MigrationOffer:
     executors: Mapping[str, Callable[[Mapping[str, Any]], Mapping[str, Any]]] = field(
         default_factory=lambda: EMPTY
     )
+    own_options: type[Any] | None = None
 
 
 # --- checkpoints (master, pure) ---------------------------------------------------------------

@@ -13,6 +13,7 @@ from rosrm.cli import formats, tables
 _SAID: Final = {
     "assigned": "was given to",
     "migrated": "was moved to",
+    "stayed": "was to move to",
     "waits": "waits",
     "set_aside": "is set aside",
 }

@@ -26,7 +26,9 @@ class PluginCheck:
         """Whether a plugin is installed; without a registry it is taken to be."""
         return self._registry is None or name in self._registry.names(kind)
 
-    def choice(self, kind: str, name: str, named: Node, options: Node | None) -> Mapping[str, Any]:
+    def choice(
+        self, kind: str, name: str, named: Node, options: Node | None, *, own: bool = False
+    ) -> Mapping[str, Any]:
         """The options of one chosen plugin.
 
         Args:
@@ -34,6 +36,7 @@ class PluginCheck:
             name: of the offer.
             named: where the file names it.
             options: as the file gives them; None: it gives none.
+            own: they are of one process.
         """
         given = options if options is not None and options.value is not None else None
         plain = {} if given is None or not given.items else given.plain()
@@ -46,7 +49,8 @@ class PluginCheck:
             return dict(plain)
         if given is None:
             given = Node({}, named.place)
-        return self._options(f"options of {TITLES[kind]} {name!r}", offer.options, given)
+        wanted = getattr(offer, "own_options", None) if own else None
+        return self._options(f"options of {TITLES[kind]} {name!r}", wanted or offer.options, given)
 
     def _options(self, title: str, wanted: type[Any], given: Node) -> Mapping[str, Any]:
         try:

@@ -101,7 +101,7 @@ def _process(node: Node, plugins: PluginCheck, problems: Problems) -> ProcessSpe
         return process.spec()
     named = node.deepest(("migration", "strategy"))
     given = node.get("migration", "options")
-    checked = plugins.choice("migration", strategy, named, given)
+    checked = plugins.choice("migration", strategy, named, given, own=True)
     # Only what this process says: for the rest the cluster's options hold.
     said = given.items if given is not None else {}
     options = {name: value for name, value in checked.items() if name in said}

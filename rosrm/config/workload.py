@@ -260,7 +260,7 @@ def _process(
     strategy = given.migration.strategy
     if strategy is not None:
         named = node.deepest(("migration", "strategy"))
-        plugins.choice("migration", strategy, named, node.get("migration", "options"))
+        plugins.choice("migration", strategy, named, node.get("migration", "options"), own=True)
     _check_fits(node, given, hosts, problems)
 
     def draw(span: Span) -> float:

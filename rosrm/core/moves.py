@@ -289,6 +289,8 @@ def _conclude(state: MasterState, run: Run, now: float) -> None:
             "parts": _parts(run),
         },
     )  # fmt: skip
+    if kind == "stayed" and process.decision and process.decision["kind"] == "migrated":
+        process.decision = {**process.decision, "kind": kind}
     _settle_owner(state, process, run, now)
 
 

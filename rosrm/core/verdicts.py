@@ -86,7 +86,7 @@ class Decision(Lazy):
     """The outcome for one process; as a mapping, it is what stands in the event record.
 
     Attributes:
-        kind: "assigned", "waits", "migrated", ...
+        kind: "assigned", "waits", "migrated", "stayed" (it was to move, and did not), ...
         column: of the chosen host; -1: none fits now.
         policy: name of the policy that decided, and which was left out.
         needs: base units by resource.

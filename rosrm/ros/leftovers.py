@@ -10,6 +10,7 @@ from typing import Final
 
 #: How Fast DDS names its threads, and its files in shared memory.
 _THREADS: Final = "dds."
+_OF_SHARED: Final = "dds.shm"
 _SHARED: Final = "/dev/shm/fastrtps_"  # noqa: S108 - not a file of ours
 #: Standard input, output and error are the supervisor's, and whoever restores takes care of them.
 _STANDARD: Final = frozenset({0, 1, 2})
@@ -18,6 +19,13 @@ _STANDARD: Final = frozenset({0, 1, 2})
 def what_is_left() -> str:
     """Why this process cannot be dumped as it is, and what to do; "": nothing is in the way."""
     threads = sorted(one for one in _thread_names() if one.startswith(_THREADS))
+    if any(thread.startswith(_OF_SHARED) for thread in threads):
+        return (
+            f"Fast DDS speaks through shared memory (threads {', '.join(threads)}), whatever its "
+            f"transports are set to, as with ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST: start the "
+            f"slaves with SUBNET, where nobody else hears them, or destroy in leave() what else "
+            f"of ROS this process has"
+        )
     if threads:
         return (
             f"ROS is still at work after the node was destroyed (threads {', '.join(threads)}): "

@@ -7,6 +7,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -149,6 +150,21 @@ def test_it_goes_on_from_where_it_has_moved_to(cluster, ear, running):
     before, first = crash(cluster, ear)
     assert 1 < first <= before + 1
     assert cluster.process(NAME).host == row.host
+
+
+def test_who_is_restarted_by_hand_begins_anew(cluster, ear, running):
+    """It is asked for where something is wrong: perhaps what it remembers."""
+    running()
+    another_image(cluster)
+    ear.hear(100)
+    cluster.client.restart([NAME])
+    deadline = time.monotonic() + PATIENCE
+    while min(ear.steps()) > 0:
+        assert time.monotonic() < deadline, "it did not begin anew"
+        ear.hear(1)
+    first = next(after for before, after in pairwise(ear.counts) if after < before)
+    assert first < 50
+    another_image(cluster)
 
 
 def test_no_count_is_lost_or_repeated_while_nothing_crashes(cluster, ear, running):

@@ -50,7 +50,6 @@ class CriuOptions:
         max_rate: bytes a second that the image may take of the network; 0: all that there is. The
             default leaves something of a gigabit to others.
         reserve: bytes that stay free where the image goes to.
-        checkpoint_every: seconds from one periodic checkpoint to the next, of one process; 0: none.
     """
 
     start_timeout: PositiveSeconds = 10.0
@@ -61,7 +60,6 @@ class CriuOptions:
     join_timeout: PositiveSeconds = 20.0
     max_rate: Bytes = 100_000_000
     reserve: Bytes = 256 << 20
-    checkpoint_every: Seconds = 0.0
 
     def __post_init__(self) -> None:
         """Refuse a wait that is no time, and a rate that is none."""
@@ -73,6 +71,22 @@ class CriuOptions:
             raise ValueError(f"max_rate is {self.max_rate} bytes/s; allowed: 0 (no bound) or more")
         if self.reserve < 0:
             raise ValueError(f"reserve is {self.reserve} bytes; allowed: 0 or more")
+
+
+@dataclass(frozen=True)
+class OwnCriuOptions(CriuOptions):
+    """What can be set for one process.
+
+    Attributes:
+        checkpoint_every: seconds from one periodic checkpoint to the next; 0: none. Not for all
+            processes at once: each stands still for it.
+    """
+
+    checkpoint_every: Seconds = 0.0
+
+    def __post_init__(self) -> None:
+        """As those of all processes, and a pace that is one."""
+        super().__post_init__()
         if not 0.0 <= self.checkpoint_every < inf:
             raise ValueError(
                 f"checkpoint_every is {self.checkpoint_every:g} s; allowed: 0 (none) or more"
@@ -83,11 +97,6 @@ class Criu:
     """Plans a move of the whole memory."""
 
     def __init__(self, options: CriuOptions) -> None:
-        if options.checkpoint_every:
-            raise ValueError(
-                "checkpoint_every is not for all processes: name it in the work file, below the "
-                "`migration` of each that shall stand still for it"
-            )
         self._options = options
 
     @property
@@ -106,7 +115,7 @@ class Criu:
     def spec_fault(self, spec: ProcessSpec) -> str:
         """Why a process cannot be moved so; "" if it can."""
         try:
-            options_of(spec, self._options)
+            self._own(spec)
         except ValueError as fault:
             return str(fault)
         if not spec.ros_node:
@@ -124,7 +133,7 @@ class Criu:
         fault = self.spec_fault(move.spec)
         if fault:
             raise ValueError(fault)
-        return _Draft(move, options_of(move.spec, self._options)).plan()
+        return _Draft(move, self._own(move.spec)).plan()
 
     def checkpoint(self, move: Move) -> Plan:
         """Dump it where it runs, ROS node or not, and end it; no node is asked to leave."""
@@ -136,11 +145,11 @@ class Criu:
 
     def checkpoint_every(self, spec: ProcessSpec) -> float:
         """As its own options say."""
-        return options_of(spec, self._options).checkpoint_every if spec.checkpointed else 0.0
+        return self._own(spec).checkpoint_every if spec.checkpointed else 0.0
 
     def periodic(self, spec: ProcessSpec, instance: InstanceId, host: str, now: int) -> Execute:
         """Have the node leave, dump it, and have it join again."""
-        return periodic_step(spec, instance, host, now, options_of(spec, self._options))
+        return periodic_step(spec, instance, host, now, self._own(spec))
 
     @property
     def discard(self) -> str:
@@ -149,7 +158,10 @@ class Criu:
 
     def _options_for(self, spec: ProcessSpec) -> CriuOptions:
         """Its own where it moves so; those of another strategy mean something else."""
-        return options_of(spec, self._options) if spec.migration.strategy == NAME else self._options
+        return self._own(spec) if spec.migration.strategy == NAME else self._options
+
+    def _own(self, spec: ProcessSpec) -> OwnCriuOptions:
+        return options_of(spec, self._options, OwnCriuOptions)
 
 
 class _Draft:

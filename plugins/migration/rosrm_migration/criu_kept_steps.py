@@ -7,6 +7,7 @@ is there again, whatever fails on the way leaves the image as it was.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
 import signal
@@ -197,7 +198,8 @@ def _reserve(state: Path, number: int) -> None:
 def _discard(state: Path, number: int) -> None:
     """Nothing is left of an image, and its ports are anybody's."""
     luggage.discard(kept(state, number))
-    ports_of_kept(state, number).unlink(missing_ok=True)
+    with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+        ports_of_kept(state, number).unlink()
     with _changing:
         for one in _reserved.pop(number, ()):
             one.close()

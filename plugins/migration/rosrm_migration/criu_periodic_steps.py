@@ -42,7 +42,7 @@ def _dump(asked: Asked) -> Mapping[str, Any]:
     pid = asked.leader(asked.source)
     control, root = control_of(pid), tree.root_of(pid)
     parent = places.periodic(asked.state, asked.source)
-    parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    _make(parent)
     periodic.discard_unfinished(parent)
     slot, away, began = periodic.new_slot(parent), parent / _AWAY, time.monotonic()
     away.write_text(asked.attempt, encoding="utf-8")
@@ -66,6 +66,14 @@ def _dump(asked: Asked) -> Mapping[str, Any]:
             "prepare": left - began, "dump": dumped - left, "join": joined - dumped,
         },
     }  # fmt: skip
+
+
+def _make(parent: Path) -> None:
+    try:
+        for directory in (parent.parent, parent):
+            directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError as error:
+        raise CriuError(f"no image can be made in {parent}: {error.strerror}") from None
 
 
 def _dump_away(asked: Asked, pid: int, control: Path, slot: Path) -> tuple[Manifest, float]:

@@ -4,30 +4,40 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from math import inf
-from typing import Any, TypeVar, get_type_hints
+from typing import Any, TypeVar, get_type_hints, overload
 
 from rosrm.config.plain import from_plain, to_plain
 from rosrm.config.units import Quantity
 from rosrm.core.model import ProcessSpec
 
 T = TypeVar("T")
+Own = TypeVar("Own")
 
 
-def options_of(spec: ProcessSpec, cluster: T) -> T:
+@overload
+def options_of(spec: ProcessSpec, cluster: T) -> T: ...
+
+
+@overload
+def options_of(spec: ProcessSpec, cluster: Any, own: type[Own]) -> Own: ...
+
+
+def options_of(spec: ProcessSpec, cluster: Any, own: type[Any] | None = None) -> Any:
     """What holds for one process.
 
     Args:
         spec: its `migration.options` are given by name, as the work file has them: who submits it
             may have no plugin that knows what is measured by them.
         cluster: the strategy's options for all processes.
+        own: those that one process may have, where they are more.
 
     Raises:
         ValueError: for an unknown option, or a value that makes no sense.
     """
     given = spec.migration.options
-    if not given:
+    wanted = own or type(cluster)
+    if not given and wanted is type(cluster):
         return cluster
-    wanted = type(cluster)
     return from_plain(wanted, {**to_plain(cluster), **_in_base_units(wanted, given)})
 
 

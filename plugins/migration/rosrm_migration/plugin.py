@@ -9,7 +9,7 @@ from typing import Any, Final
 from rosrm.hookspecs import hookimpl
 from rosrm.ports import MigrationOffer
 from rosrm_migration import criu, criu_kept, criu_periodic
-from rosrm_migration.criu import Criu, CriuOptions
+from rosrm_migration.criu import Criu, CriuOptions, OwnCriuOptions
 from rosrm_migration.handoff import WATCH, Handoff, HandoffOptions, watch
 from rosrm_migration.relaunch import Relaunch, RelaunchOptions
 
@@ -41,6 +41,7 @@ def register_migration_strategies() -> Sequence[MigrationOffer]:
             name=criu.NAME,
             create=Criu,
             options=CriuOptions,
+            own_options=OwnCriuOptions,
             summary="the whole memory of a portable node is dumped, and restored elsewhere",
             executors={
                 criu.ABILITY: _when_asked("say_ability"),

@@ -120,6 +120,7 @@ def test_a_destination_that_refuses_or_ends_is_undone() -> None:
     cluster.migrate("p")
     assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
     assert "no such executable" in cluster.told("stayed")[0]
+    assert cluster.explain("p")["decision"]["kind"] == "stayed"
 
 
 def test_stop_first_starts_again_at_the_source_when_the_destination_fails() -> None:

@@ -5,19 +5,19 @@ from __future__ import annotations
 import pytest
 
 from rosrm.core.model import MigrationPolicy, ProcessSpec
-from rosrm_migration.criu import CriuOptions
+from rosrm_migration.criu import CriuOptions, OwnCriuOptions
 from rosrm_migration.options import options_of
 
 
-def options(**given: object) -> CriuOptions:
+def options(**given: object) -> OwnCriuOptions:
     """Over those of a cluster."""
     spec = ProcessSpec("p", migration=MigrationPolicy("criu", options=given))
-    return options_of(spec, CriuOptions(dump_timeout=7.0))
+    return options_of(spec, CriuOptions(dump_timeout=7.0), OwnCriuOptions)
 
 
 def test_units_are_understood_where_whoever_submits_has_no_plugin() -> None:
     """`rosrm submit` sends what the file says; `rosrm config check` has looked at it, or nobody."""
-    assert options(checkpoint_every="1min", max_rate="20MB", reserve=5) == CriuOptions(
+    assert options(checkpoint_every="1min", max_rate="20MB", reserve=5) == OwnCriuOptions(
         dump_timeout=7.0, checkpoint_every=60.0, max_rate=20_000_000, reserve=5
     )
 
