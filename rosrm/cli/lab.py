@@ -5,8 +5,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import signal
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict
 from enum import Enum
 from typing import TYPE_CHECKING, Annotated, Any
@@ -14,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rosrm.cli.options import AsJson
-from rosrm.errors import ConfigError
+from rosrm.errors import ConfigError, LabError
 
 if TYPE_CHECKING:
     from rosrm.lab import HostPlan, HostStatus, Lab
@@ -83,17 +84,41 @@ def up(  # noqa: PLR0917 - typer calls it, by name
     limits = {"memory": memory, "cpu": cpu, "disk": disk}
     hosts = planned(number, limits, host or [])
     made = Lab(name, hosts, subnet=parse_subnet(subnet) if subnet else None)
-    made.up()
-    try:
+    with _interrupts_noted() as stop_if_asked:
+        made.up(between=stop_if_asked)
+        try:
+            stop_if_asked()
+        except KeyboardInterrupt:
+            made.down()
+            raise
         warning = overbooked(hosts)
         if warning:
             typer.echo(f"rosrm: note: {warning}", err=True)
         told = ", ".join(f"{one.name} {made.address(one.name)}" for one in hosts)
         typer.echo(f"lab {name!r} is up: {told}")
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # too late: it is up, and that is what we say
-    except KeyboardInterrupt:
-        made.down()
+
+
+@contextlib.contextmanager
+def _interrupts_noted() -> Iterator[Callable[[], None]]:
+    """Within, a Ctrl-C takes effect where that is asked for; afterwards it is too late for one.
+
+    Else it could come where Python ignores it, and says a traceback: at a fork, in a finaliser.
+    """
+    asked: list[int] = []
+
+    def stop_if_asked() -> None:
+        if asked:
+            raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGINT, lambda number, _: asked.append(number))
+    try:
+        yield stop_if_asked
+    except BaseException as error:
+        signal.signal(signal.SIGINT, before)
+        if isinstance(error, LabError):
+            stop_if_asked()  # it has ended a command of ours
         raise
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 @lab.command(

@@ -68,11 +68,12 @@ class Lab:
 
     # --- begin and end ------------------------------------------------------------------------
 
-    def up(self, *, owner: Birth | None = None) -> None:
+    def up(self, *, owner: Birth | None = None, between: Callable[[], None] = lambda: None) -> None:
         """Make the lab; what a killed attempt left is removed first.
 
         Args:
             owner: the process whose end makes it one that was left behind.
+            between: called between two hosts; what it raises takes back what was made.
 
         Raises:
             LabError: it is up already, or something is missing on this machine; nothing is left.
@@ -92,7 +93,7 @@ class Lab:
                     plan = LabPlan(self.name, self._hosts, subnet)
                     record = Record(plan, boot=store.boot_id(), owner=owner)
                     store.write(record)
-                making.make(self._hierarchies, record)
+                making.make(self._hierarchies, record, between)
             except BaseException:
                 _to_the_end(lambda: making.remove(self._hierarchies, self.name))
                 raise

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import subprocess
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from ipaddress import IPv4Network
 
 from rosrm.errors import LabError
@@ -65,12 +65,17 @@ def choose_subnet(wanted: IPv4Network | None) -> IPv4Network:
     return wanted
 
 
-def make(hierarchies: Sequence[Hierarchy], record: Record) -> None:
-    """Make all that a lab's record says, and mark it as complete; raises `LabError`."""
+def make(hierarchies: Sequence[Hierarchy], record: Record, between: Callable[[], None]) -> None:
+    """Make all that a lab's record says, and mark it as complete; raises `LabError`.
+
+    Args:
+        between: called before each host, and may raise.
+    """
     plan = record.plan
     record.links = {name: Link() for name in plan.names}
     network.make_switch(plan)
     for host in plan.hosts:
+        between()
         groups.make(hierarchies, plan.name, host)
         disks.make(store.image(plan.name, host.name), host)
         switch_on(hierarchies, record, host.name)
