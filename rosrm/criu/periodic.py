@@ -20,6 +20,7 @@ from rosrm.errors import CriuError
 
 _REJOIN: Final = "rejoin.json"
 _STARTS: Final = "starts"
+_ANEW: Final = "anew"
 #: Starts from one image. A process that has crashed so often with no newer one behind it may do so
 #: for what it remembers: then it begins anew.
 _MOST_STARTS: Final = 2
@@ -64,12 +65,21 @@ def discard_unfinished(parent: Path) -> None:
             shutil.rmtree(slot, ignore_errors=True)
 
 
+def begin_anew(parent: Path) -> None:
+    """The next start is from no image, nor from one that is being made just now."""
+    if parent.exists():
+        (parent / _ANEW).touch()
+
+
 def newest(parent: Path) -> tuple[Path, Rejoin] | None:
     """The image to start from, which counts as a start; None: begin anew.
 
     Raises:
         CriuError: what is there cannot be read, or not be counted.
     """
+    if (parent / _ANEW).exists():
+        shutil.rmtree(parent, ignore_errors=True)
+        return None
     for slot in _slots(parent):
         try:
             rejoin = Rejoin(**json.loads((slot / _REJOIN).read_text(encoding="utf-8")))

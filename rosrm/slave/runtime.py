@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
-import shutil
 import signal
 import socket
 import sys
@@ -30,7 +29,7 @@ from rosrm.core.model import (
     RestartPolicy,
     StopPolicy,
 )
-from rosrm.criu.places import periodic
+from rosrm.criu import periodic, places
 from rosrm.errors import LaunchError, Refused
 from rosrm.portable import control_root
 from rosrm.ports import ProbeContext
@@ -288,9 +287,7 @@ class SlaveRuntime:
             if isinstance(command, core.Fail):
                 self.say(f"{command.instance} is {command.reason}")
             if isinstance(command, core.Restart):  # by hand: it begins anew
-                shutil.rmtree(
-                    periodic(self._config.state, command.instance.number), ignore_errors=True
-                )
+                periodic.begin_anew(places.periodic(self._config.state, command.instance.number))
             self._supervisor.carry_out(command)
 
     def _launch(self, assignments: Sequence[Assignment]) -> None:

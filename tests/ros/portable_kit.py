@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from itertools import pairwise
@@ -109,6 +110,13 @@ def _asked(cluster: Cluster, to: str | None, name: str) -> str:
     return ""
 
 
+def found_below(cluster: Cluster, pattern: str) -> list[Path]:
+    """What there is of images now, of all hosts; a folder may go while it is looked at."""
+    while True:
+        with contextlib.suppress(FileNotFoundError):
+            return sorted(cluster.directory.glob(f"hosts/*/images/{pattern}"))
+
+
 def nothing_left(cluster: Cluster, *, but: str = "?") -> None:
     """No image, no process that stands still, nobody who offers anything.
 
@@ -117,7 +125,7 @@ def nothing_left(cluster: Cluster, *, but: str = "?") -> None:
     """
 
     def images() -> list[Path]:
-        found = cluster.directory.glob("hosts/*/images/**/*")
+        found = found_below(cluster, "**/*")
         # How a restore went stands there as long as what was restored.
         looked_at = [path for path in found if but not in path.parts]
         return [path for path in looked_at if path.is_file() and path.name != outcome.FILE]

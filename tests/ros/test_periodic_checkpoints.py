@@ -15,7 +15,15 @@ import pytest
 from rosrm.config.settings import CheckpointChoice
 from rosrm.core.model import Health, InstanceState
 from tests.ros.clusters import PATIENCE, wait_until
-from tests.ros.portable_kit import NAME, Ear, ask, counter, nothing_left, two_hosts
+from tests.ros.portable_kit import (
+    NAME,
+    Ear,
+    ask,
+    counter,
+    found_below,
+    nothing_left,
+    two_hosts,
+)
 
 pytestmark = pytest.mark.timeout(180)
 
@@ -54,7 +62,7 @@ def running(criu, cluster, ear):
 
 def images(cluster) -> list[Path]:
     """Those that count."""
-    return sorted(cluster.directory.glob("hosts/*/images/periodic-*/*/rejoin.json"))
+    return found_below(cluster, "periodic-*/*/rejoin.json")
 
 
 def another_image(cluster) -> None:
@@ -193,7 +201,7 @@ def test_a_slave_is_killed_in_a_checkpoint(cluster, ear, running):
     host = cluster.process(NAME).host
 
     def away() -> list[Path]:
-        return list(cluster.directory.glob("hosts/*/images/periodic-*/away"))
+        return found_below(cluster, "periodic-*/away")
 
     deadline = time.monotonic() + PATIENCE
     while not away():

@@ -70,6 +70,18 @@ def test_a_damaged_one_is_named(parent, content):
         periodic.newest(parent)
 
 
+def test_who_is_to_begin_anew_does_so_once(parent):
+    """Not even from an image that became complete meanwhile; those of its next life count."""
+    slot = image(parent)
+    periodic.begin_anew(parent)
+    periodic.complete(slot, REJOIN)
+    assert periodic.newest(parent) is None
+    assert not parent.exists()
+    later = image(parent)
+    periodic.complete(later, REJOIN)
+    assert periodic.newest(parent) == (later, REJOIN)
+
+
 def test_numbers_grow(parent):
     """The tenth is newer than the ninth."""
     for _ in range(10):
