@@ -136,6 +136,7 @@ def await_kept(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
     """Wait until the image is a process again; it is used up then."""
     asked = Asked.of(arguments)
     found = _wait(asked, asked.pid(asked.destination))
+    image.remove(incoming(asked.state, asked.destination))  # likewise done by its hold, if it lives
     _discard(asked.state, asked.source)
     return {"seconds": {"restore": found.seconds}}
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-from rosrm.criu import dumping, outcome, tree
+from rosrm.criu import dumping, image, outcome, tree
 from rosrm.criu.places import incoming, outgoing
 from rosrm.criu.probe import ability
 from rosrm.criu.program import find
@@ -213,6 +213,7 @@ def await_restored(arguments: Answer) -> Answer:
     except CriuError:
         luggage.remove_unused(directory)
         raise
+    image.remove(directory)  # its hold may have been killed before it did
     return {"seconds": {"restore": found.seconds}}
 
 
