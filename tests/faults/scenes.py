@@ -152,6 +152,11 @@ class Scene:
         ready = all_of(self.hold("source"), self.let_go("master"))
         return [("SHADOWING", self.hold("master")), ("READY", ready)]
 
+    def released_held(self) -> list[tuple[str, Blow]]:
+        """Blows that hold the source when it is RELEASED, before the master knows and ends it."""
+        released = all_of(self.hold("source"), self.let_go("master"))
+        return [("says SWITCH", self.hold("master")), ("RELEASED", released)]
+
     def _send(self, victim: str, number: int) -> None:
         pid = self._pid_of(victim)
         assert pid > 1, f"there is no {victim}"

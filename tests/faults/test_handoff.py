@@ -92,7 +92,7 @@ def test_the_source_is_killed(scene, moment):
 
 def test_a_source_that_will_not_die_is_killed(scene):
     """It ignores SIGINT and SIGTERM (it is stopped): SIGKILL ends it after its grace."""
-    scene.move(("RELEASED", scene.hold("source")))
+    scene.move(*scene.released_held())
     assert scene.end() == "moved"
     assert scene.is_gapless()
 
@@ -100,6 +100,6 @@ def test_a_source_that_will_not_die_is_killed(scene):
 @pytest.mark.parametrize("victim", ["master", "source's slave"])
 def test_a_source_that_will_not_die_outlives_who_orders_its_end(scene, victim):
     """The order stands: the supervisor goes on, or it is given once more."""
-    scene.move(("RELEASED", scene.hold("source")), ("source stopping", scene.kill(victim)))
+    scene.move(*scene.released_held(), ("source stopping", scene.kill(victim)))
     assert scene.end(victim) == "moved"
     assert scene.is_gapless()
