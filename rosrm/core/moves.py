@@ -153,6 +153,7 @@ def _commit(state: MasterState, run: Run, step: Commit, now: float) -> None:
     else:
         process.owner = run.destination.number
         images.set_image(state, process, None)
+    process.left_behind = None  # a source whose host was lost meanwhile has a successor now
     process.migrations += run.aim is Aim.MOVE
     process.moved_at = now
     if process.wanted is Wanted.REQUEUE:
@@ -243,8 +244,16 @@ def _why_turn_back(state: MasterState, run: Run) -> str:
     end = run.ended.get(run.source.number)
     if end is None:
         return ""
-    excused = _told_to_stop(run, run.source) or handoffs.is_switching(run)
+    excused = (
+        _told_to_stop(run, run.source) or handoffs.is_switching(run) or _has_left_in_image(run)
+    )
     return f"{run.source} ended by itself" if end.completed or not excused else ""
+
+
+def _has_left_in_image(run: Run) -> bool:
+    """The destination is being made of an image of the source, which stands still: all is in it."""
+    step = next((one for one in run.plan.steps if isinstance(one, Start)), None)
+    return step is not None and step.restored and step.instance.number in run.launched
 
 
 def _goes_on(state: MasterState, run: Run) -> bool:

@@ -183,6 +183,15 @@ def test_the_source_is_killed_in_its_dump(criu, scene):
     scene.ear.forget()
 
 
+def test_the_source_is_killed_once_its_image_is_restored(criu, scene):
+    """It stood still, and all that it remembered is in the image: the count goes on from there."""
+    scene.move("join")
+    scene.kill("source")
+    assert scene.end() == "migrated"
+    assert min(scene.ear.steps()) > 0
+    assert len(scene.ear.checksums) == 1
+
+
 @pytest.mark.parametrize("moment", ["fetch", "restore"])
 def test_the_destination_s_host_is_switched_off(criu, scene, moment):
     """Before the commit the source goes on, at the latest when that host counts as lost."""

@@ -49,12 +49,15 @@ class Portable(Machine):
         asked: names of the executors, in order.
         befalls: by the name of an executor, what happens once, just before it does its work.
         mute: names of executors whose next answer nobody hears.
+        slow: names of executors whose answers lie in `answers` until a test tells them.
         stand_still: instances that were dumped, with the attempt for which they were.
     """
 
     asked: list[str] = field(default_factory=list)
     befalls: dict[str, Callable[[], None]] = field(default_factory=dict)
     mute: set[str] = field(default_factory=set)
+    slow: set[str] = field(default_factory=set)
+    answers: list[happened.OrderAnswered] = field(default_factory=list)
     stand_still: dict[int, str] = field(default_factory=dict)
     _turned_back: set[str] = field(default_factory=set)
     _now: float = 0.0
@@ -73,6 +76,9 @@ class Portable(Machine):
         self.asked += [order.executor] if order.executor else []
         self.befalls.pop(order.executor, lambda: None)()
         answer = super().obey(order, now)
+        if order.executor in self.slow:
+            self.answers.append(answer)
+            return happened.OrderAnswered(0, accepted=True)  # of no order: nothing is said yet
         if self.connected and order.executor not in self.mute:
             return answer
         self.mute.discard(order.executor)

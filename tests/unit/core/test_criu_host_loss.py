@@ -23,9 +23,17 @@ POLICIES = ["wait", "elsewhere", "stop"]
 WAYS = ["cut", "without power"]
 
 
-def story(then: Any = "elsewhere", *others: str, delay: float = 0.0) -> Cluster:
-    """P runs on a, moves by criu, and could go to the others: b and c, if none are named."""
-    cluster = Cluster(Portable("a"), strategies={"criu": by_criu()}, lease=LEASE)
+def story(
+    then: Any = "elsewhere", *others: str, delay: float = 0.0, seconds: float = 2.0
+) -> Cluster:
+    """P runs on a, moves by criu, and could go to the others: b and c, if none are named.
+
+    Args:
+        then: its policy where its host is lost, after a `delay`.
+        others: the other hosts.
+        seconds: that each part of a move may take.
+    """
+    cluster = Cluster(Portable("a"), strategies={"criu": by_criu(seconds)}, lease=LEASE)
     policy = HostLossPolicy(then, delay)
     cluster.submit(node("p", migration=MigrationPolicy("criu"), host_loss=policy))
     for name in others or ("b", "c"):
@@ -147,6 +155,40 @@ def test_a_source_that_is_waited_for_goes_on_where_it_stands_still(executor: str
     back(cluster, "a")
     runs_alone(cluster, "a")
     assert cluster["p"].owner == first
+    nothing_else(cluster)
+
+
+def test_a_source_that_ends_is_followed_by_its_image_once_that_is_there() -> None:
+    """It stood still, so all that it remembered is in the image."""
+    cluster = story("elsewhere", seconds=10.0)
+    machine = host(cluster, "b")
+    machine.slow.add(AWAIT_RESTORED)
+    cluster.migrate("p", "b")
+    host(cluster, "a").finish("p", cluster.now, code=9)
+    wait(cluster, 1.0)
+    cluster.tell(machine.answers.pop())
+    wait(cluster, 3.0)
+    runs_alone(cluster, "b")
+    assert cluster["p"].owner == 2
+
+
+@pytest.mark.parametrize("then", ["elsewhere", "stop"])
+def test_a_source_that_is_given_up_is_followed_by_its_image(then: str) -> None:
+    """Its memory has left the lost host: neither is it begun anew, nor has it failed."""
+    cluster = story(then, seconds=3 * LEASE)
+    machine = host(cluster, "b")
+    machine.befalls[AWAIT_RESTORED] = lambda: lose(cluster, "a")
+    machine.slow.add(AWAIT_RESTORED)
+    cluster.migrate("p", "b")
+    wait(cluster, LEASE + 2.0)
+    assert cluster.told("given_up") == ["p#1 is given up: a is lost"]
+    assert not heard(cluster)
+    cluster.tell(machine.answers.pop())
+    wait(cluster, 3.0)
+    runs_alone(cluster, "b")
+    assert cluster["p"].owner == 2
+    back(cluster, "a")
+    runs_alone(cluster, "b")
     nothing_else(cluster)
 
 
