@@ -14,6 +14,7 @@ from tests.ros.clusters import PATIENCE, QUICK, Cluster, host
 
 ROOT = Path(__file__).resolve().parents[2]
 NAME = "moving"
+PROGRAMS = "benchmarks.handoff_nodes"
 RATE = 50.0
 #: Outputs of one instance alone after which it is taken for the active one.
 _ALONE = 10
@@ -40,10 +41,13 @@ class Scene:
         make: makes a cluster.
         program: of `benchmarks.handoff_nodes`.
         inputs: how many it is given a second.
+        module: that runs the program.
         options: of the strategy.
     """
 
-    def __init__(self, make, program: str, inputs: float = 0.0, **options) -> None:
+    def __init__(
+        self, make, program: str, inputs: float = 0.0, module: str = PROGRAMS, **options
+    ) -> None:
         self.cluster: Cluster = make(host("h0"), host("h1"), liveness=LivenessSettings())
         self.watcher = Watcher(self.cluster.domain, inputs)
         self._source = self._pid = 0
@@ -51,7 +55,7 @@ class Scene:
         self._begun = 0
         self.cluster.submit(
             ProcessSpec(
-                NAME, module="benchmarks.handoff_nodes",
+                NAME, module=module,
                 arguments=(program, "--rate", str(RATE)),
                 environment={"PYTHONPATH": str(ROOT)}, ros=True, stop=QUICK,
                 restart=RestartPolicy("on-failure", delay=0.2, attempts=100),
@@ -147,15 +151,13 @@ class Scene:
         """It goes on."""
         return lambda: self._send(victim, signal.SIGCONT)
 
+    def leave_alone(self) -> None:
+        """No blow falls."""
+
     def source_held(self) -> list[tuple[str, Blow]]:
         """Blows that hold the source when the destination is READY, before the master knows it."""
         ready = all_of(self.hold("source"), self.let_go("master"))
         return [("SHADOWING", self.hold("master")), ("READY", ready)]
-
-    def released_held(self) -> list[tuple[str, Blow]]:
-        """Blows that hold the source when it is RELEASED, before the master knows and ends it."""
-        released = all_of(self.hold("source"), self.let_go("master"))
-        return [("says SWITCH", self.hold("master")), ("RELEASED", released)]
 
     def _send(self, victim: str, number: int) -> None:
         pid = self._pid_of(victim)

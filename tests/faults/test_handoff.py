@@ -35,6 +35,14 @@ def scene(make_shared):
     one.close()
 
 
+@pytest.fixture(scope="module")
+def deaf(make_shared):
+    """As `scene`, but SIGKILL alone ends it."""
+    one = Scene(make_shared, "count", module="tests.ros.programs.deaf")
+    yield one
+    one.close()
+
+
 def strike(scene: Scene, victim: str, moment: str) -> str:
     """Kill somebody at a moment; how the move has ended."""
     scene.move((moment, scene.kill(victim)))
@@ -90,16 +98,16 @@ def test_the_source_is_killed(scene, moment):
         assert second[0].sequence in (first[-1].sequence, first[-1].sequence + 1)
 
 
-def test_a_source_that_will_not_die_is_killed(scene):
-    """It ignores SIGINT and SIGTERM (it is stopped): SIGKILL ends it after its grace."""
-    scene.move(*scene.released_held())
-    assert scene.end() == "moved"
-    assert scene.is_gapless()
+def test_a_source_that_will_not_die_is_killed(deaf):
+    """SIGINT and SIGTERM do not reach it: SIGKILL ends it after its grace."""
+    deaf.move(("source stopping", deaf.leave_alone))
+    assert deaf.end() == "moved"
+    assert deaf.is_gapless()
 
 
 @pytest.mark.parametrize("victim", ["master", "source's slave"])
-def test_a_source_that_will_not_die_outlives_who_orders_its_end(scene, victim):
+def test_a_source_that_will_not_die_outlives_who_orders_its_end(deaf, victim):
     """The order stands: the supervisor goes on, or it is given once more."""
-    scene.move(*scene.released_held(), ("source stopping", scene.kill(victim)))
-    assert scene.end(victim) == "moved"
-    assert scene.is_gapless()
+    deaf.move(("source stopping", deaf.kill(victim)))
+    assert deaf.end(victim) == "moved"
+    assert deaf.is_gapless()
