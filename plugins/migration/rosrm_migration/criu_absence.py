@@ -84,5 +84,8 @@ def control_of(pid: int) -> Path:
 
 
 def owner_of(pid: int) -> int:
-    """The user whom the process belongs to."""
-    return Path(f"/proc/{tree.root_of(pid)}").stat().st_uid
+    """The user whom the process belongs to; raises `CriuError` where it has ended."""
+    try:
+        return Path(f"/proc/{tree.root_of(pid)}").stat().st_uid
+    except OSError:
+        raise CriuError(f"process {pid} has ended") from None

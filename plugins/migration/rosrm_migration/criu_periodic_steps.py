@@ -34,15 +34,26 @@ _LOOK: Final = 0.01
 def dump(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
     """Have the node leave, dump it, and have it join again."""
     asked = Asked.of(arguments)
+    parent = places.periodic(asked.state, asked.source)
     with luggage.alone(asked.source, asked.timeout):
-        return _dump(asked)
+        try:
+            return _dump(asked, parent)
+        except OSError as error:
+            raise CriuError(why_not_written(parent, error)) from None
 
 
-def _dump(asked: Asked) -> Mapping[str, Any]:
+def why_not_written(parent: Path, error: OSError) -> str:
+    """In words: a process that was started anew meanwhile has taken its images away."""
+    if isinstance(error, FileNotFoundError) and not parent.exists():
+        return "the process was started anew meanwhile, and its images are removed"
+    return f"no image can be made in {parent}: {error.strerror}"
+
+
+def _dump(asked: Asked, parent: Path) -> Mapping[str, Any]:
     pid = asked.leader(asked.source)
     control, root = control_of(pid), tree.root_of(pid)
-    parent = places.periodic(asked.state, asked.source)
-    _make(parent)
+    for directory in (parent.parent, parent):
+        directory.mkdir(mode=0o700, parents=True, exist_ok=True)
     periodic.discard_unfinished(parent)
     slot, away, began = periodic.new_slot(parent), parent / _AWAY, time.monotonic()
     away.write_text(asked.attempt, encoding="utf-8")
@@ -66,14 +77,6 @@ def _dump(asked: Asked) -> Mapping[str, Any]:
             "prepare": left - began, "dump": dumped - left, "join": joined - dumped,
         },
     }  # fmt: skip
-
-
-def _make(parent: Path) -> None:
-    try:
-        for directory in (parent.parent, parent):
-            directory.mkdir(mode=0o700, parents=True, exist_ok=True)
-    except OSError as error:
-        raise CriuError(f"no image can be made in {parent}: {error.strerror}") from None
 
 
 def _dump_away(asked: Asked, pid: int, control: Path, slot: Path) -> tuple[Manifest, float]:
