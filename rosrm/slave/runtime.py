@@ -7,11 +7,9 @@ import logging
 import os
 import signal
 import socket
-import sys
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -20,35 +18,29 @@ from rosrm.config.settings import HostConfig
 from rosrm.core import slave as core
 from rosrm.core.model import (
     RESOURCE_SLOTS,
-    Assignment,
     HostDescription,
     InstanceId,
-    InstanceState,
     InstanceStatus,
     KeptState,
     RestartPolicy,
     StopPolicy,
 )
-from rosrm.criu import periodic, places
-from rosrm.errors import LaunchError, Refused
-from rosrm.portable import control_root
+from rosrm.errors import Refused
 from rosrm.ports import ProbeContext
 from rosrm.registry import Registry
 from rosrm.ros.graph import GraphWatch
 from rosrm.ros.journal_seen import JournalSeen
 from rosrm.ros.kept_endpoint import KeptEndpoint
-from rosrm.ros.names import STATE_CONFIG, Names, token
+from rosrm.ros.names import token
 from rosrm.ros.participant import Participant
 from rosrm.ros.slave_endpoint import Link, LogSlice, SlaveEndpoint
-from rosrm.slave.environment import Whereabouts
 from rosrm.slave.executing import Done, Here, execute
 from rosrm.slave.health import HealthWatch
 from rosrm.slave.keeping import Keeping
-from rosrm.slave.launch import launch_order
 from rosrm.slave.log_reading import NOTHING_YET, newest_instance, read_log
-from rosrm.slave.memos import to_memo
 from rosrm.slave.sampling import Sampler
 from rosrm.slave.sessions import SessionTable
+from rosrm.slave.starting import Starter
 from rosrm.slave.supervisor_link import SupervisorLink
 from rosrm.slave.usage import UsageWatch
 from rosrm.state_directory import only_one
@@ -86,7 +78,6 @@ class SlaveRuntime:
         self._incarnation = _random_number()
         self._stopping = ""
         self._left = False
-        self._shutting_down = False
         self._accepting = False
         max_age = max(config.control.max_age, _BEATS_MISSED * config.period)
         self._state = core.SlaveState(
@@ -94,10 +85,8 @@ class SlaveRuntime:
         )
         self._events: deque[core.Event] = deque()
         self._from_threads: deque[Callable[[], None]] = deque()
-        self._graph_before: dict[InstanceId, frozenset[bytes]] = {}
         self._unsettled: dict[tuple[InstanceId, RestartPolicy], list[Settled]] = {}
         self._executors = registry.executors()
-        self._kept = config.state / "kept"
         self._closing = contextlib.ExitStack()
         with contextlib.ExitStack() as opened:
             opened.enter_context(
@@ -105,9 +94,9 @@ class SlaveRuntime:
                     config.state, "slave", code="name_taken", remedy="another `host:` and `state:`"
                 )
             )
-            self._sessions = SessionTable()
-            self._usage = UsageWatch(self._sessions)
-            context = ProbeContext(config.scope, config.budget, config.state, self._sessions)
+            sessions = SessionTable()
+            self._usage = UsageWatch(sessions)
+            context = ProbeContext(config.scope, config.budget, config.state, sessions)
             probes = registry.probes(config.probes, context)
             self._sampler = Sampler(probes.made)
             opened.callback(self._sampler.close)
@@ -125,10 +114,9 @@ class SlaveRuntime:
                 config.ros, f"rosrm_slave_{token(config.host)}", pace="steady"
             )
             opened.callback(self._participant.close)
-            self._graph = GraphWatch(self._participant.node)
-            self._health = HealthWatch(self._participant, self._graph, self._sessions)
+            graph = GraphWatch(self._participant.node)
+            self._health = HealthWatch(self._participant, graph, sessions)
             self._limit = self._limits()
-            self._environment = {**os.environ, **config.ros.environment()}
             self._endpoint = SlaveEndpoint(
                 self._participant,
                 self,
@@ -136,10 +124,15 @@ class SlaveRuntime:
                 max_age,
                 JournalSeen(config.state / "journal_seen"),
             )
+            kept = config.state / "kept"
             self._keeping = Keeping(
-                self._kept, config.host, config.keep,
+                kept, config.host, config.keep,
                 KeptEndpoint(self._participant, config.host),
                 post=self._post, say=self.say, publish=self._endpoint.publish_kept,
+            )  # fmt: skip
+            self._starter = Starter(
+                config, self._incarnation, kept, self._state, self._supervisor, self._endpoint,
+                self._keeping, graph, sessions, take=self.take, say=self.say,
             )  # fmt: skip
             self._closing = opened.pop_all()
         self._adopt()
@@ -190,7 +183,7 @@ class SlaveRuntime:
             awaited = self._state.awaited_in_graph()
             if awaited and now >= next_graph:
                 next_graph = now + _LOOK_AT_GRAPH
-                self._look_at_graph(awaited)
+                self._starter.look_at_graph(awaited)
             if now >= next_health:
                 next_health = now + core.LOOK_PERIOD
                 self._events.extend(self._health.look(self._state.watched(), now))
@@ -235,13 +228,6 @@ class SlaveRuntime:
                 [used.memory for used in seen.values()],
             )
 
-    def _look_at_graph(self, awaited: Mapping[InstanceId, core.Held]) -> None:
-        for instance, held in awaited.items():
-            before = self._graph_before.get(instance, frozenset())
-            pids = self._sessions.known_as(held.status.pid)
-            if held.awaited and self._graph.sees(held.awaited.node_name, pids, before):
-                self.take(core.SeenInGraph(instance))
-
     # --- core and supervisor -------------------------------------------------------------
 
     def take(self, event: core.Event) -> None:
@@ -273,81 +259,26 @@ class SlaveRuntime:
 
     def _carry_out(self, command: core.Command) -> None:
         if isinstance(command, core.Launch):
-            self._launch(command.assignments)
+            self._starter.launch(command.assignments)
         elif isinstance(command, core.Report):
             self._endpoint.publish_statuses(command.statuses, complete=command.complete)
         elif isinstance(command, core.Settle):
             for settled in self._unsettled.pop((command.instance, command.restart), []):
                 settled(command.refusal)
-        elif isinstance(
-            command, core.Stop | core.Fence | core.Restart
-        ) and self._keeping.is_preparing(command.instance):
-            self._do_not_begin(command)
         else:
-            if isinstance(command, core.Fail):
-                self.say(f"{command.instance} is {command.reason}")
-            if isinstance(command, core.Restart):  # by hand: it begins anew
-                periodic.begin_anew(places.periodic(self._config.state, command.instance.number))
-            self._supervisor.carry_out(command)
+            self._have_supervisor(command)
 
-    def _launch(self, assignments: Sequence[Assignment]) -> None:
-        """Start them, each as soon as its kept state is here."""
-        # Of several events at once the last may have been that its supervisor is gone.
-        wanted = [one for one in assignments if one.instance in self._state.held]
-        ready = [one for one in wanted if self._keeping.prepare(one, self._prepared)]
-        if ready:
-            self._start(ready)
-        # A state may take its time to come. Until it runs nobody else says so, and the master would
-        # take it back.
-        waiting = [
-            self._state.held[one.instance].status
-            for one in wanted if one not in ready and one.kept_on
-        ]  # fmt: skip
-        if waiting:
-            self._endpoint.publish_statuses(waiting, complete=False)
-
-    def _prepared(self, assignment: Assignment) -> None:
-        held = self._state.held.get(assignment.instance)
-        wanted = held is not None and held.status.state is InstanceState.STARTING
-        if wanted and not self._shutting_down:
-            self._start([assignment])
-
-    def _do_not_begin(self, command: core.Stop | core.Fence | core.Restart) -> None:
-        """It is still being prepared: what it waits for comes with its start."""
-        if not isinstance(command, core.Restart):
-            self._keeping.forget(command.instance)
-            refusal = "it was stopped before it was started"
-            self.take(core.LaunchRefused(command.instance, refusal))
-
-    def _start(self, assignments: Sequence[Assignment]) -> None:
-        orders = []
-        where = Whereabouts(
-            self._config.host,
-            self._endpoint.cluster,
-            Names(self._config.ros.namespace)(STATE_CONFIG),
-            self._kept,
-            self._config.keep.every,
-            control_root(os.geteuid()),
-            self._incarnation,
-        )
-        for assignment in assignments:
-            held = self._state.held[assignment.instance]
-            awaited = held.awaited
-            if awaited is not None:
-                before = self._graph.endpoints(awaited.node_name)
-                self._graph_before[assignment.instance] = before
-            try:
-                order = launch_order(
-                    assignment, self._environment, sys.executable, where=where,
-                    state_directory=self._supervisor.state, images=self._config.state,
-                    heard=self._state.heard_at,
-                )  # fmt: skip
-                orders.append(replace(order, memo=to_memo(held.memo)))
-            except LaunchError as error:
-                self.say(f"{assignment.instance} cannot be started here: {error}")
-                self.take(core.LaunchRefused(assignment.instance, str(error)))
-        if orders:
-            self._supervisor.start(orders)
+    def _have_supervisor(self, command: core.Command) -> None:
+        """Have the supervisor carry something out, unless the instance waits for its start."""
+        if isinstance(command, core.Stop | core.Fence | core.Restart) and self._starter.call_off(
+            command
+        ):
+            return
+        if isinstance(command, core.Fail):
+            self.say(f"{command.instance} is {command.reason}")
+        if isinstance(command, core.Restart):  # by hand
+            self._starter.begin_anew(command.instance)
+        self._supervisor.carry_out(command)
 
     def _wake(self) -> None:
         # The participant may be closed already, when the last words come.
@@ -361,7 +292,7 @@ class SlaveRuntime:
     def _follow_session(self, status: InstanceStatus) -> None:
         self._usage.follow(status)
         if status.state.ended:
-            self._graph_before.pop(status.instance, None)
+            self._starter.ended(status.instance)
 
     # --- what the endpoint asks ----------------------------------------------------------
 
@@ -435,7 +366,7 @@ class SlaveRuntime:
             return 1
         if live:
             self.say(f"stopping {live} processes ({self._stopping or 'refused'})")
-        self._shutting_down = True
+        self._starter.close()
         self._endpoint.leave(self._supervisor.shut_down)
         deadline = time.monotonic() + self._longest_stop()
         self._serve(lambda: not self._left and time.monotonic() < deadline)
