@@ -49,7 +49,7 @@ class _Track:
         mixed: time stamps are not in one order: several publishers, or one that was started again
             where the clock is behind.
         overlap: a message was received that the source has processed too.
-        heard_at: when the last message came, seconds.
+        heard_at: when the last message came, here or to the source, seconds.
         held: messages in the buffer.
         last: message of the one publisher.
         after_gap: time stamp of the message before which one is missing; None: none is.
@@ -110,7 +110,7 @@ class InputBuffer:
         self._kept.append(Kept(topic, sent.stamp, item, size))
         return True
 
-    def cover(self, topic: str, stamps: Iterable[int], *, single: bool) -> None:
+    def cover(self, topic: str, stamps: Iterable[int], *, single: bool, now: float) -> None:
         """A state covers these messages of an input: they are dropped, now or when they come.
 
         Args:
@@ -118,6 +118,7 @@ class InputBuffer:
             stamps: source time stamps, ns.
             single: one publisher alone speaks there, so that its stamps are in order, and a message
                 that is older than the newest covered was passed over by the source.
+            now: monotonic seconds.
         """
         track = self._track(topic)
         stamps = list(stamps)
@@ -125,6 +126,7 @@ class InputBuffer:
         new = [stamp for stamp in stamps if stamp not in track.covered]
         if not new:
             return
+        track.heard_at = now
         track.covered.update(dict.fromkeys(new))
         newest = max(new)
         track.newest = newest if track.newest is None else max(track.newest, newest)
@@ -157,7 +159,11 @@ class InputBuffer:
         return track.newest is None or track.newest < track.after_gap
 
     def is_idle(self, topic: str, now: float, since: float, for_seconds: float) -> bool:
-        """Whether nothing waits, and nothing came for so long, `since` then at the earliest."""
+        """Whether nothing waits, and nothing came for so long, `since` then at the earliest.
+
+        Neither here nor to the source: what it is sent may have been lost on its way here, and come
+        later.
+        """
         track = self._track(topic)
         return not track.held and now - max(track.heard_at, since) >= for_seconds
 

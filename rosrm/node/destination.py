@@ -213,10 +213,11 @@ class Destination:
             self._end(HandoffReport.FAILED, str(error))
             return False
         self._cut = cut
+        now = time.monotonic()
         for mark in (*cut.passed, cut.mark):
             for covered in mark.inputs:
                 self._member.buffer.cover(
-                    covered.topic, covered.covered, single=covered.publishers <= 1
+                    covered.topic, covered.covered, single=covered.publishers <= 1, now=now
                 )
         return True
 

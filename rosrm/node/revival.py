@@ -111,7 +111,9 @@ class Revival:
         member = self._member
         member.sequence = int(mark.sequence)
         for covered in mark.inputs:
-            member.buffer.cover(covered.topic, covered.covered, single=covered.publishers <= 1)
+            member.buffer.cover(
+                covered.topic, covered.covered, single=covered.publishers <= 1, now=time.monotonic()
+            )
             member.inherit(covered.topic, covered.covered)
         due = [None if ns < 0 else ns / 1e9 for ns in mark.timers_due]
         try:

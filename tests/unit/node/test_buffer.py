@@ -31,14 +31,14 @@ def test_messages_come_out_in_the_order_in_which_they_came_in():
 def test_what_a_state_covers_is_dropped():
     """The rest stays, in order."""
     buffer = filled((A, 1), (B, 1), (A, 2), (A, 3))
-    buffer.cover(A, [1, 2], single=True)
+    buffer.cover(A, [1, 2], single=True, now=0.0)
     assert drained(buffer) == [(B, 1), (A, 3)]
 
 
 def test_a_message_may_come_after_the_state_that_covers_it():
     """Marks and inputs take different ways."""
     buffer = filled()
-    buffer.cover(A, [5], single=False)
+    buffer.cover(A, [5], single=False, now=0.0)
     assert buffer.add(A, Sent(5), None, 0.0)
     assert buffer.add(A, Sent(6), None, 0.0)
     assert drained(buffer) == [(A, 6)]
@@ -47,25 +47,25 @@ def test_a_message_may_come_after_the_state_that_covers_it():
 def test_what_one_publisher_said_before_the_newest_covered_was_passed_over():
     """The source never had it: it is not made up for, out of order."""
     buffer = filled((A, 1), (A, 2), (A, 3))
-    buffer.cover(A, [2], single=True)
+    buffer.cover(A, [2], single=True, now=0.0)
     assert drained(buffer) == [(A, 3)]
 
 
 def test_the_clocks_of_several_publishers_are_not_compared():
     """A robot whose clock is behind is not taken for covered."""
     buffer = filled((A, 1000), (A, 3))
-    buffer.cover(A, [1000], single=False)
+    buffer.cover(A, [1000], single=False, now=0.0)
     assert drained(buffer) == [(A, 3)]
 
 
 def test_a_publisher_that_moves_to_a_clock_behind_is_not_taken_for_covered():
     """Seen by its own time stamps, or by those that the source has processed."""
     buffer = filled((A, 1000))
-    buffer.cover(A, [1000], single=True)
+    buffer.cover(A, [1000], single=True, now=0.0)
     assert buffer.add(A, Sent(3), None, 0.0)
     assert drained(buffer) == [(A, 3)]
     buffer = filled()
-    buffer.cover(A, [1000, 3], single=True)
+    buffer.cover(A, [1000, 3], single=True, now=0.0)
     assert buffer.add(A, Sent(4), None, 0.0)
     assert drained(buffer) == [(A, 4)]
 
@@ -73,8 +73,8 @@ def test_a_publisher_that_moves_to_a_clock_behind_is_not_taken_for_covered():
 def test_a_publisher_that_is_alone_again_is_not_measured_by_one_that_left():
     """Its clock may have been ahead."""
     buffer = filled()
-    buffer.cover(A, [10, 1000], single=False)
-    buffer.cover(A, [11], single=True)
+    buffer.cover(A, [10, 1000], single=False, now=0.0)
+    buffer.cover(A, [11], single=True, now=0.0)
     assert buffer.add(A, Sent(12), None, 0.0)
     assert drained(buffer) == [(A, 12)]
 
@@ -87,16 +87,16 @@ def test_a_message_that_did_not_come_is_missed_until_a_state_covers_it():
         buffer.add(A, Sent(stamp, number), None, 0.0)
     assert buffer.misses_one(A)
     assert not buffer.misses_one(B)
-    buffer.cover(A, [10, 20, 30], single=True)
+    buffer.cover(A, [10, 20, 30], single=True, now=0.0)
     assert buffer.misses_one(A)  # 40 may be the second that is missing
-    buffer.cover(A, [40], single=True)
+    buffer.cover(A, [40], single=True, now=0.0)
     assert not buffer.misses_one(A)
 
 
 def test_numbers_of_several_publishers_say_nothing_of_a_loss():
     """Nor do those of one that was started again."""
     buffer = InputBuffer(10, ROOM, 0.0)
-    buffer.cover(A, [5], single=False)
+    buffer.cover(A, [5], single=False, now=0.0)
     for stamp, number in ((10, 1), (20, 70), (30, 2)):
         buffer.add(A, Sent(stamp, number), None, 0.0)
     assert not buffer.misses_one(A)
@@ -110,7 +110,7 @@ def test_the_buffer_is_bounded_for_each_input():
     buffer = filled((A, 1), (A, 2), limit=2)
     assert not buffer.add(A, Sent(3), None, 0.0)
     assert buffer.add(B, Sent(3), None, 0.0)
-    buffer.cover(A, [1], single=True)
+    buffer.cover(A, [1], single=True, now=0.0)
     assert buffer.add(A, Sent(3), None, 0.0)
     assert drained(buffer) == [(A, 2), (B, 3), (A, 3)]
 
@@ -118,11 +118,11 @@ def test_the_buffer_is_bounded_for_each_input():
 def test_an_input_overlaps_once_a_message_was_here_and_in_the_state():
     """Whichever came first."""
     buffer = filled((A, 5))
-    buffer.cover(A, [4], single=True)
+    buffer.cover(A, [4], single=True, now=0.0)
     assert not buffer.overlaps(A)
-    buffer.cover(A, [5], single=True)
+    buffer.cover(A, [5], single=True, now=0.0)
     assert buffer.overlaps(A)
-    buffer.cover(B, [7], single=True)
+    buffer.cover(B, [7], single=True, now=0.0)
     assert not buffer.overlaps(B)
     buffer.add(B, Sent(7), None, 0.0)
     assert buffer.overlaps(B)
@@ -136,8 +136,19 @@ def test_an_input_is_idle_when_nothing_waits_and_nothing_came_for_a_while():
     assert not buffer.is_idle(A, 101.0, 100.5, 1.0)
     buffer.add(A, Sent(1), None, 101.0)
     assert not buffer.is_idle(A, 103.0, 0.0, 1.0)
-    buffer.cover(A, [1], single=True)
+    buffer.cover(A, [1], single=True, now=0.0)
     assert buffer.is_idle(A, 103.0, 0.0, 1.0)
+
+
+def test_an_input_that_the_source_is_sent_is_not_idle():
+    """Though nothing comes here: a reliable reader may wait for what was lost on its way."""
+    buffer = InputBuffer(10, ROOM, 100.0)
+    buffer.cover(A, [1, 2], single=True, now=102.0)
+    assert not buffer.is_idle(A, 102.5, 0.0, 1.0)
+    buffer.cover(A, [2, 3], single=True, now=102.6)
+    assert not buffer.is_idle(A, 103.5, 0.0, 1.0)
+    buffer.cover(A, [2, 3], single=True, now=103.5)
+    assert buffer.is_idle(A, 103.6, 0.0, 1.0)
 
 
 @given(st.data())
@@ -157,5 +168,5 @@ def test_source_and_successor_together_process_each_message_once(data):
         if kind == "message":
             assert buffer.add(A, Sent(value), None, 0.0)
         else:
-            buffer.cover(A, range(value)[-3:], single=True)
+            buffer.cover(A, range(value)[-3:], single=True, now=0.0)
     assert drained(buffer) == [(A, stamp) for stamp in range(stopped, total)]
