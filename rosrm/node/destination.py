@@ -336,11 +336,7 @@ class Destination:
         passed = time.monotonic() - cut.arrived
         due = [None if ns < 0 else ns / 1e9 - passed for ns in cut.mark.timers_due]
         # What waits is served first: to let go of the source, and to become one, takes its time.
-        member.become_active(due, self._say_active, self._settle)
-
-    def _settle(self) -> None:
-        self._unfollow()
-        self._activated()
+        member.become_active(due, self._say_active, (self._unfollow, self._activated))
 
     def _say_active(self) -> None:
         if self._channel is not None:

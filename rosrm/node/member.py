@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from enum import Enum
 from typing import Any, Final
 
@@ -344,7 +344,7 @@ class Member:
 
     def become_active(
         self, timers_due: list[float | None], announce: Callable[[], None],
-        settle: Callable[[], None] | None = None,
+        settle: Sequence[Callable[[], None]] = (),
     ) -> None:  # fmt: skip
         """Go on: first say so, then serve what was kept.
 
@@ -352,22 +352,28 @@ class Member:
             timers_due: seconds until each timer is due, negative where it is late; None: it was
                 cancelled. Timers beyond the list start now.
             announce: called at once, as serving may take long.
-            settle: called after the first slice of what was kept, when timers and services go on.
+            settle: called after the first slices of what was kept, when timers and services go on.
         """
         self.mode = Mode.ACTIVE
         self._gate.is_open = True
         self._late_until = time.monotonic() + _LATE
         announce()
-        begun = time.monotonic()
+        self._replay.begin(self._go_on(timers_due, time.monotonic(), settle))
 
-        def go_on() -> None:
-            self._start_timers(timers_due, time.monotonic() - begun)
-            for opening in self._openings:
+    def _go_on(
+        self, timers_due: list[float | None], begun: float, settle: Sequence[Callable[[], None]]
+    ) -> Iterator[None]:
+        """Timers and services, in steps of some ms: what comes meanwhile is served between them."""
+        self._start_timers(timers_due, time.monotonic() - begun)
+        for opening in list(self._openings):
+            yield
+            if self.mode is not Mode.ACTIVE:
+                return
+            if opening in self._openings:
                 opening.open()
-            if settle is not None:
-                settle()
-
-        self._replay.begin(after_first=go_on)
+        for call in settle:
+            yield
+            call()
 
     def _start_timers(self, due: list[float | None], passed: float) -> None:
         for index, timer in enumerate(list(self.timers)):

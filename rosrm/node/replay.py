@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, Final
 
 from rosrm.node.steady import steady_timer
 
 #: Seconds of one slice; a callback that is begun is finished.
 _SLICE: Final = 0.02
+#: There is no further step.
+_OVER: Final = object()
 
 
 class Replay:
@@ -26,7 +28,7 @@ class Replay:
         self._turn = turn
         self._serve_next = serve_next
         self._timer: Any = None
-        self._after_first: Callable[[], None] = _nothing
+        self._beside: Iterator[None] = iter(())
         self._then: Callable[[], None] = _nothing
         self._counted = 0
 
@@ -35,13 +37,13 @@ class Replay:
         """There is, or may be, something that was kept: what comes now has to wait behind it."""
         return self._timer is not None
 
-    def begin(self, *, after_first: Callable[[], None]) -> None:
+    def begin(self, beside: Iterator[None]) -> None:
         """Serve all that is kept, from the executor's next round on.
 
         Args:
-            after_first: called after the first slice.
+            beside: does what else there is to be done; it is taken a step further after each slice.
         """
-        self._after_first = after_first
+        self._beside = beside
         self._start()
 
     def serve(self, count: int, then: Callable[[], None]) -> None:
@@ -57,16 +59,15 @@ class Replay:
         with self._turn:
             if self._timer is None:
                 return
-            more = True
+            more = steps = True
             try:
                 more = self._serve_until(time.monotonic() + _SLICE)
             finally:
-                after_first, self._after_first = self._after_first, _nothing
-                after_first()
+                steps = next(self._beside, _OVER) is not _OVER
             if not more or self._counted <= 0:
                 then, self._then = self._then, _nothing
                 then()
-            if not more:
+            if not (more or steps):
                 self._plain.destroy_timer(self._timer)
                 self._timer = None
 

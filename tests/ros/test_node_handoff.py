@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import pytest
 import rclpy
 from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
+from rclpy.duration import Duration
 from rclpy.parameter import Parameter
 from std_msgs.msg import Int64, String
 from std_srvs.srv import Trigger
@@ -111,11 +112,14 @@ def test_the_alias_changes_no_visible_name(stage, pair):
     """Topics below ~ and parameter services are where they were."""
     pair.conductor.hand_over()
     stage.remove(pair.first)
-    names = [name for name, _ in stage.plain.get_service_names_and_types()]
+
+    def names():
+        return [name for name, _ in stage.plain.get_service_names_and_types()]
+
     stage.spin_until(lambda: stage.plain.count_publishers("/counter/state") == 1, "its state topic")
+    stage.spin_until(lambda: "/counter/set_parameters" in names(), "its parameter services")
     assert pair.second.get_name() == "counter_1700000000"
-    assert "/counter/set_parameters" in names
-    assert not [name for name in names if "1700000000" in name and "type_desc" not in name]
+    assert not [name for name in names() if "1700000000" in name and "type_desc" not in name]
 
 
 def test_parameters_set_at_run_time_move_along(stage):
@@ -366,7 +370,32 @@ def test_an_opening_is_made_in_the_active_node_and_destroyed_in_the_silent_one(s
     stage.instance(Opener, 2, alias="counter_17", shadow=True)
     assert made == [("made", "counter")]
     Conductor(stage, source=1, destination=2).hand_over()
+    stage.spin_until(lambda: len(made) == 3, "what the successor makes")
     assert made[1:] == [("destroyed", "counter"), ("made", "counter_17")]
+
+
+def test_inputs_are_served_between_two_services_that_open(stage):
+    """To open one takes DDS some ms: nobody waits for all of them."""
+    talker = stage.plain.create_publisher(Int64, "add", RELIABLE)
+    totals = []
+
+    class Opener(Counter):
+        def __init__(self, **named):
+            super().__init__(**named)
+            for _ in range(3):
+                self.when_active(self.open)
+
+        def open(self):
+            totals.append((self.get_name(), self.total))
+            talker.publish(Int64(data=1))
+            assert talker.wait_for_all_acked(Duration(seconds=PATIENCE))
+
+    first = stage.instance(Opener, 1)
+    stage.spin_until(lambda: first.total == 3, "what was sent at its start")
+    stage.instance(Opener, 2, alias="counter_17", shadow=True)
+    Conductor(stage, source=1, destination=2).hand_over()
+    stage.spin_until(lambda: len(totals) == 6, "what the successor opens")
+    assert totals[3:] == [("counter_17", 3), ("counter_17", 4), ("counter_17", 5)]
 
 
 # --- called off -------------------------------------------------------------------------------
