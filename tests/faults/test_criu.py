@@ -54,10 +54,11 @@ class Scene:
         self.ear.hear(20)
         self.source, self._number = row.host, row.number
         self._before = self.cluster.client.list().last_sequence
+        left = set(self._signs(moment))  # of moves before
         refusal = ask(self.cluster, _OTHER[row.host])
         assert not refusal, refusal
         deadline = time.monotonic() + PATIENCE
-        while not any(self._signs(moment)):
+        while not set(self._signs(moment)) - left:
             assert time.monotonic() < deadline, f"no {moment}: {self._log()}"
             time.sleep(0.001)
 

@@ -16,7 +16,7 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, Final
 
-from rosrm.criu import outcome
+from rosrm.criu import image, outcome
 from rosrm.criu.places import incoming, kept, outgoing
 from rosrm.errors import CriuError
 from rosrm.transfer import Fetcher, Sender
@@ -188,8 +188,10 @@ def remove_unused_later(directory: Path, keep: float) -> None:
 
 
 def remove_unused(directory: Path) -> None:
-    """Remove an image unless a process was restored from it."""
-    if not was_restored(directory):
+    """Remove an image; where a process was restored from it, that stays to be known."""
+    if was_restored(directory):
+        image.remove(directory)  # its hold may have been killed before it did
+    else:
         discard(directory)
 
 

@@ -8,7 +8,7 @@ from itertools import count
 
 import pytest
 
-from rosrm.criu import outcome
+from rosrm.criu import image, outcome
 from rosrm.criu.outcome import Outcome
 from rosrm.criu.places import incoming, outgoing
 from rosrm.errors import CriuError
@@ -89,11 +89,13 @@ def test_what_a_former_slave_has_left_goes(tmp_path, monkeypatch):
     assert incoming(tmp_path, 3).exists()
 
 
-@pytest.mark.parametrize(("reason", "stays"), [("", True), ("the image is damaged", False)])
-def test_an_image_goes_unless_a_process_was_restored_from_it(tmp_path, reason, stays):
-    """Of the other one, the program that holds the process disposes."""
+@pytest.mark.parametrize(("reason", "known"), [("", True), ("the image is damaged", False)])
+def test_an_unused_image_goes_and_that_there_was_a_restore_stays(tmp_path, reason, known):
+    """The program that holds the process may have been killed before it removed the image."""
     directory = incoming(tmp_path, 1)
     directory.mkdir(parents=True)
+    (directory / image.MANIFEST).write_text("{}")
     outcome.write(directory, Outcome(reason=reason, pid=7))
     luggage.remove_unused(directory)
-    assert directory.exists() is stays
+    assert luggage.was_restored(directory) is known
+    assert not (directory / image.MANIFEST).exists()
