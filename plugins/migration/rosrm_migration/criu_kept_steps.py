@@ -18,7 +18,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from rosrm.criu import dumping, image, outcome, ties, tree, udp_ports
+from rosrm.criu import dumping, image, ties, tree, udp_ports
 from rosrm.criu.places import incoming, kept, kept_numbers, ports_of_kept
 from rosrm.criu.program import find
 from rosrm.errors import CriuError
@@ -135,8 +135,7 @@ def _link(source: str, target: str) -> None:
 def await_kept(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
     """Wait until the image is a process again; it is used up then."""
     asked = Asked.of(arguments)
-    found = _wait(asked, asked.pid(asked.destination))
-    image.remove(incoming(asked.state, asked.destination))  # likewise done by its hold, if it lives
+    found = luggage.await_restored(asked)
     _discard(asked.state, asked.source)
     return {"seconds": {"restore": found.seconds}}
 
@@ -153,7 +152,7 @@ def put_back(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
         return {"active": True} if gone and TAKE in asked.results else {}
     pid = asked.pid(asked.destination)
     try:
-        _wait(asked, pid)
+        luggage.await_restored(asked)
     except CriuError:
         if asked.pid(asked.destination):
             tree.send([pid], signal.SIGKILL)  # the holding program, and so whatever it holds
@@ -162,14 +161,6 @@ def put_back(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
         return {}
     _discard(asked.state, asked.source)
     return {"active": True}
-
-
-def _wait(asked: Asked, pid: int) -> outcome.Outcome:
-    with without_log_names():
-        return outcome.wait(
-            incoming(asked.state, asked.destination), timeout=asked.timeout,
-            ended=lambda: not pid or not tree.is_alive(pid),
-        )  # fmt: skip
 
 
 # --- both -------------------------------------------------------------------------------------

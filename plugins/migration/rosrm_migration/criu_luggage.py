@@ -16,10 +16,12 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, Final
 
-from rosrm.criu import image, outcome
+from rosrm.criu import image, outcome, tree
+from rosrm.criu.outcome import Outcome
 from rosrm.criu.places import incoming, kept, outgoing
 from rosrm.errors import CriuError
 from rosrm.transfer import Fetcher, Sender
+from rosrm_migration.criu_asked import Asked, without_log_names
 
 Answer = Mapping[str, Any]
 
@@ -151,7 +153,7 @@ def open_fetcher(number: int, keep: float) -> str:
     fetcher = Fetcher()
     try:
         certificate = fetcher.introduce()
-    except BaseException:
+    except BaseException:  # whatever it was: nobody else knows of this end
         fetcher.close()
         raise
     with _changing:
@@ -182,8 +184,23 @@ def _dismiss(number: int, fetcher: Fetcher) -> None:
     fetcher.close()
 
 
+def await_restored(asked: Asked) -> Outcome:
+    """Wait until the image that came here is a process again; that alone stays to be known then.
+
+    Raises:
+        CriuError: it has become none.
+    """
+    pid, directory = asked.pid(asked.destination), incoming(asked.state, asked.destination)
+    with without_log_names():
+        found = outcome.wait(
+            directory, timeout=asked.timeout, ended=lambda: not pid or not tree.is_alive(pid)
+        )
+    image.remove(directory)  # its hold may have been killed before it did
+    return found
+
+
 def remove_unused_later(directory: Path, keep: float) -> None:
-    """Remove an image unless a process is restored from it until then."""
+    """As `remove_unused`, after so many seconds."""
     _later(keep, remove_unused, directory)
 
 

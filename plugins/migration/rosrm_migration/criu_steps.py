@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-from rosrm.criu import dumping, image, outcome, tree
+from rosrm.criu import dumping, tree
 from rosrm.criu.places import incoming, outgoing
 from rosrm.criu.probe import ability
 from rosrm.criu.program import find
@@ -203,17 +203,11 @@ def _fetch(asked: Asked) -> Answer:
 def await_restored(arguments: Answer) -> Answer:
     """Wait until the image is a process again; there is nothing left of one that cannot be."""
     asked = Asked.of(arguments)
-    pid, directory = asked.pid(asked.destination), incoming(asked.state, asked.destination)
     try:
-        with without_log_names():
-            found = outcome.wait(
-                directory, timeout=asked.timeout,
-                ended=lambda: not pid or not tree.is_alive(pid),
-            )  # fmt: skip
+        found = luggage.await_restored(asked)
     except CriuError:
-        luggage.remove_unused(directory)
+        luggage.remove_unused(incoming(asked.state, asked.destination))
         raise
-    image.remove(directory)  # its hold may have been killed before it did
     return {"seconds": {"restore": found.seconds}}
 
 
