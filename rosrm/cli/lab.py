@@ -86,11 +86,6 @@ def up(  # noqa: PLR0917 - typer calls it, by name
     made = Lab(name, hosts, subnet=parse_subnet(subnet) if subnet else None)
     with _interrupts_noted() as stop_if_asked:
         made.up(between=stop_if_asked)
-        try:
-            stop_if_asked()
-        except KeyboardInterrupt:
-            made.down()
-            raise
         warning = overbooked(hosts)
         if warning:
             typer.echo(f"rosrm: note: {warning}", err=True)

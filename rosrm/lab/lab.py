@@ -73,7 +73,8 @@ class Lab:
 
         Args:
             owner: the process whose end makes it one that was left behind.
-            between: called between two hosts; what it raises takes back what was made.
+            between: called before each host and after the last; what it raises takes back what was
+                made.
 
         Raises:
             LabError: it is up already, or something is missing on this machine; nothing is left.

@@ -69,7 +69,7 @@ def make(hierarchies: Sequence[Hierarchy], record: Record, between: Callable[[],
     """Make all that a lab's record says, and mark it as complete; raises `LabError`.
 
     Args:
-        between: called before each host, and may raise.
+        between: called before each host and after the last, and may raise.
     """
     plan = record.plan
     record.links = {name: Link() for name in plan.names}
@@ -79,6 +79,7 @@ def make(hierarchies: Sequence[Hierarchy], record: Record, between: Callable[[],
         groups.make(hierarchies, plan.name, host)
         disks.make(store.image(plan.name, host.name), host)
         switch_on(hierarchies, record, host.name)
+    between()
     record.complete = True
     store.write(record)
 
