@@ -252,8 +252,10 @@ def _why_turn_back(state: MasterState, run: Run) -> str:
 
 def _has_left_in_image(run: Run) -> bool:
     """The destination is being made of an image of the source, which stands still: all is in it."""
-    step = next((one for one in run.plan.steps if isinstance(one, Start)), None)
-    return step is not None and step.restored and step.instance.number in run.launched
+    return any(
+        isinstance(step, Start) and step.restored and step.instance.number in run.launched
+        for step in run.plan.steps
+    )
 
 
 def _goes_on(state: MasterState, run: Run) -> bool:

@@ -59,7 +59,6 @@ class Replay:
         with self._turn:
             if self._timer is None:
                 return
-            more = steps = True
             try:
                 more = self._serve_until(time.monotonic() + _SLICE)
             finally:

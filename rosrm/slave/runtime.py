@@ -270,9 +270,7 @@ class SlaveRuntime:
 
     def _have_supervisor(self, command: core.Command) -> None:
         """Have the supervisor carry something out, unless the instance waits for its start."""
-        if isinstance(command, core.Stop | core.Fence | core.Restart) and self._starter.call_off(
-            command
-        ):
+        if self._starter.call_off(command):
             return
         if isinstance(command, core.Fail):
             self.say(f"{command.instance} is {command.reason}")

@@ -77,8 +77,10 @@ class Starter:
         if waiting:
             self.endpoint.publish_statuses(waiting, complete=False)
 
-    def call_off(self, command: core.Stop | core.Fence | core.Restart) -> bool:
-        """Do not begin what still waits for its state; False: it does not wait."""
+    def call_off(self, command: core.Command) -> bool:
+        """Do not begin what still waits for its state; False: that is not what is to be done."""
+        if not isinstance(command, core.Stop | core.Fence | core.Restart):
+            return False
         if not self.keeping.is_preparing(command.instance):
             return False
         if not isinstance(command, core.Restart):  # what that wants comes with the start
