@@ -105,7 +105,7 @@ def _measured(name: str, options: argparse.Namespace) -> int:
         say(f"{name}: failed: {error}")
         say(f"{name}: settings, logs and records are kept in {folder}")
         return _FAILED
-    except BaseException:
+    except BaseException:  # a Ctrl-C, or a fault of ours: nobody looks at what was kept
         shutil.rmtree(folder, ignore_errors=True)
         raise
     shutil.rmtree(folder, ignore_errors=True)

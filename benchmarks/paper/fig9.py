@@ -115,7 +115,7 @@ def _scale(options: list[str], folder: Path) -> dict[str, Any]:
         )  # fmt: skip
         try:
             said, _ = process.communicate(timeout=_LONGEST)
-        except BaseException:
+        except BaseException:  # also a Ctrl-C: it hears none, being in a session of its own
             _end(process)
             raise
     if process.returncode:

@@ -315,7 +315,7 @@ class Desk:
     def __enter__(self) -> Self:
         try:
             self._line(_START)
-        except BaseException:
+        except BaseException:  # also a Ctrl-C: `with` ends nothing that it has not entered
             self.__exit__(None, None, None)
             raise
         return self

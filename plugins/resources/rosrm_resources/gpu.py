@@ -42,7 +42,7 @@ def create(options: GpuOptions, _context: ProbeContext) -> GpuProbe:
     nvml = load_nvml()
     try:
         return GpuProbe(options, nvml)
-    except BaseException:
+    except BaseException:  # whatever it was: who has no probe cannot close the driver
         nvml.nvmlShutdown()
         raise
 
