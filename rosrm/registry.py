@@ -14,8 +14,9 @@ from typing import Any, Final, TypeVar, cast
 
 from rosrm.config.plain import from_plain
 from rosrm.core.model import EMPTY, RESOURCE_SLOTS, ResourceDescription
+from rosrm.core.plugin_calls import TITLES
 from rosrm.core.views import PluginRow
-from rosrm.errors import ConfigError, PluginError, SkipPlugin
+from rosrm.errors import ConfigError, PluginError, SkipPlugin, describe_fault
 from rosrm.handover import PluginAddress
 from rosrm.loading import (
     FAULTS,
@@ -25,7 +26,6 @@ from rosrm.loading import (
     Offer,
     Offered,
     definition,
-    describe_fault,
     load_addresses,
     load_objects,
 )
@@ -39,14 +39,6 @@ from rosrm.ports import (
     ScoringPolicy,
 )
 from rosrm.spelling import get_close_matches
-
-#: What the kinds of offers are called in messages.
-TITLES: Final[Mapping[str, str]] = {
-    "probe": "probe",
-    "scoring": "scoring policy",
-    "migration": "migration strategy",
-    "checkpoint": "checkpoint policy",
-}
 
 #: Where rosrm's own plugins of a kind are, for who has none.
 _SHIPPED_IN: Final[Mapping[str, str]] = {

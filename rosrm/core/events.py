@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
 from rosrm.core.migration import ReportPhase
 from rosrm.core.model import HostDescription, InstanceId, InstanceStatus, KeptState, ProcessSpec
+
+#: Code of an answer to an order.
+BAD_RESULT: Final = "bad_result"
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,7 +163,10 @@ class HostStateRequested:
 
 @dataclass(frozen=True, slots=True)
 class OrderAnswered:
-    """A slave answered an `Order`, or did not in time (code "timeout")."""
+    """A slave answered an `Order`, or did not in time (code "timeout").
+
+    The code `BAD_RESULT`: an executor ran to its end, but answered no JSON object.
+    """
 
     order: int
     accepted: bool

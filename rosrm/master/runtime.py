@@ -32,6 +32,7 @@ from rosrm.core.views import PluginRow
 from rosrm.errors import JournalBlocked, Refused
 from rosrm.journal import SqliteJournal
 from rosrm.journal_faults import unreadable
+from rosrm.master.policy_guard import Deadlines
 from rosrm.master.reading import Reading
 from rosrm.master.recorder import Recorder
 from rosrm.master.standstill import Standstill
@@ -145,6 +146,7 @@ class MasterRuntime:
             self._config.core(), self._config.scoring.policy or "", policy, strategies, epoch,
             self._fallback,
         )  # fmt: skip
+        state.plugins.limit = Deadlines()
         state.wall = time.time()
         state.keeping.policy = self._checkpoint
         state.keeping.policy_name = self._config.checkpoint.policy or ""
