@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
 from rosrm.core.migration import ReportPhase
-from rosrm.core.model import HostDescription, InstanceId, InstanceStatus, KeptState, ProcessSpec
+from rosrm.core.model import (
+    EMPTY,
+    HostDescription,
+    InstanceId,
+    InstanceStatus,
+    KeptState,
+    ProcessSpec,
+)
 
 #: Code of an answer to an order.
 BAD_RESULT: Final = "bad_result"
@@ -74,13 +81,17 @@ class ReadingsReceived:
 
 @dataclass(frozen=True, slots=True)
 class StatusesReceived:
-    """What became of instances on a host; `complete`: these are all that it holds."""
+    """What became of instances on a host; `complete`: these are all that it holds.
+
+    `failing` is complete in each: resource to the reason why its probe gives no readings.
+    """
 
     host_id: int
     incarnation: int
     sequence: int
     complete: bool
     statuses: tuple[InstanceStatus, ...]
+    failing: Mapping[str, str] = field(default_factory=lambda: EMPTY)
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 from rosrm.errors import PluginError, describe_plugin_fault
 
 if TYPE_CHECKING:
+    from rosrm.core.hosts import Host
     from rosrm.core.state import MasterState
 
 T = TypeVar("T")
@@ -123,6 +124,23 @@ def _record(state: MasterState, plugin: Plugin, event: str, outcome: str, now: f
     kind, name = plugin
     facts = {"plugin": kind, "name": name}
     state.record(now, event, f"the {TITLES[kind]} {name!r} {outcome}", facts=facts)
+
+
+def note_probes(state: MasterState, host: Host, failing: Mapping[str, str], now: float) -> None:
+    """Note which probes of a host fail by the report of its slave, and record what changed.
+
+    Args:
+        failing: resource to the reason why its probe gives no readings.
+    """
+    for resource in sorted(failing.keys() ^ host.failing.keys()):
+        fails = resource in failing
+        state.record(
+            now, "plugin_failed" if fails else "plugin_works",
+            f"the probe of {resource} on {host.name} "
+            + (f"fails: {failing[resource]}" if fails else "works again"),
+            host=host.name, facts={"plugin": "probe", "name": resource},
+        )  # fmt: skip
+    host.failing = failing
 
 
 def required(answer: object, kind: type[T]) -> T:

@@ -63,6 +63,7 @@ class SlaveEndpoint:
         failure: why it must give up; "" while it need not.
         superseded: it must because another slave lives under its name.
         cluster: name of the master that greeted us last; "" before the first one.
+        failing: resource to the reason why its probe gives no readings; goes with the statuses.
     """
 
     def __init__(
@@ -77,6 +78,7 @@ class SlaveEndpoint:
         self.failure = ""
         self.superseded = False
         self.cluster = ""
+        self.failing: dict[str, str] = {}
         self.host_id = 0
         self._epoch = 0
         self._master_beat = 0
@@ -174,17 +176,17 @@ class SlaveEndpoint:
         beat = self._newest_beat
         if beat is None or _speaker(beat) != _speaker(self._greeting):
             return
-        self._incarnation = beat.incarnation
-        self._asked_at = time.monotonic()
-        self.link = Link.REGISTERING
-        self._poll_open = False
         request = srv.RegisterHost.Request(
             envelope=self._control.envelope(self._master_beat, self._greeting.epoch),
             host=convert.host_to_msg(self._description),
             instances=[convert.status_to_msg(status) for status in self._host.statuses()],
             kept=[convert.kept_to_msg(one) for one in self._host.kept_states()],
-            journal_seen=self._seen.of_former_run(self.cluster, self._incarnation),
+            journal_seen=self._seen.of_former_run(self.cluster, beat.incarnation),
         )
+        self._incarnation = beat.incarnation
+        self._asked_at = time.monotonic()
+        self.link = Link.REGISTERING
+        self._poll_open = False
         self._control.call(
             self._clients[srv.RegisterHost], request, time.monotonic() + _PATIENCE,
             self._take_registration,
@@ -196,7 +198,7 @@ class SlaveEndpoint:
             self.link = Link.SEARCHING
             return
         answer = response.answer
-        if answer.code == "journal":
+        if answer.code in ("journal", "failed"):
             self._wait_for_journal(answer.message, now)
             return
         self._waits_since = None
@@ -336,6 +338,10 @@ class SlaveEndpoint:
                 protocol_version=PROTOCOL_VERSION, host_id=self.host_id,
                 incarnation=self._description.incarnation, sequence=self._status_sequence,
                 complete=complete, statuses=[convert.status_to_msg(one) for one in statuses],
+                failing=[
+                    msg.PluginState(kind="probe", name=name, state="failing", reason=reason)
+                    for name, reason in self.failing.items()
+                ],
             )
         )  # fmt: skip
 
