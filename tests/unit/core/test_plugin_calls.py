@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from rosrm.core import events as happened
 from rosrm.core.plugin_calls import WORKS_AFTER, PluginCalls, required
 from rosrm.errors import PluginError
 from rosrm.ports import HostView, ProcessView, Scores
@@ -97,3 +98,18 @@ def test_ctrl_c_passes_the_guard() -> None:
 
     with pytest.raises(KeyboardInterrupt):
         PluginCalls().ask("scoring", "x", "score", call)
+
+
+def test_a_probe_that_fails_is_recorded_when_that_changes() -> None:
+    """Every report of a slave is complete: what is missing in the next one works again."""
+    cluster = Cluster("a")
+    machine = cluster.machines["a"]
+    for failing in ({"lidar": "no such sensor"}, {"lidar": "no such sensor"}, {}):
+        machine.batches += 1
+        cluster.tell(
+            happened.StatusesReceived(
+                machine.host_id, machine.incarnation, machine.batches, False, (), failing
+            )
+        )
+    assert cluster.told("plugin_failed") == ["the probe of lidar on a fails: no such sensor"]
+    assert cluster.told("plugin_works") == ["the probe of lidar on a works again"]
