@@ -318,7 +318,7 @@ def _fault_of_resources(
 
 
 def _fault_of_types(resource: object) -> str:
-    """Why something cannot travel as the description of a resource; "" where it can."""
+    """Return why something is no description of a resource that can be sent; "" if it is one."""
     if not isinstance(resource, ResourceDescription):
         return f"gives {resource!r} as a resource; a ResourceDescription is required"
     for name in ("name", "unit", "scope"):

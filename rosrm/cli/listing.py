@@ -88,7 +88,7 @@ def plugins(
 ) -> None:
     """List the plugins and how they fare.
 
-    One is selected, available, absent on a host, broken, or failing, and the reason is said.
+    One is selected, available, absent on a host, broken, or failing, with the reason.
     """
     from rosrm.cli import json_forms, tables
     from rosrm.registry import Registry

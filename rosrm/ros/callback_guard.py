@@ -1,7 +1,7 @@
 """Keeps what a callback raises from ending the process.
 
 An exception that leaves a callback of rclpy's events executor ends the process, mostly by a
-segmentation fault without a word of the cause. So rosrm lets none out.
+segmentation fault that names no cause. So rosrm lets none out.
 """
 
 from __future__ import annotations

@@ -260,7 +260,7 @@ def test_a_probe_that_fails_is_listed_until_it_works_again(make_cluster, third_p
 
 
 def test_a_probe_whose_description_cannot_be_sent_is_broken(make_cluster, third_party) -> None:
-    """It is named, and its host registers without it."""
+    """The plugin is named, and the host registers without it."""
     cluster = make_cluster(host("h0", probes=probes("no_unit")))
     (row,) = [row for row in plugins(cluster) if row.name == "no_unit" and row.host]
     assert (row.state, "unit None" in row.reason) == ("absent", True)
@@ -321,7 +321,7 @@ def test_a_strategy_that_hangs_or_exits(make_cluster, third_party, strategy, sai
     ],
 )
 def test_an_executor_that_fails(make_cluster, third_party, strategy, said) -> None:
-    """The step fails with that sentence, the move is undone, and nobody is the worse for it."""
+    """The step fails with that sentence, the move is undone, and the process runs as before."""
     cluster = make_cluster(
         host("h0"), host("h1"), migration=MigrationSettings({strategy: {}, "relaunch": {}})
     )

@@ -1,4 +1,4 @@
-"""What a callback raises ends nothing: it is logged with its place, counted, and passed over."""
+"""An exception in a callback ends nothing: it is logged with its place, and counted."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_nothing_that_a_callback_raises_gets_out(fault) -> None:
 
 
 def test_the_log_names_the_callback_the_error_and_its_place(caplog) -> None:
-    """Of rosrm's own innermost frame, so that a bug can be reported."""
+    """The place is rosrm's own innermost frame, so that a bug can be reported."""
     CallbackGuard().call(bad_message)
     (line,) = caplog.messages
     assert line.startswith("callback bad_message failed, and its message was dropped: Refused: ")
@@ -47,7 +47,7 @@ def test_a_callback_that_fails_often_is_logged_once_a_second_and_counted(caplog)
 
 
 def test_ctrl_c_is_kept_for_the_loop(caplog) -> None:
-    """It is no failure, and is raised once."""
+    """Ctrl-C is no failure, and is raised once."""
 
     def callback() -> None:
         raise KeyboardInterrupt

@@ -74,7 +74,7 @@ def asked(kind, handle):
 
 
 def test_a_request_whose_handler_raises_is_answered_as_failed() -> None:
-    """Who asks need not wait for a time-out; the answer names the error and its place."""
+    """The caller need not wait for a time-out; the answer names the error and its place."""
 
     def handle(_request, _open_request):
         raise Refused("a result is a JSON NoneType, not an object")
@@ -89,7 +89,7 @@ def test_a_request_whose_handler_raises_is_answered_as_failed() -> None:
 
 
 def test_a_request_that_was_answered_is_not_answered_again() -> None:
-    """What is raised afterwards is logged and no more."""
+    """An error after the answer is logged and no more."""
 
     def handle(_request, open_request):
         open_request.answer(srv.Submit.Response())
@@ -101,7 +101,7 @@ def test_a_request_that_was_answered_is_not_answered_again() -> None:
 
 
 def test_ctrl_c_in_a_callback_ends_the_loop() -> None:
-    """It is raised where Python can take it, not through the executor."""
+    """The interrupt is raised where Python can take it, not through the executor."""
     made, executor = participant(ready=1)
 
     def interrupted() -> None:

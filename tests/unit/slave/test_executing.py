@@ -40,7 +40,7 @@ def test_an_answer_that_is_no_object_is_a_failure_of_its_own(answer, said) -> No
 
 @pytest.mark.parametrize("answer", [{}, {"a": 1}, ChainMap({"a": 1})])
 def test_any_mapping_is_an_answer(answer) -> None:
-    """It travels as JSON."""
+    """The answer travels as JSON."""
     code, message, result = outcome(lambda _: answer)
     assert (code, message, json.loads(result)) == ("", "", dict(answer))
 
@@ -66,7 +66,7 @@ def test_an_error_of_rosrm_is_the_whole_message() -> None:
 
 
 def test_an_answer_that_json_cannot_hold_is_a_failure() -> None:
-    """Not an exception in a thread that nobody sees."""
+    """The thread ends with an outcome, not with an exception that no log shows."""
     code, message, _ = outcome(lambda _: {"x": object()})
     assert (code, "TypeError" in message) == ("failed", True)
 
