@@ -30,12 +30,8 @@ def test_the_time_of_a_long_decision_does_not_count_for_the_core(monkeypatch, ta
     clock, events = Clock(takes), [[happened.TimePassed()], []]
     monkeypatch.setattr(runtime, "step", clock.step)
     master = MasterRuntime.__new__(MasterRuntime)
-    master._state, master._recorder, master._held, master._behind = (
-        SimpleNamespace(),
-        None,
-        None,
-        0.0,
-    )
+    master._state, master._behind = SimpleNamespace(), 0.0
+    master._recorder = master._held = None
     master._endpoint = SimpleNamespace(take_events=lambda: events.pop(0))
     monkeypatch.setattr(master, "_now", lambda: clock.now)
     master._take_in(clock.now)
