@@ -105,7 +105,10 @@ class SkipPlugin(Exception):
 
 def describe_fault(fault: BaseException) -> str:
     """Return an exception in one line: its type and its text."""
-    text = " ".join(str(fault).split())
+    try:
+        text = " ".join(str(fault).split())
+    except Exception:  # noqa: BLE001 - a plugin's own exception may fail to give its text
+        text = ""
     return f"{type(fault).__name__}: {text}" if text else type(fault).__name__
 
 

@@ -24,7 +24,7 @@ class Deadlines:
     The core treats a late call like any other failure: that decision is made without the plugin. A
     plugin that was late is not asked again for a while: a master that waits for it with every
     reading would have no time for its slaves. A loop inside C code that never returns to Python
-    cannot be ended so.
+    cannot be ended so. One of these serves a process, as a process has one such timer.
 
     Args:
         seconds: for one call.

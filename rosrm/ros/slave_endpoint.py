@@ -31,6 +31,8 @@ _PATIENCE: Final = 3.0
 #: after a registration sooner, as it may have gone out before DDS knew its way, then ever later.
 _POLL_ANEW: Final = 30.0
 _FIRST_POLL_ANEW: Final = 1.0
+#: Seconds after a request for work that was refused until the next one.
+_ASK_AGAIN: Final = 0.2
 #: Seconds for which a name that is taken is asked for again: the former run of this slave may
 #: have been killed a moment ago.
 _NAME_TAKEN: Final = 5.0
@@ -95,6 +97,7 @@ class SlaveEndpoint:
         self._waits_since: float | None = None
         self._told = ""
         self._poll_open = False
+        self._ask_at = 0.0
         self._poll_anew = _FIRST_POLL_ANEW
         self._status_sequence = 0
         self._control = ControlClient(participant, f"slave {description.name}")
@@ -283,7 +286,7 @@ class SlaveEndpoint:
 
     def ask(self, now: float) -> None:
         """Ask for work, unless a request is open already."""
-        if self._poll_open or self.link is not Link.REGISTERED:
+        if self._poll_open or self.link is not Link.REGISTERED or now < self._ask_at:
             return
         self._poll_open = True
         request = srv.RequestProcess.Request(
@@ -302,6 +305,7 @@ class SlaveEndpoint:
         self._poll_anew = _POLL_ANEW
         answer = response.answer
         if not answer.accepted:
+            self._ask_at = time.monotonic() + _ASK_AGAIN  # not with every turn of the loop
             if answer.code in ("unknown", "stale"):
                 self._lose_master(f"the master does not know this host any more: {answer.message}")
             return

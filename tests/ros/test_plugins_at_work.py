@@ -159,7 +159,7 @@ def plugins(cluster) -> list:
     [
         ("raises", "out of order"),
         ("nan", "nan"),
-        ("wrong_size", "wrong_size"),
+        ("wrong_size", "scores of shape (2,)"),
         ("hangs", "1 s"),
         ("exits", "SystemExit: 3"),
         ("answers_none", "answered None; Scores is required"),

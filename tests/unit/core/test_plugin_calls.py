@@ -79,7 +79,16 @@ def test_an_error_of_rosrm_s_own_check_has_no_place() -> None:
         PluginCalls().ask("scoring", "x", "score", lambda: required(None, Scores))
 
 
-@pytest.mark.parametrize("fault", [SystemExit(3), GeneratorExit(), ZeroDivisionError()])
+class Wordless(Exception):
+    """An exception that fails to give its text."""
+
+    def __str__(self) -> str:
+        raise RuntimeError("no words")
+
+
+@pytest.mark.parametrize(
+    "fault", [SystemExit(3), GeneratorExit(), ZeroDivisionError(), Wordless()], ids=repr
+)
 def test_nothing_that_a_plugin_raises_ends_its_caller(fault: BaseException) -> None:
     """Also what `except Exception` lets pass."""
 
