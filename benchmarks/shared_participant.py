@@ -21,6 +21,7 @@ class Berth:
         self._shared = shared
         self.node = self
         self.settings = shared.participant.settings
+        self.guard = shared.participant.guard
 
     def create_client(self, kind: Any, name: str, *, qos_profile: Any) -> Any:
         """A client; of its own only where answers come to many."""

@@ -177,7 +177,7 @@ class SimulatedSlave:
         settled(f"{self.name} is simulated: {instance} does not run")
 
     def execute(
-        self, executor: str, arguments: dict[str, Any], done: Callable[[bool, str, str], None]
+        self, executor: str, arguments: dict[str, Any], done: Callable[[str, str, str], None]
     ) -> None:
         """No executors."""
         raise Refused(f"{self.name} is simulated: it has no executor {executor!r}", "unknown")

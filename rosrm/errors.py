@@ -20,6 +20,8 @@ SkipPlugin                  not an error: a plugin says that it is absent here, 
 
 from __future__ import annotations
 
+from traceback import walk_tb
+
 
 class RosrmError(Exception):
     """Something that a user can understand and mend; its text is the whole message."""
@@ -96,3 +98,56 @@ class PortableError(RosrmError):
 
 class SkipPlugin(Exception):
     """Raised by a plugin's `create` to say that it is absent on this host, and why."""
+
+
+# --- errors of other people's code ------------------------------------------------------------
+
+
+def describe_fault(fault: BaseException) -> str:
+    """Return an exception in one line: its type and its text."""
+    try:
+        text = " ".join(str(fault).split())
+    except Exception:  # noqa: BLE001 - a plugin's own exception may fail to give its text
+        text = ""
+    return f"{type(fault).__name__}: {text}" if text else type(fault).__name__
+
+
+def describe_plugin_fault(fault: BaseException) -> str:
+    """Return an exception in one line with the place in the plugin that raised it.
+
+    A `PluginError` is rosrm's own sentence about an answer, and is returned as it is.
+    """
+    if isinstance(fault, PluginError):
+        return str(fault)
+    place = _place_in_plugin(fault)
+    return describe_fault(fault) + (f" ({place})" if place else "")
+
+
+def place_in_rosrm(fault: BaseException) -> str:
+    """Return file and line of the innermost frame of rosrm itself; "" if there is none."""
+    return _innermost(_frames(fault), "rosrm")
+
+
+def _place_in_plugin(fault: BaseException) -> str:
+    """Return file and line of the plugin's own innermost frame; "" if rosrm raised the fault.
+
+    The plugin may call libraries, so the package of the first frame outside rosrm is the plugin's.
+    """
+    frames = _frames(fault)
+    own = next((package for package, _ in frames if package != "rosrm"), "")
+    return _innermost(frames, own) if own else ""
+
+
+def _frames(fault: BaseException) -> list[tuple[str, str]]:
+    """Return top-level package and place of each frame of a traceback, the innermost last."""
+    return [
+        (
+            str(frame.f_globals.get("__name__", "?")).partition(".")[0],
+            f"{frame.f_code.co_filename}:{line}",
+        )
+        for frame, line in walk_tb(fault.__traceback__)
+    ]
+
+
+def _innermost(frames: list[tuple[str, str]], package: str) -> str:
+    return next((place for name, place in reversed(frames) if name == package), "")

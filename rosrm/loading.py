@@ -20,6 +20,7 @@ from typing import Any, Final, TypeAlias
 import pluggy
 
 from rosrm import hookspecs
+from rosrm.errors import describe_fault
 from rosrm.handover import PluginAddress
 from rosrm.ports import CheckpointOffer, MigrationOffer, ProbeOffer, ScoringOffer
 from rosrm.spelling import get_close_matches
@@ -97,12 +98,6 @@ def load_objects(plugins: Mapping[str, object]) -> Loaded:
     for name, plugin in plugins.items():
         _load(loaded, Source(name), lambda plugin=plugin: plugin)  # type: ignore[misc]
     return loaded
-
-
-def describe_fault(fault: BaseException) -> str:
-    """An exception in one line."""
-    text = " ".join(str(fault).split())
-    return f"{type(fault).__name__}: {text}" if text else type(fault).__name__
 
 
 def definition(function: object) -> str:

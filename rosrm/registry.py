@@ -14,8 +14,9 @@ from typing import Any, Final, TypeVar, cast
 
 from rosrm.config.plain import from_plain
 from rosrm.core.model import EMPTY, RESOURCE_SLOTS, ResourceDescription
+from rosrm.core.plugin_calls import TITLES
 from rosrm.core.views import PluginRow
-from rosrm.errors import ConfigError, PluginError, SkipPlugin
+from rosrm.errors import ConfigError, PluginError, SkipPlugin, describe_fault, describe_plugin_fault
 from rosrm.handover import PluginAddress
 from rosrm.loading import (
     FAULTS,
@@ -25,7 +26,6 @@ from rosrm.loading import (
     Offer,
     Offered,
     definition,
-    describe_fault,
     load_addresses,
     load_objects,
 )
@@ -39,14 +39,6 @@ from rosrm.ports import (
     ScoringPolicy,
 )
 from rosrm.spelling import get_close_matches
-
-#: What the kinds of offers are called in messages.
-TITLES: Final[Mapping[str, str]] = {
-    "probe": "probe",
-    "scoring": "scoring policy",
-    "migration": "migration strategy",
-    "checkpoint": "checkpoint policy",
-}
 
 #: Where rosrm's own plugins of a kind are, for who has none.
 _SHIPPED_IN: Final[Mapping[str, str]] = {
@@ -233,7 +225,7 @@ class Registry:
             resources = tuple(probe.resources)
             fault = _fault_of_resources(resources, before)
         except FAULTS as raised:
-            resources, fault = (), f"its `resources` raised {describe_fault(raised)}"
+            resources, fault = (), f"its `resources` raised {describe_plugin_fault(raised)}"
         if fault:
             _close_quietly(probe)
             raise self._fault("probe", name, fault)
@@ -313,12 +305,29 @@ def _fault_of_resources(
     """Why a host cannot take these resources; "" where it can."""
     taken = {resource.name: other.name for other in before for resource in other.resources}
     for resource in resources:
+        fault = _fault_of_types(resource)
+        if fault:
+            return fault
         if resource.name in taken:
             return f"reads {resource.name!r}, as {taken[resource.name]!r} does already"
         if not (math.isfinite(resource.capacity) and resource.capacity > 0.0):
             return f"gives {resource.name!r} a capacity of {resource.capacity!r}, not above 0"
     if len(taken) + len(resources) > RESOURCE_SLOTS:
         return f"brings the resources of this host to more than {RESOURCE_SLOTS}"
+    return ""
+
+
+def _fault_of_types(resource: object) -> str:
+    """Return why something is no description of a resource that can be sent; "" if it is one."""
+    if not isinstance(resource, ResourceDescription):
+        return f"gives {resource!r} as a resource; a ResourceDescription is required"
+    for name in ("name", "unit", "scope"):
+        value: object = getattr(resource, name)
+        if not isinstance(value, str):
+            return f"gives a resource the {name} {value!r}; a text is required"
+    capacity: object = resource.capacity
+    if not isinstance(capacity, int | float):
+        return f"gives {resource.name!r} the capacity {capacity!r}; a number is required"
     return ""
 
 

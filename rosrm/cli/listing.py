@@ -20,7 +20,7 @@ def status(ctx: typer.Context, as_json: AsJson = False, domain: Domain = None) -
     from rosrm.cli.tables import console
 
     with connection.master(ctx, domain) as client:
-        snapshot = client.list(hosts=True, processes=True, events=True, newest=5)
+        snapshot = client.list(hosts=True, processes=True, plugins=True, events=True, newest=5)
     connection.say_trouble(snapshot)
     if as_json:
         json_forms.show(json_forms.status_form(snapshot))
@@ -88,7 +88,7 @@ def plugins(
 ) -> None:
     """List the plugins and how they fare.
 
-    One is selected, available, absent on a host, or broken, and the reason is said.
+    One is selected, available, absent on a host, broken, or failing, with the reason.
     """
     from rosrm.cli import json_forms, tables
     from rosrm.registry import Registry

@@ -9,7 +9,7 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from rosrm.cli import formats, tables
-from rosrm.core.views import HostRow, ProcessRow, Snapshot
+from rosrm.core.views import HostRow, PluginRow, ProcessRow, Snapshot
 
 #: States of a process that somebody should look at.
 _TROUBLE = ("stuck", "unreachable", "failed", "set_aside", "backoff")
@@ -29,6 +29,7 @@ def _lines(snapshot: Snapshot) -> Iterator[RenderableType]:
         yield Text()
         yield tables.hosts(snapshot.hosts)
     yield from _troubles(snapshot.processes)
+    yield from _failing(snapshot.plugins)
     if snapshot.events:
         yield Text()
         yield from (Text(tables.event_line(event), "dim") for event in snapshot.events)
@@ -58,3 +59,15 @@ def _troubles(processes: Iterable[ProcessRow]) -> Iterator[RenderableType]:
         yield text.append(f": {row.reason}" if row.reason else "")
     if len(rows) > _MOST_NAMED:
         yield Text(f"and {len(rows) - _MOST_NAMED} more; see rosrm ps")
+
+
+def _failing(plugins: Iterable[PluginRow]) -> Iterator[RenderableType]:
+    rows = [row for row in plugins if row.state == "failing"]
+    if rows:
+        yield Text()
+    for row in rows[:_MOST_NAMED]:
+        place = f" on {row.host}" if row.host else ""
+        text = Text(f"plugin {row.kind} {row.name}{place} is ")
+        yield text.append_text(tables.state(row.state)).append(f": {row.reason}")
+    if len(rows) > _MOST_NAMED:
+        yield Text(f"and {len(rows) - _MOST_NAMED} more; see rosrm plugins")

@@ -34,6 +34,7 @@ STYLES: Final = {
     "unreachable": "red",
     "lost": "red",
     "broken": "red",
+    "failing": "red",
 }
 
 

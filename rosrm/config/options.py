@@ -8,8 +8,9 @@ from typing import Any
 from rosrm.config.checking import validated
 from rosrm.config.documents import Node, Problems
 from rosrm.config.plain import to_plain
+from rosrm.core.plugin_calls import TITLES
 from rosrm.errors import ConfigError
-from rosrm.registry import TITLES, Registry
+from rosrm.registry import Registry
 
 
 class PluginCheck:

@@ -21,6 +21,8 @@ from typing import TYPE_CHECKING, Final
 from rosrm.core import events as happened
 from rosrm.core.commands import Order
 from rosrm.core.hosts import Host, HostCondition
+from rosrm.core.plugin_calls import required
+from rosrm.errors import PluginError
 from rosrm.ports import HostChecking
 
 if TYPE_CHECKING:
@@ -85,7 +87,15 @@ def _ask(state: MasterState, name: str, strategy: HostChecking, host: Host, now:
     incarnation = host.description.incarnation
     if known is not None and known.incarnation == incarnation and now < known.ask_at:
         return
-    if strategy.ability not in host.description.executors:
+    try:
+        ability = state.plugins.ask(
+            "migration", name, "ability", lambda: required(strategy.ability, str)
+        )
+    except PluginError as error:
+        reason = f"its ability is not known: {error}"
+        state.abilities.answers[name, host.name] = Answer(incarnation, 0, reason=reason)
+        return
+    if ability not in host.description.executors:
         reason = f"the plugin of {name!r} is not installed there"
         state.abilities.answers[name, host.name] = Answer(incarnation, 0, reason=reason)
         return
@@ -94,7 +104,7 @@ def _ask(state: MasterState, name: str, strategy: HostChecking, host: Host, now:
     state.abilities.answers[name, host.name] = Answer(
         incarnation, order, ask_at=now + _PATIENCE + _ASK_AGAIN
     )
-    state.emit(Order(order, host.host_id, "execute", executor=strategy.ability, timeout=_PATIENCE))
+    state.emit(Order(order, host.host_id, "execute", executor=ability, timeout=_PATIENCE))
 
 
 def order_answered(state: MasterState, event: happened.OrderAnswered, now: float) -> bool:
@@ -146,7 +156,10 @@ def fault(state: MasterState, strategy: str, source: Host, destination: Host) ->
         if answer.facts is None:
             return f"{strategy} does not work on {host.name}: {answer.reason}"
         facts.append(answer.facts)
+    asked = checking
     try:
-        return str(checking.host_fault(*facts))
-    except Exception as error:  # noqa: BLE001 - a third party's code: anything may come
-        return f"{strategy} cannot say whether it can go there: {type(error).__name__}: {error}"
+        return state.plugins.ask(
+            "migration", strategy, "host_fault", lambda: required(asked.host_fault(*facts), str)
+        )
+    except PluginError as error:
+        return f"{strategy} cannot say whether it can go there: {error}"

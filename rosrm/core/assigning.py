@@ -17,7 +17,6 @@ from rosrm.core.placement import Demand, Ranking
 from rosrm.core.state import MasterState, Process, ProcessPhase, larger
 from rosrm.core.verdicts import Decision, decide, refused_everywhere, why_never
 
-_PLUGIN_TOLD_EVERY: Final = 10.0
 _AWAY: Final = (HostCondition.EXPECTED, HostCondition.LOST)
 _STATE_MAY_COME: Final = "a host that may keep its state has not come back yet"
 _NOBODY: Final[frozenset[str]] = frozenset()
@@ -79,7 +78,7 @@ def ranking_of(state: MasterState, demand: Demand) -> Ranking:
         state.rankings_version = state.hosts.version
     ranking = state.rankings.get(demand.key)
     if ranking is None:
-        ranking = Ranking(state.hosts, state.policies, demand)
+        ranking = Ranking(state.hosts, state.policies, demand, state.plugins)
         state.rankings[demand.key] = ranking
     else:
         ranking.refresh()
@@ -154,8 +153,6 @@ def _place_or_set_aside(state: MasterState, process: Process, now: float) -> boo
     demand = demand_of(state, process)
     ranking = ranking_of(state, demand)
     column = ranking.best()
-    if ranking.failure:
-        _tell_failure(state, ranking, now)
     if column >= 0:
         _assign(state, process, ranking, column, now)
         return True
@@ -246,13 +243,3 @@ def _tell_waits(
         state.record(
             now, "waits", f"{process.name} waits: {reason}", process=process.name, facts=facts
         )
-
-
-def _tell_failure(state: MasterState, ranking: Ranking, now: float) -> None:
-    if now - state.policy_told < _PLUGIN_TOLD_EVERY:
-        return
-    state.policy_told = now
-    state.record(
-        now, "plugin_failed",
-        f"the scoring policy {state.policy_name!r} does not decide: {ranking.failure}",
-    )  # fmt: skip

@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from typing import Final
 
 from rosrm.core.hosts import Host
 from rosrm.core.images import reason_of
 from rosrm.core.migration import Aim, Move, Plan, Start, plan_fault
 from rosrm.core.placement import Ranking
 from rosrm.core.plans import plan_to_dict
+from rosrm.core.plugin_calls import PluginCalls, required
 from rosrm.core.state import MasterState, Process, ProcessPhase, Run
 from rosrm.core.steps import title
+from rosrm.errors import PluginError, describe_fault
+
+#: The method of a strategy that plans for an aim.
+_HOOKS: Final = {Aim.MOVE: "propose", Aim.CHECKPOINT: "checkpoint", Aim.RESTORE: "restore"}
 
 
 def begin_move(
@@ -28,7 +34,6 @@ def begin_move(
         return refusal
     run = plan_move(state, process, destination, cause, now)
     if isinstance(run, str):
-        state.record(now, "plugin_failed", run, process=process.name)
         return run
     state.runs[process.name] = run
     state.charge_ranked(run.destination, destination, now, ranking)
@@ -61,7 +66,7 @@ def plan_move(
         destination.name, state.new_instance_id(process), int(state.wall),
         source.node_name or process.name,
     )  # fmt: skip
-    plan = proposed(name, move, state.strategies[name].propose)
+    plan = proposed(state.plugins, name, move, state.strategies[name].propose)
     if isinstance(plan, str):
         return plan
     return Run(
@@ -106,23 +111,34 @@ def why_immovable(state: MasterState, process: Process) -> str:
 
 
 def proposed(
-    name: str, move: Move, propose: Callable[[Move], Plan], aim: Aim = Aim.MOVE
-) -> Plan | str:
+    plugins: PluginCalls, name: str, move: Move, propose: Callable[[Move], Plan],
+    aim: Aim = Aim.MOVE,
+) -> Plan | str:  # fmt: skip
     """The plan of a strategy, or why there is none; a strategy that raises is named.
 
     Args:
+        plugins: guards the call.
         name: of the strategy.
         move: to be planned.
         propose: the strategy's own function.
         aim: of the plan.
     """
-    try:
-        plan = propose(move)
+
+    def ask() -> Plan | str:
+        try:
+            plan = required(propose(move), Plan)
+        except ValueError as reason:  # by its contract: the strategy cannot move this process
+            return f"the migration strategy {name!r} gave no plan: {describe_fault(reason)}"
         fault = plan_fault(plan, move, aim)
+        if fault:
+            raise PluginError(f"an unsound plan: {fault}")
         json.dumps(plan_to_dict(plan))  # it goes into the journal
-    except Exception as error:  # noqa: BLE001 - a third party's code: anything may come
-        return f"the migration strategy {name!r} gave no plan: {type(error).__name__}: {error}"
-    return f"the migration strategy {name!r} gave an unsound plan: {fault}" if fault else plan
+        return plan
+
+    try:
+        return plugins.ask("migration", name, _HOOKS[aim], ask)
+    except PluginError as fault:
+        return f"the migration strategy {name!r} gave no plan: {fault}"
 
 
 def destination_node(plan: Plan, move: Move) -> str:

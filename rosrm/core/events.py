@@ -3,14 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
 from rosrm.core.migration import ReportPhase
-from rosrm.core.model import HostDescription, InstanceId, InstanceStatus, KeptState, ProcessSpec
+from rosrm.core.model import (
+    EMPTY,
+    HostDescription,
+    InstanceId,
+    InstanceStatus,
+    KeptState,
+    ProcessSpec,
+)
+
+#: Code of an answer to an order.
+BAD_RESULT: Final = "bad_result"
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,13 +81,17 @@ class ReadingsReceived:
 
 @dataclass(frozen=True, slots=True)
 class StatusesReceived:
-    """What became of instances on a host; `complete`: these are all that it holds."""
+    """What became of instances on a host; `complete`: these are all that it holds.
+
+    `failing` is complete in each: resource to the reason why its probe gives no readings.
+    """
 
     host_id: int
     incarnation: int
     sequence: int
     complete: bool
     statuses: tuple[InstanceStatus, ...]
+    failing: Mapping[str, str] = field(default_factory=lambda: EMPTY)
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,7 +174,10 @@ class HostStateRequested:
 
 @dataclass(frozen=True, slots=True)
 class OrderAnswered:
-    """A slave answered an `Order`, or did not in time (code "timeout")."""
+    """A slave answered an `Order`, or did not in time (code "timeout").
+
+    The code `BAD_RESULT`: an executor ran to its end, but answered no JSON object.
+    """
 
     order: int
     accepted: bool

@@ -114,7 +114,6 @@ class Keeping:
         dropped_at: when a host was last told to drop what it keeps of a process.
         waiting: processes that are still to be looked at in this round.
         looked: time of the last look.
-        failure_told: time of the last record of a policy that fails.
     """
 
     policy: CheckpointPolicy | None = None
@@ -126,7 +125,6 @@ class Keeping:
     dropped_at: dict[tuple[str, str], float] = field(default_factory=dict)
     waiting: list[str] = field(default_factory=list)
     looked: float = -inf
-    failure_told: float = -inf
 
     def order_id(self) -> int:
         """A number for an order about kept states."""

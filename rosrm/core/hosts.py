@@ -23,7 +23,7 @@ from rosrm.core.columns import (
     HostColumns,
     IntArray,
 )
-from rosrm.core.model import RESOURCE_SLOTS, HostDescription
+from rosrm.core.model import EMPTY, RESOURCE_SLOTS, HostDescription
 
 #: A usage above this is no measurement but a mistake (a CPU reading of 1.2 can be real).
 ABSURD_USAGE: Final = 64.0
@@ -52,6 +52,7 @@ class Host:
         over_since: resource name to the time since when it is over its limit.
         told: kind of a record that is not repeated at once, to when it was made.
         lost_since: time at which it was lost, while it is.
+        failing: resource to the reason why its probe gives no readings, as the slave reports.
     """
 
     column: int
@@ -62,6 +63,7 @@ class Host:
     over_since: dict[str, float] = field(default_factory=dict)
     told: dict[str, float] = field(default_factory=dict)
     lost_since: float = 0.0
+    failing: Mapping[str, str] = field(default_factory=lambda: EMPTY)
 
     @property
     def host_id(self) -> int:

@@ -163,7 +163,7 @@ def _note_answer(
     state: MasterState, number: int, one: Unwanted, event: happened.OrderAnswered, now: float
 ) -> None:
     one.order = 0
-    if event.accepted:
+    if event.accepted or event.code == happened.BAD_RESULT:  # it ran, though it answered nothing
         del state.images.unwanted[number]
         state.record(
             now, "image_removed", f"the image of {one.process} was removed from {one.host}",

@@ -147,7 +147,7 @@ def _begin(
     if not isinstance(imaging, Imaging):
         raise TypeError(f"{strategy!r} takes no images")
     make = imaging.checkpoint if aim is Aim.CHECKPOINT else imaging.restore
-    plan = proposed(strategy, move, make, aim)
+    plan = proposed(state.plugins, strategy, move, make, aim)
     if isinstance(plan, str):
         return plan
     host = state.hosts.by_name[move.source_host]

@@ -13,6 +13,7 @@ from rosrm.core.hosts import Host, HostCondition, description_fault
 from rosrm.core.liveness import welcome_back
 from rosrm.core.lost_tail import note_seen
 from rosrm.core.migration import Execute
+from rosrm.core.model import EMPTY
 from rosrm.core.readings import take_readings
 from rosrm.core.state import MasterState, Wanted
 from rosrm.ports import Intent
@@ -37,6 +38,7 @@ def host_registered(state: MasterState, event: happened.HostRegistered, now: flo
         _refuse_host(state, event, "name_taken", taken, now)
         return
     host = state.hosts.register(description, now)
+    host.failing = EMPTY  # the slave reports what fails in this run
     if known is None:
         save_host(state, host)
     state.record(

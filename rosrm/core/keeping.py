@@ -29,15 +29,15 @@ from rosrm.core.commands import Order
 from rosrm.core.holdings import Holding, Told
 from rosrm.core.hosts import Host, HostCondition
 from rosrm.core.model import InstanceId, KeptState
+from rosrm.core.plugin_calls import required
 from rosrm.core.state import MasterState, Process, ProcessPhase
+from rosrm.errors import PluginError
 from rosrm.ports import CheckpointChoice, CheckpointView
 
 #: Seconds between two looks at the same process.
 _LOOK_EVERY: Final = 1.0
 #: Orders to drop that are remembered, so as not to give them again at once.
 _REMEMBERED: Final = 10_000
-#: Seconds between two records of a policy that fails.
-_TOLD_EVERY: Final = 10.0
 #: What is kept of a process that ended so is of no use any more.
 _DONE: Final = frozenset({ProcessPhase.FINISHED, ProcessPhase.CANCELLED})
 
@@ -195,18 +195,12 @@ def _choice(
         process.spec, host.name, None if since is None else now - since,
         _newest_size(holdings), others, hosts,
     )  # fmt: skip
+    policy = keeping.policy
     try:
-        choice = keeping.policy.choose(view)
-        return choice if choice is None else _sound(choice, view)
-    except Exception as error:  # noqa: BLE001 - a third party's code: anything may come
-        if now - keeping.failure_told >= _TOLD_EVERY:
-            keeping.failure_told = now
-            state.record(
-                now, "plugin_failed",
-                f"the checkpoint policy {keeping.policy_name!r} does not choose for "
-                f"{process.name}: {type(error).__name__}: {error}",
-                process=process.name,
-            )  # fmt: skip
+        return state.plugins.ask(
+            "checkpoint", keeping.policy_name, "choose", lambda: _sound(policy.choose(view), view)
+        )
+    except PluginError:
         return None
 
 
@@ -222,8 +216,11 @@ def _newest_size(holdings: Mapping[str, Holding]) -> int:
     return max(((one.age, one.size) for one in holdings.values()), default=((0, 0), 0))[1]
 
 
-def _sound(choice: CheckpointChoice, view: CheckpointView) -> CheckpointChoice:
+def _sound(choice: CheckpointChoice | None, view: CheckpointView) -> CheckpointChoice | None:
     """A choice that keeps to the contract; raises for any other."""
+    if choice is None:
+        return None
+    required(choice, CheckpointChoice)
     strange = [name for name in choice.hosts if name not in view.hosts or name == view.host]
     if strange or len(set(choice.hosts)) != len(choice.hosts):
         raise ValueError(f"it chose {', '.join(choice.hosts)} for a process on {view.host}")

@@ -79,4 +79,5 @@ def step(state: MasterState, event: happened.Event, now: float) -> list[Command]
     HANDLERS[type(event)](state, event, now)
     moves.advance_all(state, now)
     place_waiting(state, now)
+    state.plugins.note(state, now)
     return state.take()

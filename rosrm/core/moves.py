@@ -9,7 +9,8 @@ forward   fails, committed    it is tried again; the process is shown as stuck u
 back      is done             the next undo; after the last, the source goes on
 back      fails               it is tried again; the process is shown as stuck until it is done
 any       cannot be done      it is left out: an instance that has ended never starts again, and
-                              what an executor had to do for one whose host is lost has no use
+                              what an executor had to do for one whose host is lost has no use.
+                              An executor that ran and answered no object counts as done
 back      destination active  forward to the commit: in a handoff it decides itself; of a restore
                               an executor has found that it goes on
 ========  ==================  ==============================================================
@@ -25,6 +26,7 @@ from typing import Any
 
 from rosrm.core import abilities, handoffs, images, imaging, keeping, lifecycle, periodic
 from rosrm.core import events as happened
+from rosrm.core.events import BAD_RESULT
 from rosrm.core.hosts import HostCondition
 from rosrm.core.migration import Aim, AwaitReady, Commit, Configure, Execute, Start, Step, Stop
 from rosrm.core.model import InstanceId, InstanceState
@@ -63,6 +65,7 @@ def order_answered(state: MasterState, event: happened.OrderAnswered, now: float
     run = state.runs.get(name) if name is not None else None
     if run is not None and run.order == event.order and event.code != "timeout":
         run.answer = (event.accepted, event.message or event.code)
+        run.bad_result = event.code == BAD_RESULT
         if event.accepted and event.result:
             note_result(run, event.result)
 
@@ -80,7 +83,7 @@ def _advance(state: MasterState, run: Run, now: float) -> bool:
     if not run.begun:
         if now < run.retry_at or _is_expected(state, run, step):
             return False
-        run.begun, run.answer = True, None
+        run.begun, run.answer, run.bad_result = True, None, False
         run.deadline = now + max(step.timeout, 0.0)
         give_order(state, run, step, now)
     outcome = _outcome(state, run, step, now)
@@ -164,7 +167,10 @@ def _commit(state: MasterState, run: Run, step: Commit, now: float) -> None:
 def _cannot_be_done(state: MasterState, run: Run, step: Step, now: float) -> bool:
     """Trying again would never help: the instance has ended, or its slot was given away."""
     if isinstance(step, Execute):
-        return imaging.leave_behind(state, run, step)
+        # Asked again the executor would answer so for ever. Of a restore the answer may say that
+        # the destination is active, so that plan waits until the plugin is corrected.
+        done = run.bad_result and run.aim is not Aim.RESTORE
+        return done or imaging.leave_behind(state, run, step)
     if not isinstance(step, (Start, AwaitReady)):
         return False
     instance = state.instances.get(step.instance.number)

@@ -23,7 +23,10 @@ from rosrm.core import abilities
 from rosrm.core import events as happened
 from rosrm.core.commands import Order
 from rosrm.core.hosts import Host, HostCondition
+from rosrm.core.migration import Execute
+from rosrm.core.plugin_calls import required
 from rosrm.core.processes import Instance, Process, ProcessPhase
+from rosrm.errors import PluginError
 from rosrm.ports import MemoryPacing, MemoryView, PeriodicImaging
 
 if TYPE_CHECKING:
@@ -124,9 +127,10 @@ def _review(state: MasterState, process: Process, now: float) -> None:
     if owner is None or not isinstance(strategy, PeriodicImaging):
         return
     number, host = process.owner, owner.host
-    dumped = state.periodic.of.setdefault(
-        number, Dumped(process.name, host.name, strategy.discard, now)
-    )
+    dumped = state.periodic.of.get(number)
+    if dumped is None:
+        discard = _discard_of(state, process, strategy)
+        dumped = state.periodic.of[number] = Dumped(process.name, host.name, discard, now)
     if dumped.order and dumped.asked != host.description.incarnation:
         dumped.order, dumped.since = 0, now  # it ended with the slave that was at it
     if dumped.order or not _may_be_dumped(state, process, owner):
@@ -140,6 +144,17 @@ def _review(state: MasterState, process: Process, now: float) -> None:
         _say_trouble(state, dumped, trouble, now)
     else:
         _order(state, process, strategy, owner, dumped, now)
+
+
+def _discard_of(state: MasterState, process: Process, strategy: PeriodicImaging) -> str:
+    """The executor that removes the images of the process; "": the strategy names none."""
+    name = process.spec.migration.strategy or ""
+    try:
+        return state.plugins.ask(
+            "migration", name, "discard", lambda: required(strategy.discard, str)
+        )
+    except PluginError:
+        return ""
 
 
 def _may_be_dumped(state: MasterState, process: Process, owner: Instance) -> bool:
@@ -162,27 +177,41 @@ def _pace(
         return None, "no checkpoint policy is selected: name one in the cluster's file"
     if not isinstance(policy, MemoryPacing):
         return None, f"the checkpoint policy {name!r} makes none of memory"
+    pacing = policy
+    asked_of = process.spec.migration.strategy or ""
     try:
-        asked = strategy.checkpoint_every(process.spec)
+        asked = state.plugins.ask(
+            "migration", asked_of, "checkpoint_every",
+            lambda: float(strategy.checkpoint_every(process.spec)),
+        )  # fmt: skip
         if not asked > 0.0:
             return None, ""
         view = MemoryView(process.spec, host.name, asked, dumped.size, dumped.pause)
-        pace = policy.pace(view)
-    except Exception as error:  # noqa: BLE001 - a third party's code: anything may come
-        return None, f"{name!r} sets no pace: {type(error).__name__}: {error}"
+        asked_of = name
+        return state.plugins.ask("checkpoint", name, "pace", lambda: _sound(pacing.pace(view))), ""
+    except PluginError as error:
+        return None, f"{asked_of!r} sets no pace: {error}"
+
+
+def _sound(pace: float | None) -> float | None:
+    """A pace that keeps to the contract; raises for any other."""
     if pace is not None and not 0.0 < pace < inf:
-        return None, f"{name!r} wants one every {pace} s; allowed: more than 0"
-    return pace, ""
+        raise PluginError(f"one every {pace} s; allowed: more than 0")
+    return pace
 
 
 def _order(
     state: MasterState, process: Process, strategy: PeriodicImaging, owner: Instance,
     dumped: Dumped, now: float,
 ) -> None:  # fmt: skip
+    spec, host = process.spec, owner.host.name
     try:
-        step = strategy.periodic(process.spec, owner.id, owner.host.name, int(state.wall))
-    except Exception as error:  # noqa: BLE001 - a third party's code: anything may come
-        _say_trouble(state, dumped, f"{type(error).__name__}: {error}", now)
+        step = state.plugins.ask(
+            "migration", spec.migration.strategy or "", "periodic",
+            lambda: required(strategy.periodic(spec, owner.id, host, int(state.wall)), Execute),
+        )  # fmt: skip
+    except PluginError as error:
+        _say_trouble(state, dumped, str(error), now)
         return
     state.periodic.last_order += 1
     dumped.order, dumped.asked = state.periodic.last_order, owner.host.description.incarnation
@@ -236,7 +265,7 @@ def _say_trouble(state: MasterState, dumped: Dumped, trouble: str, now: float) -
 def _remove(state: MasterState, dumped: Dumped) -> None:
     """A host that is not heard removes them when it registers."""
     host = state.hosts.by_name.get(dumped.host)
-    if host is None or state.hosts.condition_of(host) is not HostCondition.UP:
+    if not dumped.discard or host is None or state.hosts.condition_of(host) is not HostCondition.UP:
         return
     state.periodic.last_order += 1
     state.emit(

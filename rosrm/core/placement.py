@@ -21,6 +21,8 @@ import numpy.typing as npt
 from rosrm.core.columns import BUSY, CAPACITY, LIMIT, BoolArray, FloatArray, IntArray
 from rosrm.core.hosts import HostTable
 from rosrm.core.model import EMPTY, ProcessSpec
+from rosrm.core.plugin_calls import PluginCalls, required
+from rosrm.errors import PluginError
 from rosrm.ports import HostView, ProcessView, Scores, ScoringPolicy
 
 #: Equal scores: the host with fewer processes goes first, then the one registered first.
@@ -86,12 +88,17 @@ class Ranking:
     Attributes:
         need: (R, H) fractions of each host's capacity.
         value: (H,) score plus tie-break; inf where the host does not fit now.
-        policy: that judges; None: every one was left out, all that fit score 0.
+        judge: the policy that judges; None: every one was left out, all that fit score 0.
+        plugins: guards every call of a policy.
         failure: why policies were left out.
     """
 
-    def __init__(self, table: HostTable, policies: Sequence[NamedPolicy], demand: Demand) -> None:
+    def __init__(
+        self, table: HostTable, policies: Sequence[NamedPolicy], demand: Demand,
+        plugins: PluginCalls,
+    ) -> None:  # fmt: skip
         self.table = table
+        self.plugins = plugins
         self.demand = demand
         self.failure = ""
         self.version = table.version
@@ -107,9 +114,9 @@ class Ranking:
         self._judge(slice(0, len(table)))
 
     @property
-    def policy(self) -> ScoringPolicy | None:
-        """The policy that judges now."""
-        return self._left[0][1] if self._left else None
+    def judge(self) -> NamedPolicy | None:
+        """The policy that judges now, with its name."""
+        return self._left[0] if self._left else None
 
     @property
     def policy_name(self) -> str:
@@ -218,20 +225,22 @@ class Ranking:
             _read_only(cells[CAPACITY].T), _read_only(processes[:]),
         )  # fmt: skip
         process = ProcessView(self.demand.spec, _read_only(need.T))
+        name, policy = self._left[0]
         try:
-            scores = self._left[0][1].score(hosts, process)
-            value, veto = sound(scores, hosts, fits)
-        except Exception as error:  # noqa: BLE001 - a third party's code: anything may come
+            value, veto = self.plugins.ask(
+                "scoring", name, "score", lambda: sound(policy.score(hosts, process), hosts, fits)
+            )
+        except PluginError as error:
             self._leave_out(error)
             return None
         if veto is not None:
             fits &= ~veto
         return np.where(fits, value + tie, np.inf)
 
-    def _leave_out(self, error: Exception) -> None:
+    def _leave_out(self, error: PluginError) -> None:
         """The policy raised or answered nonsense: the next one decides, or none, and it is said."""
         name, _ = self._left.pop(0)
-        reason = f"left out: {name!r}, {type(error).__name__}: {error}"
+        reason = f"left out: {name!r}, {error}"
         self.failure = f"{self.failure}; {reason}" if self.failure else reason
         self._ahead.clear()
 
@@ -255,6 +264,7 @@ def _read_only(view: npt.NDArray[Any]) -> npt.NDArray[Any]:
 def sound(scores: Scores, hosts: HostView, fits: BoolArray) -> tuple[FloatArray, BoolArray | None]:
     """The value and veto of an answer that keeps to the contract; raises for any other."""
     size = len(fits)
+    required(scores, Scores)
     value = np.asarray(scores.value, np.float64)
     if value.shape != (size,):
         raise ValueError(f"scores of shape {value.shape} for {size} hosts")

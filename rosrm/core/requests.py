@@ -12,8 +12,10 @@ from rosrm.core.begin import why_busy
 from rosrm.core.commands import Order, Reply
 from rosrm.core.intake import save_host
 from rosrm.core.model import ProcessSpec
+from rosrm.core.plugin_calls import required
 from rosrm.core.relief import try_move
 from rosrm.core.state import WAITING, MasterState, Process, ProcessPhase, Wanted
+from rosrm.errors import PluginError
 from rosrm.ports import SpecChecking
 
 
@@ -95,13 +97,17 @@ def _submission_fault(state: MasterState, event: happened.SubmissionReceived) ->
 
 def _strategy_fault(state: MasterState, spec: ProcessSpec) -> str:
     """What the strategy of a spec has against it, if it looks at specs; "" for nothing."""
-    strategy: object = state.strategies.get(spec.migration.strategy or "")
+    name = spec.migration.strategy or ""
+    strategy: object = state.strategies.get(name)
     if not isinstance(strategy, SpecChecking):
         return ""
+    checking = strategy
     try:
-        return strategy.spec_fault(spec)
-    except Exception as error:  # noqa: BLE001 - a third party's code: anything may come
-        return f"it cannot say whether it moves this process: {type(error).__name__}: {error}"
+        return state.plugins.ask(
+            "migration", name, "spec_fault", lambda: required(checking.spec_fault(spec), str)
+        )
+    except PluginError as error:
+        return f"it cannot say whether it moves this process: {error}"
 
 
 def _names(names: Iterable[str]) -> str:

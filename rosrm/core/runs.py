@@ -73,6 +73,7 @@ class Run:
         order: of the step in hand, 0: none.
         stuck: a step that must be done failed; it is tried again from `retry_at` on.
         answer: of the slave to the order of the step in hand: accepted, message.
+        bad_result: the executor of the step in hand ran to its end, but answered no JSON object.
         launched: numbers of the instances that were ordered to start.
         suspended: numbers of the instances whose slave was told not to restart them. It may have
             been told otherwise since: its answer may come before the news of an end.
@@ -108,6 +109,7 @@ class Run:
     stuck: bool = False
     retry_at: float = 0.0
     answer: tuple[bool, str] | None = None
+    bad_result: bool = False
     launched: set[int] = field(default_factory=set)
     suspended: set[int] = field(default_factory=set)
     ended: dict[int, End] = field(default_factory=dict)

@@ -20,6 +20,7 @@ from rosrm.core.model import EMPTY, Assignment, InstanceId, ProcessSpec
 from rosrm.core.needs import LearnedNeeds
 from rosrm.core.periodic import Periodic
 from rosrm.core.placement import Demand, NamedPolicy, Ranking
+from rosrm.core.plugin_calls import PluginCalls
 from rosrm.core.processes import Instance, Process, ProcessPhase, Wanted
 from rosrm.core.queue import Queue
 from rosrm.core.runs import Run, run_to_dict
@@ -76,6 +77,7 @@ class MasterState:
         wants_standby: names of the processes that ask for one and are not over.
         in_company_since: time since when at least one host has been heard; inf: none is.
         tail: whether the journal has lost what was newest in it.
+        plugins: guards every call of a plugin.
     """
 
     def __init__(
@@ -110,6 +112,7 @@ class MasterState:
         self.rankings: dict[Any, Ranking] = {}
         self.rankings_version = 0
         self.placed_at: tuple[int, ...] = ()
+        self.plugins = PluginCalls()
         self.keeping = Keeping()
         self.abilities = Abilities()
         self.images = Images()
@@ -123,7 +126,6 @@ class MasterState:
         self.tail = Tail()
         self.missing_since: dict[int, float] = {}
         self.reviewed = float("-inf")
-        self.policy_told = float("-inf")
         self.demands: dict[Any, Demand] = {}
         self._out: list[Command] = []
         self._unsaved: dict[str, Process] = {}

@@ -16,8 +16,10 @@ from rosrm.core.columns import BUSY, CAPACITY, LIMIT, LOAD, USAGE, BoolArray, Fl
 from rosrm.core.hosts import HostTable
 from rosrm.core.lazy import Lazy
 from rosrm.core.model import EMPTY
-from rosrm.core.placement import CLOSE, TIE, Demand, Names, Ranking, eligible
-from rosrm.ports import HostView, ProcessView, Scores, ScoringPolicy
+from rosrm.core.placement import CLOSE, TIE, Demand, NamedPolicy, Names, Ranking, eligible
+from rosrm.core.plugin_calls import PluginCalls, required
+from rosrm.errors import PluginError
+from rosrm.ports import HostView, ProcessView, Scores
 
 #: An explanation names every host up to this many, else the best of those that fit.
 _NAMED_HOSTS: Final = 16
@@ -54,11 +56,13 @@ class Moment:
         cells: (planes, R, n) as in `HostColumns`.
         need: (R, n) fractions.
         value: (n,) score plus tie-break; inf where it did not fit.
+        plugins: guards the calls of the policy.
         processes: (n,) held or promised.
     """
 
     demand: Demand
-    policy: ScoringPolicy | None
+    policy: NamedPolicy | None
+    plugins: PluginCalls
     table: HostTable
     resources: tuple[str, ...]
     columns: IntArray
@@ -76,10 +80,13 @@ class Moment:
             Names(self.table, self.columns), self.resources, self.cells[BUSY].T,
             self.cells[LIMIT].T, self.cells[CAPACITY].T, self.processes,
         )  # fmt: skip
+        (name, policy), process = self.policy, ProcessView(self.demand.spec, self.need.T)
         try:
-            return self.policy.score(hosts, ProcessView(self.demand.spec, self.need.T))
-        except Exception:  # noqa: BLE001 - a third party's code; the decision is made already
-            return None
+            return self.plugins.ask(
+                "scoring", name, "score", lambda: required(policy.score(hosts, process), Scores)
+            )
+        except PluginError:
+            return None  # the decision is made already
 
 
 class Decision(Lazy):
@@ -180,7 +187,7 @@ def _moment(ranking: Ranking, columns: list[int]) -> Moment:
             for column in columns
         )
     return Moment(
-        ranking.demand, ranking.policy, table, table.resources, at, closed,
+        ranking.demand, ranking.judge, ranking.plugins, table, table.resources, at, closed,
         table.cells[:, :, at], ranking.need[:, at], value, table.processes[at],
     )  # fmt: skip
 
@@ -208,23 +215,25 @@ def _verdict(moment: Moment, scores: Scores | None, at: int, *, chosen: bool) ->
     name, value = moment.table.hosts[moment.columns[at]].name, float(moment.value[at])
     if value < np.inf:
         score = value - TIE * float(moment.processes[at])
-        return Verdict(name, "chosen" if chosen else "fits", score, _said(scores, at, veto=False))
+        reason = _said(moment, scores, at, veto=False)
+        return Verdict(name, "chosen" if chosen else "fits", score, reason)
     if moment.closed[at]:
         return Verdict(name, "excluded", None, moment.closed[at])
     full = _full_reason(moment, at)
     if full:
         return Verdict(name, "full", None, full)
-    return Verdict(name, "vetoed", None, _said(scores, at, veto=True))
+    return Verdict(name, "vetoed", None, _said(moment, scores, at, veto=True))
 
 
-def _said(scores: Scores | None, at: int, *, veto: bool) -> str:
+def _said(moment: Moment, scores: Scores | None, at: int, *, veto: bool) -> str:
     """The policy's own reason; one that raises says nothing."""
-    if scores is None:
+    if scores is None or moment.policy is None:
         return ""
+    hook, reason = ("veto_reason", scores.veto_reason) if veto else ("reason", scores.reason)
     try:
-        return str(scores.veto_reason(at) if veto else scores.reason(at))
-    except Exception as error:  # noqa: BLE001 - a third party's code: anything may come
-        return f"(its reason: {type(error).__name__}: {error})"
+        return moment.plugins.ask("scoring", moment.policy[0], hook, lambda: str(reason(at)))
+    except PluginError as error:
+        return f"(its reason: {error})"
 
 
 def _full_reason(moment: Moment, at: int) -> str:

@@ -104,7 +104,7 @@ class PluginRow:
     Attributes:
         kind: "probe", "scoring", "migration" or "checkpoint".
         distribution: name and version of the package that brings it.
-        state: "selected", "available", "absent" or "broken".
+        state: "selected", "available", "absent", "broken" or "failing".
         host: "" for the master.
     """
 

@@ -1,4 +1,4 @@
-"""Ends a policy that does not come back, so that a third party's loop cannot hang us."""
+"""Deadlines for the calls of plugins, so that a third party's loop cannot hang the master."""
 
 from __future__ import annotations
 
@@ -7,108 +7,65 @@ import threading
 import time
 from collections.abc import Callable
 from types import FrameType
-from typing import Any, Final, TypeVar
+from typing import Final, TypeVar
 
-from rosrm.ports import (
-    CheckpointChoice,
-    CheckpointPolicy,
-    CheckpointView,
-    HostView,
-    MemoryPacing,
-    MemoryView,
-    ProcessView,
-    Scores,
-    ScoringPolicy,
-)
+from rosrm.core.plugin_calls import Plugin
+from rosrm.errors import PluginError, describe_plugin_fault
 
-#: Seconds between two alarms, for a policy that takes no notice of the first.
+#: Seconds between two alarms, for a plugin that takes no notice of the first.
 _AGAIN: Final = 0.05
 
 T = TypeVar("T")
 
 
-class Deadline:
-    """A deadline for calls of one policy, by the real-time interval timer; main thread only.
+class Deadlines:
+    """A deadline for each call of each plugin, by the real-time interval timer.
 
-    The core treats the TimeoutError like any other failure: the policy is left out of that
-    decision, and named. One that was late is not asked again for a while: a master that waits for
-    it with every reading would have no time for its slaves. A loop inside C code that never returns
-    to Python cannot be ended so.
+    The core treats a late call like any other failure: that decision is made without the plugin. A
+    plugin that was late is not asked again for a while: a master that waits for it with every
+    reading would have no time for its slaves. A loop inside C code that never returns to Python
+    cannot be ended so. One of these serves a process, as a process has one such timer.
 
     Args:
         seconds: for one call.
-        pause: seconds for which it is not asked after it was late.
+        pause: seconds for which a plugin is not asked after a late call.
     """
 
     def __init__(self, seconds: float = 1.0, pause: float = 30.0) -> None:
         self._seconds = seconds
         self._pause = pause
-        self._asked = False
-        self._late = float("-inf")
+        self._asked: Plugin | None = None
+        self._late: dict[Plugin, tuple[float, str]] = {}
         if threading.current_thread() is not threading.main_thread():
-            raise RuntimeError("the guard works by a signal and needs the main thread")
+            raise RuntimeError("the deadlines work by a signal and need the main thread")
+        signal.signal(signal.SIGALRM, self._expired)
 
-    def call(self, ask: Callable[..., T], *arguments: Any) -> T:
-        """What is answered in time; raises TimeoutError, or what was raised."""
-        if time.monotonic() - self._late < self._pause:
-            raise self._too_late()
-        signal.signal(signal.SIGALRM, self._expired)  # there are other policies
-        self._asked = True
+    def __call__(self, plugin: Plugin, call: Callable[[], T]) -> T:
+        """Return the answer of a call; raises `PluginError` or what the plugin raised."""
+        late_at, told = self._late.get(plugin, (float("-inf"), ""))
+        if time.monotonic() - late_at < self._pause:
+            raise PluginError(told)
+        self._asked = plugin
         signal.setitimer(signal.ITIMER_REAL, self._seconds, _AGAIN)
         try:
-            return ask(*arguments)
+            return call()
+        except TimeoutError as fault:
+            if plugin in self._late:  # the pause says where the plugin was when the time was up
+                told = describe_plugin_fault(fault)
+                self._late[plugin] = (self._late[plugin][0], told)
+            raise
+        except KeyboardInterrupt as fault:  # of the plugin: Ctrl-C raises nothing in a master
+            raise PluginError(describe_plugin_fault(fault)) from fault
         finally:
-            self._asked = False
+            self._asked = None
             signal.setitimer(signal.ITIMER_REAL, 0.0)
 
     def _expired(self, _signal: int, _frame: FrameType | None) -> None:
-        if self._asked:  # else it came back in the very last moment
-            self._late = time.monotonic()
-            raise self._too_late()
-
-    def _too_late(self) -> TimeoutError:
-        return TimeoutError(
+        if self._asked is None:  # the call ended in the very last moment
+            return
+        reason = (
             f"it took longer than {self._seconds:g} s for one decision, and is not asked again "
             f"for {self._pause:g} s"
         )
-
-
-class GuardedScoring:
-    """A scoring policy with a deadline."""
-
-    def __init__(self, policy: ScoringPolicy, deadline: Deadline) -> None:
-        self._policy, self._deadline = policy, deadline
-
-    def score(self, hosts: HostView, process: ProcessView) -> Scores:
-        """As the guarded policy."""
-        return self._deadline.call(self._policy.score, hosts, process)
-
-
-class _GuardedCheckpoints:
-    """A checkpoint policy with a deadline."""
-
-    def __init__(self, policy: CheckpointPolicy, deadline: Deadline) -> None:
-        self._policy, self._deadline = policy, deadline
-
-    def choose(self, process: CheckpointView) -> CheckpointChoice | None:
-        """As the guarded policy."""
-        return self._deadline.call(self._policy.choose, process)
-
-
-class _GuardedPacing(_GuardedCheckpoints):
-    """One that has memory dumped, too."""
-
-    def __init__(self, policy: CheckpointPolicy, pacing: MemoryPacing, deadline: Deadline) -> None:
-        super().__init__(policy, deadline)
-        self._pacing = pacing
-
-    def pace(self, process: MemoryView) -> float | None:
-        """As the guarded policy."""
-        return self._deadline.call(self._pacing.pace, process)
-
-
-def guarded_checkpoints(policy: CheckpointPolicy, deadline: Deadline) -> CheckpointPolicy:
-    """A checkpoint policy that does what the given one does, with a deadline for each call."""
-    if isinstance(policy, MemoryPacing):
-        return _GuardedPacing(policy, policy, deadline)
-    return _GuardedCheckpoints(policy, deadline)
+        self._late[self._asked] = (time.monotonic(), reason)
+        raise TimeoutError(reason)

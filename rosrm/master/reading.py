@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, Final
 
 from rosrm.core import listing
+from rosrm.core.hosts import Host
+from rosrm.core.model import ResourceDescription
 from rosrm.core.state import MasterState
 from rosrm.core.views import EventRow, PluginRow, Snapshot
 from rosrm.journal import SqliteJournal
@@ -69,15 +72,16 @@ class Reading:
         return [_event_row(one) for one in stored]
 
     def _all_plugins(self) -> list[PluginRow]:
-        rows = list(self._plugins)
+        failing = self._state.plugins.failing
+        rows = [
+            replace(row, state="failing", reason=known.reason)
+            if (known := failing.get((row.kind, row.name))) is not None
+            else row
+            for row in self._plugins
+        ]
         for host in self._state.hosts.hosts:
             described = host.description
-            rows += [
-                PluginRow(
-                    "probe", resource.name, "", "selected", f"scope {resource.scope}", host.name
-                )
-                for resource in described.resources
-            ]
+            rows += [_probe_row(host, resource) for resource in described.resources]
             rows += [
                 PluginRow("probe", name, "", "absent", reason, host.name)
                 for name, reason in described.absent.items()
@@ -88,6 +92,15 @@ class Reading:
         """The story of a process as JSON."""
         story = listing.explanation(self._state, name, self._core_now())
         return None if story is None else json.dumps(story, default=dict)
+
+
+def _probe_row(host: Host, resource: ResourceDescription) -> PluginRow:
+    """A probe of a host, by the resource that it reads."""
+    reason = host.failing.get(resource.name, "")
+    state = "failing" if reason else "selected"
+    return PluginRow(
+        "probe", resource.name, "", state, reason or f"scope {resource.scope}", host.name
+    )
 
 
 def _event_row(stored: StoredRecord) -> EventRow:

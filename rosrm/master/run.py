@@ -16,7 +16,6 @@ from rosrm.config.settings import CheckpointChoice, ClusterConfig
 from rosrm.entry import run
 from rosrm.handover import Handover
 from rosrm.master.fallback import fallback_of
-from rosrm.master.policy_guard import Deadline, GuardedScoring, guarded_checkpoints
 from rosrm.master.runtime import MasterRuntime
 from rosrm.registry import Registry
 
@@ -26,11 +25,9 @@ def serve(handover: Handover) -> int:
     config = ClusterConfig.from_json(handover.settings)
     registry = Registry.load(handover.plugins)
     name = config.scoring.policy
-    policy = GuardedScoring(registry.scoring(name, config.scoring.options), Deadline())
+    policy = registry.scoring(name, config.scoring.options)
     strategies = registry.migrations(config.migration.strategies)
     checkpoint = registry.checkpoint(_installed_policy(config, registry), config.checkpoint.options)
-    if checkpoint is not None:
-        checkpoint = guarded_checkpoints(checkpoint, Deadline())
     rows = registry.rows("scoring", "migration", "checkpoint")
     fallback = fallback_of(registry, name)
     return MasterRuntime(config, policy, strategies, rows, fallback, checkpoint).run()

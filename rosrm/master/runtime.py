@@ -32,6 +32,7 @@ from rosrm.core.views import PluginRow
 from rosrm.errors import JournalBlocked, Refused
 from rosrm.journal import SqliteJournal
 from rosrm.journal_faults import unreadable
+from rosrm.master.policy_guard import Deadlines
 from rosrm.master.reading import Reading
 from rosrm.master.recorder import Recorder
 from rosrm.master.standstill import Standstill
@@ -61,6 +62,8 @@ _DISCOVERY: Final = 1.0
 _COLLECT_AT: Final = (10_000, 20, 20)
 #: Seconds within which two masters came up at once.
 _AT_ONCE: Final = 1.0
+#: Seconds for the decisions of one turn, beyond which they do not count for the core.
+_BLOCKED: Final = 0.5
 #: Seconds between two attempts to write what could not be written.
 _TRY_AGAIN: Final = 0.5
 _BOOT_ID: Final = Path("/proc/sys/kernel/random/boot_id")
@@ -105,7 +108,7 @@ class MasterRuntime:
         self._stopping = ""
         self._recorder: Recorder | None = None
         self._held: Standstill | None = None
-        self._behind = 0.0  # seconds by which the core's clock is behind, since nothing was decided
+        self._behind = 0.0  # seconds by which the core's clock is behind, as it was blocked
         self._closing = contextlib.ExitStack()
         with contextlib.ExitStack() as opened:
             opened.enter_context(
@@ -145,6 +148,7 @@ class MasterRuntime:
             self._config.core(), self._config.scoring.policy or "", policy, strategies, epoch,
             self._fallback,
         )  # fmt: skip
+        state.plugins.limit = Deadlines()
         state.wall = time.time()
         state.keeping.policy = self._checkpoint
         state.keeping.policy_name = self._config.checkpoint.policy or ""
@@ -286,6 +290,17 @@ class MasterRuntime:
                 commands += decided
             if commands:
                 self._carry_out(commands, now)
+        if self._held is None:
+            self._leave_out_blocked(now)
+
+    def _leave_out_blocked(self, began: float) -> None:
+        """Hold the core's clock back by a time in which a plugin kept the master from its work.
+
+        The master took no answer in during that time, so no time-out of a step must pass with it.
+        """
+        blocked = self._now() - began
+        if blocked > _BLOCKED:
+            self._behind += blocked
 
     def _carry_out(self, commands: Sequence[Command], now: float) -> None:
         records = [command for command in commands if isinstance(command, Record)]

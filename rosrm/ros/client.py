@@ -142,7 +142,7 @@ def _ask_until_answered(
         if now >= deadline:
             return answers
         answers.sent += 1
-        client.call_async(request).add_done_callback(answers.take)
+        client.call_async(request).add_done_callback(participant.counted(answers.take))
         wait_until(participant, lambda: bool(answers.first), min(deadline, now + again))
     return answers
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from rosrm.errors import Refused
-from rosrm.ros.participant import OpenRequest, Participant
+from rosrm.ros.participant import OpenRequest, Participant, failed_response
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs.msg import Answer, Envelope
 
@@ -167,7 +167,9 @@ class ControlServer:
                     gate.remember(request.envelope, response)
                 open_request.answer(response)
 
-            handle(request, respond)
+            fault = self._participant.guard.call(handle, request, respond)
+            if fault and not open_request.answered:
+                respond(failed_response(service_type, fault))
 
         self._participant.serve(service_type, name, take)
 
@@ -206,7 +208,8 @@ class ControlClient:
         Args:
             client: an rclpy service client.
             deadline: monotonic seconds, compared with `expire`'s argument.
-            done: called once: with the response, or with None when the deadline has passed.
+            done: called with the response, or with None when the deadline has passed or the call
+                with the response raised.
         """
         call = _Call(client.call_async(request), client, deadline, done)
         self._calls.append(call)
@@ -215,14 +218,16 @@ class ControlClient:
     def _finish(self, call: _Call) -> None:
         if call in self._calls:
             self._calls.remove(call)
-            call.done(call.future.result())
+            guard = self.participant.guard
+            if guard.call(lambda: call.done(call.future.result())):
+                guard.call(call.done, None)  # a response that cannot be taken in counts as none
 
     def expire(self, now: float) -> None:
         """End the calls whose deadline has passed."""
         for call in [call for call in self._calls if now >= call.deadline]:
             self._calls.remove(call)
             call.client.remove_pending_request(call.future)
-            call.done(None)
+            self.participant.guard.call(call.done, None)
 
     def forget(self) -> None:
         """Drop every call without an answer: the other side is another run by now."""

@@ -103,12 +103,18 @@ class Hearing:
             return
         try:
             statuses = tuple(convert.status_from_msg(status) for status in message.statuses)
+            failing = {row.name: row.reason for row in message.failing}
         except Refused as refusal:
             self._refuse(who, str(refusal))
             return
         self._tell(
             happened.StatusesReceived(
-                message.host_id, message.incarnation, message.sequence, message.complete, statuses
+                message.host_id,
+                message.incarnation,
+                message.sequence,
+                message.complete,
+                statuses,
+                failing,
             )
         )
 

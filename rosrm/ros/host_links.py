@@ -15,6 +15,7 @@ from typing import Any, Final
 from rosrm.core import events as happened
 from rosrm.core.commands import Assign, Order, Redeliver, Withdraw
 from rosrm.core.model import Assignment, HostDescription
+from rosrm.errors import Refused
 from rosrm.ros import convert, names, qos
 from rosrm.ros.control import ControlClient, accepted, version_refusal
 from rosrm.ros.ledger import Ledger
@@ -285,5 +286,8 @@ def _order_answered(order: int, response: srv.ControlHost.Response | None) -> ha
     fault = version_refusal(answer.protocol_version, "a slave")
     if fault:
         return happened.OrderAnswered(order, False, "version", fault)
-    result = convert.json_object(response.result, "a result") if response.result else None
+    try:
+        result = convert.json_object(response.result, "a result") if response.result else None
+    except Refused as fault:
+        return happened.OrderAnswered(order, False, happened.BAD_RESULT, str(fault))
     return happened.OrderAnswered(order, answer.accepted, answer.code, answer.message, result)

@@ -52,6 +52,7 @@ class MasterEndpoint:
         control: ControlSettings,
     ) -> None:
         self._identity = identity
+        self._guard = participant.guard
         self._beat = beat
         self.events: list[happened.Event] = []
         self.rival: msg.MasterBeat | None = None
@@ -97,6 +98,9 @@ class MasterEndpoint:
         self._oldest.append(self._links.ledger.ages(time.monotonic())[1])
 
     def _take_readings(self) -> None:
+        self._guard.call(self._take_new_readings)
+
+    def _take_new_readings(self) -> None:
         readings = self._hearing.poll_readings()
         if readings is not None:
             # Before all else: a usage must not be judged by readings that are older than it.

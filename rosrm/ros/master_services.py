@@ -100,7 +100,7 @@ class MasterServices:
         """Answer a request, if it is still open."""
         answer = self._open.pop(command.request, None)
         if answer is not None:
-            answer(command)
+            self._participant.guard.call(answer, command)
 
     def _keep(self, answer: Callable[[Reply], None]) -> int:
         """Keep the way to answer a request; returns the number of the request."""

@@ -21,8 +21,10 @@ from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 
 from rosrm.ros import qos
+from rosrm.ros.callback_guard import CallbackGuard
 from rosrm.ros.fast_dds import Pace, announcing
 from rosrm.ros.settings import RosSettings
+from rosrm.version import PROTOCOL_VERSION
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -38,10 +40,12 @@ class OpenRequest:
 
     _send: Callable[[Any, Any], None]
     _header: Any
+    answered: bool = False
 
     def answer(self, response: Any) -> None:
         """Send the response."""
         self._send(response, self._header)
+        self.answered = True
 
 
 class Participant:
@@ -51,6 +55,9 @@ class Participant:
         settings: applied to the environment before the context is made.
         name: of the node.
         pace: how often it announces itself: "eager" or "steady" (docs/decisions/0009).
+
+    Attributes:
+        guard: calls everything that ROS calls.
     """
 
     def __init__(self, settings: RosSettings, name: str, *, pace: Pace = "eager") -> None:
@@ -67,6 +74,7 @@ class Participant:
         self.executor = EventsExecutor(context=self.context)
         self.executor.add_node(self.node)
         self._executed = 0
+        self.guard = CallbackGuard()
         self._unwatched: list[Node] = []
 
     def _lean_node(self, name: str) -> Node:
@@ -89,11 +97,11 @@ class Participant:
     # --- the loop ------------------------------------------------------------------------
 
     def counted(self, callback: Callable[..., None]) -> Callable[..., None]:
-        """Wrap a callback so that `spin` knows when nothing more is ready."""
+        """Wrap a callback: `spin` knows when nothing more is ready, and nothing is raised."""
 
         def call(*arguments: Any) -> None:
             self._executed += 1
-            callback(*arguments)
+            self.guard.call(callback, *arguments)
 
         return call
 
@@ -108,6 +116,7 @@ class Participant:
         while self._executed != before and time.monotonic() < flooded:
             before = self._executed
             self.executor.spin_once(timeout_sec=0.0)
+        self.guard.raise_interrupt()
 
     def wake(self) -> None:
         """End a `spin` that waits; may be called from any thread."""
@@ -121,7 +130,8 @@ class Participant:
         """Offer a service whose responses may come later.
 
         Args:
-            handle: called with each request and the means to answer it.
+            handle: called with each request and the means to answer it. Where it raises before
+                it has answered, the request is answered as failed.
         """
         # The executor passes what the callback returns to `send_response` with the header that is
         # needed for the answer: the callback hands the request through, and the answer comes later.
@@ -132,7 +142,10 @@ class Participant:
 
         def take(request: Any, header: Any) -> None:
             self._executed += 1
-            handle(request, OpenRequest(send, header))
+            opened = OpenRequest(send, header)
+            fault = self.guard.call(handle, request, opened)
+            if fault and not opened.answered:
+                self.guard.call(opened.answer, failed_response(service_type, fault))
 
         service.send_response = take
 
@@ -154,6 +167,17 @@ class Participant:
         trace: TracebackType | None,
     ) -> None:
         self.close()
+
+
+def failed_response(service_type: Any, reason: str) -> Any:
+    """Return the response to a request whose handler raised."""
+    response = service_type.Response()
+    answer = getattr(response, "answer", response)  # of a handshake the response is the answer
+    answer.protocol_version, answer.accepted = PROTOCOL_VERSION, False
+    answer.message = f"an error of the receiver: {reason}"
+    if hasattr(answer, "code"):
+        answer.code = "failed"
+    return response
 
 
 def _nothing() -> None:

@@ -19,11 +19,11 @@ from rosrm.ros.control import ControlClient, Gate, version_refusal
 from rosrm.ros.journal_seen import JournalSeen, Seen
 from rosrm.ros.participant import Participant
 from rosrm.ros.reporting import Reporter
-from rosrm.ros.slave_services import Host, LogSlice, SlaveServices, result_json
+from rosrm.ros.slave_services import Host, LogSlice, SlaveServices
 from rosrm.version import PROTOCOL_VERSION, __version__
 from rosrm_msgs import msg, srv
 
-__all__ = ["Host", "Link", "LogSlice", "SlaveEndpoint", "result_json"]
+__all__ = ["Host", "Link", "LogSlice", "SlaveEndpoint"]
 
 #: Seconds for one request to the master.
 _PATIENCE: Final = 3.0
@@ -31,6 +31,8 @@ _PATIENCE: Final = 3.0
 #: after a registration sooner, as it may have gone out before DDS knew its way, then ever later.
 _POLL_ANEW: Final = 30.0
 _FIRST_POLL_ANEW: Final = 1.0
+#: Seconds after a request for work that was refused until the next one.
+_ASK_AGAIN: Final = 0.2
 #: Seconds for which a name that is taken is asked for again: the former run of this slave may
 #: have been killed a moment ago.
 _NAME_TAKEN: Final = 5.0
@@ -63,6 +65,7 @@ class SlaveEndpoint:
         failure: why it must give up; "" while it need not.
         superseded: it must because another slave lives under its name.
         cluster: name of the master that greeted us last; "" before the first one.
+        failing: resource to the reason why its probe gives no readings; goes with the statuses.
     """
 
     def __init__(
@@ -77,6 +80,7 @@ class SlaveEndpoint:
         self.failure = ""
         self.superseded = False
         self.cluster = ""
+        self.failing: dict[str, str] = {}
         self.host_id = 0
         self._epoch = 0
         self._master_beat = 0
@@ -93,6 +97,7 @@ class SlaveEndpoint:
         self._waits_since: float | None = None
         self._told = ""
         self._poll_open = False
+        self._ask_at = 0.0
         self._poll_anew = _FIRST_POLL_ANEW
         self._status_sequence = 0
         self._control = ControlClient(participant, f"slave {description.name}")
@@ -174,17 +179,17 @@ class SlaveEndpoint:
         beat = self._newest_beat
         if beat is None or _speaker(beat) != _speaker(self._greeting):
             return
-        self._incarnation = beat.incarnation
-        self._asked_at = time.monotonic()
-        self.link = Link.REGISTERING
-        self._poll_open = False
         request = srv.RegisterHost.Request(
             envelope=self._control.envelope(self._master_beat, self._greeting.epoch),
             host=convert.host_to_msg(self._description),
             instances=[convert.status_to_msg(status) for status in self._host.statuses()],
             kept=[convert.kept_to_msg(one) for one in self._host.kept_states()],
-            journal_seen=self._seen.of_former_run(self.cluster, self._incarnation),
+            journal_seen=self._seen.of_former_run(self.cluster, beat.incarnation),
         )
+        self._incarnation = beat.incarnation
+        self._asked_at = time.monotonic()
+        self.link = Link.REGISTERING
+        self._poll_open = False
         self._control.call(
             self._clients[srv.RegisterHost], request, time.monotonic() + _PATIENCE,
             self._take_registration,
@@ -196,7 +201,7 @@ class SlaveEndpoint:
             self.link = Link.SEARCHING
             return
         answer = response.answer
-        if answer.code == "journal":
+        if answer.code in ("journal", "failed"):
             self._wait_for_journal(answer.message, now)
             return
         self._waits_since = None
@@ -281,7 +286,7 @@ class SlaveEndpoint:
 
     def ask(self, now: float) -> None:
         """Ask for work, unless a request is open already."""
-        if self._poll_open or self.link is not Link.REGISTERED:
+        if self._poll_open or self.link is not Link.REGISTERED or now < self._ask_at:
             return
         self._poll_open = True
         request = srv.RequestProcess.Request(
@@ -300,6 +305,7 @@ class SlaveEndpoint:
         self._poll_anew = _POLL_ANEW
         answer = response.answer
         if not answer.accepted:
+            self._ask_at = time.monotonic() + _ASK_AGAIN  # not with every turn of the loop
             if answer.code in ("unknown", "stale"):
                 self._lose_master(f"the master does not know this host any more: {answer.message}")
             return
@@ -336,6 +342,10 @@ class SlaveEndpoint:
                 protocol_version=PROTOCOL_VERSION, host_id=self.host_id,
                 incarnation=self._description.incarnation, sequence=self._status_sequence,
                 complete=complete, statuses=[convert.status_to_msg(one) for one in statuses],
+                failing=[
+                    msg.PluginState(kind="probe", name=name, state="failing", reason=reason)
+                    for name, reason in self.failing.items()
+                ],
             )
         )  # fmt: skip
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -52,9 +51,12 @@ class Host(Protocol):
         """
 
     def execute(
-        self, executor: str, arguments: dict[str, Any], done: Callable[[bool, str, str], None]
+        self, executor: str, arguments: dict[str, Any], done: Callable[[str, str, str], None]
     ) -> None:
-        """Run an executor; `done(accepted, message, result)` is called in the loop's thread."""
+        """Run an executor; `done(code, message, result)` is called in the loop's thread.
+
+        The code is "" where the executor did its work.
+        """
 
     def keep(self, instance: InstanceId, hosts: Sequence[str], every: float) -> None:
         """Ship the state of an instance to these hosts from now on; seconds between two times."""
@@ -122,8 +124,8 @@ class SlaveServices:
         self._host.set_restart(convert.instance_from_msg(request.instance), restart, settled)
 
     def _execute(self, request: srv.ControlHost.Request, respond: Callable[[Any], None]) -> None:
-        def done(good: bool, message: str, result: str) -> None:
-            answer = accepted(message) if good else refused("failed", message)
+        def done(code: str, message: str, result: str) -> None:
+            answer = refused(code, message) if code else accepted()
             respond(srv.ControlHost.Response(answer=answer, result=result))
 
         arguments = convert.json_object(request.arguments, "the arguments of an executor")
@@ -168,8 +170,3 @@ def _ordered(request: srv.ControlHost.Request) -> core.Event:
     if request.action not in orders:
         raise Refused(f"unknown action {request.action}")
     return orders[request.action]
-
-
-def result_json(result: Any) -> str:
-    """What an executor returned, as JSON text."""
-    return json.dumps(result, default=dict)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -9,12 +10,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from rosrm.errors import Refused, RosrmError
-from rosrm.ros.slave_endpoint import result_json
+from rosrm.core.events import BAD_RESULT
+from rosrm.errors import Refused, RosrmError, describe_plugin_fault
 
 Executor = Callable[[Mapping[str, Any]], Mapping[str, Any]]
-#: Told of the outcome: whether it worked, why not, and the result as JSON.
-Done = Callable[[bool, str, str], None]
+#: Told of the outcome: "" or the code of a failure, why it failed, and the result as JSON.
+Done = Callable[[str, str, str], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,13 +67,20 @@ def execute(
     told = {**arguments, "here": here.as_json()}
 
     def work() -> None:
-        try:
-            result = result_json(function(told))
-            outcome = (True, "", result)
-        except RosrmError as error:
-            outcome = (False, str(error), "")
-        except Exception as error:  # noqa: BLE001 - a third party's code: anything may come
-            outcome = (False, f"{name} raised {type(error).__name__}: {error}", "")
-        post(partial(done, *outcome))
+        post(partial(done, *_outcome(name, function, told)))
 
     threading.Thread(target=work, name=f"executor {name}", daemon=True).start()
+
+
+def _outcome(name: str, function: Executor, arguments: Mapping[str, Any]) -> tuple[str, str, str]:
+    """Run an executor; returns as `Done` is called."""
+    try:
+        result: object = function(arguments)
+        if not isinstance(result, Mapping):
+            given = "None" if result is None else f"a {type(result).__name__}"
+            return BAD_RESULT, f"{name} answered {given}; a JSON object is required", ""
+        return "", "", json.dumps(result, default=dict)
+    except RosrmError as error:
+        return "failed", str(error), ""
+    except BaseException as error:  # noqa: BLE001 - a third party's code, which may call sys.exit
+        return "failed", f"{name} raised {describe_plugin_fault(error)}", ""

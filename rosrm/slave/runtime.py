@@ -38,7 +38,7 @@ from rosrm.slave.executing import Done, Here, execute
 from rosrm.slave.health import HealthWatch
 from rosrm.slave.keeping import Keeping
 from rosrm.slave.log_reading import NOTHING_YET, newest_instance, read_log
-from rosrm.slave.sampling import Sampler
+from rosrm.slave.sampling import ProbeReport, Sampler
 from rosrm.slave.sessions import SessionTable
 from rosrm.slave.starting import Starter
 from rosrm.slave.supervisor_link import SupervisorLink
@@ -100,8 +100,7 @@ class SlaveRuntime:
             probes = registry.probes(config.probes, context)
             self._sampler = Sampler(probes.made)
             opened.callback(self._sampler.close)
-            for report in self._sampler.first().reports:
-                self.say(str(report))
+            first = self._sampler.first().reports
             # From here on Ctrl-C ends what was begun in good order; before, it ends us at once.
             for number in (signal.SIGINT, signal.SIGTERM):
                 signal.signal(number, self._stop)
@@ -124,6 +123,7 @@ class SlaveRuntime:
                 max_age,
                 JournalSeen(config.state / "journal_seen"),
             )
+            self._note_probes(first)
             kept = config.state / "kept"
             self._keeping = Keeping(
                 kept, config.host, config.keep,
@@ -207,8 +207,9 @@ class SlaveRuntime:
         self._endpoint.go_on(now)
         self._keeping.tick(now)
         sample = self._sampler.latest(now)
-        for report in sample.reports:
-            self.say(str(report))
+        if sample.reports:
+            self._note_probes(sample.reports)
+            self._endpoint.publish_statuses((), complete=False)
         present = self._sampler.present
         under = core.under_limits(sample.usage, self._limit, present, sample.stale)
         self._accepting = under and not self._stopping
@@ -218,6 +219,17 @@ class SlaveRuntime:
         )  # fmt: skip
         self._say_usage()
         self.take(core.TimePassed())
+
+    def _note_probes(self, reports: Sequence[ProbeReport]) -> None:
+        """Log which readings went stale or came back, and have the master know."""
+        failing = self._endpoint.failing
+        for report in reports:
+            self.say(str(report))
+            for resource in report.resources:
+                if report.stale:
+                    failing[resource] = f"probe {report.probe}: {report.reason}"
+                else:
+                    failing.pop(resource, None)
 
     def _say_usage(self) -> None:
         seen = self._usage.after_reading()
@@ -235,6 +247,8 @@ class SlaveRuntime:
         self._events.append(event)
         if isinstance(event, core.Registered):
             self._keeping.say_again()
+            if self._endpoint.failing:
+                self._endpoint.publish_statuses((), complete=False)
 
     def _post(self, call: Callable[[], None]) -> None:
         """Have something called in the loop; may be called from any thread."""
@@ -244,7 +258,7 @@ class SlaveRuntime:
     def _work(self, now: float) -> None:
         """Let the core decide about everything that happened, and carry it out."""
         while self._from_threads:
-            self._from_threads.popleft()()
+            self._participant.guard.call(self._from_threads.popleft())
         while self._events:
             events = list(self._events)
             self._events.clear()

@@ -23,7 +23,7 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Final
@@ -31,7 +31,9 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 import numpy.typing as npt
 
-from rosrm.core.model import RESOURCE_SLOTS
+from rosrm.core.model import RESOURCE_SLOTS, Reading
+from rosrm.core.plugin_calls import required
+from rosrm.errors import PluginError, describe_plugin_fault
 
 if TYPE_CHECKING:
     from rosrm.ports import Probe
@@ -370,11 +372,11 @@ class _Watched:
         reason = ""
         try:
             values = _values(self._probe, self.names)
-        except _Nonsense as nonsense:
+        except (_Nonsense, PluginError) as nonsense:
             reason = str(nonsense)
         except BaseException as error:  # noqa: BLE001 - the guard: whatever a plugin raises, even
             # SystemExit, makes its readings stale and harms nothing else.
-            reason = f"read() raised {type(error).__name__}: {error}"
+            reason = f"read() raised {describe_plugin_fault(error)}"
         ended = self._clock()
         self.outcome = _Outcome(values, reason, ended - started, ended - self.asked)
         self.busy = False
@@ -388,7 +390,8 @@ class _Nonsense(Exception):
 def _values(probe: Probe, names: tuple[str, ...]) -> tuple[float, ...]:
     """Read a probe and check every value before any is used."""
     values: dict[str, float] = {}
-    for reading in probe.read():
+    for answer in required(probe.read(), Iterable):  # type: ignore[type-abstract]
+        reading = required(answer, Reading)
         if reading.resource not in names:
             raise _Nonsense(f"a reading of {reading.resource!r}, which it did not announce")
         if reading.resource in values:

@@ -468,3 +468,34 @@ def test_a_slave_that_is_not_there_is_said(cluster) -> None:
         client._timeout = 1.0
         with pytest.raises((NoMaster, Refused), match="nowhere"):
             client.read_log("nowhere", "p", 0, 0, 0)
+
+
+def test_callbacks_that_raise_end_nothing() -> None:
+    """Of a topic, of a request and of an answer: without the guard rclpy ends this process."""
+    domain, claim = claim_domain()
+    settings = settings_on_this_machine(domain)
+    ends: list[object] = []
+
+    def fails(*arguments) -> None:
+        ends.extend(arguments[:1])
+        raise SystemExit(3)
+
+    with claim, Participant(settings, "one") as server, Participant(settings, "other") as asker:
+        server.serve(srv.List, path(names.LIST), fails)
+        server.node.create_subscription(
+            msg.MasterBeat, path(names.MASTER_BEAT), server.counted(fails), qos.BEAT
+        )
+        beats = asker.node.create_publisher(msg.MasterBeat, path(names.MASTER_BEAT), qos.BEAT)
+        beats.publish(msg.MasterBeat())
+        client = asker.node.create_client(srv.List, path(names.LIST), qos_profile=qos.SERVICE)
+        control = ControlClient(asker, "test")
+        deadline = time.monotonic() + PATIENCE
+        assert wait_for_service(asker, client, deadline)
+        control.call(client, srv.List.Request(), deadline, fails)
+        while server.guard.failures < 2 or asker.guard.failures < 2:
+            assert time.monotonic() < deadline, f"only {ends} came"
+            server.spin(0.02)
+            asker.spin(0.02)
+        control.expire(deadline)
+    kinds = [type(one).__name__ for one in ends]
+    assert sorted(kinds) == ["List_Request", "List_Response", "MasterBeat", "NoneType"]

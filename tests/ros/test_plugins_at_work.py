@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import textwrap
 import time
 from pathlib import Path
@@ -15,8 +16,10 @@ from rosrm.errors import Refused
 from tests.ros.clusters import PATIENCE, host, job, service, wait_until
 
 PLUGIN = """
-import os, time
+import os, sys, time
 import numpy as np
+from pathlib import Path
+from rosrm.core.migration import AwaitReady, Commit, Execute, Plan, Start, Stop
 from rosrm.core.model import Reading, ResourceDescription
 from rosrm.hookspecs import hookimpl
 from rosrm.errors import SkipPlugin
@@ -39,7 +42,12 @@ def register_scoring_policies():
         ScoringOffer("nan", lambda options: Policy(lambda count: np.full(count, np.nan))),
         ScoringOffer("wrong_size", lambda options: Policy(lambda count: np.zeros(count + 1))),
         ScoringOffer("hangs", lambda options: Policy(hangs)),
+        ScoringOffer("exits", lambda options: Policy(lambda count: sys.exit(3))),
+        ScoringOffer("answers_none", lambda options: Silent()),
     ]
+
+class Silent:
+    def score(self, hosts, process): pass
 
 class Probe:
     def __init__(self, name, act):
@@ -52,6 +60,13 @@ class Probe:
 def fails(): raise OSError("no such sensor")
 def sleeps():
     time.sleep(1000)
+def comes_back():
+    if not (Path(__file__).parent / "sensor").exists(): raise OSError("unplugged")
+    return 0.5
+class NoUnit(Probe):
+    def __init__(self, name, act):
+        super().__init__(name, act)
+        self.resources = [ResourceDescription(name, None, 1.0)]
 def absent(options, context): raise SkipPlugin("no such hardware here")
 def broken(options, context): raise ValueError("cannot be made")
 def probe(name, act):
@@ -62,6 +77,8 @@ def register_probes():
     return [
         probe("battery", lambda: 0.25), probe("fails", fails), probe("sleeps", sleeps),
         probe("nan_probe", lambda: float("nan")),
+        probe("comes_back", comes_back),
+        ProbeOffer("no_unit", lambda options, context: NoUnit("no_unit", lambda: 0.0)),
         ProbeOffer("absent_one", absent), ProbeOffer("broken_one", broken),
     ]
 
@@ -70,7 +87,38 @@ class Strategy:
 
 @hookimpl
 def register_migration_strategies():
-    return [MigrationOffer("never_plans", lambda options: Strategy())]
+    return [
+        MigrationOffer("never_plans", lambda options: Strategy()),
+        MigrationOffer("hangs", lambda options: Acting(hangs_long)),
+        MigrationOffer("exits", lambda options: Acting(lambda: sys.exit(3))),
+        *(MigrationOffer(name, lambda options, name=name: Executing(name), executors={name: act})
+          for name, act in EXECUTORS.items()),
+    ]
+
+class Acting:
+    def __init__(self, act): self.act = act
+    def propose(self, move): self.act()
+
+class Executing:
+    # Its executor is called on the source before anything else, and to undo that.
+    def __init__(self, name): self.name = name
+    def propose(self, move):
+        undo = Execute(self.name, move.source_host, {"begins": False}, 60.0)
+        begin = Execute(self.name, move.source_host, {"begins": True}, 60.0, undo=undo)
+        return Plan((
+            begin, Start(move.destination, move.destination_host, 30.0),
+            AwaitReady(move.destination, move.destination_host, 30.0),
+            Commit(), Stop(move.source, move.source_host, 30.0),
+        ), overlap=60.0)
+
+def hangs_long():
+    while True: time.sleep(0.01)
+def forgets(arguments): pass
+def forgets_slowly(arguments): time.sleep(2.0)
+def exits(arguments):
+    if arguments["begins"]: sys.exit(3)
+    return {}
+EXECUTORS = {"forgets": forgets, "forgets_slowly": forgets_slowly, "exits_there": exits}
 """
 
 
@@ -98,12 +146,24 @@ def third_party(tmp_path_factory):
         yield site
 
 
+def plugins(cluster) -> list:
+    """The rows of `rosrm plugins`."""
+    return list(cluster.client.list(plugins=True).plugins)
+
+
 # --- scoring ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("policy", "said"),
-    [("raises", "out of order"), ("nan", "nan"), ("wrong_size", "wrong_size"), ("hangs", "1 s")],
+    [
+        ("raises", "out of order"),
+        ("nan", "nan"),
+        ("wrong_size", "scores of shape (2,)"),
+        ("hangs", "1 s"),
+        ("exits", "SystemExit: 3"),
+        ("answers_none", "answered None; Scores is required"),
+    ],
 )
 def test_a_policy_that_fails_is_left_out_and_named(make_cluster, third_party, policy, said) -> None:
     """What it was to judge is placed without it, and the record says so; the master goes on."""
@@ -114,6 +174,8 @@ def test_a_policy_that_fails_is_left_out_and_named(make_cluster, third_party, po
     assert said in event.message
     assert cluster.ended("judged").state == "finished"
     assert policy in str(cluster.client.explain("judged"))
+    (row,) = [row for row in plugins(cluster) if (row.kind, row.name) == ("scoring", policy)]
+    assert (row.state, said in row.reason) == ("failing", True)
     began = time.monotonic()
     for number in range(5):
         assert cluster.run(job(f"more{number}", "true"))[0].state == "finished"
@@ -178,6 +240,32 @@ def test_a_probe_that_fails_is_stale_never_zero(cluster, name) -> None:
     assert part.process.wait(PATIENCE) == 0
 
 
+def test_a_probe_that_fails_is_listed_until_it_works_again(make_cluster, third_party) -> None:
+    """With its error and the place; both changes are events of its host."""
+    sensor = third_party / "sensor"
+    sensor.unlink(missing_ok=True)
+    cluster = make_cluster(host("h0", probes=probes("comes_back")))
+
+    def row():
+        return next(row for row in plugins(cluster) if row.name == "comes_back" and row.host)
+
+    event = cluster.wait_for_event("plugin_failed", host="h0")
+    assert event.message.startswith("the probe of comes_back on h0 fails: ")
+    assert row().state == "failing"
+    assert "OSError: unplugged (" in row().reason
+    assert "odd_plugin.py:" in row().reason
+    sensor.touch()
+    cluster.wait_for_event("plugin_works", host="h0")
+    assert row().state == "selected"
+
+
+def test_a_probe_whose_description_cannot_be_sent_is_broken(make_cluster, third_party) -> None:
+    """The plugin is named, and the host registers without it."""
+    cluster = make_cluster(host("h0", probes=probes("no_unit")))
+    (row,) = [row for row in plugins(cluster) if row.name == "no_unit" and row.host]
+    assert (row.state, "unit None" in row.reason) == ("absent", True)
+
+
 def test_a_probe_that_is_absent_or_broken_is_listed(cluster) -> None:
     """With its reason; the host works with the others."""
     rows = {row.name: row for row in cluster.client.list(plugins=True).plugins if row.host == "h0"}
@@ -202,6 +290,65 @@ def test_a_strategy_that_gives_no_plan(make_cluster, third_party) -> None:
     before = cluster.wait("p", "running")
     with pytest.raises(Refused, match=r"never_plans.*not on a Sunday"):
         cluster.client.migrate("p")
+    assert cluster.wait("p", "running").pid == before.pid
+    cluster.cancel("p")
+
+
+@pytest.mark.parametrize(("strategy", "said"), [("hangs", "longer than 1 s"), ("exits", "Exit: 3")])
+def test_a_strategy_that_hangs_or_exits(make_cluster, third_party, strategy, said) -> None:
+    """The move is refused within its deadline, the strategy is failing, and the master works on."""
+    cluster = make_cluster(
+        host("h0"), host("h1"), migration=MigrationSettings({strategy: {}, "relaunch": {}})
+    )
+    cluster.submit(service("p", migration=MigrationPolicy(strategy)))
+    before = cluster.wait("p", "running")
+    with pytest.raises(Refused, match=rf"{strategy}.*{said}.*odd_plugin\.py:"):
+        cluster.client.migrate("p")
+    event = cluster.wait_for_event("plugin_failed")
+    assert f"the migration strategy '{strategy}' fails: propose: " in event.message
+    (row,) = [row for row in plugins(cluster) if (row.kind, row.name) == ("migration", strategy)]
+    assert (row.state, "odd_plugin.py:" in row.reason) == ("failing", True)
+    assert cluster.wait("p", "running").pid == before.pid
+    assert cluster.run(job("more", "true"))[0].state == "finished"
+    cluster.cancel("p")
+
+
+@pytest.mark.parametrize(
+    ("strategy", "said"),
+    [
+        ("forgets", "forgets answered None; a JSON object is required"),
+        ("exits_there", "exits_there raised SystemExit: 3"),
+    ],
+)
+def test_an_executor_that_fails(make_cluster, third_party, strategy, said) -> None:
+    """The step fails with that sentence, the move is undone, and the process runs as before."""
+    cluster = make_cluster(
+        host("h0"), host("h1"), migration=MigrationSettings({strategy: {}, "relaunch": {}})
+    )
+    cluster.submit(service("p", migration=MigrationPolicy(strategy)))
+    before = cluster.wait("p", "running")
+    cluster.client.migrate("p")
+    assert said in cluster.wait_for_event("stayed", process="p").message
+    assert cluster.wait("p", "running").pid == before.pid
+    cluster.cancel("p")
+
+
+def test_an_executor_that_answers_none_to_a_master_that_was_killed(
+    make_cluster, third_party
+) -> None:
+    """The journalled step is given again, fails again, and the move is undone: not for ever."""
+    cluster = make_cluster(
+        host("h0"), host("h1"),
+        migration=MigrationSettings({"forgets_slowly": {}, "relaunch": {}}),
+    )  # fmt: skip
+    cluster.submit(service("p", migration=MigrationPolicy("forgets_slowly")))
+    before = cluster.wait("p", "running")
+    cluster.client.migrate("p")
+    cluster.wait("p", "migrating")
+    cluster.master.end(signal.SIGKILL)
+    cluster.reconnect()
+    cluster.start_master()
+    assert "answered None" in cluster.wait_for_event("stayed", process="p").message
     assert cluster.wait("p", "running").pid == before.pid
     cluster.cancel("p")
 

@@ -7,6 +7,7 @@ import time
 
 import pytest
 
+from rosrm.core.views import PluginRow
 from rosrm.errors import NoMaster
 
 from .conftest import EVENTS, NAN, PLUGINS, STORY, event, host, process, resource
@@ -31,7 +32,23 @@ def test_status_json_counts_states(rosrm, client):
         "trouble": "",
         "hosts": {"up": 2, "suspect": 1},
         "processes": {"running": 1, "queued": 1, "failed": 1, "finished": 1},
+        "failing_plugins": [],
     }
+
+
+def test_status_names_the_plugins_that_fail(rosrm, client):
+    """With the host and the last error; the others are not named."""
+    client.plugins = [
+        PluginRow("scoring", "affine", "mine 1.0", "failing", "score: KeyError: 'x' (a.py:3)"),
+        PluginRow("probe", "lidar", "", "failing", "no such sensor", "shelf"),
+        PluginRow("probe", "cpu", "", "selected", "scope machine", "shelf"),
+    ]
+    out = rosrm("status").out
+    assert "plugin scoring affine is failing: score: KeyError: 'x' (a.py:3)" in out
+    assert "plugin probe lidar on shelf is failing: no such sensor" in out
+    assert "probe cpu" not in out
+    failing = json.loads(rosrm("status", "--json").out)["failing_plugins"]
+    assert [row["name"] for row in failing] == ["affine", "lidar"]
 
 
 @pytest.mark.parametrize("command", ["status", "ps", "hosts", "events"])

@@ -269,6 +269,8 @@ class Machine:
                 result = self.executors[order.executor](order.arguments)
             except Exception as error:  # noqa: BLE001 - what a test's executor does
                 return happened.OrderAnswered(order.order, False, "failed", str(error))
+            if not isinstance(result, Mapping):
+                return happened.OrderAnswered(order.order, False, happened.BAD_RESULT, "no object")
             return happened.OrderAnswered(order.order, True, result=result)
         if order.action == "set_restart":
             return self._set_restart(order, now)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from typing import Any
 
 import pytest
@@ -303,6 +304,10 @@ def raises(move: Move) -> Plan:
     raise RuntimeError("no idea")
 
 
+def exits(move: Move) -> Plan:
+    sys.exit(3)
+
+
 def no_commit(move: Move) -> Plan:
     return Plan((Start(move.destination, move.destination_host, 1.0),))
 
@@ -342,7 +347,8 @@ def none_at_all(move: Move) -> Any:
         (no_timeout, "no time-out"),
         (foreign_instance, "other#1"),
         (never_starts, "never starts"),
-        (none_at_all, "gave no plan"),
+        (none_at_all, "gave no plan: answered None; Plan is required"),
+        (exits, "gave no plan: SystemExit: 3"),
     ],
 )
 def test_a_strategy_that_raises_or_proposes_nonsense_moves_nothing(make: Any, said: str) -> None:
@@ -355,9 +361,23 @@ def test_a_strategy_that_raises_or_proposes_nonsense_moves_nothing(make: Any, sa
     assert not reply.accepted
     assert "the migration strategy 'strange' gave" in reply.message
     assert said in reply.message
-    assert cluster.told("plugin_failed") == [reply.message]
+    (told,) = cluster.told("plugin_failed")
+    assert told.startswith("the migration strategy 'strange' fails: propose: ")
+    assert said.removeprefix("gave no plan: ") in told
     assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
     assert cluster.state.hosts.processes.tolist() == [1, 0]
+
+
+def test_a_strategy_that_cannot_move_a_process_does_not_fail() -> None:
+    """`ValueError` is its answer by the contract: the reply has the reason, no plugin fails."""
+
+    def declines(move: Move) -> Plan:
+        raise ValueError("not on a Sunday")
+
+    cluster = Cluster("a", "b", strategies={"strange": Strange(declines)})
+    cluster.submit(process("p", migration=MigrationPolicy("strange")))
+    assert "ValueError: not on a Sunday" in cluster.migrate("p").message
+    assert cluster.told("plugin_failed") == []
 
 
 def test_a_plan_without_undo_leaves_no_instance_behind() -> None:
@@ -399,6 +419,16 @@ def test_a_same_name_start_waits_where_no_overlap_is_declared() -> None:
     assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
 
 
+def noted(calls: list[Any]) -> Any:
+    """An executor that notes its arguments."""
+
+    def execute(arguments: Any) -> dict[str, Any]:
+        calls.append(arguments)
+        return {}
+
+    return execute
+
+
 def executing(move: Move) -> Plan:
     undo = Execute("sweep", move.source_host, {"what": "image"}, 5.0)
     stop_there = Stop(move.destination, move.destination_host, 5.0)
@@ -417,7 +447,7 @@ def test_an_executor_does_the_open_step_on_its_host() -> None:
     """With the arguments of the plan; a shadow under an alias may run beside the source."""
     done: list[Any] = []
     cluster = Cluster(
-        Machine("a", executors={"dump": done.append, "sweep": done.append}),
+        Machine("a", executors={"dump": noted(done), "sweep": noted(done)}),
         Machine("b", busy={"memory": 0.5}), strategies={"strange": Strange(executing)},
     )  # fmt: skip
     cluster.submit(process("p", migration=MigrationPolicy("strange")))
@@ -430,7 +460,7 @@ def test_an_executor_is_asked_again_when_its_slave_was_started_again() -> None:
     """Nobody waits for the answer of the former run, which ended with it."""
     done: list[Any] = []
     cluster = Cluster(
-        Machine("a", executors={"dump": done.append, "sweep": done.append}),
+        Machine("a", executors={"dump": noted(done), "sweep": noted(done)}),
         Machine("b", busy={"memory": 0.5}), strategies={"strange": Strange(executing)},
     )  # fmt: skip
     cluster.submit(process("p", migration=MigrationPolicy("strange")))
@@ -464,7 +494,7 @@ def test_an_executor_on_a_lost_host_is_not_waited_for() -> None:
 
     done: list[Any] = []
     cluster = Cluster(
-        Machine("a", executors={"dump": lambda _: {}, "go_on": done.append}),
+        Machine("a", executors={"dump": lambda _: {}, "go_on": noted(done)}),
         Machine("b", busy={"memory": 0.5}), strategies={"strange": Strange(fetching)},
     )  # fmt: skip
     cluster.submit(process("p", migration=MigrationPolicy("strange")))
@@ -510,7 +540,7 @@ def test_an_executor_that_fails_is_undone() -> None:
         raise OSError("disk full")
 
     cluster = Cluster(
-        Machine("a", executors={"dump": fails, "sweep": swept.append}),
+        Machine("a", executors={"dump": fails, "sweep": noted(swept)}),
         Machine("b", busy={"memory": 0.5}), strategies={"strange": Strange(executing)},
     )  # fmt: skip
     cluster.submit(process("p", migration=MigrationPolicy("strange")))
@@ -518,6 +548,62 @@ def test_an_executor_that_fails_is_undone() -> None:
     assert swept == [{"what": "image"}]
     assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
     assert cluster.told("stayed") == ["p stayed on a: dump failed on a: disk full"]
+
+
+def bad_executor(arguments: Any) -> None:
+    """Forgets `return {}`."""
+
+
+def test_an_executor_that_answers_nothing_is_undone_also_by_one_that_answers_nothing() -> None:
+    """The undo ran to its end: asked again it would answer so for ever, and the move never end."""
+    cluster = Cluster(
+        Machine("a", executors={"dump": bad_executor, "sweep": bad_executor}),
+        Machine("b", busy={"memory": 0.5}), strategies={"strange": Strange(executing)},
+    )  # fmt: skip
+    cluster.submit(process("p", migration=MigrationPolicy("strange")))
+    cluster.migrate("p")
+    assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
+    assert cluster.told("stayed") == ["p stayed on a: dump failed on a: no object"]
+    assert cluster.told("migration_stuck") == []
+
+
+def test_a_journalled_step_that_answers_nothing_is_undone_by_the_next_master() -> None:
+    """The step in hand is given once more, fails, and the source is what remains."""
+    cluster = Cluster(
+        Machine("a", executors={"dump": bad_executor, "sweep": bad_executor}),
+        Machine("b", busy={"memory": 0.5}), strategies={"strange": Strange(executing)},
+    )  # fmt: skip
+    cluster.submit(process("p", migration=MigrationPolicy("strange")))
+    commands = cluster.decide(happened.MigrationRequested(9, "p"))
+    cluster.journal(commands)
+    cluster.restart_master()
+    cluster.wait(5.0)
+    assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
+    assert len(cluster.told("stayed")) == 1
+
+
+def test_an_executor_that_answers_nothing_after_the_commit_does_not_hold_the_plan_up() -> None:
+    """There is no way back: the plan goes to its end, and the failure is recorded."""
+
+    def late(move: Move) -> Plan:
+        return Plan(
+            (
+                Start(move.destination, move.destination_host, 5.0, "alias"),
+                AwaitReady(move.destination, move.destination_host, 5.0),
+                Commit(),
+                Stop(move.source, move.source_host, 5.0),
+                Execute("sweep", move.source_host, {}, 5.0),
+            )
+        )
+
+    cluster = Cluster(
+        Machine("a", executors={"sweep": bad_executor}),
+        Machine("b", busy={"memory": 0.5}), strategies={"strange": Strange(late)},
+    )  # fmt: skip
+    cluster.submit(process("p", migration=MigrationPolicy("strange")))
+    cluster.migrate("p")
+    assert (cluster.phase("p"), cluster.where("p")) == ("running", ["b"])
+    assert cluster.told("migration_step_failed") == ["p: sweep failed on a: no object"]
 
 
 def test_a_lost_order_is_given_again() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from typing import Any
 
 import numpy as np
@@ -44,6 +45,14 @@ def a_number(hosts: HostView, process: ProcessView) -> Any:
     return 0.5
 
 
+def nothing(hosts: HostView, process: ProcessView) -> Any:
+    return None
+
+
+def exits(hosts: HostView, process: ProcessView) -> Any:
+    sys.exit(3)
+
+
 def words(hosts: HostView, process: ProcessView) -> Any:
     return Scores(["good"] * len(hosts.names))
 
@@ -62,7 +71,9 @@ BROKEN = [
     (nan, "the score of host a is nan"),
     (infinite, "the score of host a is -inf"),
     (too_few, "scores of shape (1,) for 3 hosts"),
-    (a_number, "AttributeError"),
+    (a_number, "answered a float; Scores is required"),
+    (nothing, "answered None; Scores is required"),
+    (exits, "SystemExit: 3"),
     (words, "ValueError"),
     (wrong_veto, "vetoes of shape (1,) for 3 hosts"),
     (writes, "read-only"),
@@ -84,7 +95,8 @@ def test_a_broken_policy_is_left_out_and_named(make: Any, said: str) -> None:
     assert policy.startswith("left out: 'eq1', ")
     assert said in policy
     (told,) = cluster.told("plugin_failed")
-    assert told.startswith("the scoring policy 'eq1' does not decide: left out")
+    assert told.startswith("the scoring policy 'eq1' fails: score: ")
+    assert said in told
 
 
 @pytest.mark.parametrize(("make", "said"), BROKEN)

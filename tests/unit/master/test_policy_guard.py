@@ -1,4 +1,4 @@
-"""A policy that does not come back is ended, named, and left alone for a while."""
+"""A plugin that does not come back is ended, named, and left alone for a while."""
 
 from __future__ import annotations
 
@@ -7,26 +7,15 @@ import time
 
 import pytest
 
-from rosrm.master.policy_guard import Deadline, GuardedScoring, guarded_checkpoints
-from rosrm.ports import MemoryPacing
+from rosrm.core.plugin_calls import PluginCalls
+from rosrm.errors import PluginError
+from rosrm.master.policy_guard import Deadlines
+
+SLOW = ("migration", "slow")
 
 
-class Policy:
-    """Does what a test says."""
-
-    def __init__(self, act):
-        self.act = act
-        self.asked = 0
-
-    def score(self, hosts, process):
-        self.asked += 1
-        return self.act()
-
-
-def guarded(act, **options):
-    policy = Policy(act)
-    deadline = Deadline(**{"seconds": 0.1, "pause": 0.3, **options})
-    return GuardedScoring(policy, deadline), policy
+def deadlines(**options):
+    return Deadlines(**{"seconds": 0.1, "pause": 0.3, **options})
 
 
 def spin():
@@ -44,70 +33,66 @@ def swallow():
 
 def test_one_that_answers_is_passed_on() -> None:
     """With its answer or its error, and no alarm rings afterwards."""
-    guard, _ = guarded(lambda: "scores")
-    assert guard.score(None, None) == "scores"
-    failing, _ = guarded(lambda: 1 / 0)
+    ask = deadlines()
+    assert ask(SLOW, lambda: "scores") == "scores"
     with pytest.raises(ZeroDivisionError):
-        failing.score(None, None)
+        ask(SLOW, lambda: 1 / 0)
     time.sleep(0.15)
 
 
 @pytest.mark.parametrize("act", [spin, lambda: time.sleep(100), swallow])
 def test_one_that_hangs_is_ended(act) -> None:
     """Also one that sleeps, and one that swallows the error."""
-    guard, _ = guarded(act)
+    ask = deadlines()
     began = time.monotonic()
     with pytest.raises(TimeoutError, match=r"longer than 0\.1 s"):
-        guard.score(None, None)
+        ask(SLOW, act)
     assert time.monotonic() - began < 30.0
     time.sleep(0.15)  # no alarm is left
 
 
 def test_one_that_hung_is_left_alone_for_a_while() -> None:
     """It costs its deadline once, not once for every reading that comes."""
-    guard, policy = guarded(spin, pause=1.0)
-    for _ in range(5):
-        with pytest.raises(TimeoutError, match="not asked again"):
-            guard.score(None, None)
-    assert policy.asked == 1
-    policy.act = lambda: "scores"
+    ask, asked = deadlines(pause=1.0), []
+
+    def hangs():
+        asked.append(1)
+        spin()
+
+    with pytest.raises(TimeoutError, match="not asked again"):
+        ask(SLOW, hangs)
+    for _ in range(4):
+        with pytest.raises(PluginError, match="not asked again"):
+            ask(SLOW, hangs)
+    assert len(asked) == 1
     time.sleep(1.05)
-    assert guard.score(None, None) == "scores"
-    assert policy.asked == 2
+    assert ask(SLOW, lambda: "scores") == "scores"
 
 
-class Checkpoints:
-    """A checkpoint policy that does as a test says."""
-
-    def __init__(self, act):
-        self.act = act
-
-    def choose(self, process):
-        return self.act()
-
-
-class Paced(Checkpoints):
-    """One that has memory dumped, too."""
-
-    def pace(self, process):
-        return self.act()
-
-
-def test_each_policy_has_its_own_deadline() -> None:
+def test_each_plugin_has_its_own_deadline() -> None:
     """One that was late does not keep another from being asked, or from being ended."""
-    scoring, _ = guarded(spin)
-    late = guarded_checkpoints(Checkpoints(spin), Deadline(0.1, 30.0))
-    good = guarded_checkpoints(Checkpoints(lambda: "choice"), Deadline(0.1, 30.0))
-    for ask in (lambda: scoring.score(None, None), lambda: late.choose(None)):
+    ask = deadlines(pause=30.0)
+    for late in (("scoring", "a"), ("checkpoint", "b"), ("migration", "a")):
         with pytest.raises(TimeoutError):
-            ask()
-        assert good.choose(None) == "choice"
+            ask(late, spin)
+        assert ask(("scoring", "good"), lambda: "choice") == "choice"
 
 
-def test_a_guarded_policy_can_do_what_it_could() -> None:
-    """The core asks by what it has; each call is guarded."""
-    assert not isinstance(guarded_checkpoints(Checkpoints(spin), Deadline()), MemoryPacing)
-    paced = guarded_checkpoints(Paced(spin), Deadline(0.1, 30.0))
-    assert isinstance(paced, MemoryPacing)
-    with pytest.raises(TimeoutError):
-        paced.pace(None)
+def test_the_place_at_which_a_plugin_hung_is_said_also_in_the_pause() -> None:
+    """The first message and the later ones have the plugin's own line."""
+    calls = PluginCalls(deadlines(pause=30.0))
+    first = spin.__code__.co_firstlineno
+    place = rf"test_policy_guard\.py:({first + 1}|{first + 2})\)"
+    for _ in range(2):
+        with pytest.raises(PluginError, match=place):
+            calls.ask(*SLOW, "propose", spin)
+
+
+def test_a_plugin_cannot_end_the_master_by_an_interrupt() -> None:
+    """In a master Ctrl-C raises nothing, so a KeyboardInterrupt is the plugin's."""
+
+    def interrupts():
+        raise KeyboardInterrupt("mine")
+
+    with pytest.raises(PluginError, match="KeyboardInterrupt: mine"):
+        deadlines()(SLOW, interrupts)

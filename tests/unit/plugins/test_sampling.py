@@ -138,6 +138,37 @@ def test_raising_probe_is_stale_and_recovers(rig, fault):
     assert made.reports[1:] == ["probe bad: cpu read again"]
 
 
+@pytest.mark.parametrize(
+    ("answer", "reason"),
+    [
+        (None, "answered None; Iterable is required"),
+        ([0.5], "answered a float; Reading is required"),
+    ],
+)
+def test_an_answer_that_holds_no_readings_is_named(rig, answer, reason):
+    """Forgetting `return`, or the `Reading`, gives a sentence and no AttributeError."""
+    probe = FakeProbe(cpu=0.25)
+    probe.read = lambda: answer
+    made = rig(bad=probe)
+    assert made.tick(2).stale == 1
+    assert made.reports == [f"probe bad: cpu stale: {reason}"]
+
+
+def test_the_place_at_which_a_probe_raised_is_reported(rig):
+    """The plugin's own file and line."""
+    probe = FakeProbe(cpu=0.25)
+
+    def read():
+        raise OSError("no such sensor")
+
+    probe.read = read
+    made = rig(bad=probe)
+    made.tick(2)
+    (report,) = made.reports
+    line = read.__code__.co_firstlineno + 1
+    assert report.endswith(f"read() raised OSError: no such sensor ({__file__}:{line})")
+
+
 def test_generator_that_raises_midway_changes_nothing(rig):
     """Values are used all together or not at all."""
     probe = FakeProbe(cpu=0.25, memory=0.5)

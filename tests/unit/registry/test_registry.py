@@ -224,6 +224,13 @@ def test_an_unknown_probe_stops_the_slave_at_its_start(context):
         probes(offered("cpu")).probes({"cqu": {}}, context)
 
 
+def described(**fields):
+    """A probe whose description cannot travel: sent so, it would end the slave's registration."""
+    return SimpleNamespace(
+        resources=[ResourceDescription(**{"name": "b", "unit": "1", "capacity": 1.0, **fields})]
+    )
+
+
 @pytest.mark.parametrize(
     ("second", "said"),
     [
@@ -232,6 +239,11 @@ def test_an_unknown_probe_stops_the_slave_at_its_start(context):
         (Probe("b", capacity=float("nan")), "gives 'b' a capacity of nan"),
         (Probe(*(f"r{i}" for i in range(16))), "more than 16"),
         (SimpleNamespace(), "its `resources` raised AttributeError"),
+        (described(unit=None), "gives a resource the unit None; a text is required"),
+        (described(scope=None), "gives a resource the scope None; a text is required"),
+        (described(name=3), "gives a resource the name 3; a text is required"),
+        (described(capacity="10"), "gives 'b' the capacity '10'; a number is required"),
+        (SimpleNamespace(resources=["b"]), "gives 'b' as a resource; a ResourceDescription"),
     ],
 )
 def test_a_probe_whose_resources_cannot_be_taken_is_closed_and_left_out(context, second, said):

@@ -5,11 +5,15 @@ from __future__ import annotations
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 
 from rosrm.core.commands import Order
+from rosrm.core.events import BAD_RESULT
 from rosrm.core.model import HostDescription
-from rosrm.ros.host_links import HostLinks
+from rosrm.ros.control import accepted
+from rosrm.ros.host_links import HostLinks, _order_answered
 from rosrm.ros.readings import Runs
+from rosrm_msgs import srv
 
 HOST, RUN = 1, 500
 DESCRIPTION = HostDescription("shelf", RUN)
@@ -55,3 +59,12 @@ def test_an_order_to_a_slave_that_registers_again_waits_for_a_new_beat(monkeypat
     assert client.beats == []
     heard(links, beat=900, sequence=2)
     assert client.beats == [900]
+
+
+@pytest.mark.parametrize("text", ["null", "[1]", "3", "{"])
+def test_a_result_that_is_no_object_fails_the_order(text):
+    """The step fails with that sentence; nothing is raised in the callback of the answer."""
+    response = srv.ControlHost.Response(answer=accepted(), result=text)
+    event = _order_answered(7, response)
+    assert (event.order, event.accepted, event.code) == (7, False, BAD_RESULT)
+    assert "a result is" in event.message

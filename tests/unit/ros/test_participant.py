@@ -3,8 +3,14 @@
 from __future__ import annotations
 
 import time
+from types import SimpleNamespace
 
+import pytest
+
+from rosrm.errors import Refused
+from rosrm.ros.callback_guard import CallbackGuard
 from rosrm.ros.participant import Participant
+from rosrm_msgs import srv
 
 
 class Executor:
@@ -27,6 +33,7 @@ class Executor:
 def participant(ready: int | None) -> tuple[Participant, Executor]:
     made = Participant.__new__(Participant)
     made._executed = 0
+    made.guard = CallbackGuard()
     made.executor = executor = Executor(ready)
     executor.callback = made.counted(lambda: None)
     return made, executor
@@ -46,3 +53,60 @@ def test_a_flood_does_not_keep_a_part_from_its_other_work() -> None:
     made.spin(7.0)
     assert time.monotonic() - began < 5.0
     assert len(executor.turns) > 2
+
+
+class Node:
+    """Stands for rclpy's: keeps the service that was made."""
+
+    def create_service(self, _kind, _name, _callback, *, qos_profile):
+        self.service = SimpleNamespace(send_response=lambda *sent: self.sent.append(sent))
+        self.sent = []
+        return self.service
+
+
+def asked(kind, handle):
+    """The responses to one request that a handler takes."""
+    made, _ = participant(ready=0)
+    made.node = node = Node()
+    made.serve(kind, "/service", handle)
+    node.service.send_response(kind.Request(), "header")
+    return [response for response, _ in node.sent], made.guard
+
+
+def test_a_request_whose_handler_raises_is_answered_as_failed() -> None:
+    """The caller need not wait for a time-out; the answer names the error and its place."""
+
+    def handle(_request, _open_request):
+        raise Refused("a result is a JSON NoneType, not an object")
+
+    (response,), guard = asked(srv.Submit, handle)
+    assert (response.answer.accepted, response.answer.code) == (False, "failed")
+    assert "Refused: a result is a JSON NoneType" in response.answer.message
+    assert guard.failures == 1
+    (greeting,), _ = asked(srv.Handshake, handle)
+    assert not greeting.accepted
+    assert "not an object" in greeting.message
+
+
+def test_a_request_that_was_answered_is_not_answered_again() -> None:
+    """An error after the answer is logged and no more."""
+
+    def handle(_request, open_request):
+        open_request.answer(srv.Submit.Response())
+        raise Refused("too late")
+
+    responses, guard = asked(srv.Submit, handle)
+    assert len(responses) == 1
+    assert guard.failures == 1
+
+
+def test_ctrl_c_in_a_callback_ends_the_loop() -> None:
+    """The interrupt is raised where Python can take it, not through the executor."""
+    made, executor = participant(ready=1)
+
+    def interrupted() -> None:
+        raise KeyboardInterrupt
+
+    executor.callback = made.counted(interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        made.spin(1.0)

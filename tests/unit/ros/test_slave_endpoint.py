@@ -7,6 +7,7 @@ import pytest
 from rosrm.core import slave as core
 from rosrm.core.model import HostDescription
 from rosrm.ros import slave_endpoint
+from rosrm.ros.callback_guard import CallbackGuard
 from rosrm.ros.journal_seen import JournalSeen, Seen
 from rosrm.ros.slave_endpoint import Link, SlaveEndpoint
 from rosrm.version import PROTOCOL_VERSION
@@ -72,6 +73,7 @@ class Wire:
 
     def __init__(self) -> None:
         self.node = self
+        self.guard = CallbackGuard()
         self.to: dict[type, Peer] = {}
         self.hear = {}
 
@@ -381,3 +383,20 @@ def test_a_master_that_cannot_write_is_asked_again(slave) -> None:
     assert [word for word in slave.host.said if "a full disk" in word] == slave.host.said[:1]
     ours.take_in()
     assert slave.link is Link.REGISTERED
+
+
+def test_an_answer_that_cannot_be_taken_in_counts_as_none(slave, monkeypatch) -> None:
+    """The slave does not wait for ever in the middle of a registration: it asks again."""
+    master = Master(slave, 11)
+    slave.pass_time(PERIOD)
+    master.beat()
+    master.greet()
+
+    def fails(*_arguments) -> None:
+        raise KeyError("oops")
+
+    monkeypatch.setattr(slave.endpoint._reporter, "begin", fails)
+    master.take_in()
+    assert slave.wire.guard.failures == 1
+    assert slave.link is Link.SEARCHING
+    monkeypatch.undo()

@@ -90,7 +90,13 @@ EVENTS = {
     happened.ProcessRequested: st.builds(happened.ProcessRequested, INT, INT, INT),
     happened.ReadingsReceived: readings(),
     happened.StatusesReceived: st.builds(
-        happened.StatusesReceived, INT, INT, INT, st.booleans(), STATUSES
+        happened.StatusesReceived,
+        INT,
+        INT,
+        INT,
+        st.booleans(),
+        STATUSES,
+        st.dictionaries(st.text(max_size=5), st.text(max_size=5), max_size=2),
     ),
     happened.UsagesReceived: usages(),
     happened.KeptStatesReceived: st.builds(

@@ -1,0 +1,151 @@
+"""Every call of a plugin by the core: what the call raises costs one decision, and is counted.
+
+============  ============================================================================
+a plugin      what changes that, and is recorded
+============  ============================================================================
+selected      a call raises, is late, or answers what the contract does not allow: `failing`
+failing       a call is good, and no call has failed for `WORKS_AFTER` seconds: `selected`
+============  ============================================================================
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+from rosrm.errors import PluginError, describe_plugin_fault
+
+if TYPE_CHECKING:
+    from rosrm.core.hosts import Host
+    from rosrm.core.state import MasterState
+
+T = TypeVar("T")
+#: Kind and name of an offer.
+Plugin = tuple[str, str]
+#: Carries a call out; may raise `TimeoutError` when the call takes too long.
+Limit = Callable[[Plugin, Callable[[], Any]], Any]
+
+#: What the kinds of offers are called in messages.
+TITLES: Final[Mapping[str, str]] = {
+    "probe": "probe",
+    "scoring": "scoring policy",
+    "migration": "migration strategy",
+    "checkpoint": "checkpoint policy",
+}
+
+#: Seconds without a failure after which a good answer ends the state "failing". Otherwise a plugin
+#: that fails for every second process would be recorded with each of them.
+WORKS_AFTER: Final = 10.0
+
+
+@dataclass(slots=True)
+class Failing:
+    """A plugin that fails.
+
+    Attributes:
+        error: of the last failure: the hook, the exception and its place.
+        count: failures since the plugin worked last.
+        last: time of the last failure.
+    """
+
+    error: str
+    count: int
+    last: float
+
+    @property
+    def reason(self) -> str:
+        """Return the last error and the number of failures, for a listing."""
+        return f"{self.error}; {self.count} failure{'s' if self.count > 1 else ''} so far"
+
+
+def _without_limit(_plugin: Plugin, call: Callable[[], Any]) -> Any:
+    return call()
+
+
+@dataclass(slots=True)
+class PluginCalls:
+    """The one guard around the plugins of a master.
+
+    Attributes:
+        limit: carries each call out; the master sets one with a deadline.
+        failing: the plugins that fail.
+    """
+
+    limit: Limit = _without_limit
+    failing: dict[Plugin, Failing] = field(default_factory=dict)
+    _failed: dict[Plugin, Failing] = field(default_factory=dict)
+    _worked: set[Plugin] = field(default_factory=set)
+
+    def ask(self, kind: str, name: str, hook: str, call: Callable[[], T]) -> T:
+        """Return the answer of a plugin.
+
+        Args:
+            kind: of the offer, as in `TITLES`.
+            name: of the offer.
+            hook: that is called, for messages.
+            call: calls the hook and checks the answer; raises `PluginError` for a bad answer.
+
+        Raises:
+            PluginError: the call failed; the text has the error and its place.
+        """
+        plugin = (kind, name)
+        try:
+            answer: T = self.limit(plugin, call)
+        except KeyboardInterrupt:  # Ctrl-C of a simulation; a master turns it into a flag
+            raise
+        except BaseException as fault:  # whatever a plugin raises, even SystemExit
+            reason = describe_plugin_fault(fault)
+            noted = self._failed.setdefault(plugin, Failing("", 0, 0.0))
+            noted.error, noted.count = f"{hook}: {reason}", noted.count + 1
+            raise PluginError(reason) from fault
+        if plugin in self.failing:
+            self._worked.add(plugin)
+        return answer
+
+    def note(self, state: MasterState, now: float) -> None:
+        """Record which plugins began to fail since the last call, and which work again."""
+        for plugin, noted in self._failed.items():
+            known = self.failing.setdefault(plugin, noted)
+            if known is noted:
+                _record(state, plugin, "plugin_failed", f"fails: {noted.error}", now)
+            else:
+                known.error, known.count = noted.error, known.count + noted.count
+            known.last = now
+        for plugin in self._worked - self._failed.keys():
+            if now - self.failing[plugin].last >= WORKS_AFTER:
+                del self.failing[plugin]
+                _record(state, plugin, "plugin_works", "works again", now)
+        self._failed.clear()
+        self._worked.clear()
+
+
+def _record(state: MasterState, plugin: Plugin, event: str, outcome: str, now: float) -> None:
+    kind, name = plugin
+    facts = {"plugin": kind, "name": name}
+    state.record(now, event, f"the {TITLES[kind]} {name!r} {outcome}", facts=facts)
+
+
+def note_probes(state: MasterState, host: Host, failing: Mapping[str, str], now: float) -> None:
+    """Note which probes of a host fail by the report of its slave, and record what changed.
+
+    Args:
+        failing: resource to the reason why its probe gives no readings.
+    """
+    for resource in sorted(failing.keys() ^ host.failing.keys()):
+        fails = resource in failing
+        state.record(
+            now, "plugin_failed" if fails else "plugin_works",
+            f"the probe of {resource} on {host.name} "
+            + (f"fails: {failing[resource]}" if fails else "works again"),
+            host=host.name, facts={"plugin": "probe", "name": resource},
+        )  # fmt: skip
+    host.failing = failing
+
+
+def required(answer: object, kind: type[T]) -> T:
+    """Return an answer of the required type; raise `PluginError` for any other."""
+    if not isinstance(answer, kind):
+        given = "None" if answer is None else f"a {type(answer).__name__}"
+        raise PluginError(f"answered {given}; {kind.__name__} is required")
+    return answer

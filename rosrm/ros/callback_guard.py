@@ -1,0 +1,65 @@
+"""Keeps what a callback raises from ending the process.
+
+An exception that leaves a callback of rclpy's events executor ends the process, mostly by a
+segmentation fault that names no cause. So rosrm lets none out.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from typing import Any, Final
+
+from rosrm.errors import describe_fault, place_in_rosrm
+
+_log = logging.getLogger("rosrm.callbacks")
+
+#: Seconds between two log lines about the same place.
+_LOGGED_EVERY: Final = 1.0
+
+
+class CallbackGuard:
+    """Calls callbacks: one that raises is logged and counted, and its caller continues.
+
+    Attributes:
+        failures: callbacks that raised.
+        interrupted: Ctrl-C came in a callback; the loop has to raise it.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self.failures = 0
+        self.interrupted: KeyboardInterrupt | None = None
+        self._clock = clock
+        self._places: dict[str, tuple[float, int]] = {}
+
+    def call(self, callback: Callable[..., Any], *arguments: Any) -> str:
+        """Call a callback; returns "" or what was raised, with file and line."""
+        try:
+            callback(*arguments)
+        except KeyboardInterrupt as interrupt:
+            self.interrupted = interrupt
+        except BaseException as fault:  # noqa: BLE001 - the guard: nothing may reach the executor
+            place = place_in_rosrm(fault)
+            reason = f"{describe_fault(fault)} ({place})"
+            self._note(place, getattr(callback, "__qualname__", str(callback)), reason)
+            return reason
+        return ""
+
+    def raise_interrupt(self) -> None:
+        """Raise the Ctrl-C that came in a callback, if one did."""
+        if self.interrupted is not None:
+            interrupt, self.interrupted = self.interrupted, None
+            raise interrupt
+
+    def _note(self, place: str, callback: str, reason: str) -> None:
+        """Log a failure, at most once a second for each place."""
+        self.failures += 1
+        now = self._clock()
+        logged, unlogged = self._places.get(place, (float("-inf"), 0))
+        if now - logged < _LOGGED_EVERY:
+            self._places[place] = (logged, unlogged + 1)
+            return
+        more = f"; {unlogged} more since the last line" if unlogged else ""
+        _log.error("callback %s failed, and its message was dropped: %s%s", callback, reason, more)
+        self._places[place] = (now, 0)

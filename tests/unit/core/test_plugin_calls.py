@@ -1,0 +1,124 @@
+"""The guard of plugin calls in the core: counted, recorded when the state changes, with a place."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import pytest
+
+from rosrm.core import events as happened
+from rosrm.core.plugin_calls import WORKS_AFTER, PluginCalls, required
+from rosrm.errors import PluginError
+from rosrm.ports import HostView, ProcessView, Scores
+from tests.unit.core.cluster import Cluster, Eq1, process
+
+
+class Moody:
+    """A scoring policy that fails while a test says so."""
+
+    def __init__(self) -> None:
+        self.fails = False
+
+    def score(self, hosts: HostView, process: ProcessView) -> Scores:
+        if self.fails:
+            return self._trouble()
+        return Eq1().score(hosts, process)
+
+    def _trouble(self) -> Scores:
+        raise KeyError("prefix")
+
+
+def submitted(cluster: Cluster, number: int) -> None:
+    cluster.submit(process(f"p{number}", memory=number))  # each has a ranking of its own
+
+
+def test_a_failing_plugin_is_recorded_once_and_again_when_it_works() -> None:
+    """Not with each failure; and it works only when nothing failed for a while."""
+    policy = Moody()
+    cluster = Cluster("a", policy=policy)
+    policy.fails = True
+    for number in range(1, 4):
+        submitted(cluster, number)
+    (failed,) = cluster.told("plugin_failed")
+    assert failed.startswith("the scoring policy 'eq1' fails: score: KeyError: 'prefix' (")
+    policy.fails = False
+    submitted(cluster, 4)
+    assert ("scoring", "eq1") in cluster.state.plugins.failing
+    cluster.wait(WORKS_AFTER + 1.0)
+    submitted(cluster, 5)
+    assert cluster.told("plugin_works") == ["the scoring policy 'eq1' works again"]
+    assert cluster.state.plugins.failing == {}
+
+
+def test_a_failing_plugin_is_listed_with_its_last_error_and_how_often() -> None:
+    """The reason of its row."""
+    policy = Moody()
+    cluster = Cluster("a", policy=policy)
+    policy.fails = True
+    submitted(cluster, 1)
+    submitted(cluster, 2)
+    reason = cluster.state.plugins.failing["scoring", "eq1"].reason
+    assert reason.startswith("score: KeyError: 'prefix' (")
+    assert reason.endswith("; 2 failures so far")
+
+
+def test_the_place_is_the_plugin_s_own_innermost_frame() -> None:
+    """Not the frame of a library that it called, and none of rosrm."""
+
+    def sorts() -> None:
+        sorted([1, 2], key=lambda _: sys.intern(3))  # type: ignore[arg-type]
+
+    with pytest.raises(PluginError, match=rf"\({__file__}:{sorts.__code__.co_firstlineno + 1}\)"):
+        PluginCalls().ask("scoring", "x", "score", sorts)
+
+
+def test_an_error_of_rosrm_s_own_check_has_no_place() -> None:
+    """The sentence about the answer says all; there is no line to look at."""
+    with pytest.raises(PluginError, match=r"^answered None; Scores is required$"):
+        PluginCalls().ask("scoring", "x", "score", lambda: required(None, Scores))
+
+
+class Wordless(Exception):
+    """An exception that fails to give its text."""
+
+    def __str__(self) -> str:
+        raise RuntimeError("no words")
+
+
+@pytest.mark.parametrize(
+    "fault", [SystemExit(3), GeneratorExit(), ZeroDivisionError(), Wordless()], ids=repr
+)
+def test_nothing_that_a_plugin_raises_ends_its_caller(fault: BaseException) -> None:
+    """Also what `except Exception` lets pass."""
+
+    def call() -> Any:
+        raise fault
+
+    with pytest.raises(PluginError, match=type(fault).__name__):
+        PluginCalls().ask("scoring", "x", "score", call)
+
+
+def test_ctrl_c_passes_the_guard() -> None:
+    """A simulation ends by it; a master's own handler raises nothing."""
+
+    def call() -> Any:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        PluginCalls().ask("scoring", "x", "score", call)
+
+
+def test_a_probe_that_fails_is_recorded_when_that_changes() -> None:
+    """Every report of a slave is complete: what is missing in the next one works again."""
+    cluster = Cluster("a")
+    machine = cluster.machines["a"]
+    for failing in ({"lidar": "no such sensor"}, {"lidar": "no such sensor"}, {}):
+        machine.batches += 1
+        cluster.tell(
+            happened.StatusesReceived(
+                machine.host_id, machine.incarnation, machine.batches, False, (), failing
+            )
+        )
+    assert cluster.told("plugin_failed") == ["the probe of lidar on a fails: no such sensor"]
+    assert cluster.told("plugin_works") == ["the probe of lidar on a works again"]
