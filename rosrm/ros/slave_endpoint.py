@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from enum import Enum
@@ -15,7 +16,7 @@ from rosrm.core import slave as core
 from rosrm.core.model import HostDescription, InstanceStatus, KeptState
 from rosrm.errors import Refused
 from rosrm.ros import convert, names, qos
-from rosrm.ros.control import ControlClient, Gate, version_refusal
+from rosrm.ros.control import Call, ControlClient, Gate, version_refusal
 from rosrm.ros.journal_seen import JournalSeen, Seen
 from rosrm.ros.participant import Participant
 from rosrm.ros.reporting import Reporter
@@ -92,7 +93,8 @@ class SlaveEndpoint:
         self._taken_since: float | None = None
         self._waits_since: float | None = None
         self._told = ""
-        self._poll_open = False
+        self._poll: Call | None = None
+        self._poll_at = 0.0
         self._poll_anew = _FIRST_POLL_ANEW
         self._status_sequence = 0
         self._control = ControlClient(participant, f"slave {description.name}")
@@ -177,7 +179,7 @@ class SlaveEndpoint:
         self._incarnation = beat.incarnation
         self._asked_at = time.monotonic()
         self.link = Link.REGISTERING
-        self._poll_open = False
+        self._poll_at = 0.0
         request = srv.RegisterHost.Request(
             envelope=self._control.envelope(self._master_beat, self._greeting.epoch),
             host=convert.host_to_msg(self._description),
@@ -232,6 +234,11 @@ class SlaveEndpoint:
         """A name may still be held by a former run of this very slave: ask again for a moment."""
         if self._taken_since is None:
             self._taken_since = now
+            if answer.code == "name_taken":
+                self._host.say(
+                    f"{answer.message}. Asking again for {self._patience():g} s, as that slave may "
+                    f"have been killed a moment ago"
+                )
         if answer.code != "name_taken" or now - self._taken_since >= self._patience():
             self.failure = answer.message
             self.superseded = answer.code == "name_taken"
@@ -244,7 +251,7 @@ class SlaveEndpoint:
 
     def _lose_master(self, reason: str) -> None:
         self.link = Link.SEARCHING
-        self._poll_open = False
+        self._poll_at = 0.0
         self._newest_beat = None
         self._control.forget()
         self._host.take(core.MasterLost())
@@ -280,24 +287,29 @@ class SlaveEndpoint:
     # --- asking for work -----------------------------------------------------------------
 
     def ask(self, now: float) -> None:
-        """Ask for work, unless a request is open already."""
-        if self._poll_open or self.link is not Link.REGISTERED:
+        """Ask for work, unless a request is open already.
+
+        The answer to a request that is asked anew may be on its way: it is taken as well, for it
+        may hold assignments, which the master would give again only after `control.order_retry`.
+        """
+        if now < self._poll_at or self.link is not Link.REGISTERED:
             return
-        self._poll_open = True
+        self._poll_at = now + self._poll_anew
+        self._poll_anew = min(2.0 * self._poll_anew, _POLL_ANEW)
+        if self._poll is not None:
+            self._poll.deadline = now + _PATIENCE
         request = srv.RequestProcess.Request(
             envelope=self._control.envelope(self._master_beat, self._epoch),
             host_id=self.host_id, incarnation=self._description.incarnation,
         )  # fmt: skip
-        self._control.call(
-            self._clients[srv.RequestProcess], request, now + self._poll_anew, self._take_work
+        self._poll = self._control.call(
+            self._clients[srv.RequestProcess], request, math.inf, self._take_work
         )
 
     def _take_work(self, response: srv.RequestProcess.Response | None) -> None:
-        self._poll_open = False
         if response is None:
-            self._poll_anew = min(2.0 * self._poll_anew, _POLL_ANEW)
-            return
-        self._poll_anew = _POLL_ANEW
+            return  # it was asked anew, and the former request was lost
+        self._poll_at, self._poll_anew = 0.0, _POLL_ANEW
         answer = response.answer
         if not answer.accepted:
             if answer.code in ("unknown", "stale"):
