@@ -35,7 +35,7 @@ ListOfWords = Annotated[tuple[Text, ...], Words()]
 
 @dataclass(frozen=True, slots=True)
 class RestartInFile:
-    """When a process that ended is started again on its host; no `when`: as its kind has it."""
+    """When a process that ended is started again on its host; `when` defaults by its kind."""
 
     when: Literal["never", "on-failure", "always"] | None = None
     delay: Seconds = _RESTART.delay

@@ -156,7 +156,7 @@ def _choose(
     if choice is None:
         choice = told.choice if told is not None and chosen else _as_kept(process, host, holdings)
     if not chosen and not choice.hosts:
-        return  # nothing is kept elsewhere, and nobody has asked for it
+        return  # no other host keeps a state, and the policy has asked for none
     incarnation = host.description.incarnation
     known = (
         told is not None
@@ -187,7 +187,7 @@ def _choose(
 def _as_kept(
     process: Process, host: Host, holdings: Mapping[str, Holding]
 ) -> CheckpointChoice:  # fmt: skip
-    """The other hosts that keep a state of this life of the process, as their slaves report."""
+    """Choose the other hosts whose slaves report a state of this life of the process."""
     kept = (name for name, one in holdings.items() if one.number >= process.born)
     return CheckpointChoice(tuple(sorted(name for name in kept if name != host.name)))
 

@@ -110,7 +110,7 @@ def take_status(state: MasterState, host: Host, status: InstanceStatus, now: flo
     if process is None:
         return
     if process.restarts != status.restarts:
-        process.out_of_sight = None  # another run began while its host was not heard
+        process.out_of_sight = None  # another run began while its host was silent
     process.restarts = status.restarts
     if process.wanted is not Wanted.RUN and not instance.stopping:
         stop_instance(state, instance, now)
@@ -242,7 +242,7 @@ def _end(
         and status.run_time > 0.0  # else it was stopped before it was started
     )  # fmt: skip
     told = instance.stopping or instance.recalled or process.wanted is Wanted.REQUEUE
-    told = told or status.state is InstanceState.WITHDRAWN  # its slave left; no order reached it
+    told = told or status.state is InstanceState.WITHDRAWN  # the slave stopped it, no order did
     return End(status, ordered=told and not completed, completed=completed)
 
 

@@ -329,7 +329,7 @@ class InstanceStatus:
 
     Attributes:
         pid: of the session leader; 0: none.
-        exit_code: of the last run, where it exited by itself; -1: nobody saw its end.
+        exit_code: of the last run, where no signal ended it; -1: its end was not seen.
         exit_signal: that ended the last run; 0: none.
         restarts: by the restart policy on this host.
         peak_memory: bytes, of the last run; 0: not known.
@@ -351,7 +351,10 @@ class InstanceStatus:
 
     @property
     def known_exit(self) -> int | None:
-        """How the last run ended, a signal as a negative number; None: unknown, or it never ran."""
+        """Return the exit code of the last run, or its signal as a negative number.
+
+        None: the end was not seen, or the instance never ran.
+        """
         if self.exit_signal:
             return -self.exit_signal
         ran = self.exit_code > 0 or (self.exit_code == 0 and self.run_time > 0.0)

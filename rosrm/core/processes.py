@@ -166,8 +166,8 @@ class Process:
         since: when its phase began, by this master's clock; before its own start, where the journal
             says so.
         wall: unix time at which its phase began.
-        out_of_sight: the phase that it had when its host was lost, and when that began (`since` and
-            `wall`); None: its host is heard, or something else has become of it since.
+        out_of_sight: its phase when its host was lost, with the start of that phase (`since` and
+            `wall`); None: its host reports, or the process has another phase since.
         born: lowest number that an instance of it can have; what lower ones kept is not its own.
         owner: number of the instance that owns the name; 0: none.
         instances: numbers of all its instances that may still run.

@@ -31,7 +31,7 @@ from rosrm.ports import Intent, MigrationStrategy, Record, ScoringPolicy
 _HISTORY: Final = 12
 #: Instance numbers are made durable by so many at a time.
 _RESERVED: Final = 1000
-#: Phases that a process has for a moment, until its host that is heard again says what it is.
+#: Phases between the return of a host and its report of what runs there.
 _ON_THE_WAY_BACK: Final = frozenset({ProcessPhase.ASSIGNED, ProcessPhase.STARTING})
 #: Of processes that wait for a host.
 WAITING: Final = (ProcessPhase.QUEUED, ProcessPhase.SET_ASIDE)
@@ -227,7 +227,10 @@ class MasterState:
         self._note_whether_over(process)
 
     def _begin_phase(self, process: Process, phase: ProcessPhase, now: float) -> None:
-        """Note when the phase began: one that was only out of sight goes on."""
+        """Change the phase and note its start.
+
+        A process that was unreachable and then has its former phase again keeps the former start.
+        """
         before, began = process.phase, (now, self.wall)
         if phase is ProcessPhase.UNREACHABLE:
             process.out_of_sight = (before, process.since, process.wall)

@@ -177,7 +177,7 @@ class Call:
     """A request without an answer yet.
 
     Attributes:
-        deadline: monotonic seconds; may be set anew.
+        deadline: monotonic seconds; may be changed.
     """
 
     future: Any

@@ -1,7 +1,7 @@
 """The master's link to each slave: orders and work on their way to it, and its newest beat.
 
 A slave judges the age of an order by its own clock, so nothing can be ordered before its first beat
-was heard; what is meant for it waits until then. An order also waits until DDS has discovered the
+is received; what is meant for it waits until then. An order also waits until DDS has discovered the
 service of the slave, because it would be lost otherwise.
 """
 

@@ -289,8 +289,9 @@ class SlaveEndpoint:
     def ask(self, now: float) -> None:
         """Ask for work, unless a request is open already.
 
-        The answer to a request that is asked anew may be on its way: it is taken as well, for it
-        may hold assignments, which the master would give again only after `control.order_retry`.
+        When the request is renewed, the answer to the former one may be on its way. The slave
+        takes that answer as well, because the master repeats assignments that were lost only
+        after `control.order_retry`.
         """
         if now < self._poll_at or self.link is not Link.REGISTERED:
             return
@@ -308,7 +309,7 @@ class SlaveEndpoint:
 
     def _take_work(self, response: srv.RequestProcess.Response | None) -> None:
         if response is None:
-            return  # it was asked anew, and the former request was lost
+            return  # the request was renewed, and the former one was lost
         self._poll_at, self._poll_anew = 0.0, _POLL_ANEW
         answer = response.answer
         if not answer.accepted:

@@ -154,7 +154,7 @@ def test_a_policy_that_raises_or_makes_no_sense_is_named(answer):
 
 @pytest.mark.parametrize("answer", [None, ValueError("no idea"), TimeoutError("late")])
 def test_copies_stay_after_a_start_of_the_master_until_the_policy_answers(answer):
-    """What hosts report that they keep is kept on, and shipped to; no answer deletes nothing."""
+    """The state is shipped to the hosts that report a copy, and no copy is deleted."""
     policy = Asked("b", "c")
     cluster = running(policy, "a", "b", "c")
     number, host = cluster["p"].owner, where(cluster)
@@ -165,7 +165,7 @@ def test_copies_stay_after_a_start_of_the_master_until_the_policy_answers(answer
     register(cluster, host, ("p", number, 9))
     register(cluster, one, ("p", number, 8))
     cluster.wait(3.0)
-    register(cluster, two, ("p", number, 7))  # later, and older than what is kept already
+    register(cluster, two, ("p", number, 7))  # later, and with an older state
     cluster.wait(5.0)
     assert not cluster.orders("drop_kept")
     assert cluster.orders("keep")[-1].keep_on == (one, two)

@@ -80,7 +80,7 @@ def test_a_process_that_was_cancelled_before_its_slave_ended_it_stays_cancelled(
 
 
 def test_since_when_and_where_outlive_the_master() -> None:
-    """Of what runs, what waits and what has ended: when its phase began, and on which host."""
+    """The start of the phase and the host of what runs, of what waits and of what has ended."""
     cluster = Cluster("a")
     cluster.submit(process("runs"), process("waits", memory=1e6), job("ends"))
     cluster.machines["a"].finish("ends", cluster.now, code=4)
@@ -91,7 +91,7 @@ def test_since_when_and_where_outlive_the_master() -> None:
     cluster.kill_master()
     unseen = listing.process_row(cluster.state, cluster["runs"], cluster.now)
     assert (unseen.state, unseen.since) == ("unreachable", 0.0)
-    cluster.restart_master()  # killed once more, before anybody was heard
+    cluster.restart_master()  # killed once more, before any slave registered
     after = {row.name: row for row in listing.process_rows(cluster.state, cluster.now)}
     for name, row in after.items():
         told = (row.state, row.host, row.exit_code)

@@ -325,7 +325,7 @@ def test_a_request_for_work_that_was_lost_is_soon_repeated(slave) -> None:
 
 
 def test_work_that_crosses_with_the_next_request_is_taken(slave) -> None:
-    """The master answered the former request at the moment in which it was asked anew."""
+    """The master answered the former request at the moment in which the slave renewed it."""
     master = Master(slave, 11)
     slave.join(master)
     slave.pass_time(1.4, master)
@@ -341,7 +341,7 @@ def test_work_that_crosses_with_the_next_request_is_taken(slave) -> None:
 
 
 def test_a_name_that_is_taken_is_said_at_once(slave) -> None:
-    """The slave asks again for a moment, and the user is not left without a word."""
+    """The slave asks again for a moment, and tells the user so once."""
     ours = Master(slave, 11)
     answer = msg.Answer(protocol_version=PROTOCOL_VERSION, code="name_taken", message="a live one")
     for _ in range(3):
