@@ -82,7 +82,7 @@ def _why(row: ProcessRow) -> str:
     parts = [f"no. {row.queue_position} in the queue"] if row.queue_position else []
     if row.reason:
         parts.append(row.reason)
-    elif row.state == "failed":
+    elif row.state == "failed" and row.exit_code is not None:
         parts.append(f"exit code {row.exit_code}")
     if row.restarts:
         parts.append(f"{row.restarts} restarts")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Annotated, Any, Final, Literal
 
 from rosrm.config.markers import NullIsEmpty, PlainWord, Words
@@ -35,9 +35,9 @@ ListOfWords = Annotated[tuple[Text, ...], Words()]
 
 @dataclass(frozen=True, slots=True)
 class RestartInFile:
-    """When a process that ended is started again on its host."""
+    """When a process that ended is started again on its host; `when` defaults by its kind."""
 
-    when: Literal["never", "on-failure", "always"] = "never"
+    when: Literal["never", "on-failure", "always"] | None = None
     delay: Seconds = _RESTART.delay
     max_delay: Seconds = _RESTART.max_delay
     factor: Annotated[float, Quantity(low=1.0, high=100.0)] = _RESTART.factor
@@ -147,6 +147,13 @@ class ProcessInFile:
         """A ROS node: as said, else whatever comes from a ROS package."""
         return self.package is not None if self.ros is None else self.ros
 
+    @property
+    def restart_policy(self) -> RestartPolicy:
+        """The default brings a service back after a power cut; a job may not be repeatable."""
+        when = self.restart.when or ("never" if self.kind == "job" else "on-failure")
+        policy: RestartPolicy = _same(RestartPolicy, self.restart)
+        return replace(policy, when=when)
+
     def spec(self) -> ProcessSpec:
         """The same as the core takes it."""
         return ProcessSpec(
@@ -163,7 +170,7 @@ class ProcessInFile:
             working_directory=self.working_directory,
             ros=self.is_ros,
             kind=Kind(self.kind),
-            restart=_same(RestartPolicy, self.restart),
+            restart=self.restart_policy,
             needs=self.needs,
             required_labels=self.labels.required,
             preferred_labels=self.labels.preferred,

@@ -173,7 +173,7 @@ def _assign(
     state.queue.remove(process.name)
     state.charge_ranked(instance, host, now, ranking)
     ranking.took()
-    process.owner, process.left_behind = instance.number, None
+    process.owner, process.left_behind, process.exit_code = instance.number, None, None
     state.set_phase(process, ProcessPhase.ASSIGNED, now)
     state.note_decision(process, decision, "assigned", now)
     state.record(

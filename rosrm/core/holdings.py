@@ -88,6 +88,8 @@ class Told:
     Attributes:
         number: of the instance.
         incarnation: of the slave.
+        chosen: the policy has chosen so since the master started. False: it gives no answer, and
+            the hosts are those that keep a state already.
         taken: it has said yes.
     """
 
@@ -96,6 +98,7 @@ class Told:
     choice: CheckpointChoice
     order: int
     at: float
+    chosen: bool = True
     taken: bool = False
 
 

@@ -50,6 +50,8 @@ class Host:
         column: of this host in the arrays of `HostTable`.
         instances: numbers of the instances that it holds or was promised.
         over_since: resource name to the time since when it is over its limit.
+        over_at: resource name to the time at which it was last seen over its limit; of those whose
+            excess is on record, and whose end is not.
         told: kind of a record that is not repeated at once, to when it was made.
         lost_since: time at which it was lost, while it is.
         failing: resource to the reason why its probe gives no readings, as the slave reports.
@@ -61,6 +63,7 @@ class Host:
     draining: bool = False
     instances: set[int] = field(default_factory=set)
     over_since: dict[str, float] = field(default_factory=dict)
+    over_at: dict[str, float] = field(default_factory=dict)
     told: dict[str, float] = field(default_factory=dict)
     lost_since: float = 0.0
     failing: Mapping[str, str] = field(default_factory=lambda: EMPTY)
@@ -112,6 +115,7 @@ class HostTable(HostColumns):
         column = host.column
         host.description = description
         host.over_since.clear()
+        host.over_at.clear()
         for resource in description.resources:
             if resource.name not in self.resources:
                 self.add_resource(resource.name)

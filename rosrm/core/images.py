@@ -121,6 +121,7 @@ def drop(state: MasterState, process: Process, *numbers: int) -> None:
     image = process.image
     if image is not None:
         set_image(state, process, None)
+        process.ended_on = image.host
         remove(state, process.name, image.host, image.drop, image.number, *numbers)
 
 

@@ -71,7 +71,11 @@ def _execute_again(state: MasterState, host: Host) -> None:
 def _refuse_host(
     state: MasterState, event: happened.HostRegistered, code: str, why: str, now: float
 ) -> None:
-    state.record(now, "host_refused", why, host=event.description.name)
+    known = state.hosts.by_name.get(event.description.name)
+    if known is None:
+        state.record(now, "host_refused", why, host=event.description.name)
+    else:  # a slave whose name is taken asks again for a moment
+        _tell(state, known, "host_refused", now, why)
     state.emit(Reply(event.request, False, code, why))
 
 

@@ -10,9 +10,12 @@ what is seen                                what is ordered
 it runs, and the policy chooses hosts       `keep`: its slave ships the state to them from now on,
                                             beginning with the first that this instance has
 its slave was told something else before    `keep`: the new choice
+it runs, and the policy gives no answer     as it chose last; where it has not chosen since the
+                                            master started, `keep` on the hosts that keep a state
 it is cancelled, or has finished            `drop_kept` wherever something is kept of it
 it was submitted anew                       `drop_kept` of what is kept of its former life
-a host that is not chosen keeps a state     `drop_kept`, once a newer one lies where it should
+a host that is not chosen keeps a state     `drop_kept`, once a newer one lies where it should;
+                                            never before the policy has chosen
 ==========================================  =====================================================
 
 What is kept of a name that this master does not know is left alone: its journal may be lost.
@@ -149,18 +152,23 @@ def _choose(
     """Ask the policy, and tell the slave what is new to it."""
     choice = _choice(state, process, host, holdings, now)
     told = state.keeping.told.get(process.name)
+    chosen = choice is not None or (told is not None and told.chosen)
     if choice is None:
-        choice = told.choice if told is not None else CheckpointChoice(())
+        choice = told.choice if told is not None and chosen else _as_kept(process, host, holdings)
+    if not chosen and not choice.hosts:
+        return  # no other host keeps a state, and the policy has asked for none
     incarnation = host.description.incarnation
     known = (
         told is not None
         and (told.number, told.incarnation, told.choice) == (process.owner, incarnation, choice)
     )  # fmt: skip
+    if told is not None:
+        told.chosen = chosen
     if told is not None and known and (told.taken or now - told.at < state.settings.order_retry):
         return
     order = state.keeping.order_id()
     state.keeping.orders[order] = process.name
-    state.keeping.told[process.name] = Told(process.owner, incarnation, choice, order, now)
+    state.keeping.told[process.name] = Told(process.owner, incarnation, choice, order, now, chosen)
     state.emit(
         Order(
             order, host.host_id, "keep", InstanceId(process.name, process.owner),
@@ -174,6 +182,14 @@ def _choose(
             process=process.name, host=host.name,
             facts={"hosts": list(choice.hosts), "every": choice.every},
         )  # fmt: skip
+
+
+def _as_kept(
+    process: Process, host: Host, holdings: Mapping[str, Holding]
+) -> CheckpointChoice:  # fmt: skip
+    """Choose the other hosts whose slaves report a state of this life of the process."""
+    kept = (name for name, one in holdings.items() if one.number >= process.born)
+    return CheckpointChoice(tuple(sorted(name for name in kept if name != host.name)))
 
 
 def _choice(
@@ -239,7 +255,9 @@ def _is_stale(
     owner, told = state.instances.get(process.owner), state.keeping.told.get(process.name)
     if owner is None or process.phase is not ProcessPhase.RUNNING or host == owner.host.name:
         return False
-    if told is None or told.number != process.owner or host in told.choice.hosts:
+    if told is None or not told.chosen or told.number != process.owner:
+        return False
+    if host in told.choice.hosts:
         return False
     # A copy that is no longer wanted is worth something until there is a newer one elsewhere.
     better = told.choice.hosts or (owner.host.name,)

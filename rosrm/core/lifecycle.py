@@ -111,6 +111,8 @@ def take_status(state: MasterState, host: Host, status: InstanceStatus, now: flo
     process = state.owned_by(instance)
     if process is None:
         return
+    if process.restarts != status.restarts:
+        process.out_of_sight = None  # another run began while its host was silent
     process.restarts = status.restarts
     if process.wanted is not Wanted.RUN and not instance.stopping:
         stop_instance(state, instance, now)
@@ -242,6 +244,7 @@ def _end(
         and status.run_time > 0.0  # else it was stopped before it was started
     )  # fmt: skip
     told = instance.stopping or instance.recalled or process.wanted is Wanted.REQUEUE
+    told = told or status.state is InstanceState.WITHDRAWN  # the slave stopped it, no order did
     return End(status, ordered=told and not completed, completed=completed)
 
 
@@ -251,8 +254,7 @@ def conclude(state: MasterState, process: Process, end: End, host: Host, now: fl
         return
     status = end.status
     process.owner = 0
-    if not end.gone:
-        process.exit_code = status.exit_code or -status.exit_signal
+    process.exit_code = None if end.gone else status.known_exit
     if process.wanted is Wanted.CANCEL:
         _finish(state, process, ProcessPhase.CANCELLED, host, now, "")
     elif end.gone:
@@ -267,7 +269,7 @@ def conclude(state: MasterState, process: Process, end: End, host: Host, now: fl
     elif status.succeeded:
         _finish(state, process, ProcessPhase.FINISHED, host, now, status.message)
     else:
-        reason = status.message or f"exit code {process.exit_code}"
+        reason = status.message or f"exit code {status.exit_code}"
         _finish(state, process, ProcessPhase.FAILED, host, now, reason)
 
 
@@ -295,6 +297,7 @@ def _finish(
     state: MasterState, process: Process, phase: ProcessPhase, host: Host, now: float, reason: str
 ) -> None:
     state.set_phase(process, phase, now, reason)
+    process.ended_on = host.name
     state.record(
         now, phase.value,
         f"{process.name} {phase.value} on {host.name}" + (f": {reason}" if reason else ""),

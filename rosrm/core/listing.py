@@ -69,7 +69,7 @@ def process_row(state: MasterState, process: Process, now: float) -> ProcessRow:
 def _host_of(process: Process, owner: Instance | None) -> str:
     if owner is not None:
         return owner.host.name
-    return process.image.host if process.image is not None else ""
+    return process.image.host if process.image is not None else process.ended_on
 
 
 def _of_standby(process: Process) -> str:

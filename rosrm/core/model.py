@@ -307,6 +307,7 @@ class InstanceState(str, Enum):
     FAILED = "failed"
     REFUSED = "refused"
     FENCED = "fenced"
+    WITHDRAWN = "withdrawn"
 
     @property
     def ended(self) -> bool:
@@ -315,8 +316,11 @@ class InstanceState(str, Enum):
 
 
 _ENDED: Final = frozenset(
-    {InstanceState.EXITED, InstanceState.FAILED, InstanceState.REFUSED, InstanceState.FENCED}
-)
+    {
+        InstanceState.EXITED, InstanceState.FAILED, InstanceState.REFUSED, InstanceState.FENCED,
+        InstanceState.WITHDRAWN,
+    }
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -325,7 +329,7 @@ class InstanceStatus:
 
     Attributes:
         pid: of the session leader; 0: none.
-        exit_code: of the last run, where it exited by itself.
+        exit_code: of the last run, where no signal ended it; -1: its end was not seen.
         exit_signal: that ended the last run; 0: none.
         restarts: by the restart policy on this host.
         peak_memory: bytes, of the last run; 0: not known.
@@ -344,6 +348,17 @@ class InstanceStatus:
     cpu_time: float = 0.0
     run_time: float = 0.0
     message: str = ""
+
+    @property
+    def known_exit(self) -> int | None:
+        """Return the exit code of the last run, or its signal as a negative number.
+
+        None: the end was not seen, or the instance never ran.
+        """
+        if self.exit_signal:
+            return -self.exit_signal
+        ran = self.exit_code > 0 or (self.exit_code == 0 and self.run_time > 0.0)
+        return self.exit_code if ran else None
 
     @property
     def succeeded(self) -> bool:

@@ -338,7 +338,7 @@ def _end_of_owner(process: Process, run: Run) -> End:
     if process.owner == run.source.number and _told_to_stop(run, run.source) and not end.completed:
         return replace(end, ordered=True)
     if process.owner in run.suspended and lifecycle.restarts_after(policy, end.status):
-        how = end.status.message or f"it ended on a signal or with code {process.exit_code}"
+        how = run.how_ended(InstanceId(process.name, process.owner))
         why = f"restart by policy {policy.when!r}: {how}"
         return replace(end, gone=True, status=replace(end.status, message=why))
     return end

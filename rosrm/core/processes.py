@@ -163,10 +163,18 @@ class Process:
 
     Attributes:
         order: place in the line; kept when it returns to the queue.
+        since: when its phase began, by this master's clock; before its own start, where the journal
+            says so.
+        wall: unix time at which its phase began.
+        out_of_sight: its phase when its host was lost, with the start of that phase (`since` and
+            `wall`); None: its host reports, or the process has another phase since.
         born: lowest number that an instance of it can have; what lower ones kept is not its own.
         owner: number of the instance that owns the name; 0: none.
         instances: numbers of all its instances that may still run.
         excluded: host name to the reason why it cannot run there.
+        exit_code: of its last run, a signal as a negative number; None: it is not known, or it
+            runs.
+        ended_on: name of the host on which it has ended; "": it has not, or ran nowhere.
         decision: the newest one about it, with its kind.
         left_behind: the instance that may still run on a lost host, while this process waits in the
             queue for another one.
@@ -189,7 +197,10 @@ class Process:
     born: int = 0
     migrations: int = 0
     moved_at: float = float("-inf")
-    exit_code: int = 0
+    exit_code: int | None = None
+    ended_on: str = ""
+    wall: float = 0.0
+    out_of_sight: tuple[ProcessPhase, float, float] | None = None
     restarts: int = 0
     decision: Mapping[str, Any] | None = None
     decided_at: float = 0.0

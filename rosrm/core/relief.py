@@ -35,24 +35,34 @@ def relieve_hosts(state: MasterState, now: float) -> None:
 
 
 def _note_limits(state: MasterState, now: float) -> None:
-    """Since when is which host over which limit?"""
+    """Note since when each host is over which of its limits."""
     over = {int(column) for column in state.hosts.hosts_over_limit()}
     for host in state.hosts.hosts:
-        if host.column not in over:
-            if host.over_since:
-                state.record(now, "under_limit", f"{host.name} is under its limits", host=host.name)
-                host.over_since.clear()
-            continue
-        names = state.hosts.over_limit(host.column)
+        names = state.hosts.over_limit(host.column) if host.column in over else ()
         for name in names:
-            if name not in host.over_since:
-                host.over_since[name] = now
+            host.over_since.setdefault(name, now)
+            if name not in host.over_at:
                 state.record(
                     now, "over_limit", f"{host.name} reached its limit of {name}", host=host.name,
                     facts={"resource": name},
                 )  # fmt: skip
-        for name in set(host.over_since) - set(names):
+            host.over_at[name] = now
+        for name in host.over_since.keys() - names:
             del host.over_since[name]
+        if len(host.over_at) > len(names):
+            _note_under_limit(state, host, now)
+
+
+def _note_under_limit(state: MasterState, host: Host, now: float) -> None:
+    """Record that a host is under its limits, once it has stayed there.
+
+    A reading at the limit crosses it many times a minute, which says nothing new.
+    """
+    for name, at in list(host.over_at.items()):
+        if name not in host.over_since and now - at >= state.settings.hysteresis:
+            del host.over_at[name]
+    if not host.over_at:
+        state.record(now, "under_limit", f"{host.name} is under its limits", host=host.name)
 
 
 def _relieve(state: MasterState, host: Host, now: float) -> None:

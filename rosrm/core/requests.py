@@ -38,7 +38,12 @@ def submission_received(state: MasterState, event: happened.SubmissionReceived, 
         return
     for spec in event.specs:
         process = Process(
-            spec, state.next_order, ProcessPhase.QUEUED, now, born=state.next_instance
+            spec,
+            state.next_order,
+            ProcessPhase.QUEUED,
+            now,
+            wall=state.wall,
+            born=state.next_instance,
         )
         state.next_order += 1
         state.add_process(process)

@@ -53,10 +53,14 @@ def restore(state: MasterState, intents: Callable[[str], _Table], now: float) ->
 
 
 def _restore_process(state: MasterState, item: Mapping[str, Any], now: float) -> Process:
+    phase, exit_code = ProcessPhase(item["phase"]), item["exit_code"]
+    wall = float(item.get("since", state.wall))  # older journals say nothing of it
     process = Process(
-        spec_from_dict(item["spec"]), int(item["order"]), ProcessPhase(item["phase"]), now,
+        spec_from_dict(item["spec"]), int(item["order"]), phase,
+        now - max(0.0, state.wall - wall), wall=wall,  # the clock may have been set back
         wanted=Wanted(item["wanted"]), reason=item["reason"], excluded=dict(item["excluded"]),
-        migrations=int(item["migrations"]), exit_code=int(item["exit_code"]),
+        migrations=int(item["migrations"]), exit_code=exit_code if phase.over else None,
+        ended_on=item["host"] if phase.over else "",
         restarts=int(item["restarts"]), born=int(item.get("born", 0)),
         left_behind=LeftBehind(*left) if (left := item.get("left_behind")) else None,
     )  # fmt: skip

@@ -217,7 +217,7 @@ def _end_to_dict(end: End) -> dict[str, Any]:
     return {
         "state": status.state.value, "exit_code": status.exit_code,
         "exit_signal": status.exit_signal, "message": status.message, "ordered": end.ordered,
-        "completed": end.completed, "gone": end.gone,
+        "completed": end.completed, "gone": end.gone, "run_time": status.run_time,
     }  # fmt: skip
 
 
@@ -226,5 +226,6 @@ def end_from_dict(instance: InstanceId, plain: Mapping[str, Any]) -> End:
     status = InstanceStatus(
         instance, InstanceState(plain["state"]), exit_code=int(plain["exit_code"]),
         exit_signal=int(plain["exit_signal"]), message=str(plain["message"]),
+        run_time=float(plain.get("run_time", 0.0)),  # older journals have none
     )  # fmt: skip
     return End(status, bool(plain["ordered"]), bool(plain["completed"]), bool(plain["gone"]))

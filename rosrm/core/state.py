@@ -32,6 +32,8 @@ from rosrm.ports import Intent, MigrationStrategy, Record, ScoringPolicy
 _HISTORY: Final = 12
 #: Instance numbers are made durable by so many at a time.
 _RESERVED: Final = 1000
+#: Phases between the return of a host and its report of what runs there.
+_ON_THE_WAY_BACK: Final = frozenset({ProcessPhase.ASSIGNED, ProcessPhase.STARTING})
 #: Of processes that wait for a host.
 WAITING: Final = (ProcessPhase.QUEUED, ProcessPhase.SET_ASIDE)
 #: No instance gets a number as large as this.
@@ -166,6 +168,7 @@ class MasterState:
 
     def _intent_of(self, process: Process) -> Intent:
         owner, left = self.instances.get(process.owner), process.left_behind
+        phase, _, began = process.out_of_sight or (process.phase, 0.0, process.wall)
         held = {str(number): self.instances[number].host.name for number in process.instances}
         aliases = {
             str(number): alias
@@ -175,9 +178,9 @@ class MasterState:
         return Intent(
             "process", process.name,
             {
-                "spec": process.plain, "order": process.order, "phase": process.phase.value,
+                "spec": process.plain, "order": process.order, "phase": phase.value, "since": began,
                 "wanted": process.wanted.value, "owner": process.owner,
-                "host": owner.host.name if owner else "", "instances": held,
+                "host": owner.host.name if owner else process.ended_on, "instances": held,
                 "reason": process.reason, "excluded": dict(process.excluded),
                 "migrations": process.migrations, "exit_code": process.exit_code,
                 "restarts": process.restarts, "node_names": aliases,
@@ -221,10 +224,24 @@ class MasterState:
     ) -> None:
         """Move a process to another phase."""
         if process.phase is not phase:
-            process.since = now
-        process.phase = phase
+            self._begin_phase(process, phase, now)
         process.reason = reason
         self._note_whether_over(process)
+
+    def _begin_phase(self, process: Process, phase: ProcessPhase, now: float) -> None:
+        """Change the phase and note its start.
+
+        A process that was unreachable and then has its former phase again keeps the former start.
+        """
+        before, began = process.phase, (now, self.wall)
+        if phase is ProcessPhase.UNREACHABLE:
+            process.out_of_sight = (before, process.since, process.wall)
+        elif process.out_of_sight is not None and phase not in _ON_THE_WAY_BACK:
+            if process.out_of_sight[0] is phase:
+                began = process.out_of_sight[1:]
+            process.out_of_sight = None
+        process.phase = phase
+        process.since, process.wall = began
 
     def add_process(self, process: Process) -> None:
         """One more is known; of a name that was known, this one is from now on."""
@@ -256,7 +273,7 @@ class MasterState:
 
     def enqueue(self, process: Process, now: float, reason: str = "") -> None:
         """Queue a process at its place in the line."""
-        process.owner = 0
+        process.owner, process.ended_on = 0, ""
         process.wanted = Wanted.RUN
         self.set_phase(process, ProcessPhase.QUEUED, now, reason)
         self.queue.add(process.name, process.spec.priority, process.order)

@@ -52,8 +52,9 @@ class ProcessRow:
         state: "queued", "set_aside", "assigned", "starting", "running", "backoff", "stopping",
             "migrating", "checkpointed", "finished", "failed", "cancelled", "unreachable" or
             "stuck".
-        host: where the owning instance is, or the image; "" for none.
+        host: where the owning instance is, or the image, or where it has ended; "" for none.
         number: of the owning instance; 0: none.
+        exit_code: of the last run, a signal as a negative number; None: unknown, or it runs.
         queue_position: 1 is the head; 0: not in the queue.
         since: seconds in this state.
         cpu: cores.
@@ -69,7 +70,7 @@ class ProcessRow:
     pid: int
     restarts: int
     migrations: int
-    exit_code: int
+    exit_code: int | None
     priority: int
     queue_position: int
     since: float

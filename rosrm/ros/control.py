@@ -175,7 +175,13 @@ class ControlServer:
 
 
 @dataclass(slots=True)
-class _Call:
+class Call:
+    """A request without an answer yet.
+
+    Attributes:
+        deadline: monotonic seconds; may be changed.
+    """
+
     future: Any
     client: Any
     deadline: float
@@ -193,7 +199,7 @@ class ControlClient:
 
     participant: Participant
     sender: str
-    _calls: list[_Call] = field(default_factory=list)
+    _calls: list[Call] = field(default_factory=list)
 
     def envelope(self, receiver_beat: int, epoch: int = 0) -> Envelope:
         """The head of a new request."""
@@ -202,7 +208,7 @@ class ControlClient:
             epoch=epoch, receiver_beat=receiver_beat,
         )  # fmt: skip
 
-    def call(self, client: Any, request: Any, deadline: float, done: Callable[[Any], None]) -> None:
+    def call(self, client: Any, request: Any, deadline: float, done: Callable[[Any], None]) -> Call:
         """Send a request.
 
         Args:
@@ -211,11 +217,12 @@ class ControlClient:
             done: called with the response, or with None when the deadline has passed or the call
                 with the response raised.
         """
-        call = _Call(client.call_async(request), client, deadline, done)
+        call = Call(client.call_async(request), client, deadline, done)
         self._calls.append(call)
         call.future.add_done_callback(self.participant.counted(lambda _: self._finish(call)))
+        return call
 
-    def _finish(self, call: _Call) -> None:
+    def _finish(self, call: Call) -> None:
         if call in self._calls:
             self._calls.remove(call)
             guard = self.participant.guard

@@ -379,12 +379,15 @@ def host_row_from_msg(message: msg.HostState) -> HostRow:
 
 def process_row_to_msg(row: ProcessRow) -> msg.ProcessState:
     """A row of `rosrm ps`."""
-    return msg.ProcessState(**{name: getattr(row, name) for name in ProcessRow.__slots__})
+    fields = {name: getattr(row, name) for name in ProcessRow.__slots__}
+    known = row.exit_code is not None
+    return msg.ProcessState(**fields | {"exit_code": row.exit_code or 0, "exit_code_known": known})
 
 
 def process_row_from_msg(message: msg.ProcessState) -> ProcessRow:
     """The inverse of `process_row_to_msg`."""
-    return ProcessRow(**{name: getattr(message, name) for name in ProcessRow.__slots__})
+    fields = {name: getattr(message, name) for name in ProcessRow.__slots__}
+    return ProcessRow(**fields if message.exit_code_known else fields | {"exit_code": None})
 
 
 def plugin_row_to_msg(row: PluginRow) -> msg.PluginState:

@@ -1,7 +1,8 @@
 """The master's link to each slave: orders and work on their way to it, and its newest beat.
 
 A slave judges the age of an order by its own clock, so nothing can be ordered before its first beat
-was heard; what is meant for it waits until then.
+is received; what is meant for it waits until then. An order also waits until DDS has discovered the
+service of the slave, because it would be lost otherwise.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ _ACTIONS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class _Unheard:
-    """An order for a slave, or a request of one, whose first reading has not come.
+    """An order for a slave, or a request of one, that waits for its next reading.
 
     Attributes:
         deadline: monotonic seconds.
@@ -142,7 +143,7 @@ class HostLinks:
         self.ledger.forget(link.host_id)
 
     def heard(self, host_ids: Iterable[int]) -> None:
-        """Readings of these hosts have come: what waited for their first beat goes out."""
+        """Readings of these hosts have come: what waited for them goes out."""
         for host_id in self._waiting.intersection(host_ids) if self._waiting else ():
             self._waiting.discard(host_id)
             link = self._links[host_id]
@@ -165,8 +166,11 @@ class HostLinks:
         """
         if self.ledger.beat[link.host_id]:
             send()
-            return
-        link.unheard.append(_Unheard(deadline, send, done))
+        else:
+            self._wait(link, _Unheard(deadline, send, done))
+
+    def _wait(self, link: HostLink, order: _Unheard) -> None:
+        link.unheard.append(order)
         self._waiting.add(link.host_id)
 
     # --- work ----------------------------------------------------------------------------
@@ -243,6 +247,9 @@ class HostLinks:
             self._tell(_order_answered(command.order, response))
 
         def send() -> None:
+            if not link.control.service_is_ready():
+                self._wait(link, _Unheard(deadline, send, done))
+                return
             beat = int(self.ledger.beat[link.host_id])
             request.envelope = self._client.envelope(beat, self._epoch)
             self._client.call(link.control, request, deadline, done)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from enum import Enum
@@ -15,7 +16,7 @@ from rosrm.core import slave as core
 from rosrm.core.model import HostDescription, InstanceStatus, KeptState
 from rosrm.errors import Refused
 from rosrm.ros import convert, names, qos
-from rosrm.ros.control import ControlClient, Gate, version_refusal
+from rosrm.ros.control import Call, ControlClient, Gate, version_refusal
 from rosrm.ros.journal_seen import JournalSeen, Seen
 from rosrm.ros.participant import Participant
 from rosrm.ros.reporting import Reporter
@@ -96,8 +97,8 @@ class SlaveEndpoint:
         self._taken_since: float | None = None
         self._waits_since: float | None = None
         self._told = ""
-        self._poll_open = False
-        self._ask_at = 0.0
+        self._poll: Call | None = None
+        self._poll_at = 0.0
         self._poll_anew = _FIRST_POLL_ANEW
         self._status_sequence = 0
         self._control = ControlClient(participant, f"slave {description.name}")
@@ -189,7 +190,7 @@ class SlaveEndpoint:
         self._incarnation = beat.incarnation
         self._asked_at = time.monotonic()
         self.link = Link.REGISTERING
-        self._poll_open = False
+        self._poll_at = 0.0
         self._control.call(
             self._clients[srv.RegisterHost], request, time.monotonic() + _PATIENCE,
             self._take_registration,
@@ -237,6 +238,11 @@ class SlaveEndpoint:
         """A name may still be held by a former run of this very slave: ask again for a moment."""
         if self._taken_since is None:
             self._taken_since = now
+            if answer.code == "name_taken":
+                self._host.say(
+                    f"{answer.message}. Asking again for {self._patience():g} s, as that slave may "
+                    f"have been killed a moment ago"
+                )
         if answer.code != "name_taken" or now - self._taken_since >= self._patience():
             self.failure = answer.message
             self.superseded = answer.code == "name_taken"
@@ -249,7 +255,7 @@ class SlaveEndpoint:
 
     def _lose_master(self, reason: str) -> None:
         self.link = Link.SEARCHING
-        self._poll_open = False
+        self._poll_at = 0.0
         self._newest_beat = None
         self._control.forget()
         self._host.take(core.MasterLost())
@@ -285,27 +291,33 @@ class SlaveEndpoint:
     # --- asking for work -----------------------------------------------------------------
 
     def ask(self, now: float) -> None:
-        """Ask for work, unless a request is open already."""
-        if self._poll_open or self.link is not Link.REGISTERED or now < self._ask_at:
+        """Ask for work, unless a request is open already.
+
+        When the request is renewed, the answer to the former one may be on its way. The slave
+        takes that answer as well, because the master repeats assignments that were lost only
+        after `control.order_retry`.
+        """
+        if now < self._poll_at or self.link is not Link.REGISTERED:
             return
-        self._poll_open = True
+        self._poll_at = now + self._poll_anew
+        self._poll_anew = min(2.0 * self._poll_anew, _POLL_ANEW)
+        if self._poll is not None:
+            self._poll.deadline = now + _PATIENCE
         request = srv.RequestProcess.Request(
             envelope=self._control.envelope(self._master_beat, self._epoch),
             host_id=self.host_id, incarnation=self._description.incarnation,
         )  # fmt: skip
-        self._control.call(
-            self._clients[srv.RequestProcess], request, now + self._poll_anew, self._take_work
+        self._poll = self._control.call(
+            self._clients[srv.RequestProcess], request, math.inf, self._take_work
         )
 
     def _take_work(self, response: srv.RequestProcess.Response | None) -> None:
-        self._poll_open = False
         if response is None:
-            self._poll_anew = min(2.0 * self._poll_anew, _POLL_ANEW)
-            return
-        self._poll_anew = _POLL_ANEW
+            return  # the request was renewed, and the former one was lost
+        self._poll_at, self._poll_anew = 0.0, _POLL_ANEW
         answer = response.answer
         if not answer.accepted:
-            self._ask_at = time.monotonic() + _ASK_AGAIN  # not with every turn of the loop
+            self._poll_at = time.monotonic() + _ASK_AGAIN  # not with every turn of the loop
             if answer.code in ("unknown", "stale"):
                 self._lose_master(f"the master does not know this host any more: {answer.message}")
             return

@@ -24,6 +24,7 @@ class UsageWatch:
     def __init__(self, sessions: SessionTable) -> None:
         self._sessions = sessions
         self._leaders: dict[InstanceId, int] = {}
+        self._starting: set[InstanceId] = set()
         self._seen: Mapping[int, SessionUsage] = {}
         self._say_in = 0
 
@@ -34,8 +35,14 @@ class UsageWatch:
         if leader and (leader != status.pid or not runs):
             self._sessions.remove(leader, status.cpu_time)
             del self._leaders[status.instance]
-        elif status.state.ended:  # too short to have been seen running: its time counts too
+        elif status.state.ended and status.instance in self._starting:
+            # Too short to have been seen running: its time counts too. That of an instance which
+            # ended before this slave started does not.
             self._sessions.remove(status.pid, status.cpu_time)
+        if status.state is InstanceState.STARTING:
+            self._starting.add(status.instance)
+        else:
+            self._starting.discard(status.instance)
         if runs and status.instance not in self._leaders:
             self._sessions.add(status.pid)
             self._leaders[status.instance] = status.pid

@@ -126,8 +126,8 @@ def _take_state(recorded: Recorded, fields: Mapping[str, Any]) -> None:
 _PLAIN_FIELDS: Final = tuple(
     name for name in Instance.__slots__ if name not in ("key", "restart", "stop", "fence")
 )
-#: Records of before protocol 3 have none of these.
-_NEW_FIELDS: Final = frozenset({"fault", "fenced", "heard", "kill_by"})
+#: Older records have not all of these.
+_NEW_FIELDS: Final = frozenset({"fault", "fenced", "heard", "kill_by", "withdrawn"})
 
 
 class Record:

@@ -5,7 +5,8 @@ may have run already; whose end nobody saw has an unknown exit code.
 
 The clocks of fences go on from the newest time at which the master is known to have heard this
 host: who is killed in between puts no fence off. After a restart of the machine nobody knows how
-long it was away, and whether there is a successor elsewhere: what has a fence is fenced.
+long it was away, and whether there is a successor elsewhere: what has a fence is fenced. What has
+none has failed with its machine, and its restart policy decides.
 """
 
 from __future__ import annotations
@@ -51,6 +52,9 @@ def restore(state: str, core: Supervision, family: Family) -> Recorded:
 
 def _begin_clock_anew(instance: Instance, now: float) -> None:
     """It began anew with this boot."""
+    instance.recent.clear()  # times of the former boot may lie ahead, and would count for hours
+    if instance.pid:
+        instance.fault = "its machine was restarted"
     if instance.deadline is not None:
         instance.deadline = now
     if instance.fence is not None:

@@ -139,6 +139,8 @@ def test_ps(rosrm, cluster) -> None:
     assert rows["talker"]["pid"] == cluster.process("talker").pid
     assert (rows["loser"]["state"], rows["loser"]["exit_code"]) == ("failed", 4)
     assert rows["counter"]["state"] == "finished"
+    assert rows["talker"]["exit_code"] is None
+    assert "loser" in rosrm.run("ps", "--host", rows["loser"]["host"])
     where = rows["talker"]["host"]
     assert "talker" in rosrm.run("ps", "--host", where)
     assert "talker" not in rosrm.run("ps", "--host", "h1" if where == "h0" else "h0")

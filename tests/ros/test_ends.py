@@ -55,6 +55,28 @@ def test_a_slave_that_is_stopped_stops_its_processes(make_cluster, number) -> No
     assert cluster.wait("p3", "running").host == "h0"
 
 
+def test_a_slave_that_is_stopped_after_its_master_loses_no_process(make_cluster) -> None:
+    """Master first, then the slave: what it ran is queued again when both are back."""
+    cluster = make_cluster(host("h0"))
+    cluster.submit(service("p"), service("q", restart=RestartPolicy("on-failure", delay=0.1)))
+    before = {name: cluster.wait(name, "running").number for name in ("p", "q")}
+    assert end(cluster.master, signal.SIGINT) == 0
+    assert end(cluster.slaves["h0"], signal.SIGINT) == 0
+    assert wait_until_none(cluster.directory / "hosts") == {}
+
+    cluster.reconnect()
+    cluster.start_master()
+    cluster.add(host("h0"))
+    for name, number in before.items():
+        cluster.wait_until(
+            f"{name} runs again", lambda v, name=name, number=number: any(
+                row.name == name and row.state == "running" and row.number > number
+                for row in v.processes
+            ),
+        )  # fmt: skip
+    assert not cluster.events("failed")
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_master_that_is_stopped_touches_no_process(make_cluster, number) -> None:
     """Exit code 0, no traceback; started again it goes on with the same processes."""

@@ -20,6 +20,8 @@ from rosrm_resources.rate import Rate
 _TICKS: Final = float(os.sysconf("SC_CLK_TCK"))
 #: Seconds by which `Sessions.pids` may be behind; so old may the CPU time of a new pid be.
 _BEHIND: Final = 1.1
+#: Position of the start time of a process among the fields of /proc/PID/stat behind its name.
+_START: Final = 19
 
 
 @dataclass(frozen=True)
@@ -277,7 +279,9 @@ class TreeTime:
     """A counter of the CPU time of a changing set of processes that never falls.
 
     A child that has ended lives on in the time of its parent, which waited for it; a leader that
-    has ended keeps its last known time until `Sessions` has taken it over as ended.
+    has ended keeps its last known time until `Sessions` has taken it over as ended. What a process
+    used before it was seen counts only if it started after this one: the time of a process that an
+    earlier slave started is no load of this moment.
     """
 
     def __init__(self, sessions: Sessions, proc: Path, now: float) -> None:
@@ -285,6 +289,9 @@ class TreeTime:
         self._files = ProcessFiles(proc, "stat")
         self._leader_time: dict[int, float] = {}
         self._machine = machine_cores(proc)
+        self._start = int(_stat_fields((proc / "self" / "stat").read_bytes())[_START])
+        self._known: set[int] = set()
+        self._taken_over = 0.0
         self._at = now
         self._before = self._sum()
         self._seconds = 0.0
@@ -296,9 +303,8 @@ class TreeTime:
             now: monotonic seconds.
         """
         total = self._sum()
-        grown = total - self._before
-        # Time is lost where an orphan ends, and comes at once where a long-running process is
-        # taken over from an earlier slave: neither is load of this moment.
+        grown = total - self._before - self._taken_over
+        # Time is lost where an orphan ends, and comes at once where a walk finds a member late.
         most = self._machine * (now - self._at + _BEHIND)
         self._seconds += min(max(0.0, grown), most)
         self._before, self._at = total, now
@@ -317,16 +323,25 @@ class TreeTime:
             pids = self._sessions.pids()
         total = ended
         leaders: dict[int, float] = {}
+        seen: set[int] = set()
+        self._taken_over = 0.0
         for pid, line in self._files.read(pids):
-            # The name, in parentheses, may itself hold spaces and parentheses.
-            fields = line[line.rindex(b")") + 2 :].split(None, 15)
+            fields = _stat_fields(line)
             used = (int(fields[11]) + int(fields[12]) + int(fields[13]) + int(fields[14])) / _TICKS
             total += used
+            seen.add(pid)
+            if pid not in self._known and int(fields[_START]) < self._start:
+                self._taken_over += used
             if int(fields[3]) == pid:
                 leaders[pid] = used
         for pid, used in self._leader_time.items():
             if pid not in leaders and pid in pids:
                 total += used
                 leaders[pid] = used
-        self._leader_time = leaders
+        self._leader_time, self._known = leaders, seen
         return total
+
+
+def _stat_fields(line: bytes) -> list[bytes]:
+    """The fields of /proc/PID/stat behind the name, which may hold spaces and parentheses."""
+    return line[line.rindex(b")") + 2 :].split(None, _START + 1)

@@ -45,6 +45,9 @@ the master hears this host (`Heard`; its start counts as such) or, where the fen
 the slave is at work. What was fenced is not restarted
 here, whatever its policy and whatever is ordered afterwards.
 
+`ShutdownOrdered` stops every instance as `StopOrdered` does. What no order had stopped before ends
+as withdrawn, not exited: the master must know that neither the process nor the master ended it.
+
 Whatever is not in the table changes nothing; an order that changes nothing has its status told
 again, as DDS may repeat it. Every change of an instance is told (`Tell`). A signal goes to every
 process that is left of an instance, and none is sent after its end.
@@ -72,6 +75,7 @@ from rosrm.core.supervision.instance import (
     THEN_POLICY,
     THEN_RESTART,
     UNKNOWN_EXIT,
+    WITHDRAWN,
     Instance,
     signal_name,
 )
@@ -135,6 +139,7 @@ __all__ = [
     "THEN_RESTART",
     "TRANSITIONS",
     "UNKNOWN_EXIT",
+    "WITHDRAWN",
     "AmendOrdered",
     "Cleared",
     "ClientLost",

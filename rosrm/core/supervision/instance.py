@@ -15,7 +15,8 @@ EXITED: Final = "exited"
 FAILED: Final = "failed"
 REFUSED: Final = "refused"
 FENCED: Final = "fenced"
-ENDED: Final = frozenset({EXITED, FAILED, REFUSED, FENCED})
+WITHDRAWN: Final = "withdrawn"
+ENDED: Final = frozenset({EXITED, FAILED, REFUSED, FENCED, WITHDRAWN})
 
 #: What becomes of a stopping instance when nothing of it is left.
 THEN_END: Final = "end"
@@ -50,6 +51,7 @@ class Instance:
         heard: when the master last heard this host, as far as is known, or when it was started.
         fenced: why it was fenced, for people; "": it was not, or was meant to end already.
         kill_by: when SIGKILL comes at the latest, once it is fenced; None: it is not.
+        withdrawn: the shutdown of the supervisor stops it; no order of the client does.
     """
 
     __slots__ = (
@@ -78,6 +80,7 @@ class Instance:
         "stop_began",
         "then",
         "trail",
+        "withdrawn",
     )
 
     def __init__(self, key: Key, restart: RestartRule, stop: StopRule) -> None:
@@ -88,6 +91,7 @@ class Instance:
         self.heard = 0.0
         self.fenced = ""
         self.kill_by: float | None = None
+        self.withdrawn = False
         self.phase = STARTING
         self.then = ""
         self.pid = 0

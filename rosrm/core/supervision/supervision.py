@@ -5,7 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Final
 
-from rosrm.core.supervision.instance import BACKOFF, MOST_KILLS, REFUSED, Instance, end
+from rosrm.core.supervision.instance import (
+    BACKOFF,
+    MOST_KILLS,
+    REFUSED,
+    THEN_END,
+    Instance,
+    end,
+)
 from rosrm.core.supervision.transitions import TRANSITIONS
 from rosrm.core.supervision.words import (
     AmendOrdered,
@@ -93,6 +100,7 @@ class Supervision:
         elif isinstance(event, ShutdownOrdered):
             self.closing = True
             for instance in list(self.instances.values()):
+                instance.withdrawn |= not instance.ended and instance.then != THEN_END
                 yield from self._apply(instance, StopOrdered(instance.key), now)
         elif isinstance(event, ClientLost):
             return

@@ -20,6 +20,7 @@ from rosrm.core.supervision.instance import (
     THEN_END,
     THEN_POLICY,
     THEN_RESTART,
+    WITHDRAWN,
     Instance,
     end,
     ending,
@@ -167,7 +168,7 @@ def _restart_now(instance: Instance, event: Event, now: float) -> list[Command]:
 
 
 def _stop_in_backoff(instance: Instance, event: Event, now: float) -> list[Command]:
-    end(instance, EXITED, f"stopped while it waited for its restart ({ending(instance)})")
+    _end_as_meant(instance, f"stopped while it waited for its restart ({ending(instance)})")
     return [Tell(instance.key)]
 
 
@@ -304,7 +305,7 @@ def _end_as_meant(instance: Instance, how: str) -> None:
     if instance.fenced:
         end(instance, FENCED, f"{instance.fenced}; {how}")
     else:
-        end(instance, EXITED, how)
+        end(instance, WITHDRAWN if instance.withdrawn else EXITED, how)
 
 
 def _when_nothing_is_left(instance: Instance, now: float) -> list[Command]:

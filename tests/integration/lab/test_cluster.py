@@ -97,7 +97,7 @@ def holding(name: str, megabytes: int) -> dict:
 def test_processes_go_to_the_hosts_that_have_room(cluster):
     """Slaves without any file show the lab host as the whole; two large processes need two hosts.
 
-    Then a host is cut off and healed, loses its power and comes back.
+    Then a host is cut off and healed, loses its power and comes back: its service comes back too.
     """
     for host in ("host1", "host2"):
         cluster.start(host, "slave")
@@ -134,6 +134,13 @@ def test_processes_go_to_the_hosts_that_have_room(cluster):
     cluster.lab.boot("host2")
     cluster.start("host2", "slave")
     cluster.wait_for_hosts(host1=["up"], host2=["up"])
+    again = cluster.wait(
+        "both run again", cluster.processes,
+        lambda p: {one["state"] for one in p.values()} == {"running"},
+    )  # fmt: skip
+    assert {n: one["host"] for n, one in again.items()} == {
+        n: one["host"] for n, one in running.items()
+    }
 
 
 @pytest.mark.timeout(300)

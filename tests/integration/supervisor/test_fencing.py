@@ -196,11 +196,7 @@ def test_after_a_restart_of_the_machine_it_is_not_started(host, client):
     pids = [host.running(client, "driver").pid]
     client.start([host.order("one", *SLEEPS, restart=ALWAYS, fence=Fence(1000.0, 0.0))])
     pids.append(host.running(client, "one").pid)
-    host.kill_supervisor(client)
-    for pid in pids:
-        os.kill(pid, signal.SIGKILL)
-        wait_gone(pid)
-    rewrite(host, boot="another")
+    lose_power(host, client, *pids)
     client = host.connect()
     if not of_one(client).state.ended:
         host.ended(client, "one")
@@ -209,6 +205,30 @@ def test_after_a_restart_of_the_machine_it_is_not_started(host, client):
     assert of_one(client).state is InstanceState.FENCED
     assert of_one(client).message.startswith("fenced: ")
     wait_until(host.alive, "the driver was started again")
+
+
+def test_after_a_restart_of_the_machine_the_policy_decides(host, client):
+    """A service comes back, also one that had used up its restarts; another one has failed."""
+    again = RestartPolicy("on-failure", delay=0.05, attempts=1, window=1e6)
+    client.start([host.order("once", *SLEEPS)])
+    pid = host.running(client, "once").pid
+    client.start([host.order("service", *SLEEPS, restart=again)])
+    os.kill(host.running(client, "service").pid, signal.SIGKILL)
+    lose_power(host, client, pid, host.running(client, "service").pid)
+    client = host.connect()
+    (once,) = [status for status in client.instances if status.instance.process == "once"]
+    assert (once.state, once.message) == (InstanceState.FAILED, "its machine was restarted")
+    assert once.known_exit is None
+    assert host.running(client, "service").restarts == 2
+
+
+def lose_power(host, client, *pids: int) -> None:
+    """All is gone at once, and the next supervisor starts after a restart of the machine."""
+    host.kill_supervisor(client)
+    for pid in pids:
+        os.kill(pid, signal.SIGKILL)
+        wait_gone(pid)
+    rewrite(host, boot="another")
 
 
 def rewrite(host, **header) -> None:

@@ -70,7 +70,11 @@ def test_every_word_is_read(file):
     [
         ("command: sleep '1 0'", "command", ("sleep", "1 0")),
         ("command: [sleep, 10]", "command", ("sleep", "10")),
-        ("command: x, restart: always", "restart", RestartPolicy("always")),
+        ("command: x", "restart", RestartPolicy("on-failure")),
+        ("command: x, restart: {delay: 3s}", "restart", RestartPolicy("on-failure", delay=3.0)),
+        ("command: x, kind: job", "restart", RestartPolicy("never")),
+        ("command: x, kind: job, restart: always", "restart", RestartPolicy("always")),
+        ("command: x, restart: never", "restart", RestartPolicy("never")),
         ("command: x, migration: relaunch", "migration", MigrationPolicy("relaunch")),
         ("command: x, migration: null", "migration", MigrationPolicy()),
         ("command: x, readiness: running", "readiness", Readiness("running")),

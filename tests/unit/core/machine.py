@@ -342,6 +342,11 @@ class Machine:
             for instance, program in self.programs.items()
         ]
 
+    def stop_unheard(self, now: float) -> None:
+        """The slave is stopped while no master hears it: it ends all that it runs."""
+        for instance in list(self.programs):
+            self._end(instance, InstanceState.WITHDRAWN, now, signal=2)
+
     def restart_slave(self, now: float) -> None:
         """The slave is killed and comes up again; what runs, runs on."""
         self.incarnation += 1000

@@ -137,6 +137,8 @@ def test_a_second_live_slave_of_a_name_is_refused() -> None:
     reply = cluster.ask(happened.HostRegistered, second, ())
     assert (reply.accepted, reply.code) == (False, "name_taken")
     assert "pid 7 on a.local" in reply.message
+    cluster.ask(happened.HostRegistered, second, ())  # it asks again for a moment
+    assert len(cluster.told("host_refused")) == 1
     cluster.submit(process("p"))
     assert cluster.where("p") == ["a"]
 

@@ -152,6 +152,29 @@ def test_a_policy_that_raises_or_makes_no_sense_is_named(answer):
     assert all(order.keep_on == () for order in cluster.orders("keep")[told:])
 
 
+@pytest.mark.parametrize("answer", [None, ValueError("no idea"), TimeoutError("late")])
+def test_copies_stay_after_a_start_of_the_master_until_the_policy_answers(answer):
+    """The state is shipped to the hosts that report a copy, and no copy is deleted."""
+    policy = Asked("b", "c")
+    cluster = running(policy, "a", "b", "c")
+    number, host = cluster["p"].owner, where(cluster)
+    one, two = others(cluster)
+    policy.answer = answer
+    cluster.kill_master()
+    cluster.state.keeping.policy, cluster.state.keeping.policy_name = policy, "asked"
+    register(cluster, host, ("p", number, 9))
+    register(cluster, one, ("p", number, 8))
+    cluster.wait(3.0)
+    register(cluster, two, ("p", number, 7))  # later, and with an older state
+    cluster.wait(5.0)
+    assert not cluster.orders("drop_kept")
+    assert cluster.orders("keep")[-1].keep_on == (one, two)
+    policy.answer = CheckpointChoice((one,))
+    cluster.wait(3.0)
+    (dropped, *_) = cluster.orders("drop_kept")
+    assert dropped.host_id == cluster.machines[two].host_id
+
+
 def test_a_choice_of_the_processs_own_host_is_refused():
     policy = Asked()
     cluster = running(policy, "a", "b")

@@ -46,6 +46,19 @@ def test_the_largest_relief_leaves_a_host_that_is_over_its_limit() -> None:
     assert cluster.explain("large")["decision"]["kind"] == "migrated"
 
 
+def test_a_reading_that_crosses_the_limit_each_second_is_recorded_once() -> None:
+    """The end is on record when the host has been under its limits for the hysteresis."""
+    cluster = cluster_of(machine("a"))
+    for _ in range(10):
+        for memory in (0.9, 0.3):
+            cluster.machines["a"].busy["memory"] = memory
+            cluster.wait(1.0)
+    assert cluster.told("over_limit") == ["a reached its limit of memory"]
+    assert cluster.told("under_limit") == []
+    cluster.wait(1.5)
+    assert cluster.told("under_limit") == ["a is under its limits"]
+
+
 def test_it_must_relieve_the_resource_that_is_over() -> None:
     """A process that uses no CPU does not leave a host whose CPU is over."""
     cluster = cluster_of(machine("a"))
@@ -105,6 +118,7 @@ def test_a_host_that_is_over_for_a_moment_only_is_left_alone() -> None:
         cluster.machines["a"].busy["memory"] = 0.1
         cluster.wait(0.5)
     assert cluster.where("p") == ["a"]
+    cluster.wait(2.0)
     assert cluster.told("under_limit")
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from rosrm.core import events as happened
-from rosrm.core.model import InstanceId, InstanceState, InstanceStatus
+from rosrm.core import listing
+from rosrm.core.model import InstanceId, InstanceState, InstanceStatus, RestartPolicy
 from tests.unit.core.cluster import MIB, Cluster, Machine, job, movable, process
 
 
@@ -48,6 +49,66 @@ def test_what_ended_meanwhile_is_heard_of() -> None:
     cluster.machines["a"].finish("bad", cluster.now, code=4)
     cluster.restart_master()
     assert (cluster.phase("good"), cluster.phase("bad")) == ("finished", "failed")
+
+
+@pytest.mark.parametrize("spec", [process("p"), job("p"), movable("p")], ids=lambda one: one.kind)
+def test_what_a_slave_ended_while_the_master_was_away_is_queued_again(spec) -> None:
+    """The slave was stopped by Ctrl-C: its processes were asked for, and did not fail."""
+    cluster = Cluster("a")
+    cluster.submit(spec)
+    machine = cluster.machines["a"]
+    cluster.kill_master()
+    machine.stop_unheard(cluster.now)
+    machine.restart_slave(cluster.now)
+    cluster.register(machine)
+    cluster.wait(1.0)
+    assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
+    assert cluster.told("queued") == ["p returns to the queue: it was ended on a"]
+
+
+def test_a_process_that_was_cancelled_before_its_slave_ended_it_stays_cancelled() -> None:
+    """The cancel is on record, and had not reached the slave."""
+    cluster = Cluster("a")
+    cluster.submit(process("p"))
+    cluster.journal(cluster.decide(happened.CancelRequested(9, ("p",))))
+    cluster.kill_master()
+    machine = cluster.machines["a"]
+    machine.stop_unheard(cluster.now)
+    machine.restart_slave(cluster.now)
+    cluster.register(machine)
+    assert cluster.phase("p") == "cancelled"
+
+
+def test_since_when_and_where_outlive_the_master() -> None:
+    """The start of the phase and the host of what runs, of what waits and of what has ended."""
+    cluster = Cluster("a")
+    cluster.submit(process("runs"), process("waits", memory=1e6), job("ends"))
+    cluster.machines["a"].finish("ends", cluster.now, code=4)
+    cluster.wait(60.0, tick=1.0)
+    before = {row.name: row for row in listing.process_rows(cluster.state, cluster.now)}
+    assert (before["ends"].host, before["ends"].exit_code) == ("a", 4)
+    assert before["runs"].exit_code is None
+    cluster.kill_master()
+    unseen = listing.process_row(cluster.state, cluster["runs"], cluster.now)
+    assert (unseen.state, unseen.since) == ("unreachable", 0.0)
+    cluster.restart_master()  # killed once more, before any slave registered
+    after = {row.name: row for row in listing.process_rows(cluster.state, cluster.now)}
+    for name, row in after.items():
+        told = (row.state, row.host, row.exit_code)
+        assert told == (before[name].state, before[name].host, before[name].exit_code)
+        assert row.since == pytest.approx(before[name].since) == pytest.approx(60.0, abs=1.0)
+
+
+def test_one_that_was_started_again_out_of_sight_runs_since_then() -> None:
+    """Its slave restarted it while the master was away."""
+    cluster = Cluster("a")
+    cluster.submit(process("p", restart=RestartPolicy("always")))
+    cluster.wait(60.0, tick=1.0)
+    cluster.kill_master()
+    cluster.machines["a"].finish("p", cluster.now)
+    cluster.restart_master()
+    assert cluster.phase("p") == "running"
+    assert listing.process_row(cluster.state, cluster["p"], cluster.now).since < 1.0
 
 
 def test_an_assignment_that_was_not_delivered_is_given_again() -> None:

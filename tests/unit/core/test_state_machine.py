@@ -523,6 +523,8 @@ class Play(RuleBasedStateMachine):
                 "killed",
                 "killed",
                 "leaves",
+                "leaves unheard",
+                "loses power",
                 "loses a poll",
                 "full",
                 "over",
@@ -543,6 +545,13 @@ class Play(RuleBasedStateMachine):
             self.ask(happened.HostLeft, machine.host_id, machine.incarnation)
             for instance in list(machine.programs):
                 machine.tell(slave.StopOrdered(instance), self.cluster.now)
+        elif what in ("leaves unheard", "loses power"):
+            if what == "leaves unheard":
+                machine.stop_unheard(self.cluster.now)
+            else:
+                self.lose_power(machine)
+            machine.restart_slave(self.cluster.now)
+            self.register(machine)
         elif what == "another supervisor":
             machine.replace_supervisor(self.cluster.now)
         elif what == "loses a poll":
@@ -550,6 +559,13 @@ class Play(RuleBasedStateMachine):
         elif what in ("full", "over", "empty"):
             machine.busy["memory"] = {"full": 0.75, "over": 0.85, "empty": 0.1}[what]
         self.flow()
+
+    def lose_power(self, machine: Machine) -> None:
+        """All that runs there has failed, and what its policy starts again runs when it is back."""
+        for instance in list(machine.programs):
+            if machine.programs[instance].restart.when == "never":
+                self.failed.add(instance.process)
+            machine.finish(instance.process, self.cluster.now, code=-1)
 
     @rule()
     def all_is_well(self) -> None:

@@ -25,13 +25,14 @@ class Tree:
         self.path = path
         cpus = "".join(f"cpu{n} 0 0 0 0\n" for n in range(cores))
         (path / "stat").write_text(f"cpu 0 0 0 0\n{cpus}")
+        self.put("self", 1, own=0.0, started=1000)
 
-    def put(self, pid, session, own, children=0.0, pages=0):
+    def put(self, pid, session, own, children=0.0, pages=0, started=2000):
         folder = self.path / str(pid)
         folder.mkdir(exist_ok=True)
         ticks = f"{round(own * TICKS)} 0 {round(children * TICKS)} 0"
         (folder / "stat").write_text(
-            f"{pid} (a) b) S 1 {pid} {session} 0 -1 0 0 0 0 0 {ticks} 20\n"
+            f"{pid} (a) b) S 1 {pid} {session} 0 -1 0 0 0 0 0 {ticks} 20 0 1 0 {started} 0 0\n"
         )
         (folder / "statm").write_text(f"9999 {pages} 10 1 0 50 0\n")
 
@@ -109,10 +110,22 @@ def test_cpu_of_processes_too_short_to_be_seen_counts(tree):
 def test_cpu_of_a_process_taken_over_is_no_burst(tree):
     """An hour of an earlier slave's process is not load of this moment."""
     gauge = Gauge(tree)
+    tree.put(10, 10, own=3600.0, started=999)
+    gauge.sessions.members = (10,)
+    assert gauge.after() == 0.0
+    tree.put(10, 10, own=3600.1, started=999)
+    assert gauge.after() == pytest.approx(0.1 / 0.2 / 2)
+    tree.end(10)
+    gauge.sessions.members, gauge.sessions.ended = (), 3600.1
+    assert gauge.after() == pytest.approx(0.1 / 0.3 / 2)
+
+
+def test_cpu_of_a_process_that_is_found_late_is_bounded(tree):
+    """A session that began and was not seen for long counts as what four cores can do by then."""
+    gauge = Gauge(tree)
     tree.put(10, 10, own=3600.0)
     gauge.sessions.members = (10,)
-    usage = gauge.after(0.1)
-    assert usage <= 4 * 1.2 / 0.1 / 2  # what four cores can do in the second before
+    assert 0.0 < gauge.after(0.1) <= 4 * 1.2 / 0.1 / 2
     for _ in range(15):
         usage = gauge.after()
     assert usage == pytest.approx(0.0)

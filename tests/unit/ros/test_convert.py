@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -185,9 +187,8 @@ def test_rows_survive() -> None:
     )
     plugin = PluginRow("probe", "gpu", "rosrm-resources 0.1", "absent", "no driver", "h")
     event = EventRow(2**40, 1.7e9, 12.5, "assigned", "a", "h", "a goes to h", {"n": [1, {"x": 2}]})
-    assert (
-        convert.process_row_from_msg(over_the_wire(convert.process_row_to_msg(process))) == process
-    )
+    for row in (process, replace(process, exit_code=None), replace(process, exit_code=0)):
+        assert convert.process_row_from_msg(over_the_wire(convert.process_row_to_msg(row))) == row
     assert convert.plugin_row_from_msg(over_the_wire(convert.plugin_row_to_msg(plugin))) == plugin
     assert convert.event_from_msg(over_the_wire(convert.event_to_msg(event))) == event
 

@@ -43,15 +43,48 @@ def heard(links: HostLinks, beat: int, sequence: int) -> None:
     links.heard([HOST])
 
 
-def test_an_order_to_a_slave_that_registers_again_waits_for_a_new_beat(monkeypatch):
-    """It was cut off: what it said before is old by now, and an order with that would be stale."""
-    node = SimpleNamespace(create_client=lambda *arguments, **named: None)
+class Control:
+    """Stands for the client of the slave's service."""
+
+    ready = True
+
+    def service_is_ready(self) -> bool:
+        return self.ready
+
+
+@pytest.fixture
+def control() -> Control:
+    return Control()
+
+
+@pytest.fixture
+def links(monkeypatch, control) -> HostLinks:
+    node = SimpleNamespace(create_client=lambda *arguments, **named: control)
     participant = SimpleNamespace(node=node, settings=SimpleNamespace(namespace="/rosrm"))
     links = HostLinks(participant, "master test", 1, 5.0, lambda event: None)
-    client = links._client = FakeClient()
+    links._client = FakeClient()
     monkeypatch.setattr(
         "rosrm.ros.host_links._order_request", lambda command: SimpleNamespace(envelope=None)
     )
+    return links
+
+
+def test_an_order_waits_until_dds_has_told_of_the_slaves_service(links, control):
+    """Sent before, it would be lost, and given again only after `control.order_retry`."""
+    control.ready = False
+    links.renew(HOST, DESCRIPTION)
+    heard(links, beat=100, sequence=1)
+    links.order(Order(1, HOST, "report"), now=0.0)
+    heard(links, beat=200, sequence=2)
+    assert links._client.beats == []
+    control.ready = True
+    heard(links, beat=300, sequence=3)
+    assert links._client.beats == [300]
+
+
+def test_an_order_to_a_slave_that_registers_again_waits_for_a_new_beat(links):
+    """It was cut off: what it said before is old by now, and an order with that would be stale."""
+    client = links._client
     links.renew(HOST, DESCRIPTION)
     heard(links, beat=100, sequence=1)
     links.renew(HOST, DESCRIPTION)

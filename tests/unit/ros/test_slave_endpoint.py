@@ -326,6 +326,36 @@ def test_a_request_for_work_that_was_lost_is_soon_repeated(slave) -> None:
     assert len(slave.sent(srv.RequestProcess)) == before + 1
 
 
+def test_work_that_crosses_with_the_next_request_is_taken(slave) -> None:
+    """The master answered the former request at the moment in which the slave renewed it."""
+    master = Master(slave, 11)
+    slave.join(master)
+    slave.pass_time(1.4, master)
+    first, second = slave.sent(srv.RequestProcess)
+    answer = msg.Answer(protocol_version=PROTOCOL_VERSION, accepted=True)
+    first.answer(srv.RequestProcess.Response(answer=answer))
+    assert core.AssignmentsReceived((), None) in slave.host.events
+    slave.pass_time(PERIOD, master)
+    assert len(slave.sent(srv.RequestProcess)) == 3  # of which the master keeps the newest open
+    slave.pass_time(5.0, master)
+    second.answer(srv.RequestProcess.Response(answer=answer))  # given up by then
+    assert slave.host.events.count(core.AssignmentsReceived((), None)) == 1
+
+
+def test_a_name_that_is_taken_is_said_at_once(slave) -> None:
+    """The slave asks again for a moment, and tells the user so once."""
+    ours = Master(slave, 11)
+    answer = msg.Answer(protocol_version=PROTOCOL_VERSION, code="name_taken", message="a live one")
+    for _ in range(3):
+        slave.pass_time(PERIOD)
+        ours.beat()
+        ours.greet()
+        slave.newest(srv.RegisterHost).answer(srv.RegisterHost.Response(answer=answer))
+    (said,) = slave.host.said
+    assert said.startswith("a live one. Asking again for 5 s")
+    assert slave.endpoint.failure == ""
+
+
 # --- what is remembered of the master's journal ------------------------------------------------
 
 

@@ -75,5 +75,13 @@ def test_a_session_is_followed_from_its_start_to_its_end(table) -> None:
 
 def test_one_that_was_never_seen_running_counts_too(table) -> None:
     """It ended before anybody looked."""
-    UsageWatch(table).follow(told(InstanceState.FAILED, 40, cpu_time=0.1))
+    watch = UsageWatch(table)
+    watch.follow(told(InstanceState.STARTING))
+    watch.follow(told(InstanceState.FAILED, 40, cpu_time=0.1))
     assert table.removed == [(40, 0.1)]
+
+
+def test_one_that_ended_before_this_slave_started_does_not_count(table) -> None:
+    """Its hours of CPU time are no load of the moment in which its end is found on record."""
+    UsageWatch(table).follow(told(InstanceState.EXITED, cpu_time=3600.0))
+    assert table.removed == []

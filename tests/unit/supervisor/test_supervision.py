@@ -421,6 +421,27 @@ def test_shutdown_leaves_when_all_have_ended():
     assert kinds(core.handle(sv.Exited(TALKER, signal=2), 2.0)) == ["Tell", "Leave"]
 
 
+@pytest.mark.parametrize("before", [None, sv.Exited(TALKER, 1), sv.RestartOrdered(TALKER)])
+def test_what_a_shutdown_ends_is_withdrawn(before):
+    """Neither the process nor an order has ended it, whatever its exit code says."""
+    core, instance = started(restart=sv.RestartRule("on-failure"))
+    if before is not None:
+        core.handle(before, 0.5)
+    core.handle(sv.ShutdownOrdered(), 1.0)
+    core.handle(sv.ShutdownOrdered(), 1.5)  # the slave repeats it to the next supervisor
+    core.handle(sv.Exited(TALKER, 0), 2.0)
+    assert instance.phase == sv.WITHDRAWN
+
+
+def test_what_was_ordered_to_stop_before_a_shutdown_is_not_withdrawn():
+    """The order that came first counts: its master does not want it back."""
+    core, instance = started()
+    core.handle(sv.StopOrdered(TALKER), 1.0)
+    core.handle(sv.ShutdownOrdered(), 1.5)
+    core.handle(sv.Exited(TALKER, signal=2), 2.0)
+    assert instance.phase == sv.EXITED
+
+
 def test_a_lost_client_changes_nothing():
     """The processes of a slave that died keep running."""
     core, instance = started()
