@@ -1,4 +1,7 @@
-"""What can happen to the master, in the past tense. Readings arrive as one batch."""
+"""What can happen to the master, in the past tense. Readings arrive as one batch.
+
+`by` of a request is the name of the client that sent it; "": unknown.
+"""
 
 from __future__ import annotations
 
@@ -106,6 +109,7 @@ class SubmissionReceived:
 
     request: int
     specs: tuple[ProcessSpec, ...]
+    by: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,6 +118,7 @@ class CancelRequested:
 
     request: int
     names: tuple[str, ...]
+    by: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,6 +127,7 @@ class RestartRequested:
 
     request: int
     names: tuple[str, ...]
+    by: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,6 +137,7 @@ class MigrationRequested:
     request: int
     name: str
     host: str | None = None
+    by: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,6 +146,7 @@ class CheckpointRequested:
 
     request: int
     name: str
+    by: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,6 +155,7 @@ class RestoreRequested:
 
     request: int
     name: str
+    by: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,6 +165,22 @@ class HostStateRequested:
     request: int
     host: str
     action: str
+    by: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class PruneRequested:
+    """A client removes ended processes and departed hosts from the listings.
+
+    Attributes:
+        names: of processes.
+        hosts: their names; with no names either: all that ended, and all hosts that left.
+    """
+
+    request: int
+    names: tuple[str, ...] = ()
+    hosts: tuple[str, ...] = ()
+    by: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,6 +248,7 @@ Event = (
     | CheckpointRequested
     | RestoreRequested
     | HostStateRequested
+    | PruneRequested
     | OrderAnswered
     | AssignmentWithdrawn
     | HandoffReported

@@ -305,6 +305,11 @@ class Play(RuleBasedStateMachine):
         self.ask(happened.MigrationRequested, self.pick(self.movable(), which), host)
         self.flow()
 
+    @rule()
+    def prune(self) -> None:
+        self.ask(happened.PruneRequested)
+        self.flow()
+
     @rule(host=hosts, action=st.sampled_from(["cordon", "uncordon", "uncordon", "drain"]))
     def set_host(self, host: str, action: str) -> None:
         self.ask(happened.HostStateRequested, host, action)
