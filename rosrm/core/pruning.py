@@ -25,10 +25,12 @@ def prune_requested(state: MasterState, event: happened.PruneRequested, now: flo
     else:
         ended = [state.processes[name] for name in state.over]
         processes = [process for process in ended if not _why_kept(state, process)]
-        hosts = [
-            host for host in state.hosts.listed()
-            if state.hosts.condition_of(host) is HostCondition.LEFT and not (host.instances or _why_held(state, host))
-        ]  # fmt: skip
+        left = [
+            host
+            for host in state.hosts.listed()
+            if state.hosts.condition_of(host) is HostCondition.LEFT and not host.instances
+        ]
+        hosts = [host for host in left if not _why_held(state, host)]
     for process in processes:
         state.remove_process(process.name)
     for host in hosts:

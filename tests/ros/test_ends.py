@@ -1,4 +1,4 @@
-"""Ctrl-C, SIGTERM, a second master, a second slave: everybody ends in good order and says why."""
+"""Ctrl-C, SIGTERM, SIGHUP, second masters and slaves: every part ends cleanly and says why."""
 
 from __future__ import annotations
 
@@ -27,13 +27,16 @@ from tests.ros.clusters import (
     wait_until_none,
 )
 
+#: A user ends a part by Ctrl-C, by `kill`, or by closing its terminal.
+STOPS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
+
 
 def end(part, number) -> int:
     part.process.send_signal(number)
     return part.process.wait(PATIENCE)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", STOPS)
 def test_a_slave_that_is_stopped_stops_its_processes(make_cluster, number) -> None:
     """Exit code 0, no traceback, no process left; what it ran is queued for another host."""
     cluster = make_cluster(host("h0"))
@@ -45,7 +48,10 @@ def test_a_slave_that_is_stopped_stops_its_processes(make_cluster, number) -> No
 
     assert not [pid for pid in pids if alive(pid)]
     assert wait_until_none(cluster.directory / "hosts") == {}
-    assert "Traceback" not in cluster.log_of("h0")
+    log = cluster.log_of("h0")
+    assert "Traceback" not in log
+    assert f"stopping 4 processes ({number.name})" in log
+    assert "slave of h0 ended; 4 processes were stopped" in log
     view = cluster.wait_until(
         "all queued", lambda v: all(row.state == "queued" for row in v.processes)
     )
@@ -55,7 +61,7 @@ def test_a_slave_that_is_stopped_stops_its_processes(make_cluster, number) -> No
     assert cluster.wait("p3", "running").host == "h0"
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", STOPS)
 def test_a_master_that_is_stopped_touches_no_process(make_cluster, number) -> None:
     """Exit code 0, no traceback; started again it goes on with the same processes."""
     cluster = make_cluster(host("h0"))
@@ -63,7 +69,9 @@ def test_a_master_that_is_stopped_touches_no_process(make_cluster, number) -> No
     before = cluster.wait("p", "running")
 
     assert end(cluster.master, number) == 0
-    assert "Traceback" not in cluster.log_of("master")
+    log = cluster.log_of("master")
+    assert "Traceback" not in log
+    assert f"ended ({number.name}); 1 process keeps running; start the master again" in log
     assert alive(before.pid)
 
     cluster.reconnect()
@@ -83,6 +91,9 @@ def test_keep_leaves_the_processes_running(make_cluster) -> None:
 
     assert end(cluster.slaves["h0"], signal.SIGINT) == 0
     assert alive(before.pid)
+    log = cluster.log_of("h0")
+    assert "slave of h0 ended (SIGINT); 2 processes keep running (supervisor pid " in log
+    assert "`rosrm slave --stop-all`" in log
     go.touch()  # it ends while no slave is there
 
     cluster.start_slave(host("h0"))
@@ -270,6 +281,9 @@ def test_a_slave_that_is_killed(make_cluster) -> None:
 
     end(cluster.slaves["h0"], signal.SIGKILL)
     assert alive(before.pid)
+    log = cluster.log_of("h0")
+    assert "slave of h0 ended (SIGINT); 2 processes keep running (supervisor pid " in log
+    assert "`rosrm slave --stop-all`" in log
     go.touch()
     cluster.start_slave(host("h0"))
     row = cluster.ended("ends")
