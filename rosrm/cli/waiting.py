@@ -51,7 +51,7 @@ def longest(text: str) -> float:
 
 @contextmanager
 def interruptible(what_follows: str) -> Iterator[None]:
-    """Within, a Ctrl-C ends the waiting alone, and the user is told so."""
+    """Within, a Ctrl-C ends the waiting alone; a message to the user has what follows."""
     try:
         yield
     except KeyboardInterrupt:
@@ -63,21 +63,21 @@ def interruptible(what_follows: str) -> Iterator[None]:
 
 
 def settled(row: ProcessRow) -> str:
-    """A job has ended, a service runs."""
+    """Judge by the end of a job and by the running of a service."""
     if row.state in _UNTIL_ASKED:
         return "failed"
-    if row.state == "finished":  # a service that ends by itself is not started again
+    if row.state == "finished":  # a service that has finished is not started again
         return "done" if row.kind == "job" else "failed"
     return "done" if row.kind != "job" and row.state == "running" else "awaited"
 
 
 def over(row: ProcessRow) -> str:
-    """It has ended, however."""
+    """Judge by the end of a process, whatever its cause."""
     return "done" if row.state in _OVER else "awaited"
 
 
 def restarted(before: Mapping[str, Identity]) -> Judge:
-    """It runs, or has finished, in another run than `before` (of what had not ended then)."""
+    """Judge by another run than `before`, which holds the processes that had not ended then."""
 
     def judge(row: ProcessRow) -> str:
         if before.get(row.name) == identity(row) and row.state not in _UNTIL_ASKED | _OVER:
@@ -88,7 +88,7 @@ def restarted(before: Mapping[str, Identity]) -> Judge:
 
 
 def identity(row: ProcessRow) -> Identity:
-    """What differs between two runs of a process."""
+    """Return the values that differ between two runs of a process."""
     return row.number, row.pid, row.restarts
 
 
@@ -177,7 +177,7 @@ def wait_until_drained(client: MasterClient, host: str, since: int, longest: flo
         time.sleep(PERIOD)
 
 
-# --- what is said -----------------------------------------------------------------------------
+# --- messages ---------------------------------------------------------------------------------
 
 
 def _say_news(rows: Iterable[ProcessRow], said: dict[str, str]) -> None:
@@ -199,8 +199,8 @@ def _say_end(
     ended = [row for row in failed if row.state == "finished"]
     if ended:
         typer.echo(
-            f"rosrm: not running, as a service does: {_named(ended)}; what is to end by itself is "
-            f"a `kind: job`",
+            f"rosrm: not running, as a service does: {_named(ended)}; a program that is to end "
+            f"is a `kind: job`",
             err=True,
         )
     if awaited and stays:

@@ -98,7 +98,7 @@ def why_immovable(state: MasterState, process: Process) -> str:
 
 
 def why_never_movable(state: MasterState, process: Process) -> str:
-    """Why a process cannot be moved in any phase; "" if it can."""
+    """Return why a process cannot be moved in any phase; "" if it can."""
     strategy = process.spec.migration.strategy
     if strategy is None:
         return f"{process.name} has no migration strategy; give it `migration:` in its file"

@@ -288,7 +288,7 @@ class HostTable(HostColumns):
         )  # fmt: skip
 
     def why_unreachable(self, host: Host) -> str:
-        """Why a host cannot be reached, without its name; "" if it can."""
+        """Return why a host cannot be reached, without its name; "" if it can."""
         return _UNREACHABLE.get(self.condition_of(host), "")
 
     def why_away(self, column: int) -> str:

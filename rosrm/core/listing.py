@@ -77,7 +77,7 @@ def process_row(state: MasterState, process: Process, now: float) -> ProcessRow:
 
 
 def _silence(state: MasterState, owner: Instance | None, now: float) -> str:
-    """Why what is known of an instance is old; "" where its host is heard."""
+    """Return why readings of an instance are old; "" where its host reports."""
     if owner is None or state.hosts.condition_of(owner.host) in _HEARD:
         return ""
     age = now - float(state.hosts.heard[owner.host.column])

@@ -64,7 +64,7 @@ def _named(
 
 
 def _why_kept(state: MasterState, process: Process) -> str:
-    """Why a process cannot be removed; "" if it can."""
+    """Return why a process cannot be removed; "" if it can."""
     if not process.phase.over:
         return f"{process.name} is {process.phase.value}; cancel it first"
     if process.instances:
@@ -74,7 +74,7 @@ def _why_kept(state: MasterState, process: Process) -> str:
 
 
 def _why_held(state: MasterState, host: Host) -> str:
-    """Why a host cannot be removed; "" if it can."""
+    """Return why a host cannot be removed; "" if it can."""
     if state.hosts.condition_of(host) in _PRESENT:
         return f"{host.name} is up; stop its slave first"
     for number in sorted(host.instances):

@@ -182,7 +182,7 @@ def _leaving(state: MasterState, host: Host) -> list[str]:
 
 
 def _staying(state: MasterState, host: Host) -> list[str]:
-    """Why the processes that cannot leave a host cannot."""
+    """Return the reason of each process that cannot leave a host."""
     leaving = set(_leaving(state, host))
     held = sorted({state.instances[number].id.process for number in host.instances} - leaving)
     return [

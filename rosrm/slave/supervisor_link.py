@@ -76,7 +76,7 @@ class SupervisorLink:
 
     @property
     def pid(self) -> int:
-        """Of the supervisor."""
+        """Pid of the supervisor."""
         return self._client.pid
 
     # --- what it is told -----------------------------------------------------------------

@@ -17,8 +17,8 @@ def left(tmp_path):
     (tmp_path / "supervisor").mkdir()
     host = Host(tmp_path / "supervisor")
     client = host.connect()
-    client.start([host.order(name, "sleep", "600") for name in ("a", "b")])
     for name in ("a", "b"):
+        client.start([host.order(name, "sleep", "600")])
         host.running(client, name)
     client.close()
     yield host
@@ -26,7 +26,7 @@ def left(tmp_path):
 
 
 def test_all_processes_and_their_supervisor_end(left, tmp_path) -> None:
-    """The user is told how many were stopped."""
+    """The message has the number of processes."""
     assert stop_all(tmp_path) == "2 processes stopped; the supervisor has ended"
     assert left.alive() == []
     for pid in left.pids:
@@ -35,7 +35,7 @@ def test_all_processes_and_their_supervisor_end(left, tmp_path) -> None:
 
 
 def test_while_the_slave_runs_it_is_refused(left, tmp_path) -> None:
-    """That slave stops its processes when it is stopped."""
+    """Its own end stops the processes."""
     with (
         only_one(tmp_path, "slave", code="name_taken", remedy=""),
         pytest.raises(Refused, match="Stop it first"),

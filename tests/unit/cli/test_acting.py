@@ -116,7 +116,7 @@ def test_submit_wait_fails_with_the_reason_when_a_process_failed(rosrm, client, 
 
 
 def test_submit_wait_gives_up_after_its_time(rosrm, client, work, monkeypatch):
-    """It names what it waits for, and nothing that has ended."""
+    """The message names processes that have not ended, and no others."""
     monkeypatch.setattr("rosrm.cli.waiting.PERIOD", 0.01)
     client.processes = [process("a", "starting", kind="job"), process("b", "finished")]
     result = rosrm("submit", work, "--wait", "--timeout", "50ms")
@@ -186,7 +186,7 @@ def test_submit_takes_several_files_and_the_standard_input(rosrm, client, work, 
     ids=" ".join,
 )
 def test_cancel_takes_all_processes_or_those_of_a_file(rosrm, client, work, words, asked):
-    """Of those that have not ended: what a file names and nobody submitted is no mistake."""
+    """Processes of a file that have ended or were never submitted are left out."""
     client.processes = [process("a"), process("c", "queued"), process("d", "failed")]
     result = rosrm("cancel", *[work if word == "WORK" else word for word in words])
     assert (result.code, client.asked[-1]) == (0, ("cancel", asked))
@@ -218,7 +218,7 @@ def test_cancel_wait_ends_when_all_have_ended(rosrm, client, monkeypatch):
 
 
 def test_restart_wait_ends_when_each_runs_in_another_run(rosrm, client, monkeypatch):
-    """What had ended before runs again at all; a job may have finished meanwhile."""
+    """A process that had ended runs again at all; a job may have finished."""
     client.processes = [process("a"), process("b", "failed", pid=0), process("c", kind="job")]
     looks = iter(
         (
@@ -238,7 +238,7 @@ def test_restart_wait_ends_when_each_runs_in_another_run(rosrm, client, monkeypa
 
 @pytest.mark.parametrize(("left", "code"), [([], 0), ([process("driver")], 1)])
 def test_drain_wait_ends_when_the_host_is_drained(rosrm, client, monkeypatch, left, code):
-    """With 1 where a process has stayed there: whoever turns the host off ends it."""
+    """Exit code 1 where a process has stayed, because turning the host off would end it."""
     client.hosts, client.processes = [host("alpha", draining=True)], [process("talker")]
 
     def later(seconds):
