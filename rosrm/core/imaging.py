@@ -162,9 +162,10 @@ def _begin(
         state.charge_ranked(run.destination, host, now, ranking)
     state.set_phase(process, ProcessPhase.MIGRATING, now, run.course)
     state.record(
-        now, _BEGUN[aim], f"{process.name}: {run.course}", process=process.name, host=host.name,
+        now, _BEGUN[aim], f"{process.name}: {run.course}; {cause}", process=process.name,
+        host=host.name,
         facts={
-            "strategy": strategy, "steps": [title(step) for step in plan.steps],
+            "strategy": strategy, "cause": cause, "steps": [title(step) for step in plan.steps],
             "source": move.source.number, "destination": move.destination.number,
         },
     )  # fmt: skip

@@ -806,6 +806,23 @@ class Play(RuleBasedStateMachine):
             assert sum(node.active for node in active) <= 1, [str(one.instance) for one in active]
 
     @invariant()
+    def what_was_cancelled_runs_nowhere(self) -> None:
+        """In truth: `cancelled` is said of what has ended, unless a fence sees to its end."""
+        if not hasattr(self, "cluster"):
+            return
+        left = self.given_up()
+        for process in self.cluster.state.processes.values():
+            if process.phase is not ProcessPhase.CANCELLED or process.spec.host_loss.then != "wait":
+                continue
+            running = {
+                instance.number
+                for machine in self.cluster.machines.values()
+                for instance in machine.programs
+                if instance.process == process.name and instance.number >= process.born
+            }
+            assert running <= left | process.instances, process.name
+
+    @invariant()
     def the_newest_state_of_a_life_is_not_dropped(self) -> None:
         """What a process may go on from lies somewhere until it has finished or was cancelled."""
         if not hasattr(self, "cluster"):
