@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pty
 import signal
 import subprocess
 import sys
@@ -388,8 +389,9 @@ def test_a_lost_journal_of_a_master_that_is_back_at_once(make_cluster, epoch) ->
 # --- the shell --------------------------------------------------------------------------------
 
 
-def test_ctrl_c_in_a_terminal(make_cluster) -> None:
-    """A process group is interrupted, as a terminal does: the processes end with their slave."""
+@pytest.fixture
+def by_hand(make_cluster):
+    """A cluster without hosts, the state directory of a host t, and the command for its slave."""
     cluster = make_cluster()
     state = cluster.directory / "hosts" / "t"
     config = cluster.directory / "host.yaml"
@@ -398,10 +400,15 @@ def test_ctrl_c_in_a_terminal(make_cluster) -> None:
         "probes: {memory: {}, cpu: {}}\n"
         f"ros: {{domain: {cluster.domain}}}\n"
     )
+    return cluster, state, [sys.executable, "-m", "rosrm.cli", "slave", "--config", str(config)]
+
+
+def test_ctrl_c_in_a_terminal(by_hand) -> None:
+    """A process group is interrupted, as a terminal does: the processes end with their slave."""
+    cluster, state, command = by_hand
     log = cluster.directory / "terminal.log"
     with log.open("wb") as sink, subprocess.Popen(
-        [sys.executable, "-m", "rosrm.cli", "slave", "--config", str(config)],
-        stdin=subprocess.DEVNULL, stdout=sink, stderr=sink, start_new_session=True,
+        command, stdin=subprocess.DEVNULL, stdout=sink, stderr=sink, start_new_session=True,
     ) as slave:  # fmt: skip
         cluster.wait_until("host t", lambda v: any(row.accepting for row in v.hosts))
         cluster.submit(service("p"))
@@ -410,4 +417,24 @@ def test_ctrl_c_in_a_terminal(make_cluster) -> None:
         assert slave.wait(PATIENCE) == 0
     assert not alive(pid)
     assert "Traceback" not in Path(log).read_text()
+    assert wait_until_none(state) == {}
+
+
+def test_a_terminal_that_is_closed(by_hand) -> None:
+    """The slave gets SIGHUP, can write nowhere any more, and stops its processes all the same."""
+    cluster, state, command = by_hand
+    terminal, its_end = pty.openpty()
+    slave = subprocess.Popen(
+        ["setsid", "--ctty", *command], stdin=its_end, stdout=its_end, stderr=its_end
+    )
+    os.close(its_end)
+    try:
+        cluster.wait_until("host t", lambda v: any(row.accepting for row in v.hosts))
+        cluster.submit(service("p"))
+        pid = cluster.wait("p", "running").pid
+    finally:
+        os.close(terminal)
+        code = slave.wait(PATIENCE)
+    assert code == 0
+    assert not alive(pid)
     assert wait_until_none(state) == {}
