@@ -13,6 +13,7 @@ from rosrm.core.assigning import demand_to_move, ranking_of, unable
 from rosrm.core.begin import begin_move, moves_under_way, why_immovable, why_never_movable
 from rosrm.core.hosts import Host
 from rosrm.core.model import InstanceState
+from rosrm.core.placement import Demand, eligible
 from rosrm.core.state import Instance, MasterState, Process, Wanted
 from rosrm.core.verdicts import decide, verdict_of
 
@@ -169,26 +170,35 @@ def departures(state: MasterState, host: Host) -> str:
 
 def _leaving(state: MasterState, host: Host) -> list[str]:
     """Names of the processes of which an instance is on a host and will leave it or end."""
-    return sorted(
-        {
-            one.id.process
-            for one in (state.instances[number] for number in host.instances)
-            if (process := state.owned_by(one)) is None
-            or process.wanted is not Wanted.RUN
-            or process.name in state.runs
-            or not why_never_movable(state, process)
-        }
-    )
+    held = [state.instances[number] for number in host.instances]
+    return sorted({one.id.process for one in held if not _why_it_stays(state, one)})
 
 
 def _staying(state: MasterState, host: Host) -> list[str]:
     """Return the reason of each process that cannot leave a host."""
-    leaving = set(_leaving(state, host))
-    held = sorted({state.instances[number].id.process for number in host.instances} - leaving)
-    return [
-        *(why_never_movable(state, state.processes[name]) for name in held),
-        *_images_on(state, host),
-    ]
+    held = [state.instances[number] for number in sorted(host.instances)]
+    reasons = [reason for one in held if (reason := _why_it_stays(state, one))]
+    return reasons + _images_on(state, host)
+
+
+def _why_it_stays(state: MasterState, instance: Instance) -> str:
+    """Return why an instance can neither leave its host nor is about to end; "" if it can."""
+    process, source = state.owned_by(instance), instance.host
+    if process is None or process.wanted is not Wanted.RUN or process.name in state.runs:
+        return ""
+    reason = why_never_movable(state, process)
+    if reason:
+        return reason
+    demand = demand_to_move(state, process, _measured(instance), source.name, 0.0)
+    # What a strategy or a lost host lacks may change later; labels and resources do not.
+    lasting = {**process.excluded, source.name: "it is there"}
+    possible = eligible(
+        state.hosts, Demand(process.spec, demand.amounts, demand.estimated, lasting)
+    )
+    others = [host for host in state.hosts.listed() if host is not source]
+    if any(possible[host.column] or not state.hosts.incarnation[host.column] for host in others):
+        return ""
+    return f"no other host may take {process.name} (`rosrm explain {process.name}` says why)"
 
 
 def _listed(reasons: list[str]) -> str:
