@@ -719,7 +719,7 @@ class Play(RuleBasedStateMachine):
                 assert not moving
                 assert phase.over or not process.instances
             elif not moving:
-                waits_for_an_end = process.wanted is Wanted.REQUEUE and process.instances
+                waits_for_an_end = process.wanted is not Wanted.RUN and process.instances
                 assert process.owner in state.instances or waits_for_an_end, (name, phase)
         assert queued <= set(state.processes)
 
@@ -807,7 +807,7 @@ class Play(RuleBasedStateMachine):
 
     @invariant()
     def what_was_cancelled_runs_nowhere(self) -> None:
-        """In truth: `cancelled` is said of what has ended, unless a fence sees to its end."""
+        """In truth: a `cancelled` process has ended, unless a fence sees to its end."""
         if not hasattr(self, "cluster"):
             return
         left = self.given_up()
