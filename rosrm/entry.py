@@ -6,9 +6,20 @@ import logging
 import signal
 import sys
 from collections.abc import Callable
+from types import FrameType
 
 from rosrm.errors import RosrmError
 from rosrm.handover import Handover, take_over
+
+
+def handle_stop_signals(handler: Callable[[int, FrameType | None], None]) -> None:
+    """Have SIGINT, SIGTERM and SIGHUP (the terminal was closed) handled alike.
+
+    A SIGHUP that is ignored, as by `nohup`, stays ignored.
+    """
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
+            signal.signal(number, handler)
 
 
 def run(role: str, serve: Callable[[Handover], int]) -> int:

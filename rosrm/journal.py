@@ -186,10 +186,12 @@ class SqliteJournal:
         """The newest matching records after a sequence, oldest first."""
         where, values = ["sequence > ?"], [after]
         matched: list[Any] = list(values)
-        for column, value in (("process", process), ("host", host)):
-            if value:
-                where.append(f"{column} = ?")
-                matched.append(value)
+        if process:
+            where.append("process = ?")
+            matched.append(process)
+        if host:  # or a move from there, by the text of the facts: damaged facts are no JSON
+            where.append("(host = ? OR instr(facts, ?))")
+            matched += [host, f'"from": {json.dumps(host)}']
         rows = self._guarded(
             lambda: self._database.execute(
                 f"SELECT * FROM record WHERE {' AND '.join(where)} "  # noqa: S608 - fixed words

@@ -427,7 +427,10 @@ class Journal(Protocol):
     def records(
         self, *, after: int = 0, process: str = "", host: str = "", newest: int = 1000
     ) -> Sequence[StoredRecord]:
-        """The newest matching records after a sequence, oldest first."""
+        """The newest matching records after a sequence, oldest first.
+
+        Those of a host include moves from it: their facts name the host as `from`.
+        """
 
     def close(self) -> None:
         """Flush and release the files."""

@@ -12,3 +12,8 @@ def get_close_matches(
     import difflib  # noqa: PLC0415 - the runtimes, whose memory is budgeted, seldom need it
 
     return difflib.get_close_matches(word, list(possibilities), n=n, cutoff=cutoff)
+
+
+def counted(number: int, singular: str, plural: str = "") -> str:
+    """Return a number with its noun: "1 process", "2 processes"; `plural` if "s" is not enough."""
+    return f"{number} {singular if number == 1 else plural or singular + 's'}"

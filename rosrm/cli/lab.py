@@ -216,7 +216,7 @@ def status(
     if as_json:
         json_forms.show([asdict(row) for row in rows])
     elif rows:
-        tables.console().print(_table(rows))
+        tables.show(_table(rows))
     else:
         typer.echo("no lab; `rosrm lab up` makes one")
 

@@ -17,7 +17,7 @@ def status(ctx: typer.Context, as_json: AsJson = False, domain: Domain = None) -
     """Show the cluster on half a page."""
     from rosrm.cli import json_forms
     from rosrm.cli import status as overview
-    from rosrm.cli.tables import console
+    from rosrm.cli.tables import show
 
     with connection.master(ctx, domain) as client:
         snapshot = client.list(hosts=True, processes=True, plugins=True, events=True, newest=5)
@@ -25,7 +25,7 @@ def status(ctx: typer.Context, as_json: AsJson = False, domain: Domain = None) -
     if as_json:
         json_forms.show(json_forms.status_form(snapshot))
     else:
-        console().print(overview.render(snapshot))
+        show(overview.render(snapshot))
 
 
 def ps(
@@ -51,7 +51,7 @@ def ps(
         return
     listed = [row for row in shown if everything or row.state not in ("finished", "cancelled")]
     if listed:
-        tables.console().print(tables.processes(listed))
+        tables.show(tables.processes(listed))
     if len(listed) < len(shown):
         typer.echo(f"{len(shown) - len(listed)} finished or cancelled (--all shows them)")
     elif not listed:
@@ -72,7 +72,7 @@ def hosts(ctx: typer.Context, as_json: AsJson = False, domain: Domain = None) ->
     if as_json:
         json_forms.show(json_forms.forms(rows))
     elif rows:
-        tables.console().print(tables.hosts(rows))
+        tables.show(tables.hosts(rows))
     else:
         typer.echo("no host; start `rosrm slave` on each")
 
@@ -101,7 +101,7 @@ def plugins(
     if as_json:
         json_forms.show(json_forms.forms(rows))
     elif rows:
-        tables.console().print(tables.plugins(rows))
+        tables.show(tables.plugins(rows))
     else:
         typer.echo("no plugin is installed; rosrm's own are in rosrm-scoring and its siblings")
 
@@ -118,7 +118,7 @@ def explain(ctx: typer.Context, name: Name, as_json: AsJson = False, domain: Dom
     if as_json:
         json_forms.show(dict(story))
     else:
-        tables.console().print(explaining.render(story))
+        tables.show(explaining.render(story))
 
 
 COMMANDS: Final = (status, ps, hosts, plugins, explain)

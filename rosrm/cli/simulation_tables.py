@@ -26,14 +26,14 @@ def show(report: Report) -> None:
     """Print what came of it."""
     if report.recording is not None and report.replayed is not None:
         _say_of_record(report, report.replayed)
-    console = tables.console()
-    halves = (_PROCESSES + _HOSTS,) if console.width >= _WIDE else (_PROCESSES, _HOSTS)
+    is_wide = tables.console().width >= _WIDE
+    halves = (_PROCESSES + _HOSTS,) if is_wide else (_PROCESSES, _HOSTS)
     for columns in halves:
         made = tables.table("RUN", *columns, right=columns)
         for run in report.runs:
             cells = _cells(run)
             made.add_row(Text(run.name), *(cells[column] for column in columns))
-        console.print(made)
+        tables.show(made)
     for run in report.runs:
         never = list(run.outcome.never_placed.items())
         if never:

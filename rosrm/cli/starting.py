@@ -62,17 +62,30 @@ def slave(
         Path | None,
         typer.Option("--config", metavar="FILE", help="host.yaml; without it, the defaults."),
     ] = None,
+    stop_everything: Annotated[
+        bool,
+        typer.Option(
+            "--stop-all",
+            help="Start no slave: stop the processes that an ended one left running here.",
+        ),
+    ] = False,
     domain: Domain = None,
 ) -> None:
     """Start the slave of this host.
 
-    It runs until Ctrl-C, which stops its processes too, unless the file says `on_stop: keep`.
+    It runs until Ctrl-C, SIGTERM or SIGHUP (a closed terminal), which stop its processes too,
+    unless the file says `on_stop: keep`.
     """
     from rosrm.config import HostConfig, load_host
     from rosrm.registry import Registry
 
     registry = Registry.discover()
     settings = load_host(config, registry) if config else HostConfig()
+    if stop_everything:
+        from rosrm.slave.stop_all import stop_all
+
+        typer.echo(stop_all(settings.state))
+        return
     if settings.probes is None:
         registry.default_probes()  # raises where there is none
     settings = replace(settings, ros=_with_domain(settings.ros, ctx, domain))

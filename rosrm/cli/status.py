@@ -12,7 +12,7 @@ from rosrm.cli import formats, tables
 from rosrm.core.views import HostRow, PluginRow, ProcessRow, Snapshot
 
 #: States of a process that somebody should look at.
-_TROUBLE = ("stuck", "unreachable", "failed", "set_aside", "backoff")
+_TROUBLE = ("stuck", "unreachable", "unknown", "failed", "set_aside", "backoff")
 _MOST_NAMED = 5
 
 
@@ -42,9 +42,14 @@ def _counted(states: Iterable[str]) -> str:
 
 def _set(hosts: Iterable[HostRow]) -> str:
     rows = list(hosts)
-    draining = sum(row.draining for row in rows)
+    drained = sum(row.drained for row in rows)
+    draining = sum(row.draining and not row.drained for row in rows)
     cordoned = sum(row.cordoned and not row.draining for row in rows)
-    parts = [f"{n} {word}" for n, word in ((cordoned, "cordoned"), (draining, "draining")) if n]
+    parts = [
+        f"{n} {word}"
+        for n, word in ((cordoned, "cordoned"), (draining, "draining"), (drained, "drained"))
+        if n
+    ]
     return f" ({', '.join(parts)})" if parts else ""
 
 

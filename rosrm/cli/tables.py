@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from typing import Final
 
 from rich import box
-from rich.console import Console
+from rich.console import Console, RenderableType
 from rich.table import Table
 from rich.text import Text
 
@@ -32,6 +32,7 @@ STYLES: Final = {
     "failed": "red",
     "stuck": "bold red",
     "unreachable": "red",
+    "unknown": "yellow",
     "lost": "red",
     "broken": "red",
     "failing": "red",
@@ -55,6 +56,17 @@ def table(*columns: str, right: Sequence[str] = ()) -> Table:
     return made
 
 
+def show(renderable: RenderableType) -> None:
+    """Print; into a file or pipe without the blanks that fill the last column."""
+    output = console()
+    if output.is_terminal:
+        output.print(renderable)
+        return
+    with output.capture() as captured:
+        output.print(renderable)
+    output.file.write("".join(f"{line.rstrip()}\n" for line in captured.get().splitlines()))
+
+
 def state(word: str) -> Text:
     """A state in its colour."""
     return Text(formats.words(word), style=STYLES.get(word, ""))
@@ -71,11 +83,16 @@ def processes(rows: Iterable[ProcessRow]) -> Table:
             state(row.state),
             Text(row.host),
             formats.duration(row.since),
-            f"{row.cpu:.2f}" if runs else "",
-            formats.size(row.memory) if runs else "",
+            _age(row, f"{row.cpu:.2f}") if runs else "",
+            _age(row, formats.size(row.memory)) if runs else "",
             Text(_why(row)),
         )
     return made
+
+
+def _age(row: ProcessRow, reading: str) -> Text:
+    """A reading of a process; `?` stands before an old one."""
+    return Text(f"?{reading}", "dim") if row.stale else Text(reading)
 
 
 def _why(row: ProcessRow) -> str:
@@ -107,7 +124,7 @@ def host_state(row: HostRow) -> Text:
     """The state of a host and what an operator did to it."""
     text = state(row.state)
     if row.draining:
-        text.append(", draining", "yellow")
+        text.append(", drained" if row.drained else ", draining", "yellow")
     elif row.cordoned:
         text.append(", cordoned", "yellow")
     return text

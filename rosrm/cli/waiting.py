@@ -1,12 +1,12 @@
-"""`--wait`: watches processes until there is nothing more to wait for."""
+"""`--wait`: watches processes or a host until nothing that is awaited can change any more."""
 
 from __future__ import annotations
 
 import math
-import sys
 import time
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Final
 
 import typer
@@ -20,14 +20,25 @@ if TYPE_CHECKING:
 
 #: Seconds between two looks.
 PERIOD: Final = 0.5
+#: Seconds for which a process is set aside before it counts as waiting for a host that may never
+#: come: just after the start of a cluster its hosts are still registering.
+SETTLED: Final = 5.0
 
-_FAILED: Final = frozenset({"failed", "cancelled", "stuck"})
-#: Kinds of events by which a checkpoint or a restore ends; whether it was done.
-_IMAGED: Final = {
-    "checkpointed": True, "restored": True, "checkpoint_failed": False, "restore_failed": False,
-    "cancelled": False,
+#: Judges a process: "done", "failed", or "awaited".
+Judge = Callable[[ProcessRow], str]
+#: What makes one run of a process: number of the instance, pid, restarts.
+Identity = tuple[int, int, int]
+
+_OVER: Final = frozenset({"finished", "failed", "cancelled"})
+#: States that only a request of a user ends.
+_UNTIL_ASKED: Final = frozenset({"failed", "cancelled", "stuck", "checkpointed"})
+#: Kinds of events by which a checkpoint, a restore or a migration ends; whether it was done.
+_ENDINGS: Final = {
+    "checkpointed": True, "restored": True, "migrated": True, "checkpoint_failed": False,
+    "restore_failed": False, "stayed": False, "cancelled": False,
 }  # fmt: skip
-_NOTEWORTHY: Final = _FAILED | {"set_aside", "unreachable"}
+_NOTEWORTHY: Final = _UNTIL_ASKED | {"set_aside", "unreachable", "unknown"}
+_MOST_NAMED: Final = 5
 
 
 def longest(text: str) -> float:
@@ -38,11 +49,65 @@ def longest(text: str) -> float:
         raise ConfigError(f"--timeout: {error}") from None
 
 
-def wait_for(client: MasterClient, names: Sequence[str], longest: float) -> bool:
-    """Watch until each job has ended and each service runs, saying what goes wrong on the way.
+@contextmanager
+def interruptible(what_follows: str) -> Iterator[None]:
+    """Within, a Ctrl-C ends the waiting alone; a message to the user has what follows."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        typer.echo(f"rosrm: no longer waiting; {what_follows}", err=True)
+        raise
+
+
+# --- what is awaited --------------------------------------------------------------------------
+
+
+def settled(row: ProcessRow) -> str:
+    """Judge by the end of a job and by the running of a service."""
+    if row.state in _UNTIL_ASKED:
+        return "failed"
+    if row.state == "finished":  # a service that has finished is not started again
+        return "done" if row.kind == "job" else "failed"
+    return "done" if row.kind != "job" and row.state == "running" else "awaited"
+
+
+def over(row: ProcessRow) -> str:
+    """Judge by the end of a process, whatever its cause."""
+    return "done" if row.state in _OVER else "awaited"
+
+
+def restarted(before: Mapping[str, Identity]) -> Judge:
+    """Judge by another run than `before`, which holds the processes that had not ended then."""
+
+    def judge(row: ProcessRow) -> str:
+        if before.get(row.name) == identity(row) and row.state not in _UNTIL_ASKED | _OVER:
+            return "awaited"
+        return "done" if row.state == "running" else settled(row)
+
+    return judge
+
+
+def identity(row: ProcessRow) -> Identity:
+    """Return the values that differ between two runs of a process."""
+    return row.number, row.pid, row.restarts
+
+
+# --- waiting ----------------------------------------------------------------------------------
+
+
+def wait_for(
+    client: MasterClient, names: Sequence[str], longest: float, judge: Judge = settled
+) -> bool:
+    """Watch processes until none of them is awaited, or none can change without a user.
+
+    Args:
+        client: of the master.
+        names: of the processes.
+        longest: seconds.
+        judge: what is awaited of each.
 
     Returns:
-        Whether none of them failed and all were done in time.
+        Whether all were done in time.
     """
     deadline = time.monotonic() + longest
     said: dict[str, str] = {}
@@ -50,37 +115,69 @@ def wait_for(client: MasterClient, names: Sequence[str], longest: float) -> bool
         rows = {row.name: row for row in client.list(processes=True).processes}
         ours = [rows[name] for name in names if name in rows]
         _say_news(ours, said)
-        waiting = [row for row in ours if not _is_done(row)]
-        if not waiting or time.monotonic() >= deadline:
-            _say_end(ours, waiting)
-            return not waiting and all(row.state not in _FAILED for row in ours)
+        verdicts = {row.name: judge(row) for row in ours}
+        awaited = [row for row in ours if verdicts[row.name] == "awaited"]
+        stays = all(row.state == "set_aside" and row.since >= SETTLED for row in awaited)
+        if stays or time.monotonic() >= deadline:
+            failed = [row for row in ours if verdicts[row.name] == "failed"]
+            _say_end(ours, awaited, failed, stays=stays)
+            return not awaited and not failed
         time.sleep(PERIOD)
 
 
-def wait_for_image(client: MasterClient, name: str, since: int) -> bool:
-    """Watch until a checkpoint or a restore of a process has come to its end, and say how.
+def wait_for_ending(client: MasterClient, name: str, since: int, longest: float) -> bool:
+    """Watch until a checkpoint, a restore or a migration of a process has ended, and say how.
 
     Args:
         client: of the master.
         name: of the process.
         since: sequence of the newest event before that was asked for.
+        longest: seconds.
 
     Returns:
-        Whether it was done.
+        Whether it was done in time.
     """
+    deadline = time.monotonic() + longest
     said: dict[str, str] = {}
     while True:
         view = client.list(processes=True, events=True, process=name, after=since)
         for event in view.events:
-            if event.kind in _IMAGED:
-                typer.echo(event.message, err=not _IMAGED[event.kind])
-                return _IMAGED[event.kind]
-        _say_news([row for row in view.processes if row.name == name], said)
+            if event.kind in _ENDINGS:
+                typer.echo(event.message, err=not _ENDINGS[event.kind])
+                return _ENDINGS[event.kind]
+        ours = [row for row in view.processes if row.name == name]
+        _say_news(ours, said)
+        if time.monotonic() >= deadline:
+            _say_time_is_up(ours)
+            return False
         time.sleep(PERIOD)
 
 
-def _is_done(row: ProcessRow) -> bool:
-    return row.state in _FAILED or row.state == ("finished" if row.kind == "job" else "running")
+def wait_until_drained(client: MasterClient, host: str, since: int, longest: float) -> bool:
+    """Watch until a host is drained, and say what has stayed there.
+
+    Returns:
+        Whether it was drained in time and nothing has stayed there.
+    """
+    deadline = time.monotonic() + longest
+    while True:
+        view = client.list(hosts=True, processes=True, events=True, host=host, after=since)
+        row = next((row for row in view.hosts if row.description.name == host), None)
+        staying = [row for row in view.processes if row.host == host and row.state not in _OVER]
+        if row is not None and row.drained:
+            told = [event.message for event in view.events if event.kind == "host_drained"]
+            typer.echo(told[-1] if told else f"{host} is drained", err=bool(staying))
+            return not staying
+        if row is None or not row.draining:
+            typer.echo(f"rosrm: {host} is no longer draining", err=True)
+            return False
+        if time.monotonic() >= deadline:
+            _say_time_is_up(staying)
+            return False
+        time.sleep(PERIOD)
+
+
+# --- messages ---------------------------------------------------------------------------------
 
 
 def _say_news(rows: Iterable[ProcessRow], said: dict[str, str]) -> None:
@@ -92,11 +189,34 @@ def _say_news(rows: Iterable[ProcessRow], said: dict[str, str]) -> None:
                 typer.echo(f"{row.name} is {row.state.replace('_', ' ')}{why}", err=True)
 
 
-def _say_end(rows: Sequence[ProcessRow], waiting: Sequence[ProcessRow]) -> None:
+def _say_end(
+    rows: Sequence[ProcessRow], awaited: Sequence[ProcessRow], failed: Sequence[ProcessRow],
+    *, stays: bool,
+) -> None:  # fmt: skip
     counts = Counter(row.state.replace("_", " ") for row in rows)
     summary = ", ".join(f"{count} {state}" for state, count in sorted(counts.items()))
-    typer.echo(summary or "all gone", file=sys.stdout)
-    if waiting:
-        some = ", ".join(row.name for row in waiting[:5])
-        more = f" and {len(waiting) - 5} more" if len(waiting) > 5 else ""
-        typer.echo(f"rosrm: the time is up; still waiting for {some}{more}", err=True)
+    typer.echo(summary or "all gone")
+    ended = [row for row in failed if row.state == "finished"]
+    if ended:
+        typer.echo(
+            f"rosrm: not running, as a service does: {_named(ended)}; a program that is to end "
+            f"is a `kind: job`",
+            err=True,
+        )
+    if awaited and stays:
+        typer.echo(
+            f"rosrm: no longer waiting for {_named(awaited)}: set aside until a host registers or "
+            f"changes (`rosrm explain NAME` says what it has to have)",
+            err=True,
+        )
+    elif awaited:
+        _say_time_is_up(awaited)
+
+
+def _say_time_is_up(awaited: Sequence[ProcessRow]) -> None:
+    typer.echo(f"rosrm: the time is up; still waiting for {_named(awaited)}", err=True)
+
+
+def _named(rows: Sequence[ProcessRow]) -> str:
+    some = ", ".join(row.name for row in rows[:_MOST_NAMED])
+    return f"{some} and {len(rows) - _MOST_NAMED} more" if len(rows) > _MOST_NAMED else some

@@ -7,6 +7,7 @@ Plain words are read as YAML 1.2 reads them: only `true` and `false` are boolean
 from __future__ import annotations
 
 import re
+import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -109,7 +110,10 @@ class Problems:
 
 
 def read(path: str | Path) -> Node:
-    """Read a file; raises `ConfigError` for what is unreadable, with line and column."""
+    """Read a file; raises `ConfigError` for what is unreadable, with line and column.
+
+    `-` is the standard input.
+    """
     return parse(_text(Path(path)), str(path))
 
 
@@ -133,7 +137,7 @@ def parse(text: str, file: str) -> Node:
 
 def _text(path: Path) -> str:
     try:
-        content = path.read_bytes()
+        content = sys.stdin.buffer.read() if str(path) == "-" else path.read_bytes()
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
     try:

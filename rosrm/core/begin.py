@@ -89,7 +89,6 @@ def why_busy(run: Run) -> str:
 
 def why_immovable(state: MasterState, process: Process) -> str:
     """Why a process cannot be moved now; "" if it can."""
-    strategy = process.spec.migration.strategy
     if process.name in state.runs:
         return why_busy(state.runs[process.name])
     if process.phase is ProcessPhase.CHECKPOINTED:
@@ -100,6 +99,12 @@ def why_immovable(state: MasterState, process: Process) -> str:
     others = process.instances - {process.owner, standby.destination.number if standby else 0}
     if others:
         return f"an earlier instance of {process.name} is still being stopped"
+    return why_never_movable(state, process)
+
+
+def why_never_movable(state: MasterState, process: Process) -> str:
+    """Return why a process cannot be moved in any phase; "" if it can."""
+    strategy = process.spec.migration.strategy
     if strategy is None:
         return f"{process.name} has no migration strategy; give it `migration:` in its file"
     if strategy not in state.strategies:

@@ -1,4 +1,7 @@
-"""What can happen to the master, in the past tense. Readings arrive as one batch."""
+"""What can happen to the master, in the past tense. Readings arrive as one batch.
+
+`by` of a request is the name of the client that sent it; "": unknown.
+"""
 
 from __future__ import annotations
 
@@ -120,6 +123,7 @@ class SubmissionReceived:
 
     request: int
     specs: tuple[ProcessSpec, ...]
+    by: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,6 +132,7 @@ class CancelRequested:
 
     request: int
     names: tuple[str, ...]
+    by: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,6 +141,7 @@ class RestartRequested:
 
     request: int
     names: tuple[str, ...]
+    by: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,6 +151,7 @@ class MigrationRequested:
     request: int
     name: str
     host: str | None = None
+    by: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,6 +160,7 @@ class CheckpointRequested:
 
     request: int
     name: str
+    by: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,6 +169,7 @@ class RestoreRequested:
 
     request: int
     name: str
+    by: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,6 +179,22 @@ class HostStateRequested:
     request: int
     host: str
     action: str
+    by: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class PruneRequested:
+    """A client removes ended processes and departed hosts from the listings.
+
+    Attributes:
+        names: of processes.
+        hosts: their names; with no names either: all that ended, and all hosts that left.
+    """
+
+    request: int
+    names: tuple[str, ...] = ()
+    hosts: tuple[str, ...] = ()
+    by: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,6 +265,7 @@ Event = (
     | CheckpointRequested
     | RestoreRequested
     | HostStateRequested
+    | PruneRequested
     | OrderAnswered
     | AssignmentWithdrawn
     | HandoffReported

@@ -31,6 +31,8 @@ def is_ready(state: MasterState, process: Process) -> bool:
     standby = state.standbys.get(process.name)
     if standby is None or standby.source.number != process.owner:
         return False
+    if process.wanted is Wanted.CANCEL:
+        return False
     said: Mapping[ReportPhase, str] = standby.phases_of(standby.destination)
     instance = state.instances.get(standby.destination.number)
     follows = ReportPhase.READY in said and not said.keys() & _OVER
@@ -43,7 +45,7 @@ def take_over(state: MasterState, process: Process, end: End, now: float) -> boo
     Returns:
         False: it has none that could, or has come to its end as it was meant to.
     """
-    if process.wanted is Wanted.CANCEL or _succeeded(end) or not is_ready(state, process):
+    if _succeeded(end) or not is_ready(state, process):
         return False
     run: Run = state.standbys.pop(process.name)
     run.ended[run.source.number] = end

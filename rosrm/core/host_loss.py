@@ -7,7 +7,8 @@ the owner of the name      given up at once, where a standby can take over
                            by `host_loss`: `wait`; after `delay` go `elsewhere`, or `stop`
 one that may be the owner  as the owner: the destination of a move that may be active, or the last
                            that is left of a process
-one that is cancelled      given up at once: nothing follows it
+one that is cancelled      kept until its host reports it ended, or is pruned; with `elsewhere`
+                           given up after `delay`: its fence has ended it by then
 is being restored          never: its memory is there alone
 any other                  given up at once: a former source, a shadow
 =========================  ======================================================================
@@ -35,17 +36,8 @@ def lose_sight(state: MasterState, host: Host, now: float) -> None:
     for number in host.instances:
         process = state.owned_by(state.instances[number])
         if process is not None and process.name not in state.runs:
-            reason = f"{host.name} is lost{_what_follows(process)}"
-            state.set_phase(process, ProcessPhase.UNREACHABLE, now, reason)
+            lifecycle.note_phase(state, process, state.instances[number], now)
     _review(state, host, now)
-
-
-def _what_follows(process: Process) -> str:
-    policy = process.spec.host_loss
-    if policy.then == "wait":
-        return ""
-    when = f" in {policy.delay:g} s" if policy.delay else ""
-    return f"; it goes elsewhere{when}" if policy.then == "elsewhere" else f"; it fails{when}"
 
 
 def regain_sight(state: MasterState, host: Host, now: float) -> None:
@@ -53,8 +45,10 @@ def regain_sight(state: MasterState, host: Host, now: float) -> None:
     for number in host.instances:
         instance = state.instances[number]
         process = state.owned_by(instance)
-        if process is not None and process.phase is ProcessPhase.UNREACHABLE:
-            state.set_phase(process, lifecycle.phase_of(process, instance), now)
+        if process is None or process.name in state.runs:
+            continue
+        if process.phase is ProcessPhase.UNREACHABLE or process.wanted is Wanted.CANCEL:
+            lifecycle.note_phase(state, process, instance, now)
     coming_back.take_back_all(state, host, now)
 
 
@@ -73,7 +67,7 @@ def _review(state: MasterState, host: Host, now: float) -> None:
 
 def _is_given_up(state: MasterState, instance: Instance, now: float) -> bool:
     process = state.processes.get(instance.id.process)
-    if process is None or process.wanted is Wanted.CANCEL:
+    if process is None:
         return True
     if now < state.in_company_since + state.settings.lease:
         return False
@@ -85,7 +79,9 @@ def _is_given_up(state: MasterState, instance: Instance, now: float) -> bool:
     if process.owner == instance.id.number and failover.is_ready(state, process):
         return True
     policy = process.spec.host_loss
-    return policy.then != "wait" and now - instance.host.lost_since >= policy.delay
+    # Nothing ends a cancelled process on a lost host, unless it has the fence of `elsewhere`.
+    ends = ("elsewhere",) if process.wanted is Wanted.CANCEL else ("elsewhere", "stop")
+    return policy.then in ends and now - instance.host.lost_since >= policy.delay
 
 
 def _may_be_active(state: MasterState, instance: Instance) -> bool:

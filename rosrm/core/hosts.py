@@ -52,6 +52,8 @@ class Host:
         over_since: resource name to the time since when it is over its limit.
         over_at: resource name to the time at which it was last seen over its limit; of those whose
             excess is on record, and whose end is not.
+        drained: it is draining, and no process is left on it that can leave.
+        pruned: it is in no listing, until it registers.
         told: kind of a record that is not repeated at once, to when it was made.
         lost_since: time at which it was lost, while it is.
         failing: resource to the reason why its probe gives no readings, as the slave reports.
@@ -61,6 +63,8 @@ class Host:
     description: HostDescription
     cordoned: bool = False
     draining: bool = False
+    drained: bool = False
+    pruned: bool = False
     instances: set[int] = field(default_factory=set)
     over_since: dict[str, float] = field(default_factory=dict)
     over_at: dict[str, float] = field(default_factory=dict)
@@ -113,7 +117,7 @@ class HostTable(HostColumns):
         """Take in a host, or a new run of a known one; its readings are still to come."""
         host = self.by_name.get(description.name) or self.expect(description.name)
         column = host.column
-        host.description = description
+        host.description, host.pruned = description, False
         host.over_since.clear()
         host.over_at.clear()
         for resource in description.resources:
@@ -137,12 +141,23 @@ class HostTable(HostColumns):
         self.changed()
         return host
 
+    def prune(self, host: Host) -> None:
+        """Leave a host out of every listing until its slave registers, which it has to."""
+        host.pruned, host.description = True, HostDescription(host.name, 0)
+        self.incarnation[host.column] = 0
+        self._labelled.clear()
+        self.set_condition(host, HostCondition.LEFT)
+
     def find(self, host_id: int, incarnation: int) -> Host | None:
         """The host of this number, if it is this run of it."""
         column = host_id - 1
         if not 0 <= column < len(self.hosts) or int(self.incarnation[column]) != incarnation:
             return None
         return self.hosts[column]
+
+    def listed(self) -> list[Host]:
+        """Every host that was not pruned."""
+        return [host for host in self.hosts if not host.pruned]
 
     def labelled(self, key: str, value: str) -> BoolArray:
         """(H,) True: the host has this label; kept until a host registers."""
@@ -178,7 +193,7 @@ class HostTable(HostColumns):
 
     def set_closed(self, host: Host, *, cordoned: bool, draining: bool) -> None:
         """Cordon, drain or reopen a host."""
-        host.cordoned, host.draining = cordoned, draining
+        host.cordoned, host.draining, host.drained = cordoned, draining, False
         self.closed[host.column] = cordoned or draining
         self.changed()
 
@@ -278,6 +293,10 @@ class HostTable(HostColumns):
             | (self.condition == HostCondition.LOST) | (self.condition == HostCondition.LEFT)
         )  # fmt: skip
 
+    def why_unreachable(self, host: Host) -> str:
+        """Return why a host cannot be reached, without its name; "" if it can."""
+        return _UNREACHABLE.get(self.condition_of(host), "")
+
     def why_away(self, column: int) -> str:
         """Why a host is away, or may be; "" if it is there."""
         host = self.hosts[column]
@@ -360,6 +379,10 @@ def description_fault(description: HostDescription) -> str:
     return ""
 
 
+_UNREACHABLE: Final[Mapping[HostCondition, str]] = {
+    HostCondition.LOST: "is lost",
+    HostCondition.EXPECTED: "has not come back since the master started",
+}
 _AWAY: Final[Mapping[HostCondition, str]] = {
     HostCondition.LOST: "it is lost",
     HostCondition.LEFT: "it has left",

@@ -30,7 +30,7 @@ _BEGUN: Final = {Aim.CHECKPOINT: "checkpoint_begun", Aim.RESTORE: "restore_begun
 # --- checkpoint -------------------------------------------------------------------------------
 
 
-def begin_checkpoint(state: MasterState, process: Process, now: float) -> str:
+def begin_checkpoint(state: MasterState, process: Process, cause: str, now: float) -> str:
     """Begin to dump a running process into an image.
 
     Returns:
@@ -49,7 +49,7 @@ def begin_checkpoint(state: MasterState, process: Process, now: float) -> str:
     if refusal:
         return f"{process.name} cannot be checkpointed: {refusal}"
     move = _planned(state, process, owner.id, owner.host, owner.node_name or process.name)
-    return _begin(state, process, move, name, Aim.CHECKPOINT, now)
+    return _begin(state, process, move, name, Aim.CHECKPOINT, now, cause=cause)
 
 
 def _why_no_checkpoint(state: MasterState, process: Process) -> str:
@@ -84,7 +84,7 @@ def _strategy_of(state: MasterState, process: Process) -> str:
 # --- restore ----------------------------------------------------------------------------------
 
 
-def begin_restore(state: MasterState, process: Process, now: float) -> str:
+def begin_restore(state: MasterState, process: Process, cause: str, now: float) -> str:
     """Begin to restore a process from its image, where that lies; returns as `begin_checkpoint`."""
     image = process.image
     refusal = _why_no_restore(state, process)
@@ -100,7 +100,9 @@ def begin_restore(state: MasterState, process: Process, now: float) -> str:
         )
     source = InstanceId(process.name, image.number)
     move = _planned(state, process, source, host, image.node_name or process.name)
-    return _begin(state, process, move, image.strategy, Aim.RESTORE, now, ranking=ranking)
+    return _begin(
+        state, process, move, image.strategy, Aim.RESTORE, now, cause=cause, ranking=ranking
+    )
 
 
 def _why_no_restore(state: MasterState, process: Process) -> str:
@@ -140,7 +142,7 @@ def _planned(
 
 def _begin(
     state: MasterState, process: Process, move: Move, strategy: str, aim: Aim, now: float,
-    *, ranking: Ranking | None = None,
+    *, cause: str, ranking: Ranking | None = None,
 ) -> str:  # fmt: skip
     """Have the strategy plan it, and begin; `ranking`: by which the destination is charged."""
     imaging: object = state.strategies[strategy]
@@ -152,7 +154,7 @@ def _begin(
         return plan
     host = state.hosts.by_name[move.source_host]
     run = Run(
-        process.name, plan, strategy, move.source, host, move.destination, host, "asked for", now,
+        process.name, plan, strategy, move.source, host, move.destination, host, cause, now,
         move.source_node, destination_node(plan, move), state.wall, aim=aim,
     )  # fmt: skip
     state.runs[process.name] = run
@@ -160,9 +162,10 @@ def _begin(
         state.charge_ranked(run.destination, host, now, ranking)
     state.set_phase(process, ProcessPhase.MIGRATING, now, run.course)
     state.record(
-        now, _BEGUN[aim], f"{process.name}: {run.course}", process=process.name, host=host.name,
+        now, _BEGUN[aim], f"{process.name}: {run.course}; {cause}", process=process.name,
+        host=host.name,
         facts={
-            "strategy": strategy, "steps": [title(step) for step in plan.steps],
+            "strategy": strategy, "cause": cause, "steps": [title(step) for step in plan.steps],
             "source": move.source.number, "destination": move.destination.number,
         },
     )  # fmt: skip

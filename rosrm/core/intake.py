@@ -37,9 +37,10 @@ def host_registered(state: MasterState, event: happened.HostRegistered, now: flo
     if taken:
         _refuse_host(state, event, "name_taken", taken, now)
         return
+    is_new = known is None or known.pruned
     host = state.hosts.register(description, now)
     host.failing = EMPTY  # the slave reports what fails in this run
-    if known is None:
+    if is_new:
         save_host(state, host)
     state.record(
         now, "host_registered", f"{host.name} registered with {len(event.instances)} processes",

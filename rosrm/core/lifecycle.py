@@ -324,18 +324,27 @@ def _wait_for_ends(state: MasterState, process: Process, now: float) -> None:
     """It is queued, at its place, once nothing of it runs any more."""
     state.unqueue(process)
     process.wanted = Wanted.REQUEUE
-    left = ", ".join(f"{one.id} on {one.host.name}" for one in state.instances_of(process))
-    state.set_phase(process, ProcessPhase.STOPPING, now, f"waits for the end of {left}")
+    note_awaited_ends(state, process, now)
     state.save(process)
 
 
+def note_awaited_ends(state: MasterState, process: Process, now: float) -> None:
+    """Set the phase of a process without an owner, of which instances are still to end."""
+    left = ", ".join(f"{one.id} on {one.host.name}" for one in state.instances_of(process))
+    state.set_phase(process, ProcessPhase.STOPPING, now, f"waits for the end of {left}")
+
+
 def requeue_if_clear(state: MasterState, process: Process, now: float) -> bool:
-    """Queue a process that is to return, unless an instance of it may still run."""
-    if process.owner or process.instances or process.name in state.runs:
+    """Queue or cancel a process as it is wanted, unless an instance of it may still run."""
+    if process.owner or process.instances or process.name in state.runs or process.phase.over:
         return False
-    if process.wanted is not Wanted.REQUEUE or process.phase.over:
+    if process.wanted is Wanted.CANCEL:
+        state.set_phase(process, ProcessPhase.CANCELLED, now)
+        state.record(now, "cancelled", f"{process.name} cancelled", process=process.name)
+    elif process.wanted is Wanted.REQUEUE:
+        state.enqueue(process, now)
+    else:
         return False
-    state.enqueue(process, now)
     state.save(process)
     return True
 
@@ -369,8 +378,25 @@ def assignment_withdrawn(
         gone(state, instance, now, f"{instance.host.name} did not take it up in time")
 
 
-def phase_in_sight(state: MasterState, process: Process, owner: Instance) -> ProcessPhase:
-    """As `phase_of`, unless the host is not heard."""
-    if state.hosts.condition_of(owner.host) in (HostCondition.LOST, HostCondition.EXPECTED):
-        return ProcessPhase.UNREACHABLE
-    return phase_of(process, owner)
+def note_phase(state: MasterState, process: Process, owner: Instance, now: float) -> None:
+    """Set the phase of a process that no plan moves, by its owner and by the owner's host."""
+    host = owner.host
+    unreachable = state.hosts.why_unreachable(host)
+    if process.wanted is Wanted.CANCEL:
+        where = f"; it may still run on {host.name}, which {unreachable}" if unreachable else ""
+        ends = f", and ends when {host.name} returns" if unreachable else ""
+        state.set_phase(process, ProcessPhase.STOPPING, now, f"being cancelled{where}{ends}")
+    elif unreachable:
+        lost = state.hosts.condition_of(host) is HostCondition.LOST
+        reason = f"{host.name} {unreachable}{_what_follows(process) if lost else ''}"
+        state.set_phase(process, ProcessPhase.UNREACHABLE, now, reason)
+    else:
+        state.set_phase(process, phase_of(process, owner), now)
+
+
+def _what_follows(process: Process) -> str:
+    policy = process.spec.host_loss
+    if policy.then == "wait":
+        return ""
+    when = f" in {policy.delay:g} s" if policy.delay else ""
+    return f"; it goes elsewhere{when}" if policy.then == "elsewhere" else f"; it fails{when}"

@@ -19,16 +19,21 @@ _CONDITION: Final = {
     HostCondition.LEFT: "left",
     HostCondition.EXPECTED: "lost",
 }
+#: Of hosts that report: one that leaves reports until all that it held has ended.
+_HEARD: Final = (HostCondition.UP, HostCondition.LEFT)
+#: Phases that a slave observes: of a silent host they are not known.
+_OBSERVED: Final = (ProcessPhase.STARTING, ProcessPhase.RUNNING, ProcessPhase.BACKOFF)
 
 
 def host_rows(state: MasterState, now: float) -> list[HostRow]:
     """Every host, in order of registration."""
-    return [_host_row(state, host, now) for host in state.hosts.hosts]
+    return [_host_row(state, host, now) for host in state.hosts.listed()]
 
 
 def _host_row(state: MasterState, host: Host, now: float) -> HostRow:
     table, column = state.hosts, host.column
     stale = set(table.stale_resources(host))
+    condition = table.condition_of(host)
     rows = []
     for resource in host.description.resources:
         at = table.resources.index(resource.name)
@@ -36,13 +41,14 @@ def _host_row(state: MasterState, host: Host, now: float) -> HostRow:
             ResourceRow(
                 resource.name, resource.unit, resource.capacity, resource.scope,
                 float(table.usage[at, column]), float(table.load[at, column]),
-                float(table.limit[at, column]), resource.name in stale,
+                float(table.limit[at, column]),
+                resource.name in stale or condition is not HostCondition.UP,
             )
         )  # fmt: skip
     return HostRow(
-        host.description, host.host_id, _CONDITION[table.condition_of(host)], host.cordoned,
-        host.draining, table.is_accepting(host), now - float(table.heard[column]), tuple(rows),
-        int(table.processes[column]),
+        host.description, host.host_id, _CONDITION[condition], host.cordoned,
+        host.draining, table.is_accepting(host) and condition is HostCondition.UP,
+        now - float(table.heard[column]), tuple(rows), int(table.processes[column]), host.drained,
     )  # fmt: skip
 
 
@@ -55,15 +61,27 @@ def process_row(state: MasterState, process: Process, now: float) -> ProcessRow:
     """One process."""
     owner = state.instances.get(process.owner)
     seen = owner.seen if owner else {}
+    silence = _silence(state, owner, now)
+    phase, reason = process.phase.value, reason_of(state, process) or _of_standby(process)
+    if silence and process.phase in _OBSERVED:
+        phase, reason = "unknown", f"{silence}; last known: {phase}"
     return ProcessRow(
-        name=process.name, kind=process.spec.kind.value, state=process.phase.value,
+        name=process.name, kind=process.spec.kind.value, state=phase,
         host=_host_of(process, owner), number=process.owner,
         pid=owner.pid if owner else 0, restarts=process.restarts, migrations=process.migrations,
         exit_code=process.exit_code, priority=process.spec.priority,
         queue_position=state.queue.position(process.name), since=now - process.since,
-        cpu=seen.get("cpu", 0.0), memory=int(seen.get("memory", 0.0)),
-        reason=reason_of(state, process) or _of_standby(process),
+        cpu=seen.get("cpu", 0.0), memory=int(seen.get("memory", 0.0)), reason=reason,
+        stale=bool(silence),
     )  # fmt: skip
+
+
+def _silence(state: MasterState, owner: Instance | None, now: float) -> str:
+    """Return why readings of an instance are old; "" where its host reports."""
+    if owner is None or state.hosts.condition_of(owner.host) in _HEARD:
+        return ""
+    age = now - float(state.hosts.heard[owner.host.column])
+    return f"{owner.host.name} has been silent for {age:.0f} s"
 
 
 def _host_of(process: Process, owner: Instance | None) -> str:

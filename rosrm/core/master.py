@@ -17,6 +17,7 @@ MigrationRequested      begins a migration
 CheckpointRequested     begins to dump a process into an image
 RestoreRequested        begins to restore a process from its image
 HostStateRequested      cordons, uncordons, drains
+PruneRequested          removes ended processes and departed hosts from the listings
 OrderAnswered           notes that a slave took an order or refused it
 HandoffReported         notes how far the nodes of a handoff are
 AssignmentWithdrawn     queues the process again at its old place
@@ -32,7 +33,7 @@ from types import MappingProxyType
 from typing import Any, Final
 
 from rosrm.core import events as happened
-from rosrm.core import handoffs, intake, keeping, lifecycle, moves, requests, upkeep
+from rosrm.core import handoffs, intake, keeping, lifecycle, moves, pruning, requests, upkeep
 from rosrm.core.assigning import place_waiting
 from rosrm.core.commands import Command
 from rosrm.core.state import MasterState
@@ -58,6 +59,7 @@ HANDLERS: Final[Mapping[type, _Handler]] = MappingProxyType(
         happened.CheckpointRequested: requests.checkpoint_requested,
         happened.RestoreRequested: requests.restore_requested,
         happened.HostStateRequested: requests.host_state_requested,
+        happened.PruneRequested: pruning.prune_requested,
         happened.OrderAnswered: moves.order_answered,
         happened.HandoffReported: handoffs.handoff_reported,
         happened.TimePassed: upkeep.time_passed,

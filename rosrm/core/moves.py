@@ -327,7 +327,7 @@ def _settle_owner(state: MasterState, process: Process, run: Run, now: float) ->
         return
     if process.wanted is not Wanted.RUN and not owner.stopping:
         lifecycle.stop_instance(state, owner, now)
-    state.set_phase(process, lifecycle.phase_in_sight(state, process, owner), now)
+    lifecycle.note_phase(state, process, owner, now)
     state.save(process)
 
 

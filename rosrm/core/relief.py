@@ -10,25 +10,31 @@ from collections.abc import Mapping
 from typing import Final
 
 from rosrm.core.assigning import demand_to_move, ranking_of, unable
-from rosrm.core.begin import begin_move, moves_under_way, why_immovable
+from rosrm.core.begin import begin_move, moves_under_way, why_immovable, why_never_movable
 from rosrm.core.hosts import Host
 from rosrm.core.model import InstanceState
-from rosrm.core.state import Instance, MasterState, Process
+from rosrm.core.placement import Demand, eligible
+from rosrm.core.state import Instance, MasterState, Process, Wanted
 from rosrm.core.verdicts import decide, verdict_of
 
 #: Seconds between two records that nothing can be moved off a host.
 _TOLD_EVERY = 10.0
 #: Reasons against hosts that one answer names.
 _MOST_SAID: Final = 3
+#: Processes that one answer about a drain names.
+_MOST_NAMED: Final = 8
 
 
 def relieve_hosts(state: MasterState, now: float) -> None:
     """Move processes off hosts that were over a limit for long enough, and off drained ones."""
     _note_limits(state, now)
     for host in state.hosts.hosts:
+        if host.draining:
+            _note_drained(state, host, now)
+    for host in state.hosts.hosts:
         if moves_under_way(state) >= state.settings.max_migrations:
             return
-        if host.draining:
+        if host.draining and not host.drained:
             _drain(state, host, now)
         elif state.settings.automatic and host.over_since:
             _relieve(state, host, now)
@@ -158,6 +164,68 @@ def _measured(source: Instance) -> Mapping[str, float]:
     """What it was seen to use of what its host has a probe for: of the rest nobody has asked."""
     probed = {resource.name for resource in source.host.description.resources}
     return {name: amount for name, amount in source.seen.items() if name in probed}
+
+
+# --- drain ------------------------------------------------------------------------------------
+
+
+def departures(state: MasterState, host: Host) -> str:
+    """Return which processes leave a draining host, and which cannot and why."""
+    leaving, staying = _leaving(state, host), _staying(state, host)
+    count = "1 process leaves" if len(leaving) == 1 else f"{len(leaving)} processes leave"
+    named = ", ".join(leaving[:_MOST_NAMED]) + (", ..." if len(leaving) > _MOST_NAMED else "")
+    said = f"{count} ({named})" if leaving else "no process is left that can leave"
+    return f"{said}; cannot leave: {_listed(staying)}" if staying else said
+
+
+def _leaving(state: MasterState, host: Host) -> list[str]:
+    """Names of the processes of which an instance is on a host and will leave it or end."""
+    held = [state.instances[number] for number in host.instances]
+    return sorted({one.id.process for one in held if not _why_it_stays(state, one)})
+
+
+def _staying(state: MasterState, host: Host) -> list[str]:
+    """Return the reason of each process that cannot leave a host."""
+    held = [state.instances[number] for number in sorted(host.instances)]
+    reasons = [reason for one in held if (reason := _why_it_stays(state, one))]
+    return reasons + _images_on(state, host)
+
+
+def _why_it_stays(state: MasterState, instance: Instance) -> str:
+    """Return why an instance can neither leave its host nor is about to end; "" if it can."""
+    process, source = state.owned_by(instance), instance.host
+    if process is None or process.wanted is not Wanted.RUN or process.name in state.runs:
+        return ""
+    reason = why_never_movable(state, process)
+    if reason:
+        return reason
+    demand = demand_to_move(state, process, _measured(instance), source.name, 0.0)
+    # What a strategy or a lost host lacks may change later; labels and resources do not.
+    lasting = {**process.excluded, source.name: "it is there"}
+    possible = eligible(
+        state.hosts, Demand(process.spec, demand.amounts, demand.estimated, lasting)
+    )
+    others = [host for host in state.hosts.listed() if host is not source]
+    if any(possible[host.column] or not state.hosts.incarnation[host.column] for host in others):
+        return ""
+    return f"no other host may take {process.name} (`rosrm explain {process.name}` says why)"
+
+
+def _listed(reasons: list[str]) -> str:
+    more = f"; and {len(reasons) - _MOST_NAMED} more" if len(reasons) > _MOST_NAMED else ""
+    return "; ".join(reasons[:_MOST_NAMED]) + more
+
+
+def _note_drained(state: MasterState, host: Host, now: float) -> None:
+    """Say once that nothing which can leave a host is left on it."""
+    if state.hosts.why_unreachable(host):
+        return
+    was, host.drained = host.drained, not _leaving(state, host)
+    if host.drained and not was:
+        state.record(
+            now, "host_drained", f"{host.name} is drained: {departures(state, host)}",
+            host=host.name,
+        )  # fmt: skip
 
 
 def _drain(state: MasterState, host: Host, now: float) -> None:

@@ -10,16 +10,18 @@ from rosrm.core import images, imaging, keeping, lifecycle
 from rosrm.core.assigning import reconsider_set_aside
 from rosrm.core.begin import why_busy
 from rosrm.core.commands import Order, Reply
+from rosrm.core.hosts import Host
 from rosrm.core.intake import save_host
 from rosrm.core.model import ProcessSpec
 from rosrm.core.plugin_calls import required
-from rosrm.core.relief import try_move
+from rosrm.core.relief import departures, try_move
 from rosrm.core.state import WAITING, MasterState, Process, ProcessPhase, Wanted
 from rosrm.errors import PluginError
 from rosrm.ports import SpecChecking
 
 
-def _refuse(state: MasterState, request: int, message: str, code: str = "invalid") -> None:
+def refuse(state: MasterState, request: int, message: str, code: str = "invalid") -> None:
+    """Answer a request that changes nothing."""
     state.emit(Reply(request, False, code, message))
 
 
@@ -30,11 +32,11 @@ def submission_received(state: MasterState, event: happened.SubmissionReceived, 
     """Queue all of the processes, or refuse all."""
     taken = _taken(state, event)
     if taken:
-        _refuse(state, event.request, taken, "name_taken")
+        refuse(state, event.request, taken, "name_taken")
         return
     fault = _submission_fault(state, event)
     if fault:
-        _refuse(state, event.request, fault)
+        refuse(state, event.request, fault)
         return
     for spec in event.specs:
         process = Process(
@@ -48,9 +50,9 @@ def submission_received(state: MasterState, event: happened.SubmissionReceived, 
         state.next_order += 1
         state.add_process(process)
         state.enqueue(process, now)
-        state.record(now, "submitted", f"{spec.name} was submitted", process=spec.name)
+        state.record(now, "submitted", f"{spec.name} was submitted", process=spec.name, by=event.by)
         state.save(process)
-    state.emit(Reply(event.request, message=f"{_count(len(event.specs))} queued"))
+    state.emit(Reply(event.request, message=f"{count(len(event.specs))} queued"))
 
 
 def _taken(state: MasterState, event: happened.SubmissionReceived) -> str:
@@ -62,6 +64,9 @@ def _taken(state: MasterState, event: happened.SubmissionReceived) -> str:
         spec.name for spec in event.specs
         if spec.name in state.processes and not state.processes[spec.name].phase.over
     ]  # fmt: skip
+    for name in taken:
+        if state.processes[name].wanted is Wanted.CANCEL:
+            return f"{name} is in use still: {state.processes[name].reason}. Nothing was queued"
     if taken:
         return (
             f"in use already by a live process: {_names(taken)}. Cancel it first or choose another "
@@ -120,41 +125,57 @@ def _names(names: Iterable[str]) -> str:
     return ", ".join(named[:8]) + (f" and {len(named) - 8} more" if len(named) > 8 else "")
 
 
-def _count(number: int) -> str:
+def count(number: int) -> str:
+    """Return a number of processes: "1 process", "3 processes"."""
     return "1 process" if number == 1 else f"{number} processes"
 
 
 # --- cancel, restart --------------------------------------------------------------------------
 
 
-def _known(state: MasterState, request: int, names: Iterable[str]) -> list[Process] | None:
+def known_processes(state: MasterState, request: int, names: Iterable[str]) -> list[Process] | None:
     """The processes of these names; a name that nobody has refuses the whole request."""
     unknown = [name for name in names if name not in state.processes]
     if unknown:
-        _refuse(state, request, f"no such process: {_names(unknown)}; see `rosrm ps`", "unknown")
+        refuse(state, request, f"no such process: {_names(unknown)}; see `rosrm ps`", "unknown")
         return None
     return [state.processes[name] for name in dict.fromkeys(names)]
 
 
 def cancel_requested(state: MasterState, event: happened.CancelRequested, now: float) -> None:
     """Take processes out of the queue, or stop them."""
-    processes = _known(state, event.request, event.names)
+    processes = known_processes(state, event.request, event.names)
     if processes is None:
         return
     over = [process.name for process in processes if process.phase.over]
     for process in processes:
         if not process.phase.over:
-            _cancel(state, process, now)
-    ended = f"; ended before: {_names(over)}" if over else ""
-    state.emit(
-        Reply(event.request, message=f"{_count(len(processes) - len(over))} cancelled{ended}")
-    )
+            _cancel(state, process, now, event.by)
+    state.emit(Reply(event.request, message=_cancelled(state, processes, over)))
 
 
-def _cancel(state: MasterState, process: Process, now: float) -> None:
+def _cancelled(state: MasterState, processes: Iterable[Process], over: list[str]) -> str:
+    """Return what has become of cancelled processes; `over` had ended before."""
+    asked = [process for process in processes if process.name not in over]
+    pending = [process for process in asked if not process.phase.over]
+    said = [f"{count(len(asked) - len(pending))} cancelled"] if len(asked) > len(pending) else []
+    if pending:
+        said.append(f"{count(len(pending))} being cancelled")
+    said += [
+        f"{process.name} is {process.reason}"
+        for process in pending
+        if (owner := state.instances.get(process.owner)) is not None
+        and state.hosts.why_unreachable(owner.host)
+    ]
+    if over:
+        said.append(f"ended before: {_names(over)}")
+    return "; ".join(said)
+
+
+def _cancel(state: MasterState, process: Process, now: float, by: str) -> None:
     process.wanted, process.left_behind = Wanted.CANCEL, None
     state.record(
-        now, "cancel_requested", f"{process.name} is to be cancelled", process=process.name
+        now, "cancel_requested", f"{process.name} is to be cancelled", process=process.name, by=by
     )
     if process.phase in WAITING:
         state.unqueue(process)
@@ -170,28 +191,29 @@ def _cancel(state: MasterState, process: Process, now: float) -> None:
             process=process.name,
         )  # fmt: skip
     elif process.owner == 0 and process.name not in state.runs:
-        # Its owner has ended and a former instance is being stopped: that goes on by itself.
-        state.set_phase(process, ProcessPhase.CANCELLED, now)
-        state.record(now, "cancelled", f"{process.name} cancelled", process=process.name)
+        # Its owner has ended, and former instances are being stopped.
+        if not lifecycle.requeue_if_clear(state, process, now):
+            lifecycle.note_awaited_ends(state, process, now)
     elif process.name not in state.runs:  # else the plan in hand turns back first
-        state.set_phase(process, ProcessPhase.STOPPING, now, "cancelled")
-        lifecycle.stop_instance(state, state.instances[process.owner], now)
+        owner = state.instances[process.owner]
+        lifecycle.note_phase(state, process, owner, now)
+        lifecycle.stop_instance(state, owner, now)
     state.save(process)
 
 
 def restart_requested(state: MasterState, event: happened.RestartRequested, now: float) -> None:
     """Restart what runs where it runs; queue anew what has ended."""
-    processes = _known(state, event.request, event.names)
+    processes = known_processes(state, event.request, event.names)
     if processes is None:
         return
     for process in processes:
         fault = _restart_fault(state, process)
         if fault:
-            _refuse(state, event.request, f"{fault}. Nothing was restarted")
+            refuse(state, event.request, f"{fault}. Nothing was restarted")
             return
     for process in processes:
-        _restart(state, process, now)
-    state.emit(Reply(event.request, message=f"{_count(len(processes))} restarted"))
+        _restart(state, process, now, event.by)
+    state.emit(Reply(event.request, message=f"{count(len(processes))} restarted"))
 
 
 def _restart_fault(state: MasterState, process: Process) -> str:
@@ -208,8 +230,10 @@ def _restart_fault(state: MasterState, process: Process) -> str:
     return ""
 
 
-def _restart(state: MasterState, process: Process, now: float) -> None:
-    state.record(now, "restart_requested", f"{process.name} is restarted", process=process.name)
+def _restart(state: MasterState, process: Process, now: float, by: str) -> None:
+    state.record(
+        now, "restart_requested", f"{process.name} is restarted", process=process.name, by=by
+    )
     if process.phase.over or process.image is not None:
         images.drop(state, process)
         keeping.begin_anew(state, process)
@@ -231,19 +255,18 @@ def _restart(state: MasterState, process: Process, now: float) -> None:
 
 def migration_requested(state: MasterState, event: happened.MigrationRequested, now: float) -> None:
     """Begin to move a process."""
-    processes = _known(state, event.request, [event.name])
+    processes = known_processes(state, event.request, [event.name])
     if processes is None:
         return
     host = None
     if event.host is not None:
-        host = state.hosts.by_name.get(event.host)
+        host = known_host(state, event.request, event.host)
         if host is None:
-            _refuse_host(state, event.request, event.host)
             return
     (process,) = processes
-    reason = try_move(state, process, "asked for", now, host=host)
+    reason = try_move(state, process, asked_for(event.by), now, host=host)
     if reason:
-        _refuse(state, event.request, reason)
+        refuse(state, event.request, reason)
         return
     name = state.runs[process.name].destination_host.name
     state.emit(Reply(event.request, message=f"{process.name} moves to {name}", host=name))
@@ -264,37 +287,46 @@ def restore_requested(state: MasterState, event: happened.RestoreRequested, now:
 def _begin(
     state: MasterState,
     event: happened.CheckpointRequested | happened.RestoreRequested,
-    begin: Callable[[MasterState, Process, float], str],
+    begin: Callable[[MasterState, Process, str, float], str],
     now: float,
 ) -> None:
-    processes = _known(state, event.request, [event.name])
+    processes = known_processes(state, event.request, [event.name])
     if processes is None:
         return
-    refusal = begin(state, processes[0], now)
+    refusal = begin(state, processes[0], asked_for(event.by), now)
     if refusal:
-        _refuse(state, event.request, refusal)
+        refuse(state, event.request, refusal)
         return
     run = state.runs[event.name]
     message = f"{event.name}: {run.course}"
     state.emit(Reply(event.request, message=message, host=run.source_host.name))
 
 
-def _refuse_host(state: MasterState, request: int, name: str) -> None:
-    there = _names(sorted(state.hosts.by_name)) or "none"
-    _refuse(state, request, f"no such host: {name!r}; there are: {there}", "unknown")
+def asked_for(by: str) -> str:
+    """Return the cause of what a client asked for."""
+    return f"asked for by {by}" if by else "asked for"
+
+
+def known_host(state: MasterState, request: int, name: str) -> Host | None:
+    """The host of a name; a name that no listed host has refuses the whole request."""
+    host = state.hosts.by_name.get(name)
+    if host is not None and not host.pruned:
+        return host
+    there = _names(sorted(host.name for host in state.hosts.listed())) or "none"
+    refuse(state, request, f"no such host: {name!r}; there are: {there}", "unknown")
+    return None
 
 
 def host_state_requested(
     state: MasterState, event: happened.HostStateRequested, now: float
 ) -> None:
     """Cordon, uncordon or drain a host."""
-    host = state.hosts.by_name.get(event.host)
+    host = known_host(state, event.request, event.host)
     if host is None:
-        _refuse_host(state, event.request, event.host)
         return
     done = {"cordon": "cordoned", "uncordon": "uncordoned", "drain": "draining"}.get(event.action)
     if done is None:
-        _refuse(
+        refuse(
             state,
             event.request,
             f"unknown action {event.action!r}; there are: cordon, uncordon, drain",
@@ -305,6 +337,9 @@ def host_state_requested(
     )
     host.told.clear()
     save_host(state, host)
-    state.record(now, f"host_{done}", f"{host.name} is {done}", host=host.name)
+    state.record(now, f"host_{done}", f"{host.name} is {done}", host=host.name, by=event.by)
     reconsider_set_aside(state, now)
-    state.emit(Reply(event.request, message=f"{host.name} is {done}"))
+    said = f"{host.name} is {done}"
+    if host.draining:
+        said = f"{said}: {departures(state, host)}"
+    state.emit(Reply(event.request, message=said))

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from rosrm.core import images, lost_tail
-from rosrm.core.lifecycle import adopt_to_stop
+from rosrm.core.lifecycle import adopt_to_stop, note_awaited_ends, note_phase
 from rosrm.core.migration import Aim
 from rosrm.core.model import InstanceId
 from rosrm.core.plans import plan_from_dict
@@ -106,14 +106,13 @@ def _restore_instances(
 def _expect_to_run(state: MasterState, process: Process, now: float) -> None:
     owner = state.instances.get(process.owner)
     if owner is not None:
-        reason = f"{owner.host.name} has not come back since the master started"
-        state.set_phase(process, ProcessPhase.UNREACHABLE, now, reason)
+        note_phase(state, process, owner, now)
+    elif process.instances:
+        if process.wanted is not Wanted.CANCEL:
+            process.wanted = Wanted.REQUEUE
+        note_awaited_ends(state, process, now)
     elif process.wanted is Wanted.CANCEL:
         state.set_phase(process, ProcessPhase.CANCELLED, now)
-    elif process.instances:
-        process.wanted = Wanted.REQUEUE
-        left = ", ".join(f"{one.id} on {one.host.name}" for one in state.instances_of(process))
-        state.set_phase(process, ProcessPhase.STOPPING, now, f"waits for the end of {left}")
     else:
         state.enqueue(process, now, "nothing of it was left when the master started")
 

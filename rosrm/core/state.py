@@ -152,9 +152,11 @@ class MasterState:
 
     def record(
         self, now: float, kind: str, message: str, *, process: str = "", host: str = "",
-        facts: Mapping[str, Any] = EMPTY,
+        facts: Mapping[str, Any] = EMPTY, by: str = "",
     ) -> None:  # fmt: skip
-        """Write a line of the event record."""
+        """Write a line of the event record; `by` is the client that asked for it."""
+        if by:
+            message, facts = f"{message} (by {by})", {**facts, "by": by}
         self.emit(Record(kind, process, host, message, facts))
         known = self.processes.get(process)
         if known is not None:
@@ -266,10 +268,14 @@ class MasterState:
             return
         gone = [name for name in self.over if not self.processes[name].instances]
         for name in gone[:excess]:
-            del self.over[name]
-            del self.processes[name]
-            self._unsaved.pop(name, None)
-            self.emit(Intent("process", name, None))
+            self.remove_process(name)
+
+    def remove_process(self, name: str) -> None:
+        """Remove an ended process of which no instance may run from memory and journal."""
+        del self.over[name]
+        del self.processes[name]
+        self._unsaved.pop(name, None)
+        self.emit(Intent("process", name, None))
 
     def enqueue(self, process: Process, now: float, reason: str = "") -> None:
         """Queue a process at its place in the line."""

@@ -149,7 +149,8 @@ def decide(ranking: Ranking, *, chosen: int | None = None) -> Decision:
     column = ranking.best() if chosen is None else chosen
     hosts = len(ranking.value)
     if hosts <= _NAMED_HOSTS:
-        moment = _moment(ranking, _first(column, range(hosts)))
+        listed = [host.column for host in ranking.table.listed()]
+        moment = _moment(ranking, _first(column, listed))
         return Decision(column, ranking.policy_name, moment, EMPTY)
     # Of many hosts only those that were nearly chosen are of interest, and time is short.
     nearly = ranking.lowest() if column >= 0 else range(_NAMED_HOSTS)
@@ -273,7 +274,7 @@ def why_never(table: HostTable, demand: Demand) -> str:
         return ""
     return "; ".join(
         f"{host.name}: {_never_reason(table, demand, host.column)}"
-        for host in table.hosts[:_NAMED_HOSTS]
+        for host in table.listed()[:_NAMED_HOSTS]
     )
 
 

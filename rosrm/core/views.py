@@ -11,7 +11,11 @@ from rosrm.core.model import EMPTY, HostDescription
 
 @dataclass(frozen=True, slots=True)
 class ResourceRow:
-    """One resource of a host: fractions 0..1 of its capacity."""
+    """One resource of a host: fractions 0..1 of its capacity.
+
+    Attributes:
+        stale: the reading is old: its probe is late or failed, or the host is not up.
+    """
 
     name: str
     unit: str
@@ -31,6 +35,7 @@ class HostRow:
         state: "up", "suspect", "lost" or "left".
         accepting: the slave is under all its limits and has asked for work.
         reading_age: seconds since the newest `resource_info`.
+        drained: it is draining, and no process is left on it that can leave.
     """
 
     description: HostDescription
@@ -42,6 +47,7 @@ class HostRow:
     reading_age: float
     resources: tuple[ResourceRow, ...]
     processes: int
+    drained: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,8 +56,8 @@ class ProcessRow:
 
     Attributes:
         state: "queued", "set_aside", "assigned", "starting", "running", "backoff", "stopping",
-            "migrating", "checkpointed", "finished", "failed", "cancelled", "unreachable" or
-            "stuck".
+            "migrating", "checkpointed", "finished", "failed", "cancelled", "unreachable", "stuck"
+            or "unknown" (its host is silent, and not lost yet).
         host: where the owning instance is, or the image, or where it has ended; "" for none.
         number: of the owning instance; 0: none.
         exit_code: of the last run, a signal as a negative number; None: unknown, or it runs.
@@ -60,6 +66,7 @@ class ProcessRow:
         cpu: cores.
         memory: bytes.
         reason: why it waits, failed, ...
+        stale: `cpu` and `memory` are old, as its host is silent or lost.
     """
 
     name: str
@@ -77,6 +84,7 @@ class ProcessRow:
     cpu: float
     memory: int
     reason: str
+    stale: bool = False
 
 
 @dataclass(frozen=True, slots=True)

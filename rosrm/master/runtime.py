@@ -29,6 +29,7 @@ from rosrm.core.commands import (
 from rosrm.core.master import step
 from rosrm.core.state import MasterState
 from rosrm.core.views import PluginRow
+from rosrm.entry import handle_stop_signals
 from rosrm.errors import JournalBlocked, Refused
 from rosrm.journal import SqliteJournal
 from rosrm.journal_faults import unreadable
@@ -48,6 +49,7 @@ from rosrm.recording.reading import TABLES, Header
 from rosrm.ros.client import find_master
 from rosrm.ros.master_endpoint import Identity, MasterEndpoint
 from rosrm.ros.participant import Participant
+from rosrm.spelling import counted
 from rosrm.state_directory import only_one
 from rosrm.version import __version__
 
@@ -120,8 +122,7 @@ class MasterRuntime:
             )  # fmt: skip
             opened.callback(self._journal.close)
             # From here on Ctrl-C ends what was begun in good order; before, it ends us at once.
-            for number in (signal.SIGINT, signal.SIGTERM):
-                signal.signal(number, self._stop)
+            handle_stop_signals(self._stop)
             self._participant = Participant(config.ros, "rosrm_master")
             opened.callback(self._participant.close)
             self._refuse_second()
@@ -217,7 +218,7 @@ class MasterRuntime:
     # --- the loop ------------------------------------------------------------------------
 
     def run(self) -> int:
-        """Serve until SIGINT or SIGTERM; returns the exit code."""
+        """Serve until SIGINT, SIGTERM or SIGHUP; returns the exit code."""
         # What is there by now stays: the collector need not go through it with every burst of work.
         gc.collect()
         gc.freeze()
@@ -245,6 +246,12 @@ class MasterRuntime:
             self._write([Record("master_stopped", message=f"master stopped: {self._stopping}")], [])
         except JournalBlocked as fault:
             _log.warning("%s; what was decided last was not written, nor carried out", fault)
+        live = sum(instance.runs for instance in self._state.instances.values())
+        keeps = counted(live, "process keeps", "processes keep")
+        _log.info(
+            "master %s ended (%s); %s running; start the master again to manage what runs",
+            self._config.name, self._stopping, keeps,
+        )  # fmt: skip
 
     def _stop(self, number: int, _frame: Any) -> None:
         self._stopping = self._stopping or signal.Signals(number).name

@@ -29,6 +29,7 @@ _REFUSED: Final = (
     happened.CheckpointRequested,
     happened.RestoreRequested,
     happened.HostStateRequested,
+    happened.PruneRequested,
 )
 #: These come again by themselves.
 _DROPPED: Final = (happened.TimePassed, happened.UsagesReceived, happened.PeerRefused)

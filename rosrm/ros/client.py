@@ -257,6 +257,11 @@ class MasterClient:
         request = srv.SetHostState.Request(host=host, action=action)
         return str(self._ask(srv.SetHostState, names.SET_HOST_STATE, request).answer.message)
 
+    def prune(self, processes: Sequence[str] = (), hosts: Sequence[str] = ()) -> str:
+        """Remove ended processes and departed hosts from the listings; without names: all."""
+        request = srv.Prune.Request(processes=list(processes), hosts=list(hosts))
+        return str(self._ask(srv.Prune, names.PRUNE, request).answer.message)
+
     # --- what can be read ----------------------------------------------------------------
 
     def list(

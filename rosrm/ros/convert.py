@@ -346,16 +346,21 @@ def host_row_to_msg(row: HostRow) -> msg.HostState:
         cordoned=row.cordoned, draining=row.draining, accepting=row.accepting,
         reading_age=row.reading_age, usage=[r.usage for r in row.resources],
         in_flight=[r.in_flight for r in row.resources], limit=[r.limit for r in row.resources],
-        stale=[r.stale for r in row.resources], processes=row.processes,
+        stale=[r.stale for r in row.resources], processes=row.processes, drained=row.drained,
     )  # fmt: skip
+
+
+def _fraction(value: float) -> float:
+    """A number that travelled as float32, without the digits that float32 does not have."""
+    return round(float(value), 6)
 
 
 def host_row_from_msg(message: msg.HostState) -> HostRow:
     """The inverse of `host_row_to_msg`."""
     resources = tuple(
         ResourceRow(
-            resource.name, resource.unit, resource.capacity, resource.scope, float(usage),
-            float(in_flight), float(limit), bool(stale),
+            resource.name, resource.unit, resource.capacity, resource.scope, _fraction(usage),
+            _fraction(in_flight), _fraction(limit), bool(stale),
         )
         for resource, usage, in_flight, limit, stale in zip(
             message.description.resources, message.usage, message.in_flight, message.limit,
@@ -373,7 +378,7 @@ def host_row_from_msg(message: msg.HostState) -> HostRow:
             mapping(description.absent),
         ),
         message.host_id, message.state, message.cordoned, message.draining, message.accepting,
-        message.reading_age, resources, message.processes,
+        message.reading_age, resources, message.processes, message.drained,
     )  # fmt: skip
 
 
@@ -387,6 +392,7 @@ def process_row_to_msg(row: ProcessRow) -> msg.ProcessState:
 def process_row_from_msg(message: msg.ProcessState) -> ProcessRow:
     """The inverse of `process_row_to_msg`."""
     fields = {name: getattr(message, name) for name in ProcessRow.__slots__}
+    fields["cpu"] = _fraction(message.cpu)
     return ProcessRow(**fields if message.exit_code_known else fields | {"exit_code": None})
 
 

@@ -89,6 +89,7 @@ class MasterServices:
             (srv.Checkpoint, names.CHECKPOINT, _checkpointed),
             (srv.Restore, names.RESTORE, _restored),
             (srv.SetHostState, names.SET_HOST_STATE, _host_set),
+            (srv.Prune, names.PRUNE, _pruned),
         ):
             offer(kind, path(name), self._as_event(kind, event))
         # Last, as DDS tells of them in this order: who can shake hands can ask for all the others.
@@ -238,28 +239,40 @@ class MasterServices:
 
 def _submitted(request: srv.Submit.Request, token: int) -> happened.Event:
     specs = tuple(convert.spec_from_msg(spec) for spec in request.processes)
-    return happened.SubmissionReceived(token, specs)
+    return happened.SubmissionReceived(token, specs, _requester(request))
 
 
 def _cancelled(request: srv.Cancel.Request, token: int) -> happened.Event:
-    return happened.CancelRequested(token, tuple(request.processes))
+    return happened.CancelRequested(token, tuple(request.processes), _requester(request))
 
 
 def _restarted(request: srv.Restart.Request, token: int) -> happened.Event:
-    return happened.RestartRequested(token, tuple(request.processes))
+    return happened.RestartRequested(token, tuple(request.processes), _requester(request))
 
 
 def _migrated(request: srv.Migrate.Request, token: int) -> happened.Event:
-    return happened.MigrationRequested(token, request.process, request.host or None)
+    host = request.host or None
+    return happened.MigrationRequested(token, request.process, host, _requester(request))
 
 
 def _checkpointed(request: srv.Checkpoint.Request, token: int) -> happened.Event:
-    return happened.CheckpointRequested(token, request.process)
+    return happened.CheckpointRequested(token, request.process, _requester(request))
 
 
 def _restored(request: srv.Restore.Request, token: int) -> happened.Event:
-    return happened.RestoreRequested(token, request.process)
+    return happened.RestoreRequested(token, request.process, _requester(request))
 
 
 def _host_set(request: srv.SetHostState.Request, token: int) -> happened.Event:
-    return happened.HostStateRequested(token, request.host, request.action)
+    by = _requester(request)
+    return happened.HostStateRequested(token, request.host, request.action, by)
+
+
+def _pruned(request: srv.Prune.Request, token: int) -> happened.Event:
+    names, hosts = tuple(request.processes), tuple(request.hosts)
+    return happened.PruneRequested(token, names, hosts, _requester(request))
+
+
+def _requester(request: Any) -> str:
+    """The name of the client that sent a request, for records."""
+    return str(request.envelope.sender).removeprefix("client ")

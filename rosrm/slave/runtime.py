@@ -25,6 +25,7 @@ from rosrm.core.model import (
     RestartPolicy,
     StopPolicy,
 )
+from rosrm.entry import handle_stop_signals
 from rosrm.errors import Refused
 from rosrm.ports import ProbeContext
 from rosrm.registry import Registry
@@ -43,6 +44,7 @@ from rosrm.slave.sessions import SessionTable
 from rosrm.slave.starting import Starter
 from rosrm.slave.supervisor_link import SupervisorLink
 from rosrm.slave.usage import UsageWatch
+from rosrm.spelling import counted
 from rosrm.state_directory import only_one
 from rosrm.version import __version__
 
@@ -102,8 +104,7 @@ class SlaveRuntime:
             opened.callback(self._sampler.close)
             first = self._sampler.first().reports
             # From here on Ctrl-C ends what was begun in good order; before, it ends us at once.
-            for number in (signal.SIGINT, signal.SIGTERM):
-                signal.signal(number, self._stop)
+            handle_stop_signals(self._stop)
             self._supervisor = SupervisorLink(
                 config.state / "supervisor", config.logs, post=self._post, take=self.take,
                 follow=self._follow_session, say=self.say, ended=self._supervisor_ended,
@@ -162,7 +163,7 @@ class SlaveRuntime:
     # --- the loop ------------------------------------------------------------------------
 
     def run(self) -> int:
-        """Serve until SIGINT or SIGTERM; returns the exit code."""
+        """Serve until SIGINT, SIGTERM or SIGHUP; returns the exit code."""
         self._supervisor.listen()
         with self._closing:
             self._serve(lambda: not self._stopping and not self._endpoint.failure)
@@ -370,9 +371,10 @@ class SlaveRuntime:
         failure = self._endpoint.failure
         if failure:
             _log.error("%s", failure)
-        if self._left or self._config.on_stop == "keep":
-            return 1 if failure else 0
         live = self._state.live()
+        if self._left or self._config.on_stop == "keep":
+            self._say_kept(0 if self._left else live)
+            return 1 if failure else 0
         if live and failure and not self._endpoint.superseded:
             _log.error("its %d processes go on; start the slave again when that is mended", live)
             return 1
@@ -382,14 +384,28 @@ class SlaveRuntime:
         self._endpoint.leave(self._supervisor.shut_down)
         deadline = time.monotonic() + self._longest_stop()
         self._serve(lambda: not self._left and time.monotonic() < deadline)
-        return self._ended(failure)
+        return self._ended(failure, live)
 
-    def _ended(self, failure: str) -> int:
+    def _say_kept(self, live: int) -> None:
+        ended = f"slave of {self._config.host} ended ({self._stopping or 'refused'})"
+        if live:
+            keep = counted(live, "process keeps", "processes keep")
+            self.say(
+                f"{ended}; {keep} running (supervisor pid {self._supervisor.pid}). Start the slave "
+                f"again to manage what runs, or end it by `rosrm slave --stop-all` with the same "
+                f"--config"
+            )
+        else:
+            self.say(f"{ended}; it left no process running")
+
+    def _ended(self, failure: str, stopped: int) -> int:
         if not self._left:
             _log.error("the supervisor did not end in time; it goes on stopping the processes")
             return 1
         self._work(time.monotonic())
         self._endpoint.wait_until_heard()
+        count = counted(stopped, "process was", "processes were")
+        self.say(f"slave of {self._config.host} ended; {count} stopped")
         return 1 if failure else 0
 
     def _longest_stop(self) -> float:

@@ -74,6 +74,11 @@ class SupervisorLink:
         self._is_closed = True
         self._client.close()
 
+    @property
+    def pid(self) -> int:
+        """Pid of the supervisor."""
+        return self._client.pid
+
     # --- what it is told -----------------------------------------------------------------
 
     def start(self, orders: Sequence[LaunchOrder]) -> None:

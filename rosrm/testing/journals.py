@@ -56,7 +56,7 @@ class MemoryJournal:
             for stored in self.stored
             if stored.sequence > after
             and process in ("", stored.record.process)
-            and host in ("", stored.record.host)
+            and host in ("", stored.record.host, stored.record.facts.get("from"))
         ]
         return matching[max(0, len(matching) - newest) :]
 
@@ -90,10 +90,11 @@ class JournalContract:
         journal.close()
 
     def test_selects_records(self, tmp_path: Path) -> None:
-        """By process, by host, after a sequence; of too many the newest, oldest first."""
+        """By process, by host (moves from it too), after a sequence; of too many the newest."""
         journal = self.open(tmp_path)
+        moved = Record("d", facts={"from": "source", "to": "i"})
         journal.write(
-            [Record("a", "p", "h"), Record("b", "q", "h"), Record("c", "p", "i"), Record("d")],
+            [Record("a", "p", "h"), Record("b", "q", "h"), Record("c", "p", "i"), moved],
             [],
             0,
         )
@@ -101,6 +102,7 @@ class JournalContract:
             "a b c d": journal.records(),
             "a c": journal.records(process="p"),
             "a b": journal.records(host="h"),
+            "d": journal.records(host="source"),
             "c": journal.records(process="p", after=1),
             "c d": journal.records(newest=2),
             "": journal.records(process="unknown"),

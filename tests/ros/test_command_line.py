@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import getpass
 import json
 import os
 import select
@@ -320,32 +321,22 @@ def test_a_wrong_file(rosrm) -> None:
 
 
 def test_migrate_restart_cordon_drain_cancel(rosrm, cluster) -> None:
-    """Each says what it does, and it is done."""
+    """Each says what it does; with --wait it is done when the command ends."""
     before = cluster.process("talker")
     other = "h1" if before.host == "h0" else "h0"
-    assert other in rosrm.run("migrate", "talker", "--to", other)
-    cluster.wait_until(
-        "talker on the other host",
-        lambda v: any(
-            r.name == "talker" and r.host == other and r.state == "running" for r in v.processes
-        ),
-    )
+    said = rosrm.run("migrate", "talker", "--to", other, "--wait", "--timeout", "60s")
+    assert f"talker moved from {before.host} to {other}" in said
     here = cluster.process("talker")
-    rosrm.run("restart", "talker")
+    assert (here.host, here.state) == (other, "running")
+    rosrm.run("restart", "talker", "--wait", "--timeout", "60s")
     wait_gone(here.pid)
-    cluster.wait_until(
-        "talker under another pid",
-        lambda v: any(
-            r.name == "talker" and r.state == "running" and r.pid not in (0, here.pid)
-            for r in v.processes
-        ),
-    )
+    assert cluster.process("talker").pid not in (0, here.pid)
 
     assert "cordoned" in rosrm.run("cordon", before.host)
     assert cluster.host(before.host).cordoned
     assert "uncordoned" in rosrm.run("uncordon", before.host)
     assert not cluster.host(before.host).cordoned
-    rosrm.run("drain", other)
+    assert "talker" in rosrm.run("drain", other)
     cluster.wait_until(
         "talker off the drained host",
         lambda v: any(
@@ -353,11 +344,15 @@ def test_migrate_restart_cordon_drain_cancel(rosrm, cluster) -> None:
             for r in v.processes
         ),
     )
+    assert f"talker moves from {other}" in rosrm.run("events", "--host", other)
     rosrm.run("uncordon", other)
     last = cluster.process("talker")
-    rosrm.run("cancel", "talker")
-    assert cluster.ended("talker").state == "cancelled"
+    rosrm.run("cancel", "talker", "--wait", "--timeout", "60s")
+    assert cluster.process("talker").state == "cancelled"
     assert not alive(last.pid)
+    assert f"(by {getpass.getuser()}@" in rosrm.run("events", "--process", "talker", "-n", "1000")
+    rosrm.run("prune", "talker")
+    assert "talker" not in rosrm.run("ps", "--all")
 
 
 @pytest.mark.parametrize(

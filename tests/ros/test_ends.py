@@ -1,8 +1,9 @@
-"""Ctrl-C, SIGTERM, a second master, a second slave: everybody ends in good order and says why."""
+"""Ctrl-C, SIGTERM, SIGHUP, second masters and slaves: every part ends cleanly and says why."""
 
 from __future__ import annotations
 
 import os
+import pty
 import signal
 import subprocess
 import sys
@@ -27,13 +28,16 @@ from tests.ros.clusters import (
     wait_until_none,
 )
 
+#: A user ends a part by Ctrl-C, by `kill`, or by closing its terminal.
+STOPS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
+
 
 def end(part, number) -> int:
     part.process.send_signal(number)
     return part.process.wait(PATIENCE)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", STOPS)
 def test_a_slave_that_is_stopped_stops_its_processes(make_cluster, number) -> None:
     """Exit code 0, no traceback, no process left; what it ran is queued for another host."""
     cluster = make_cluster(host("h0"))
@@ -45,7 +49,10 @@ def test_a_slave_that_is_stopped_stops_its_processes(make_cluster, number) -> No
 
     assert not [pid for pid in pids if alive(pid)]
     assert wait_until_none(cluster.directory / "hosts") == {}
-    assert "Traceback" not in cluster.log_of("h0")
+    log = cluster.log_of("h0")
+    assert "Traceback" not in log
+    assert f"stopping 4 processes ({number.name})" in log
+    assert "slave of h0 ended; 4 processes were stopped" in log
     view = cluster.wait_until(
         "all queued", lambda v: all(row.state == "queued" for row in v.processes)
     )
@@ -77,7 +84,7 @@ def test_a_slave_that_is_stopped_after_its_master_loses_no_process(make_cluster)
     assert not cluster.events("failed")
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", STOPS)
 def test_a_master_that_is_stopped_touches_no_process(make_cluster, number) -> None:
     """Exit code 0, no traceback; started again it goes on with the same processes."""
     cluster = make_cluster(host("h0"))
@@ -85,7 +92,9 @@ def test_a_master_that_is_stopped_touches_no_process(make_cluster, number) -> No
     before = cluster.wait("p", "running")
 
     assert end(cluster.master, number) == 0
-    assert "Traceback" not in cluster.log_of("master")
+    log = cluster.log_of("master")
+    assert "Traceback" not in log
+    assert f"ended ({number.name}); 1 process keeps running; start the master again" in log
     assert alive(before.pid)
 
     cluster.reconnect()
@@ -105,6 +114,9 @@ def test_keep_leaves_the_processes_running(make_cluster) -> None:
 
     assert end(cluster.slaves["h0"], signal.SIGINT) == 0
     assert alive(before.pid)
+    log = cluster.log_of("h0")
+    assert "slave of h0 ended (SIGINT); 2 processes keep running (supervisor pid " in log
+    assert "`rosrm slave --stop-all`" in log
     go.touch()  # it ends while no slave is there
 
     cluster.start_slave(host("h0"))
@@ -292,6 +304,9 @@ def test_a_slave_that_is_killed(make_cluster) -> None:
 
     end(cluster.slaves["h0"], signal.SIGKILL)
     assert alive(before.pid)
+    log = cluster.log_of("h0")
+    assert "slave of h0 ended (SIGINT); 2 processes keep running (supervisor pid " in log
+    assert "`rosrm slave --stop-all`" in log
     go.touch()
     cluster.start_slave(host("h0"))
     row = cluster.ended("ends")
@@ -396,8 +411,9 @@ def test_a_lost_journal_of_a_master_that_is_back_at_once(make_cluster, epoch) ->
 # --- the shell --------------------------------------------------------------------------------
 
 
-def test_ctrl_c_in_a_terminal(make_cluster) -> None:
-    """A process group is interrupted, as a terminal does: the processes end with their slave."""
+@pytest.fixture
+def by_hand(make_cluster):
+    """A cluster without hosts, the state directory of a host t, and the command for its slave."""
     cluster = make_cluster()
     state = cluster.directory / "hosts" / "t"
     config = cluster.directory / "host.yaml"
@@ -406,10 +422,15 @@ def test_ctrl_c_in_a_terminal(make_cluster) -> None:
         "probes: {memory: {}, cpu: {}}\n"
         f"ros: {{domain: {cluster.domain}}}\n"
     )
+    return cluster, state, [sys.executable, "-m", "rosrm.cli", "slave", "--config", str(config)]
+
+
+def test_ctrl_c_in_a_terminal(by_hand) -> None:
+    """A process group is interrupted, as a terminal does: the processes end with their slave."""
+    cluster, state, command = by_hand
     log = cluster.directory / "terminal.log"
     with log.open("wb") as sink, subprocess.Popen(
-        [sys.executable, "-m", "rosrm.cli", "slave", "--config", str(config)],
-        stdin=subprocess.DEVNULL, stdout=sink, stderr=sink, start_new_session=True,
+        command, stdin=subprocess.DEVNULL, stdout=sink, stderr=sink, start_new_session=True,
     ) as slave:  # fmt: skip
         cluster.wait_until("host t", lambda v: any(row.accepting for row in v.hosts))
         cluster.submit(service("p"))
@@ -418,4 +439,24 @@ def test_ctrl_c_in_a_terminal(make_cluster) -> None:
         assert slave.wait(PATIENCE) == 0
     assert not alive(pid)
     assert "Traceback" not in Path(log).read_text()
+    assert wait_until_none(state) == {}
+
+
+def test_a_terminal_that_is_closed(by_hand) -> None:
+    """The slave gets SIGHUP, can write nowhere any more, and stops its processes all the same."""
+    cluster, state, command = by_hand
+    terminal, its_end = pty.openpty()
+    slave = subprocess.Popen(
+        ["setsid", "--ctty", *command], stdin=its_end, stdout=its_end, stderr=its_end
+    )
+    os.close(its_end)
+    try:
+        cluster.wait_until("host t", lambda v: any(row.accepting for row in v.hosts))
+        cluster.submit(service("p"))
+        pid = cluster.wait("p", "running").pid
+    finally:
+        os.close(terminal)
+        code = slave.wait(PATIENCE)
+    assert code == 0
+    assert not alive(pid)
     assert wait_until_none(state) == {}

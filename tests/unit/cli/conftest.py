@@ -27,10 +27,14 @@ def resource(name, usage=0.4, in_flight=0.1, limit=0.8, stale=False):
     return ResourceRow(name, "B", 2e9, "machine", usage, in_flight, limit, stale)
 
 
-def host(name, state="up", *, cordoned=False, draining=False, resources=None, processes=2):
+def host(
+    name, state="up", *, cordoned=False, draining=False, resources=None, processes=2, drained=False
+):
     rows = (resource("memory"), resource("cpu", 0.95, 0.0, 0.9)) if resources is None else resources
     description = HostDescription(name, 7, labels={"gpu": "true"})
-    return HostRow(description, 3, state, cordoned, draining, True, 0.05, tuple(rows), processes)
+    return HostRow(
+        description, 3, state, cordoned, draining, True, 0.05, tuple(rows), processes, drained
+    )
 
 
 def process(name, state="running", host="alpha", *, number=1, kind="service", **more):
@@ -141,6 +145,10 @@ class FakeClient:
     def set_host_state(self, host, action):
         self._note(action, host)
         return f"{host}: {action}"
+
+    def prune(self, processes, hosts):
+        self._note("prune", list(processes), list(hosts))
+        return "removed"
 
     def explain(self, name):
         self._note("explain", name)

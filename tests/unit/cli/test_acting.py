@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import io
+from types import SimpleNamespace
+
 import pytest
 
 from rosrm.errors import NoMaster, Refused
 
-from .conftest import event, process
+from .conftest import event, host, process
 
 
 @pytest.fixture
@@ -31,6 +34,8 @@ def work(tmp_path):
         (["cordon", "alpha"], ("cordon", "alpha"), "alpha: cordon\n"),
         (["uncordon", "alpha"], ("uncordon", "alpha"), "alpha: uncordon\n"),
         (["drain", "alpha"], ("drain", "alpha"), "alpha: drain\n"),
+        (["prune"], ("prune", [], []), "removed\n"),
+        (["prune", "a", "--host", "beta"], ("prune", ["a"], ["beta"]), "removed\n"),
     ],
 )
 def test_a_command_asks_the_master_and_prints_its_answer(rosrm, client, words, asked, said):
@@ -48,9 +53,11 @@ def test_a_command_asks_the_master_and_prints_its_answer(rosrm, client, words, a
         ("restore", "restored", "a goes on from its image on alpha", 0),
         ("restore", "restore_failed", "a stays checkpointed on alpha: a port is in use", 1),
         ("restore", "cancelled", "a cancelled; its image is removed", 1),
+        ("migrate", "migrated", "a moved from alpha to beta", 0),
+        ("migrate", "stayed", "a stayed on alpha: beta did not start it", 1),
     ],
 )
-def test_wait_says_how_a_checkpoint_or_a_restore_ended(
+def test_wait_says_how_a_checkpoint_a_restore_or_a_move_ended(
     rosrm, client, monkeypatch, action, kind, message, code
 ):
     """By the first such event after it was asked for; an older one says nothing of it."""
@@ -109,12 +116,144 @@ def test_submit_wait_fails_with_the_reason_when_a_process_failed(rosrm, client, 
 
 
 def test_submit_wait_gives_up_after_its_time(rosrm, client, work, monkeypatch):
+    """The message names processes that have not ended, and no others."""
     monkeypatch.setattr("rosrm.cli.waiting.PERIOD", 0.01)
-    client.processes = [process("a", "set_aside", kind="job", reason="no host has camera=front")]
+    client.processes = [process("a", "starting", kind="job"), process("b", "finished")]
     result = rosrm("submit", work, "--wait", "--timeout", "50ms")
     assert result.code == 1
+    assert "the time is up; still waiting for a\n" in result.err
+
+
+def test_submit_wait_ends_when_a_service_has_ended(rosrm, client, work):
+    """Nothing starts it again, and a service is to run."""
+    client.processes = [process("a", "finished", kind="job"), process("b", "finished")]
+    result = rosrm("submit", work, "--wait")
+    assert (result.code, result.out.splitlines()[-1]) == (1, "2 finished")
+    assert "not running, as a service does: b;" in result.err
+    assert "waiting" not in result.err
+
+
+def test_submit_wait_ends_when_all_that_is_left_is_set_aside(rosrm, client, work, monkeypatch):
+    """Once it has been for a moment: at the start of a cluster hosts are still registering."""
+    looks = iter((1.0, 6.0))
+
+    def later(seconds=0.0):
+        reason = "no host has camera=front"
+        since = next(looks)
+        client.processes = [
+            process("a", "set_aside", kind="job", reason=reason, since=since),
+            process("b", "running"),
+        ]
+
+    later()
+    monkeypatch.setattr("rosrm.cli.waiting.time.sleep", later)
+    result = rosrm("submit", work, "--wait")
+    assert (result.code, result.out.splitlines()[-1]) == (1, "1 running, 1 set aside")
     assert "a is set aside: no host has camera=front" in result.err
-    assert "the time is up; still waiting for a" in result.err
+    assert "no longer waiting for a: set aside until a host registers or changes" in result.err
+
+
+def test_ctrl_c_in_a_wait_says_that_the_processes_stay(rosrm, client, work, monkeypatch):
+    client.processes = [process("a", "queued", kind="job")]
+
+    def interrupt(seconds):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("rosrm.cli.waiting.time.sleep", interrupt)
+    result = rosrm("submit", work, "--wait")
+    assert result.code == 130
+    assert result.err == (
+        "rosrm: no longer waiting; what was submitted stays queued or runs (`rosrm ps`)\n"
+    )
+
+
+def test_submit_takes_several_files_and_the_standard_input(rosrm, client, work, monkeypatch):
+    """As one submission: all processes are taken, or none."""
+    other = SimpleNamespace(buffer=io.BytesIO(b"processes: [{name: c, command: x}]"))
+    monkeypatch.setattr("rosrm.config.documents.sys", SimpleNamespace(stdin=other))
+    assert rosrm("submit", work, "-").code == 0
+    assert client.asked == [("submit", ["a", "b", "c"])]
+
+
+@pytest.mark.parametrize(
+    ("words", "asked"),
+    [
+        (["--all"], ["a", "c"]),
+        (["WORK"], ["a"]),
+        (["c", "WORK"], ["c", "a"]),
+        (["c", "c"], ["c"]),
+    ],
+    ids=" ".join,
+)
+def test_cancel_takes_all_processes_or_those_of_a_file(rosrm, client, work, words, asked):
+    """Processes of a file that have ended or were never submitted are left out."""
+    client.processes = [process("a"), process("c", "queued"), process("d", "failed")]
+    result = rosrm("cancel", *[work if word == "WORK" else word for word in words])
+    assert (result.code, client.asked[-1]) == (0, ("cancel", asked))
+
+
+def test_cancel_of_what_has_ended_says_so(rosrm, client, work):
+    client.processes = [process("a", "finished"), process("b", "cancelled")]
+    for words in (["--all"], [work]):
+        result = rosrm("cancel", *words)
+        assert (result.code, result.out.startswith("no process to cancel")) == (0, True)
+
+
+@pytest.mark.parametrize("words", [[], ["--all", "a"]])
+def test_cancel_needs_names_or_all_of_them(rosrm, client, words):
+    result = rosrm("cancel", *words)
+    assert (result.code, client.asked) == (2, [])
+    assert "give names of processes or work files, or --all" in result.err
+
+
+def test_cancel_wait_ends_when_all_have_ended(rosrm, client, monkeypatch):
+    client.processes = [process("a", "stopping"), process("b", "finished")]
+
+    def later(seconds):
+        client.processes = [process("a", "cancelled"), process("b", "finished")]
+
+    monkeypatch.setattr("rosrm.cli.waiting.time.sleep", later)
+    result = rosrm("cancel", "a", "b", "--wait")
+    assert (result.code, result.out) == (0, "cancelled\n1 cancelled, 1 finished\n")
+
+
+def test_restart_wait_ends_when_each_runs_in_another_run(rosrm, client, monkeypatch):
+    """A process that had ended runs again at all; a job may have finished."""
+    client.processes = [process("a"), process("b", "failed", pid=0), process("c", kind="job")]
+    looks = iter(
+        (
+            [process("a"), process("b", "queued"), process("c", "finished", kind="job")],
+            [process("a", pid=100), process("b"), process("c", "finished", kind="job")],
+        )
+    )
+
+    def later(seconds):
+        client.processes = next(looks)
+
+    monkeypatch.setattr("rosrm.cli.waiting.time.sleep", later)
+    result = rosrm("restart", "a", "b", "c", "--wait")
+    assert (result.code, result.out) == (0, "restarted\n1 finished, 2 running\n")
+    assert next(looks, None) is None
+
+
+@pytest.mark.parametrize(("left", "code"), [([], 0), ([process("driver")], 1)])
+def test_drain_wait_ends_when_the_host_is_drained(rosrm, client, monkeypatch, left, code):
+    """Exit code 1 where a process has stayed, because turning the host off would end it."""
+    client.hosts, client.processes = [host("alpha", draining=True)], [process("talker")]
+
+    def later(seconds):
+        client.hosts, client.processes = [host("alpha", draining=True, drained=True)], left
+        client.events += [event(9, "host_drained", message="alpha is drained: so and so")]
+
+    monkeypatch.setattr("rosrm.cli.waiting.time.sleep", later)
+    result = rosrm("drain", "alpha", "--wait")
+    assert (result.code, "alpha is drained: so and so\n" in result.out + result.err) == (code, True)
+
+
+def test_drain_wait_ends_when_somebody_uncordons_the_host(rosrm, client):
+    client.hosts = [host("alpha")]
+    result = rosrm("drain", "alpha", "--wait")
+    assert (result.code, result.err) == (1, "rosrm: alpha is no longer draining\n")
 
 
 def test_a_wrong_timeout_is_refused_before_anything_is_submitted(rosrm, client, work):

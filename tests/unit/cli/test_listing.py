@@ -101,6 +101,7 @@ def test_ps_json_has_every_process_with_every_field(rosrm, client):
         "name": "talker", "kind": "service", "state": "running", "host": "alpha", "number": 1,
         "pid": 99, "restarts": 2, "migrations": 1, "exit_code": 0, "priority": 0,
         "queue_position": 0, "since": 12.0, "cpu": 0.5, "memory": 64_000_000, "reason": "",
+        "stale": False,
     }  # fmt: skip
 
 
@@ -123,6 +124,28 @@ def test_a_stale_or_missing_reading_is_marked(rosrm, client):
     out = rosrm("hosts").out
     assert "?40/80" in out
     assert "?/80" in out
+
+
+def test_old_readings_of_a_process_are_marked(rosrm, client):
+    """In the table by `?`, in JSON by `stale`."""
+    client.processes = [process("p", "unreachable", pid=9, stale=True, reason="alpha is lost")]
+    out = rosrm("ps").out
+    assert "?0.50" in out
+    assert "?64.0 MB" in out
+    (row,) = json.loads(rosrm("ps", "--json").out)
+    assert row["stale"] is True
+
+
+def test_a_drained_host_is_shown_as_one(rosrm, client):
+    client.hosts = [host("a", draining=True, drained=True)]
+    assert "up, drained" in rosrm("hosts").out
+    assert "(1 drained)" in rosrm("status").out
+
+
+@pytest.mark.parametrize("command", ["status", "ps", "hosts", "plugins", "explain"])
+def test_a_table_in_a_pipe_has_no_blanks_at_the_ends_of_its_lines(rosrm, client, command):
+    out = rosrm(command, *(["talker"] if command == "explain" else [])).out
+    assert [line for line in out.splitlines() if line != line.rstrip()] == []
 
 
 def test_hosts_json_joins_host_and_description_and_has_no_nan(rosrm, client):

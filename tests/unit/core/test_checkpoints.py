@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from rosrm.core import events as happened
 from rosrm.core.commands import Command, Order
 from rosrm.core.migration import Aim, Commit, Move, Plan, Start, Stop, plan_fault
 from rosrm.core.model import (
@@ -320,7 +321,16 @@ def test_a_drained_host_says_that_images_stay() -> None:
     _, cluster = checkpointed()
     cluster.set_host("a", "drain")
     cluster.wait(0.5)
-    assert "p is checkpointed: its image stays on a" in " ".join(cluster.told("nothing_moves"))
+    (message,) = cluster.told("host_drained")
+    assert "p is checkpointed: its image stays on a" in message
+
+
+def test_the_record_of_a_checkpoint_names_its_requester() -> None:
+    """As the cause of the plan."""
+    _, cluster = playing()
+    cluster.ask(happened.CheckpointRequested, "p", "anna@desk:42")
+    (message,) = cluster.told("checkpoint_begun")
+    assert message.endswith("; asked for by anna@desk:42")
 
 
 @pytest.mark.parametrize("then", ["wait", "elsewhere", "stop"])

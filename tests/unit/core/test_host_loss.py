@@ -6,7 +6,8 @@ from typing import Any
 
 import pytest
 
-from rosrm.core import slave
+from rosrm.core import events as happened
+from rosrm.core import listing, slave
 from rosrm.core.model import (
     HostLossPolicy,
     InstanceState,
@@ -205,15 +206,49 @@ def test_a_restarted_master_gives_the_hosts_their_lease_first() -> None:
 # --- others than owners -----------------------------------------------------------------------
 
 
-def test_cancel_of_one_whose_host_is_lost_is_over_at_once() -> None:
-    """What may still run there is stopped when the host is back."""
-    cluster = on_a(process("p"))
+BEING_CANCELLED = "being cancelled; it may still run on a, which is lost, and ends when a returns"
+
+
+@pytest.mark.parametrize("then", ["wait", "stop"])
+def test_a_process_on_a_lost_host_is_being_cancelled_until_the_host_reports_its_end(
+    then: Any,
+) -> None:
+    """However long that takes: it may run. The name is not given again before."""
+    cluster = on_a(process("p", host_loss=HostLossPolicy(then, 50.0)), "b")
+    lose(cluster, "a")
+    assert cluster.cancel("p").message == f"1 process being cancelled; p is {BEING_CANCELLED}"
+    cluster.wait(100.0)
+    assert (cluster.phase("p"), cluster["p"].reason) == ("stopping", BEING_CANCELLED)
+    assert BEING_CANCELLED in cluster.submit(process("p")).message
+    back(cluster, "a")
+    assert (cluster.phase("p"), cluster.where("p")) == ("cancelled", [])
+
+
+def test_a_process_that_is_being_cancelled_when_its_host_is_lost_says_so() -> None:
+    """Also after a restart of the master."""
+    cluster = on_a(process("p"), "b")
+    cluster.machines["a"].stubborn.add("p")
+    cluster.cancel("p")
+    lose(cluster, "a")
+    assert (cluster.phase("p"), cluster["p"].reason) == ("stopping", BEING_CANCELLED)
+    cluster.kill_master()
+    assert cluster.phase("p") == "stopping"
+    assert "a, which has not come back since the master started" in cluster["p"].reason
+    cluster.machines["a"].let_go("p", cluster.now)
+    cluster.machines["a"].connected = True
+    cluster.register(cluster.machines["a"])
+    cluster.wait(1.0)
+    assert cluster.phase("p") == "cancelled"
+
+
+def test_a_fenced_process_is_cancelled_when_its_fence_has_ended_it() -> None:
+    """With `elsewhere` it has ended by the time at which a successor could have started."""
+    cluster = on_a(process("p", host_loss=HostLossPolicy("elsewhere", 20.0)), "b")
     lose(cluster, "a")
     cluster.cancel("p")
-    cluster.wait(0.5)
+    assert cluster.phase("p") == "stopping"
+    cluster.wait(20.0)
     assert cluster.phase("p") == "cancelled"
-    back(cluster, "a")
-    assert cluster.where("p") == []
 
 
 def test_the_former_host_of_a_move_that_is_lost_does_not_hold_it_up() -> None:
@@ -331,17 +366,48 @@ def test_what_was_cancelled_out_of_sight_is_not_taken_back() -> None:
 
 
 def test_a_new_process_of_the_name_waits_until_the_old_one_has_ended() -> None:
-    """It was cancelled out of sight, and the name was given again; its host comes back."""
+    """Its host was pruned while it was lost, the name was given again; the host comes back."""
     cluster = on_a(process("p"), "b")
     cluster.machines["a"].stubborn.add("p")
     lose(cluster, "a")
     cluster.cancel("p")
-    cluster.wait(0.5)
+    cluster.ask(happened.PruneRequested, (), ("a",))
     cluster.set_host("b", "cordon")
     assert cluster.submit(process("p")).accepted
-    back(cluster, "a")
+    cluster.machines["a"].connected = True
+    cluster.register(cluster.machines["a"])
+    cluster.wait(1.0)
     assert (cluster.phase("p"), cluster.queue()) == ("stopping", [])
     assert cluster["p"].reason == "waits for the end of p#1 on a"
     cluster.machines["a"].let_go("p", cluster.now)
     cluster.wait(0.5)
     assert (cluster.phase("p"), cluster["p"].owner) == ("running", 2)
+
+
+# --- what is shown ----------------------------------------------------------------------------
+
+
+def test_of_a_silent_host_nothing_is_said_to_run_and_readings_are_old() -> None:
+    """From the first silence on, in every row; when the host is back all is known."""
+    cluster = on_a(process("p"), "b")
+
+    def rows() -> Any:
+        (process,) = listing.process_rows(cluster.state, cluster.now)
+        host = listing.host_rows(cluster.state, cluster.now)[0]
+        return process, host, {resource.stale for resource in host.resources}
+
+    process_row, host_row, stale = rows()
+    assert (process_row.state, process_row.stale, stale) == ("running", False, {False})
+    assert host_row.accepting
+    lose(cluster, "a", seconds=4.0)
+    process_row, host_row, stale = rows()
+    assert (host_row.state, stale, host_row.accepting) == ("suspect", {True}, False)
+    assert (process_row.state, process_row.stale) == ("unknown", True)
+    assert process_row.reason == "a has been silent for 4 s; last known: running"
+    cluster.wait(10.0)
+    process_row, host_row, stale = rows()
+    assert (host_row.state, stale) == ("lost", {True})
+    assert (process_row.state, process_row.stale) == ("unreachable", True)
+    back(cluster, "a")
+    process_row, host_row, stale = rows()
+    assert (process_row.state, process_row.stale, stale) == ("running", False, {False})

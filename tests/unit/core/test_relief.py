@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from rosrm.core import listing
 from rosrm.core.model import ResourceDescription
 from tests.unit.core.cluster import GIB, MIB, Cluster, Machine, movable, process
 
@@ -179,12 +180,50 @@ def test_a_drained_host_is_emptied_of_what_can_move() -> None:
     on_a(cluster, p=50, q=50)
     cluster.submit(process("fixed"))
     cluster.add(machine("b"))
-    assert cluster.set_host("a", "drain").message == "a is draining"
+    stays = "cannot leave: fixed has no migration strategy; give it `migration:` in its file"
+    said = cluster.set_host("a", "drain").message
+    assert said == f"a is draining: 2 processes leave (p, q); {stays}"
     cluster.wait(3.0)
     assert cluster.counts() == {"a": 1, "b": 2}
-    assert "fixed has no migration strategy" in cluster.told("nothing_moves")[0]
+    assert cluster.told("host_drained") == [
+        f"a is drained: no process is left that can leave; {stays}"
+    ]
+    assert listing.host_rows(cluster.state, cluster.now)[0].drained
     cluster.submit(process("new"))
     assert cluster.where("new") == ["b"]
+
+
+def test_a_draining_host_is_drained_only_when_what_can_leave_has_left() -> None:
+    """Not while no host has room for it, nor while it is lost; another process brings it back."""
+    cluster = cluster_of(machine("a"))
+    on_a(cluster, p=50)
+    cluster.add(machine("b"))
+    cluster.set_host("b", "cordon")
+    cluster.set_host("a", "drain")
+    cluster.wait(3.0)
+    assert "no host has room for p" in cluster.told("nothing_moves")[0]
+    cluster.machines["a"].connected = False
+    cluster.set_host("b", "uncordon")
+    cluster.wait(12.0)
+    assert cluster.told("host_drained") == []
+    cluster.machines["a"].connected = True
+    cluster.wait(5.0)
+    assert (cluster.where("p"), len(cluster.told("host_drained"))) == (["b"], 1)
+    cluster.set_host("a", "uncordon")
+    assert not listing.host_rows(cluster.state, cluster.now)[0].drained
+
+
+def test_a_process_that_no_other_host_may_take_stays_on_a_draining_host() -> None:
+    """The host is drained with it, until a host registers that may take the process."""
+    cluster = cluster_of(Machine("a", labels={"camera": "front"}), machine("b"))
+    cluster.submit(movable("p", required_labels={"camera": "front"}))
+    said = cluster.set_host("a", "drain").message
+    assert said.endswith("cannot leave: no other host may take p (`rosrm explain p` says why)")
+    cluster.wait(3.0)
+    assert len(cluster.told("host_drained")) == 1
+    cluster.add(Machine("c", labels={"camera": "front"}))
+    cluster.wait(3.0)
+    assert cluster.where("p") == ["c"]
 
 
 def test_with_automatic_off_nothing_moves_by_itself() -> None:

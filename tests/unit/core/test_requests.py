@@ -164,7 +164,7 @@ def test_cancel_of_one_that_is_over_says_so() -> None:
     cluster.submit(job("p"), process("q"))
     cluster.machines["a"].finish("p", cluster.now)
     cluster.settle()
-    assert cluster.cancel("p", "q").message == "1 process cancelled; ended before: p"
+    assert cluster.cancel("p", "q").message == "1 process being cancelled; ended before: p"
     assert (cluster.phase("p"), cluster.phase("q")) == ("finished", "cancelled")
 
 
@@ -442,3 +442,43 @@ def test_one_that_shows_up_after_it_was_withdrawn_is_stopped_and_queued_again() 
     assert cluster.where("p") == ["a"]
     assert cluster["p"].owner == 2
     assert cluster.phase("p") == "running"
+
+
+# --- who asked --------------------------------------------------------------------------------
+
+
+def test_the_record_of_a_request_names_its_requester() -> None:
+    """In the message and as `by` of the facts; moves name it in their cause."""
+    cluster = Cluster("a")
+    by = "anna@desk:42"
+    cluster.ask(happened.SubmissionReceived, (movable("p"), process("q")), by)
+    cluster.add("b")
+    cluster.ask(happened.MigrationRequested, "p", "b", by)
+    cluster.ask(happened.RestartRequested, ("q",), by)
+    cluster.ask(happened.CancelRequested, ("q",), by)
+    cluster.ask(happened.HostStateRequested, "a", "drain", by)
+    cluster.ask(happened.PruneRequested, ("q",), (), by)
+    for kind in ("submitted", "restart_requested", "cancel_requested", "host_draining", "pruned"):
+        record = next(record for record in cluster.records if record.kind == kind)
+        assert record.message.endswith(f" (by {by})"), kind
+        assert record.facts["by"] == by
+    assert cluster.told("migration_begun")[0].endswith(f"asked for by {by}")
+
+
+def test_a_process_without_an_owner_is_cancelled_when_its_last_instance_has_ended() -> None:
+    """Until then it is being cancelled, as that instance runs."""
+    cluster = Cluster("a")
+    cluster.machines["a"].stubborn.add("p")
+    cluster.submit(process("p"))
+    cluster.cancel("p")
+    cluster.kill_master()
+    cluster["p"].owner = 0
+    cluster.cancel("p")
+    assert (cluster.phase("p"), cluster["p"].reason) == (
+        "stopping",
+        "waits for the end of p#1 on a",
+    )
+    cluster.machines["a"].let_go("p", cluster.now)
+    cluster.register(cluster.machines["a"])
+    cluster.wait(1.0)
+    assert cluster.phase("p") == "cancelled"

@@ -305,6 +305,11 @@ class Play(RuleBasedStateMachine):
         self.ask(happened.MigrationRequested, self.pick(self.movable(), which), host)
         self.flow()
 
+    @rule()
+    def prune(self) -> None:
+        self.ask(happened.PruneRequested)
+        self.flow()
+
     @rule(host=hosts, action=st.sampled_from(["cordon", "uncordon", "uncordon", "drain"]))
     def set_host(self, host: str, action: str) -> None:
         self.ask(happened.HostStateRequested, host, action)
@@ -730,7 +735,7 @@ class Play(RuleBasedStateMachine):
                 assert not moving
                 assert phase.over or not process.instances
             elif not moving:
-                waits_for_an_end = process.wanted is Wanted.REQUEUE and process.instances
+                waits_for_an_end = process.wanted is not Wanted.RUN and process.instances
                 assert process.owner in state.instances or waits_for_an_end, (name, phase)
         assert queued <= set(state.processes)
 
@@ -815,6 +820,23 @@ class Play(RuleBasedStateMachine):
                 if node.instance.process == name and node.instance.number not in left
             ]  # fmt: skip
             assert sum(node.active for node in active) <= 1, [str(one.instance) for one in active]
+
+    @invariant()
+    def what_was_cancelled_runs_nowhere(self) -> None:
+        """In truth: a `cancelled` process has ended, unless a fence sees to its end."""
+        if not hasattr(self, "cluster"):
+            return
+        left = self.given_up()
+        for process in self.cluster.state.processes.values():
+            if process.phase is not ProcessPhase.CANCELLED or process.spec.host_loss.then != "wait":
+                continue
+            running = {
+                instance.number
+                for machine in self.cluster.machines.values()
+                for instance in machine.programs
+                if instance.process == process.name and instance.number >= process.born
+            }
+            assert running <= left | process.instances, process.name
 
     @invariant()
     def the_newest_state_of_a_life_is_not_dropped(self) -> None:

@@ -17,7 +17,7 @@ from tests.unit.core.cluster import Cluster, process
 REFUSED = {
     happened.HostRegistered, happened.SubmissionReceived, happened.CancelRequested,
     happened.RestartRequested, happened.MigrationRequested, happened.HostStateRequested,
-    happened.CheckpointRequested, happened.RestoreRequested,
+    happened.CheckpointRequested, happened.RestoreRequested, happened.PruneRequested,
 }  # fmt: skip
 KEPT = {
     happened.HostLeft, happened.StatusesReceived, happened.OrderAnswered,

@@ -115,7 +115,10 @@ EVENTS = {
     ),
     happened.CheckpointRequested: st.builds(happened.CheckpointRequested, INT, TEXT),
     happened.RestoreRequested: st.builds(happened.RestoreRequested, INT, TEXT),
-    happened.HostStateRequested: st.builds(happened.HostStateRequested, INT, TEXT, TEXT),
+    happened.HostStateRequested: st.builds(happened.HostStateRequested, INT, TEXT, TEXT, TEXT),
+    happened.PruneRequested: st.builds(
+        happened.PruneRequested, INT, *2 * [st.lists(TEXT).map(tuple)], TEXT
+    ),
     happened.OrderAnswered: st.builds(
         happened.OrderAnswered, INT, st.booleans(), TEXT, TEXT, st.one_of(st.none(), JSON)
     ),

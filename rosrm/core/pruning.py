@@ -1,0 +1,100 @@
+"""Removing ended processes and departed hosts from memory, journal and listings."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from rosrm.core import events as happened
+from rosrm.core import lifecycle
+from rosrm.core.commands import Reply
+from rosrm.core.hosts import Host, HostCondition
+from rosrm.core.requests import count, known_host, known_processes, refuse
+from rosrm.core.state import MasterState, Process, Wanted
+from rosrm.ports import Intent
+
+_PRESENT: Final = (HostCondition.UP, HostCondition.SUSPECT)
+
+
+def prune_requested(state: MasterState, event: happened.PruneRequested, now: float) -> None:
+    """Remove the named processes and hosts, or all that ended and left; all of them, or none."""
+    if event.names or event.hosts:
+        found = _named(state, event)
+        if found is None:
+            return
+        processes, hosts = found
+    else:
+        ended = [state.processes[name] for name in state.over]
+        processes = [process for process in ended if not _why_kept(state, process)]
+        left = [
+            host
+            for host in state.hosts.listed()
+            if state.hosts.condition_of(host) is HostCondition.LEFT and not host.instances
+        ]
+        hosts = [host for host in left if not _why_held(state, host)]
+    for process in processes:
+        state.remove_process(process.name)
+    for host in hosts:
+        _prune_host(state, host, event.by, now)
+    if processes:
+        state.record(now, "pruned", f"{count(len(processes))} removed", by=event.by)
+    of_hosts = "1 host" if len(hosts) == 1 else f"{len(hosts)} hosts"
+    state.emit(Reply(event.request, message=f"{count(len(processes))} and {of_hosts} removed"))
+
+
+def _named(
+    state: MasterState, event: happened.PruneRequested
+) -> tuple[list[Process], list[Host]] | None:
+    """The processes and hosts that a request names; None: it was refused."""
+    processes = known_processes(state, event.request, event.names)
+    if processes is None:
+        return None
+    hosts = []
+    for name in dict.fromkeys(event.hosts):
+        host = known_host(state, event.request, name)
+        if host is None:
+            return None
+        hosts.append(host)
+    faults = [_why_kept(state, process) for process in processes]
+    faults += [_why_held(state, host) for host in hosts]
+    for fault in faults:
+        if fault:
+            refuse(state, event.request, f"{fault}. Nothing was removed")
+            return None
+    return processes, hosts
+
+
+def _why_kept(state: MasterState, process: Process) -> str:
+    """Return why a process cannot be removed; "" if it can."""
+    if not process.phase.over:
+        return f"{process.name} is {process.phase.value}; cancel it first"
+    if process.instances:
+        instance = state.instances[min(process.instances)]
+        return f"{instance.id} is still being stopped on {instance.host.name}"
+    return ""
+
+
+def _why_held(state: MasterState, host: Host) -> str:
+    """Return why a host cannot be removed; "" if it can."""
+    if state.hosts.condition_of(host) in _PRESENT:
+        return f"{host.name} is up; stop its slave first"
+    for number in sorted(host.instances):
+        instance = state.instances[number]
+        process = state.owned_by(instance)
+        if process is not None and process.wanted is not Wanted.CANCEL:
+            return f"{host.name} may still run {process.name}; cancel it first"
+        if instance.id.process in state.runs:
+            return f"{instance.id.process} is moving from or to {host.name}"
+    for name in state.images.of:
+        image = state.processes[name].image
+        if image is not None and image.host == host.name:
+            return f"the image of {name} is on {host.name}; cancel {name} first"
+    return ""
+
+
+def _prune_host(state: MasterState, host: Host, by: str, now: float) -> None:
+    """Give up what may still run on a host; if the host returns, that is stopped there."""
+    state.hosts.prune(host)
+    for number in sorted(host.instances):
+        lifecycle.gone(state, state.instances[number], now, f"{host.name} was pruned")
+    state.emit(Intent("host", host.name, None))
+    state.record(now, "host_pruned", f"{host.name} was removed", host=host.name, by=by)
