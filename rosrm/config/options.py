@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Collection, Mapping
+from typing import Any, get_args, get_type_hints
 
-from rosrm.config.checking import validated
+from rosrm.config.checking import near, validated
 from rosrm.config.documents import Node, Problems
 from rosrm.config.plain import to_plain
+from rosrm.config.units import IsResource
 from rosrm.errors import ConfigError
 from rosrm.registry import TITLES, Registry
+
+
+def _holds_resources(hint: Any) -> bool:
+    """Return True if the keys or items of an option are marked as names of resources."""
+    marks = getattr(next(iter(get_args(hint)), None), "__metadata__", ())
+    return any(isinstance(mark, IsResource) for mark in marks)
 
 
 class PluginCheck:
@@ -55,10 +62,45 @@ class PluginCheck:
     def _options(self, title: str, wanted: type[Any], given: Node) -> Mapping[str, Any]:
         try:
             value = validated(wanted, given, self._problems, title)
-            return {} if value is None else dict(to_plain(value))
+            if value is None:
+                return {}
+            self._check_names(wanted, given, title)
+            return dict(to_plain(value))
         except Exception as fault:  # noqa: BLE001 - the annotations are a plugin's, not ours
             self._problems.add(given.place, f"{title} cannot be checked: {fault}")
             return {}
+
+    def _check_names(self, wanted: type[Any], given: Node, title: str) -> None:
+        """Note names of resources that no probe reads, where an option is marked to hold such."""
+        for name, hint in get_type_hints(wanted, include_extras=True).items():
+            node = given.child(name)
+            if node is not None and _holds_resources(hint):
+                self.check_resources(node, f"{title}: {name}")
+
+    def check_resources(
+        self, named: Node | None, where: str, probes: Collection[str] | None = None
+    ) -> None:
+        """Note names of resources that no installed probe reads, or none of the chosen ones.
+
+        Args:
+            named: a mapping from resources, or a list of them.
+            where: goes before each message.
+            probes: that are chosen; None: any that is installed.
+        """
+        if self._registry is None or named is None:
+            return
+        nodes = named.value if isinstance(named.value, tuple) else ()
+        items = [(str(node.value), node) for node in nodes] or list(named.items.items())
+        for name, node in items:
+            reads = self._registry.probes_of(name)
+            if not reads:
+                note = f"unknown resource {name!r}{near(name, self._registry.resources())}"
+                note += " (what the probes that are installed here read)"
+            elif probes is not None and not set(reads) & set(probes):
+                note = f"{name!r} is read by the probe {reads[0]!r}, which is not among `probes`"
+            else:
+                continue
+            self._problems.add(node.key_place or node.place, f"{where}: {note}")
 
     def by_name(self, kind: str, chosen: Node | None) -> dict[str, Mapping[str, Any]]:
         """The options of each plugin in a list of names or a mapping from name to options."""

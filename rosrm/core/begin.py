@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 
 from rosrm.core.hosts import Host
 from rosrm.core.images import reason_of
-from rosrm.core.migration import Aim, Move, Plan, Start, plan_fault
+from rosrm.core.migration import Aim, Commit, Move, Plan, Start, executors_of, plan_fault
 from rosrm.core.placement import Ranking
 from rosrm.core.plans import plan_to_dict
 from rosrm.core.state import MasterState, Process, ProcessPhase, Run
@@ -30,6 +31,9 @@ def begin_move(
     if isinstance(run, str):
         state.record(now, "plugin_failed", run, process=process.name)
         return run
+    lacking = why_no_executor(state, run)
+    if lacking:
+        return lacking
     state.runs[process.name] = run
     state.charge_ranked(run.destination, destination, now, ranking)
     state.set_phase(process, ProcessPhase.MIGRATING, now, f"to {destination.name}: {cause}")
@@ -61,7 +65,7 @@ def plan_move(
         destination.name, state.new_instance_id(process), int(state.wall),
         source.node_name or process.name,
     )  # fmt: skip
-    plan = proposed(name, move, state.strategies[name].propose)
+    plan = proposed(state, name, move, state.strategies[name].propose)
     if isinstance(plan, str):
         return plan
     return Run(
@@ -105,24 +109,59 @@ def why_immovable(state: MasterState, process: Process) -> str:
     return ""
 
 
+def why_no_executor(state: MasterState, run: Run) -> str:
+    """Return which host of a plan lacks an executor that it names; "": none does."""
+    own = state.declared.executors.get(run.strategy)
+    if own is None:
+        return ""  # its offer is not known
+    commit = run.plan.steps[run.commit_index]
+    named = [*executors_of(run.plan)]
+    if isinstance(commit, Commit) and commit.image:
+        named.append((commit.image, run.source_host.name))
+    for executor, name in named:
+        host = state.hosts.by_name[name].description
+        if host.incarnation and executor not in host.executors:
+            brought_by = state.declared.brought_by.get(run.strategy) or "the plugin"
+            return (
+                f"{name} has no executor {executor!r}, which {run.strategy} needs there to move "
+                f"{run.process}: install {brought_by} on {name} and restart its slave"
+            )
+    return ""
+
+
 def proposed(
-    name: str, move: Move, propose: Callable[[Move], Plan], aim: Aim = Aim.MOVE
-) -> Plan | str:
+    state: MasterState, name: str, move: Move, propose: Callable[[Move], Plan],
+    aim: Aim = Aim.MOVE,
+) -> Plan | str:  # fmt: skip
     """The plan of a strategy, or why there is none; a strategy that raises is named.
 
     Args:
+        state: says what the strategy's offer declares.
         name: of the strategy.
-        move: to be planned.
+        move: to be planned; it is given its options.
         propose: the strategy's own function.
         aim: of the plan.
     """
     try:
+        move = replace(move, options=state.declared.options_of(name, move.spec))
         plan = propose(move)
-        fault = plan_fault(plan, move, aim)
-        json.dumps(plan_to_dict(plan))  # it goes into the journal
+        fault = plan_fault(plan, move, aim) or _strange_executor(state, name, plan)
+        if not fault:
+            json.dumps(plan_to_dict(plan))  # it goes into the journal
     except Exception as error:  # noqa: BLE001 - a third party's code: anything may come
         return f"the migration strategy {name!r} gave no plan: {type(error).__name__}: {error}"
     return f"the migration strategy {name!r} gave an unsound plan: {fault}" if fault else plan
+
+
+def _strange_executor(state: MasterState, name: str, plan: Plan) -> str:
+    """Return what is wrong with an executor of a plan that its own offer lacks; "": nothing."""
+    own = state.declared.executors.get(name)
+    images = [step.image for step in plan.steps if isinstance(step, Commit) and step.image]
+    for executor in [*(executor for executor, _ in executors_of(plan)), *images]:
+        if own is not None and executor not in own:
+            there = ", ".join(sorted(own)) or "none"
+            return f"it names the executor {executor!r}, which its offer lacks; its own: {there}"
+    return ""
 
 
 def destination_node(plan: Plan, move: Move) -> str:

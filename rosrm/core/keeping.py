@@ -154,7 +154,8 @@ def _choose(
     incarnation = host.description.incarnation
     known = (
         told is not None
-        and (told.number, told.incarnation, told.choice) == (process.owner, incarnation, choice)
+        and (told.number, told.incarnation) == (process.owner, incarnation)
+        and _is_same(told.choice, choice)
     )  # fmt: skip
     if told is not None and known and (told.taken or now - told.at < state.settings.order_retry):
         return
@@ -167,13 +168,18 @@ def _choose(
             keep_on=choice.hosts, keep_every=choice.every,
         )
     )  # fmt: skip
-    if not known and (told is None or told.choice.hosts != choice.hosts):
+    if not known and (told is None or set(told.choice.hosts) != set(choice.hosts)):
         where = ", ".join(choice.hosts) or "no other host"
         state.record(
             now, "kept_on", f"the state of {process.name} is kept on {where}",
             process=process.name, host=host.name,
             facts={"hosts": list(choice.hosts), "every": choice.every},
         )  # fmt: skip
+
+
+def _is_same(one: CheckpointChoice, other: CheckpointChoice) -> bool:
+    """Return True if two choices differ at most in the order of their hosts."""
+    return set(one.hosts) == set(other.hosts) and one.every == other.every
 
 
 def _choice(

@@ -13,10 +13,11 @@ from typing import Any, Final
 import numpy as np
 
 from rosrm.core.columns import BUSY, CAPACITY, LIMIT, LOAD, USAGE, BoolArray, FloatArray, IntArray
+from rosrm.core.declared import declared_spec
 from rosrm.core.hosts import HostTable
 from rosrm.core.lazy import Lazy
 from rosrm.core.model import EMPTY
-from rosrm.core.placement import CLOSE, TIE, Demand, Names, Ranking, eligible
+from rosrm.core.placement import CLOSE, TIE, Demand, Labels, Names, Ranking, eligible
 from rosrm.ports import HostView, ProcessView, Scores, ScoringPolicy
 
 #: An explanation names every host up to this many, else the best of those that fit.
@@ -75,9 +76,11 @@ class Moment:
         hosts = HostView(
             Names(self.table, self.columns), self.resources, self.cells[BUSY].T,
             self.cells[LIMIT].T, self.cells[CAPACITY].T, self.processes,
+            Labels(self.table, self.columns),
         )  # fmt: skip
         try:
-            return self.policy.score(hosts, ProcessView(self.demand.spec, self.need.T))
+            spec = declared_spec(self.demand.spec, self.demand.reads)
+            return self.policy.score(hosts, ProcessView(spec, self.need.T))
         except Exception:  # noqa: BLE001 - a third party's code; the decision is made already
             return None
 

@@ -33,7 +33,10 @@ def serve(handover: Handover) -> int:
         checkpoint = guarded_checkpoints(checkpoint, Deadline())
     rows = registry.rows("scoring", "migration", "checkpoint")
     fallback = fallback_of(registry, name)
-    return MasterRuntime(config, policy, strategies, rows, fallback, checkpoint).run()
+    declared = registry.declared(name, config.migration.strategies)
+    return MasterRuntime(
+        config, policy, strategies, rows, fallback, checkpoint, declared=declared
+    ).run()
 
 
 def _installed_policy(config: ClusterConfig, registry: Registry) -> str | None:
