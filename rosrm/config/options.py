@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from typing import Any, get_args, get_type_hints
+from typing import Any, Final, get_args, get_type_hints
 
 from rosrm.config.checking import near, validated
 from rosrm.config.documents import Node, Problems
@@ -11,6 +11,9 @@ from rosrm.config.plain import to_plain
 from rosrm.config.units import IsResource
 from rosrm.errors import ConfigError
 from rosrm.registry import TITLES, Registry
+
+#: Stands among `probes` for all that are read where the file names none.
+DEFAULT_PROBES: Final = "default"
 
 
 def _holds_resources(hint: Any) -> bool:
@@ -103,13 +106,22 @@ class PluginCheck:
             self._problems.add(node.key_place or node.place, f"{where}: {note}")
 
     def by_name(self, kind: str, chosen: Node | None) -> dict[str, Mapping[str, Any]]:
-        """The options of each plugin in a list of names or a mapping from name to options."""
+        """The options of each plugin in a list of names or a mapping from name to options.
+
+        Among probes `default` stands for the default ones.
+        """
         if chosen is None:
             return {}
         if isinstance(chosen.value, tuple):
-            named = {str(node.value): (node, None) for node in chosen.value}
-            return {name: self.choice(kind, name, *pair) for name, pair in named.items()}
-        return {
-            name: self.choice(kind, name, options, options)
-            for name, options in chosen.items.items()
-        }
+            given: Mapping[str, tuple[Node, Node | None]] = {
+                str(node.value): (node, None) for node in chosen.value
+            }
+        else:
+            given = {name: (options, options) for name, options in chosen.items.items()}
+        found: dict[str, Mapping[str, Any]] = {}
+        for name, pair in given.items():
+            if kind == "probe" and name == DEFAULT_PROBES and self._registry is not None:
+                found = {**self._registry.default_probes(), **found}
+            else:
+                found[name] = self.choice(kind, name, *pair)
+        return found

@@ -1,4 +1,4 @@
-"""What the offers of the selected plugins declare, and the view of a spec that follows from it.
+"""Declarations of the selected plugins' offers, and the view of a spec that follows from them.
 
 Processes that no policy can tell apart share one ranking. A scoring policy therefore reads only the
 fields by which demands are compared: the standard ones, and those that its offer declares.
@@ -67,7 +67,7 @@ def no_options(_strategy: str, _spec: ProcessSpec) -> Any:
 
 @dataclass(frozen=True)
 class Declared:
-    """What the offers of the selected plugins declare.
+    """Declarations of the selected plugins' offers.
 
     Attributes:
         reads: fields of a spec that scoring policies read beyond the standard ones.

@@ -94,7 +94,7 @@ def _submission_fault(state: MasterState, event: happened.SubmissionReceived) ->
 
 
 def _strategy_fault(state: MasterState, spec: ProcessSpec) -> str:
-    """What the strategy of a spec has against it, its options among others; "" for nothing."""
+    """Return why the strategy of a spec cannot move the process; "": it can, by what is known."""
     name = spec.migration.strategy or ""
     strategy: object = state.strategies.get(name)
     if strategy is None:

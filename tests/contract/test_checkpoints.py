@@ -79,7 +79,7 @@ def test_a_process_that_stood_still_for_long_runs_for_longer():
 
 
 def test_a_policy_that_follows_the_order_of_the_copies_is_caught():
-    """That order changes by the second; its two copies would travel to and fro."""
+    """`kept_on` changes its order by the second, so the copies would travel to and fro."""
 
     class Follows:
         def choose(self, process):

@@ -29,7 +29,7 @@ class Weights:
 
 
 class Made:
-    """What the offer makes of them."""
+    """The policy that the offer makes."""
 
     def __init__(self, options):
         self.score = options

@@ -157,7 +157,7 @@ def test_a_resource_that_no_probe_reads_is_refused_with_the_nearest(refusal, wit
 
 
 def test_a_limit_of_a_probe_that_is_not_chosen_is_refused(refusal, file, with_fds):
-    """It would never bite."""
+    """Nothing would ever be compared with it."""
     said = refusal(load_host, "limits: {fds: 0.9}", with_fds)
     assert "limits: 'fds' is read by the probe 'fds', which is not among `probes`" in said
     assert load_host(file("limits: {fds: 0.9}\nprobes: [fds]"), with_fds).limits["fds"] == 0.9
@@ -175,3 +175,10 @@ def test_a_limit_of_a_probe_that_may_be_absent_on_the_host_is_taken(file):
 
     registry = Registry.of(ours=SimpleNamespace(register_probes=register_probes))
     assert load_host(file("limits: {gpu_memory: 0.9}"), registry).limits["gpu_memory"] == 0.9
+
+
+@pytest.mark.parametrize("probes", ["[default, fds]", "[fds, default]", "{fds: {}, default: }"])
+def test_default_among_the_probes_stands_for_the_default_ones(file, with_fds, probes):
+    config = load_host(file(f"probes: {probes}"), with_fds)
+    assert config.probes == {"disk": {}, "fds": {}}
+    assert HostConfig.from_json(config.to_json()) == config

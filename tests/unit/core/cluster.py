@@ -164,7 +164,7 @@ _SHIPPED = {offer.name: offer for offer in register_migration_strategies()}
 
 
 def declared_by(strategies: Mapping[str, Any]) -> Declared:
-    """What the offers of these strategies declare: the options of the shipped ones."""
+    """Return the declarations of the shipped strategies among these: their options."""
 
     def options_of(name: str, spec: ProcessSpec) -> Any:
         offer = _SHIPPED.get(name)

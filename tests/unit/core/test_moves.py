@@ -386,7 +386,7 @@ def sleepy(*executors: str) -> Cluster:
 
 
 def test_a_plan_is_refused_before_its_first_step_where_a_host_lacks_an_executor() -> None:
-    """By its undo too; nothing was stopped, and it is said what to install where."""
+    """By its undo too. Nothing was stopped, and the reply names what to install on which host."""
     cluster = sleepy("sleepy.wait")
     orders = sum(isinstance(one, Order) for one in cluster.carried)
     reply = cluster.migrate("p")

@@ -160,7 +160,7 @@ def test_fields_that_a_spec_lacks_cannot_be_declared(reads, said):
     ],
 )
 def test_a_resource_that_no_message_can_carry_is_refused(context, described, said):
-    """Its probe is left out by name; the slave goes on."""
+    """Its probe is left out by name, and the others are made."""
     probe = Probe("a")
     probe.resources = [described]
     result = probes(offered("a", lambda options, context: probe)).probes({"a": {}}, context)
