@@ -35,8 +35,10 @@ from rosrm.loading import (
 )
 from rosrm.ports import (
     CheckpointPolicy,
+    HostChecking,
     MigrationOffer,
     MigrationStrategy,
+    PeriodicImaging,
     Probe,
     ProbeContext,
     ProbeOffer,
@@ -209,10 +211,24 @@ class Registry:
 
     def migrations(self, chosen: NameToOptions) -> dict[str, MigrationStrategy]:
         """Make migration strategies by name, in this order; raises as `scoring` does."""
-        return {
+        made = {
             name: cast(MigrationStrategy, self._required("migration", name, options))
             for name, options in chosen.items()
         }
+        for name, strategy in made.items():
+            self._check_executors(name, strategy)
+        return made
+
+    def _check_executors(self, name: str, strategy: object) -> None:
+        """Refuse a strategy whose `ability` or `discard` is no executor of its own offer."""
+        own = cast(MigrationOffer, self.offer("migration", name)).executors
+        for kind, named in ((HostChecking, "ability"), (PeriodicImaging, "discard")):
+            if isinstance(strategy, kind) and (executor := getattr(strategy, named)) not in own:
+                raise self._fault(
+                    "migration", name,
+                    f"its `{named}` is {executor!r}, no executor of its offer; "
+                    f"there are: {', '.join(sorted(own)) or 'none'}",
+                )  # fmt: skip
 
     def declared(self, scoring: str, chosen: NameToOptions) -> Declared:
         """Return what the offers of a scoring policy and of migration strategies declare."""

@@ -43,7 +43,7 @@ def blocks(page: Path) -> Iterator[tuple[str, str] | Command]:
 def matches(shown: str, given: str) -> bool:
     """`...` in the page stands for anything, and every run of spaces for any other."""
     parts = [re.escape(part.strip()) for part in shown.split("...")]
-    pattern = ".*".join(part.replace(r"\ ", r"\s+").replace("\n", r"\s+") for part in parts)
+    pattern = ".*".join(part.replace(r"\ ", r"\s+").replace("\\\n", r"\s+") for part in parts)
     return re.fullmatch(pattern, given.strip(), re.DOTALL) is not None
 
 

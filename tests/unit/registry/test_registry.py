@@ -347,6 +347,15 @@ def test_executors_come_from_every_migration_offer_and_a_shared_name_is_left_out
     assert "the executor 'x' is left out: a and b both register it" in caplog.text
 
 
+def test_an_ability_that_is_no_executor_of_the_offer_is_refused():
+    """Otherwise every host would count as one on which the plugin is not installed."""
+    able = SimpleNamespace(propose=None, ability="m.abel", host_fault=max)
+    offer = MigrationOffer("m", lambda options: able, executors={"m.able": dict})
+    registry = Registry.of(ours=plugin(register_migration_strategies=[offer]))
+    with pytest.raises(PluginError, match=r"`ability` is 'm\.abel', no executor .*are: m\.able"):
+        registry.migrations({"m": {}})
+
+
 def test_options_that_cannot_be_read_are_the_plugins_fault():
     @dataclass(frozen=True)
     class Unreadable:
