@@ -20,9 +20,15 @@ from typing import Any, Final, TypeAlias
 import pluggy
 
 from rosrm import hookspecs
+from rosrm.core.declared import SPEC_FIELDS
 from rosrm.errors import describe_fault
 from rosrm.handover import PluginAddress
-from rosrm.ports import CheckpointOffer, MigrationOffer, ProbeOffer, ScoringOffer
+from rosrm.ports import (
+    CheckpointOffer,
+    MigrationOffer,
+    ProbeOffer,
+    ScoringOffer,
+)
 from rosrm.spelling import get_close_matches
 
 Offer: TypeAlias = "ProbeOffer | ScoringOffer | MigrationOffer | CheckpointOffer"
@@ -171,7 +177,8 @@ def _take(loaded: Loaded, source: Source, hook: str, function: Callable[..., Any
         loaded.broken.append(Broken(source, f"{place} failed with {describe_fault(fault)}", kind))
         return
     if isinstance(answer, str) or not isinstance(answer, Sequence):
-        reason = f"{place} returned {type(answer).__name__}, not a list of {wanted.__name__}"
+        given = "None" if answer is None else type(answer).__name__
+        reason = f"{place} returned {given}, not a list of {wanted.__name__}"
         loaded.broken.append(Broken(source, reason, kind))
         return
     for offer in answer:
@@ -189,7 +196,7 @@ def _call(hook: str, function: Callable[..., Any]) -> Any:
     alone.add_hookspecs(hookspecs)
     alone.register(SimpleNamespace(**{hook: function}))
     answers = getattr(alone.hook, hook)()
-    return answers[0] if answers else ()
+    return answers[0] if answers else None  # pluggy leaves an answer of None out
 
 
 def _fault_of(offer: object, wanted: type[Any]) -> str:
@@ -209,4 +216,20 @@ def _fault_of(offer: object, wanted: type[Any]) -> str:
         for f in fields(options)
         if f.init and f.default is MISSING and f.default_factory is MISSING
     ]
-    return f"{name!r}: option {bare[0]!r} has no default" if bare else ""
+    if bare:
+        return f"{name!r}: option {bare[0]!r} has no default"
+    fault = _fault_of_reads(offer) if isinstance(offer, ScoringOffer) else ""
+    return f"{name!r}: {fault}" if fault else ""
+
+
+def _fault_of_reads(offer: ScoringOffer) -> str:
+    """Return why the fields that a scoring policy declares to read cannot be; "": they can."""
+    reads: object = offer.reads
+    if isinstance(reads, str) or not isinstance(reads, Sequence):
+        return f'`reads` is {reads!r}; a tuple of field names is wanted, as ("name",)'
+    for field in reads:
+        if field not in SPEC_FIELDS:
+            near = get_close_matches(str(field), SPEC_FIELDS, 1)
+            meant = f"; did you mean {near[0]!r}?" if near else "."
+            return f"`reads` has no field {field!r}{meant} Allowed: {', '.join(SPEC_FIELDS)}"
+    return ""

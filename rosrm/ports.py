@@ -7,6 +7,7 @@ by name; their options are checked against the dataclass's annotations before an
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -89,6 +90,7 @@ class ProbeOffer:
         period: seconds between reads.
         deadline: seconds after which a read counts as late.
         default: chosen where the configuration names no probes.
+        resources: names of all that it may read; (): one of its own name.
     """
 
     name: str
@@ -98,6 +100,11 @@ class ProbeOffer:
     period: float = 0.1
     deadline: float = 1.0
     default: bool = False
+    resources: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Fill in the resource of a probe that has one name for both."""
+        object.__setattr__(self, "resources", tuple(self.resources) or (self.name,))
 
 
 # --- scoring (master, pure) -------------------------------------------------------------------
@@ -110,11 +117,12 @@ class HostView:
     Attributes:
         names: N host names.
         resources: R resource names, the columns.
-        usage: (N, R) reading + in-flight load, fractions of the capacity; 0 where a host has no
-            such resource.
+        usage: (N, R) reading + in-flight load, fractions of the capacity; NaN where a host does
+            not measure such a resource. `column` has no NaN.
         limit: (N, R) upper limits, fractions; 1 where a host sets none.
-        capacity: (N, R) base units for usage 1.0; 0 where a host has no such resource.
+        capacity: (N, R) base units for usage 1.0; NaN as in `usage`.
         processes: (N,) processes held or promised.
+        labels: N mappings, the labels of each host.
     """
 
     names: Sequence[str]
@@ -123,12 +131,22 @@ class HostView:
     limit: FloatArray
     capacity: FloatArray
     processes: npt.NDArray[np.int64]
+    labels: Sequence[Mapping[str, str]] = ()
 
-    def column(self, resource: str) -> FloatArray:
-        """Usage of one resource, (N,): 0 where a host has no such resource."""
+    def column(self, resource: str, missing: float = 0.0) -> FloatArray:
+        """Return the usage of one resource, (N,), as a new array without NaN.
+
+        Args:
+            resource: its name.
+            missing: stands where a host does not measure it.
+        """
         if resource not in self.resources:
-            return np.zeros(len(self.usage))
-        return np.array(self.usage[:, self.resources.index(resource)])
+            return np.full(len(self.usage), missing)
+        column = self.usage[:, self.resources.index(resource)]
+        # One product tells whether there is any NaN, in a tenth of the time that replacing takes.
+        if math.isnan(column.dot(column)):
+            return np.nan_to_num(column, nan=missing)
+        return np.array(column)
 
 
 @dataclass(frozen=True)
@@ -136,7 +154,9 @@ class ProcessView:
     """What a scoring policy may know of the process to place.
 
     Attributes:
-        spec: as submitted.
+        spec: as submitted. A policy gets the standard fields (what it runs, `namespace`, `kind`,
+            `priority`, `needs` and labels) and those that its offer declares in `reads`; to read
+            another one raises `UndeclaredField`.
         need: (N, R) what it will use on each host, fractions of that host's capacity.
     """
 
@@ -173,12 +193,18 @@ class ScoringPolicy(Protocol):
 
 @dataclass(frozen=True)
 class ScoringOffer:
-    """Registers a scoring policy; the fields are as in `ProbeOffer`."""
+    """Registers a scoring policy; the fields are as in `ProbeOffer`.
+
+    Attributes:
+        reads: fields of the spec that it reads beyond the standard ones, as `("name",)`. Processes
+            that differ in none of these fields are judged together.
+    """
 
     name: str
     create: Callable[[Any], ScoringPolicy]
     options: type[Any] = NoOptions
     summary: str = ""
+    reads: tuple[str, ...] = ()
 
 
 # --- migration (master, pure; executors on the slaves) ----------------------------------------

@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import logging
 import math
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, TypeVar, cast
 
+from rosrm.config.own_options import merged_options
 from rosrm.config.plain import from_plain
-from rosrm.core.model import EMPTY, RESOURCE_SLOTS, ResourceDescription
+from rosrm.core.declared import Declared
+from rosrm.core.model import EMPTY, RESOURCE_SLOTS, ProcessSpec, ResourceDescription
 from rosrm.core.plugin_calls import TITLES
 from rosrm.core.views import PluginRow
 from rosrm.errors import ConfigError, PluginError, SkipPlugin, describe_fault, describe_plugin_fault
@@ -25,20 +28,32 @@ from rosrm.loading import (
     Loaded,
     Offer,
     Offered,
+    Source,
     definition,
     load_addresses,
     load_objects,
 )
 from rosrm.ports import (
     CheckpointPolicy,
+    HostChecking,
     MigrationOffer,
     MigrationStrategy,
+    PeriodicImaging,
     Probe,
     ProbeContext,
     ProbeOffer,
+    ScoringOffer,
     ScoringPolicy,
 )
 from rosrm.spelling import get_close_matches
+
+#: What the object of each kind must have.
+_METHODS: Final[Mapping[str, tuple[str, ...]]] = {
+    "probe": ("resources", "read", "close"),
+    "scoring": ("score",),
+    "migration": ("propose",),
+    "checkpoint": ("choose",),
+}
 
 #: Where rosrm's own plugins of a kind are, for who has none.
 _SHIPPED_IN: Final[Mapping[str, str]] = {
@@ -47,6 +62,10 @@ _SHIPPED_IN: Final[Mapping[str, str]] = {
     "migration": "rosrm-migration",
     "checkpoint": "rosrm-checkpoint",
 }
+
+_RESOURCE_NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_.-]{0,63}")
+#: Of what stands in the description of a resource.
+_EXAMPLES: Final = {"unit": '"B", "core", "B/s" or "1"', "scope": '"machine"'}
 
 _log = logging.getLogger("rosrm.plugins")
 
@@ -126,6 +145,19 @@ class Registry:
         """The offer of a name; raises `ConfigError` with what there is instead."""
         return self._offered(kind, name).offer
 
+    def resources(self) -> tuple[str, ...]:
+        """Return the names of all resources that the installed probes may read."""
+        offers = [cast(ProbeOffer, self.offer("probe", name)) for name in self.names("probe")]
+        return tuple(sorted({name for offer in offers for name in offer.resources}))
+
+    def probes_of(self, resource: str) -> tuple[str, ...]:
+        """Return the names of the probes that may read a resource."""
+        return tuple(
+            name
+            for name in self.names("probe")
+            if resource in cast(ProbeOffer, self.offer("probe", name)).resources
+        )
+
     def default_probes(self) -> NameToOptions:
         """The probes that a host has where its configuration names none, without options."""
         offers = [self.offer("probe", name) for name in self.names("probe")]
@@ -171,10 +203,43 @@ class Registry:
 
     def migrations(self, chosen: NameToOptions) -> dict[str, MigrationStrategy]:
         """Make migration strategies by name, in this order; raises as `scoring` does."""
-        return {
+        made = {
             name: cast(MigrationStrategy, self._required("migration", name, options))
             for name, options in chosen.items()
         }
+        for name, strategy in made.items():
+            self._check_executors(name, strategy)
+        return made
+
+    def _check_executors(self, name: str, strategy: object) -> None:
+        """Refuse a strategy whose `ability` or `discard` is no executor of its own offer."""
+        own = cast(MigrationOffer, self.offer("migration", name)).executors
+        for kind, named in ((HostChecking, "ability"), (PeriodicImaging, "discard")):
+            if isinstance(strategy, kind) and (executor := getattr(strategy, named)) not in own:
+                raise self._fault(
+                    "migration", name,
+                    f"its `{named}` is {executor!r}, no executor of its offer; "
+                    f"there are: {', '.join(sorted(own)) or 'none'}",
+                )  # fmt: skip
+
+    def declared(self, scoring: str, chosen: NameToOptions) -> Declared:
+        """Return what the offers of a scoring policy and of migration strategies declare."""
+        offers = {name: cast(MigrationOffer, self.offer("migration", name)) for name in chosen}
+
+        def options(strategy: str, spec: ProcessSpec) -> Any:
+            offer = offers[strategy]
+            own = spec.migration.options if spec.migration.strategy == strategy else EMPTY
+            wanted = offer.own_options or offer.options
+            return merged_options(wanted, chosen[strategy], own)
+
+        return Declared(
+            reads=tuple(cast(ScoringOffer, self.offer("scoring", scoring)).reads),
+            options_of=options,
+            executors={name: frozenset(offer.executors) for name, offer in offers.items()},
+            brought_by={
+                name: self._offers["migration", name].source.distribution for name in offers
+            },
+        )
 
     def executors(self) -> dict[str, Executor]:
         """What the open steps of plans may name on this host, from all migration offers.
@@ -223,7 +288,7 @@ class Registry:
         probe = self._make("probe", name, options, context)
         try:
             resources = tuple(probe.resources)
-            fault = _fault_of_resources(resources, before)
+            fault = _fault_of_resources(resources, offer, before)
         except FAULTS as raised:
             resources, fault = (), f"its `resources` raised {describe_plugin_fault(raised)}"
         if fault:
@@ -256,6 +321,9 @@ class Registry:
         except FAULTS as fault:
             reason = f"`create` ({definition(create)}) raised {describe_fault(fault)}"
             raise self._fault(kind, name, reason) from fault
+        lacks = _missing_method(kind, thing)
+        if lacks:
+            raise self._fault(kind, name, f"`create` ({definition(create)}) made {lacks}")
         self._outcome[kind, name] = ("selected", offer.summary)
         return thing
 
@@ -292,42 +360,87 @@ class Registry:
         )
 
     def _broken_note(self, kind: str, name: str = "") -> str:
-        """What is broken and might be what is missing; only the name itself where that is known."""
+        """Return the faults of the broken plugin that may be meant, and the number of the others.
+
+        A plugin is meant by the name of its offer or, where that is not known, by its own.
+        """
         might = [b for b in self._broken if b.kind in ("", kind)]
-        same = [b for b in might if name and b.name == name]
-        reasons = dict.fromkeys(f"{b.source}: {b.reason}" for b in same or might)
-        return " Broken: " + "; ".join(reasons) + "." if reasons else ""
+        meant = [b for b in might if not name or name == b.name]
+        if not meant:
+            meant = [b for b in might if not b.name and _is_named_like(b.source, name)]
+        reasons = dict.fromkeys(f"{b.source}: {b.reason}" for b in meant)
+        note = " Broken: " + "; ".join(reasons) + "." if reasons else ""
+        others = len(might) - len(meant)
+        if not others:
+            return note
+        many = "1 plugin is" if others == 1 else f"{others} plugins are"
+        return f"{note} {many} broken{' besides' if note else ''}: see `rosrm plugins --local`."
+
+
+def _is_named_like(source: Source, name: str) -> bool:
+    """Return True if an offer of this name may be one of a plugin that did not get so far."""
+    words = {word for text in (source.plugin, source.distribution) for word in _words(text)}
+    return bool(words & set(_words(name))) or bool(get_close_matches(name, [source.plugin], 1))
+
+
+def _words(text: str) -> list[str]:
+    return [word for word in re.split(r"[^a-z]+", text.lower()) if word not in ("", "rosrm")]
+
+
+def _missing_method(kind: str, thing: object) -> str:
+    """Return what is wrong with an object that an offer made; "": it has all its methods."""
+    if thing is None:
+        wanted = " and ".join(f"`{name}`" for name in _METHODS[kind])
+        return f"None; an object with {wanted} is wanted (does it lack a `return`?)"
+    for name in _METHODS[kind]:
+        if not hasattr(type(thing), name) and not hasattr(thing, name):
+            has = [one for one in dir(thing) if not one.startswith("_")]
+            near = get_close_matches(name, has, 1)
+            misspelt = f"; is its `{near[0]}` misspelt?" if near else ""
+            return f"a {type(thing).__name__}, which has no `{name}`{misspelt}"
+    return ""
+
+
+def resource_fault(resource: object) -> str:
+    """Return what is wrong with the description of a resource; "": nothing."""
+    if not isinstance(resource, ResourceDescription):
+        return f"describes a resource by {resource!r}, which is not a ResourceDescription"
+    name: object = resource.name
+    if not (isinstance(name, str) and _RESOURCE_NAME.fullmatch(name)):
+        return (
+            f"names a resource {name!r}. Allowed: at most 64 letters, digits, '_', '-' and '.', "
+            "the first of them a letter"
+        )
+    for field in ("unit", "scope"):
+        word: object = getattr(resource, field)
+        if not isinstance(word, str):
+            return f"gives {name!r} the {field} {word!r}; text is wanted, as {_EXAMPLES[field]}"
+    capacity: object = resource.capacity
+    numeric = isinstance(capacity, (int, float)) and not isinstance(capacity, bool)
+    if not (numeric and math.isfinite(resource.capacity) and resource.capacity > 0.0):
+        return f"gives {name!r} a capacity of {capacity!r}; a number above 0 is wanted"
+    return ""
 
 
 def _fault_of_resources(
-    resources: Sequence[ResourceDescription], before: Sequence[MadeProbe]
+    resources: Sequence[ResourceDescription], offer: ProbeOffer, before: Sequence[MadeProbe]
 ) -> str:
     """Why a host cannot take these resources; "" where it can."""
     taken = {resource.name: other.name for other in before for resource in other.resources}
     for resource in resources:
-        fault = _fault_of_types(resource)
+        fault = resource_fault(resource)
         if fault:
             return fault
         if resource.name in taken:
             return f"reads {resource.name!r}, as {taken[resource.name]!r} does already"
-        if not (math.isfinite(resource.capacity) and resource.capacity > 0.0):
-            return f"gives {resource.name!r} a capacity of {resource.capacity!r}, not above 0"
+        if resource.name not in offer.resources:
+            declared = repr((*offer.resources, resource.name))
+            return (
+                f"reads {resource.name!r}, which its offer does not declare: "
+                f"say ProbeOffer(..., resources={declared})"
+            )
     if len(taken) + len(resources) > RESOURCE_SLOTS:
         return f"brings the resources of this host to more than {RESOURCE_SLOTS}"
-    return ""
-
-
-def _fault_of_types(resource: object) -> str:
-    """Return why something is no description of a resource that can be sent; "" if it is one."""
-    if not isinstance(resource, ResourceDescription):
-        return f"gives {resource!r} as a resource; a ResourceDescription is required"
-    for name in ("name", "unit", "scope"):
-        value: object = getattr(resource, name)
-        if not isinstance(value, str):
-            return f"gives a resource the {name} {value!r}; a text is required"
-    capacity: object = resource.capacity
-    if not isinstance(capacity, int | float):
-        return f"gives {resource.name!r} the capacity {capacity!r}; a number is required"
     return ""
 
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
+    from rosrm.config.settings import ClusterConfig
     from rosrm.registry import Registry
 
 config = typer.Typer(no_args_is_help=True, help="Look at configuration files.")
@@ -58,6 +59,27 @@ def check(
         raise ConfigError("\n".join(wrong))
 
 
+def _make(file: Path, cluster: ClusterConfig, registry: Registry) -> None:
+    """Make the plugins that a master would make; raises `ConfigError` with all that fail."""
+    from rosrm.errors import ConfigError, PluginError
+
+    wrong = []
+    for section, make in (
+        ("scoring", lambda: registry.scoring(cluster.scoring.policy, cluster.scoring.options)),
+        ("migration", lambda: registry.migrations(cluster.migration.strategies)),
+        (
+            "checkpoint",
+            lambda: registry.checkpoint(cluster.checkpoint.policy, cluster.checkpoint.options),
+        ),
+    ):
+        try:
+            make()
+        except (ConfigError, PluginError) as error:
+            wrong.append(f"{file}: {section}: {error}")
+    if wrong:
+        raise ConfigError("\n".join(wrong))
+
+
 def _checked(file: Path, kind: KindOfFile | None, registry: Registry) -> str:
     """A summary of a file; raises `ConfigError`."""
     from rosrm.config import load_cluster, load_host, load_work
@@ -67,8 +89,12 @@ def _checked(file: Path, kind: KindOfFile | None, registry: Registry) -> str:
     match kind.value if kind else kind_of(read(file)):
         case "cluster":
             cluster = load_cluster(file, registry)
+            _make(file, cluster, registry)
             strategies = ", ".join(cluster.migration.strategies) or "none"
-            return f"a cluster: scoring {cluster.scoring.policy}, migration {strategies}"
+            return (
+                f"a cluster: scoring {cluster.scoring.policy}, migration {strategies}, "
+                f"checkpoint {cluster.checkpoint.policy or 'none'}"
+            )
         case "host":
             host = load_host(file, registry)
             probes = ", ".join(registry.default_probes() if host.probes is None else host.probes)

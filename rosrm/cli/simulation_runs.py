@@ -23,6 +23,7 @@ from rosrm.config.variants import (
     variant_in_text,
 )
 from rosrm.config.workload import load_workload
+from rosrm.core.declared import Declared
 from rosrm.core.placement import NamedPolicy
 from rosrm.errors import ConfigError, RecordError
 from rosrm.ports import MigrationStrategy
@@ -210,8 +211,10 @@ def replay_record(
             f"{recording.header.software}): {fault}"
         ) from None
     extraction = Extraction(recording)
-    policy, strategies = _plugins(config, registry)
-    replayed = replay(recording, config.core(), policy, strategies, extraction.watch, until)
+    policy, strategies, declared = _plugins(config, registry)
+    replayed = replay(
+        recording, config.core(), policy, strategies, extraction.watch, until, declared=declared
+    )
     return replayed, extraction.workload()
 
 
@@ -224,8 +227,8 @@ def run(
     """Simulate one variant of a workload."""
     if variant.hosts is not None:
         workload = workload.with_hosts(variant.hosts)
-    policy, strategies = _plugins(variant.cluster, registry)
-    simulation = Simulation(workload, variant.cluster.core(), policy, strategies)
+    policy, strategies, declared = _plugins(variant.cluster, registry)
+    simulation = Simulation(workload, variant.cluster.core(), policy, strategies, declared)
     began = time.perf_counter()
     outcome = simulation.run(None if shown is None else shown.named(variant.name))
     return Run(variant.name, len(workload.hosts), outcome, time.perf_counter() - began)
@@ -233,10 +236,11 @@ def run(
 
 def _plugins(
     config: ClusterConfig, registry: Registry
-) -> tuple[NamedPolicy, dict[str, MigrationStrategy]]:
+) -> tuple[NamedPolicy, dict[str, MigrationStrategy], Declared]:
     name = config.scoring.policy
     policy = registry.scoring(name, config.scoring.options)
-    return (name, policy), registry.migrations(config.migration.strategies)
+    chosen = config.migration.strategies
+    return (name, policy), registry.migrations(chosen), registry.declared(name, chosen)
 
 
 class Shown:

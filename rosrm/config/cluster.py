@@ -41,7 +41,9 @@ def checked_cluster(root: Node, path: str | Path, registry: Registry | None) -> 
     problems = Problems()
     config = validated(ClusterConfig, root, problems)
     _check_rules(root, config, problems)
-    config = _with_options(root, config or ClusterConfig(), PluginCheck(registry, problems))
+    plugins = PluginCheck(registry, problems)
+    plugins.check_resources(root.get("defaults", "needs"), "defaults.needs")
+    config = _with_options(root, config or ClusterConfig(), plugins)
     problems.raise_any()
     if config.record.directory != Path():
         directory = settled(config.record.directory, path)

@@ -28,7 +28,13 @@ def load_host(path: str | Path, registry: Registry | None = None) -> HostConfig:
     config = validated(HostConfig, root, problems)
     _check_rules(root, problems)
     chosen = root.get("probes")
-    probes = PluginCheck(registry, problems).by_name("probe", chosen)
+    plugins = PluginCheck(registry, problems)
+    probes = plugins.by_name("probe", chosen)
+    given = chosen is not None and chosen.value is not None
+    if registry is not None:
+        for key in ("limits", "budget"):
+            measured = probes if given else registry.default_probes()
+            plugins.check_resources(root.get(key), key, measured)
     problems.raise_any()
     assert config is not None  # else there was a problem
     if chosen is None or chosen.value is None:

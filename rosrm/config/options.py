@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Collection, Mapping
+from typing import Any, Final, get_args, get_type_hints
 
-from rosrm.config.checking import validated
+from rosrm.config.checking import near, validated
 from rosrm.config.documents import Node, Problems
 from rosrm.config.plain import to_plain
+from rosrm.config.units import IsResource
 from rosrm.core.plugin_calls import TITLES
 from rosrm.errors import ConfigError
 from rosrm.registry import Registry
+
+#: Stands among `probes` for all that are read where the file names none.
+DEFAULT_PROBES: Final = "default"
+
+
+def _holds_resources(hint: Any) -> bool:
+    """Return True if the keys or items of an option are marked as names of resources."""
+    marks = getattr(next(iter(get_args(hint)), None), "__metadata__", ())
+    return any(isinstance(mark, IsResource) for mark in marks)
 
 
 class PluginCheck:
@@ -56,19 +66,63 @@ class PluginCheck:
     def _options(self, title: str, wanted: type[Any], given: Node) -> Mapping[str, Any]:
         try:
             value = validated(wanted, given, self._problems, title)
-            return {} if value is None else dict(to_plain(value))
+            if value is None:
+                return {}
+            self._check_names(wanted, given, title)
+            return dict(to_plain(value))
         except Exception as fault:  # noqa: BLE001 - the annotations are a plugin's, not ours
             self._problems.add(given.place, f"{title} cannot be checked: {fault}")
             return {}
 
+    def _check_names(self, wanted: type[Any], given: Node, title: str) -> None:
+        """Note names of resources that no probe reads, where an option is marked to hold such."""
+        for name, hint in get_type_hints(wanted, include_extras=True).items():
+            node = given.child(name)
+            if node is not None and _holds_resources(hint):
+                self.check_resources(node, f"{title}: {name}")
+
+    def check_resources(
+        self, named: Node | None, where: str, probes: Collection[str] | None = None
+    ) -> None:
+        """Note names of resources that no installed probe reads, or none of the chosen ones.
+
+        Args:
+            named: a mapping from resources, or a list of them.
+            where: goes before each message.
+            probes: that are chosen; None: any that is installed.
+        """
+        if self._registry is None or named is None:
+            return
+        nodes = named.value if isinstance(named.value, tuple) else ()
+        items = [(str(node.value), node) for node in nodes] or list(named.items.items())
+        for name, node in items:
+            reads = self._registry.probes_of(name)
+            if not reads:
+                note = f"unknown resource {name!r}{near(name, self._registry.resources())}"
+                note += " (what the probes that are installed here read)"
+            elif probes is not None and not set(reads) & set(probes):
+                note = f"{name!r} is read by the probe {reads[0]!r}, which is not among `probes`"
+            else:
+                continue
+            self._problems.add(node.key_place or node.place, f"{where}: {note}")
+
     def by_name(self, kind: str, chosen: Node | None) -> dict[str, Mapping[str, Any]]:
-        """The options of each plugin in a list of names or a mapping from name to options."""
+        """The options of each plugin in a list of names or a mapping from name to options.
+
+        Among probes `default` stands for the default ones.
+        """
         if chosen is None:
             return {}
         if isinstance(chosen.value, tuple):
-            named = {str(node.value): (node, None) for node in chosen.value}
-            return {name: self.choice(kind, name, *pair) for name, pair in named.items()}
-        return {
-            name: self.choice(kind, name, options, options)
-            for name, options in chosen.items.items()
-        }
+            given: Mapping[str, tuple[Node, Node | None]] = {
+                str(node.value): (node, None) for node in chosen.value
+            }
+        else:
+            given = {name: (options, options) for name, options in chosen.items.items()}
+        found: dict[str, Mapping[str, Any]] = {}
+        for name, pair in given.items():
+            if kind == "probe" and name == DEFAULT_PROBES and self._registry is not None:
+                found = {**self._registry.default_probes(), **found}
+            else:
+                found[name] = self.choice(kind, name, *pair)
+        return found

@@ -162,6 +162,13 @@ ANY_AMOUNT: Final = Quantity("amount")
 #: Of any resource; `amount_of` knows more where the resource is known.
 Amount = Annotated[float, ANY_AMOUNT]
 
+
+class IsResource:
+    """Marks text that names a resource: the configuration refuses names that no probe reads."""
+
+
+ResourceName = Annotated[str, IsResource()]
+
 _MEASURES: Final = {"memory": "size", "disk": "size", "cpu": "cores"}
 
 

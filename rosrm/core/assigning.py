@@ -30,8 +30,9 @@ def demand_of(state: MasterState, process: Process) -> Demand:
     if known is None or known[0] != version or known[1].near != near:
         estimate = state.learned.estimate(process.spec, state.settings.default_needs)
         demand = Demand(
-            process.spec, estimate.amounts, estimate.estimated, dict(process.excluded), near=near
-        )
+            process.spec, estimate.amounts, estimate.estimated, dict(process.excluded), near=near,
+            reads=state.declared.reads,
+        )  # fmt: skip
         # Equal processes share one: thousands of them may wait.
         known = process.demand = (version, state.demands.setdefault(demand.key, demand))
     return known[1]
@@ -44,12 +45,15 @@ def demand_to_move(
     excluded = {
         **process.excluded, **unable(state, process, source), source: "it is there already",
     }  # fmt: skip
-    return Demand(process.spec, *_amounts(state, process, seen), excluded, headroom)
+    return Demand(
+        process.spec, *_amounts(state, process, seen), excluded, headroom,
+        reads=state.declared.reads,
+    )  # fmt: skip
 
 
 def demand_to_restore(state: MasterState, process: Process, seen: Mapping[str, float]) -> Demand:
     """What its host must have for a process that goes on from an image that lies there."""
-    return Demand(process.spec, *_amounts(state, process, seen))
+    return Demand(process.spec, *_amounts(state, process, seen), reads=state.declared.reads)
 
 
 def _amounts(

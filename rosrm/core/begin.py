@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Final
 
 from rosrm.core.hosts import Host
 from rosrm.core.images import reason_of
-from rosrm.core.migration import Aim, Move, Plan, Start, plan_fault
+from rosrm.core.migration import Aim, Commit, Move, Plan, Start, executors_of, plan_fault
 from rosrm.core.placement import Ranking
 from rosrm.core.plans import plan_to_dict
-from rosrm.core.plugin_calls import PluginCalls, required
+from rosrm.core.plugin_calls import required
 from rosrm.core.state import MasterState, Process, ProcessPhase, Run
 from rosrm.core.steps import title
 from rosrm.errors import PluginError, describe_fault
@@ -35,6 +36,9 @@ def begin_move(
     run = plan_move(state, process, destination, cause, now)
     if isinstance(run, str):
         return run
+    lacking = why_no_executor(state, run)
+    if lacking:
+        return lacking
     state.runs[process.name] = run
     state.charge_ranked(run.destination, destination, now, ranking)
     state.set_phase(process, ProcessPhase.MIGRATING, now, f"to {destination.name}: {cause}")
@@ -66,7 +70,7 @@ def plan_move(
         destination.name, state.new_instance_id(process), int(state.wall),
         source.node_name or process.name,
     )  # fmt: skip
-    plan = proposed(state.plugins, name, move, state.strategies[name].propose)
+    plan = proposed(state, name, move, state.strategies[name].propose)
     if isinstance(plan, str):
         return plan
     return Run(
@@ -115,35 +119,67 @@ def why_never_movable(state: MasterState, process: Process) -> str:
     return ""
 
 
+def why_no_executor(state: MasterState, run: Run) -> str:
+    """Return which host of a plan lacks an executor that it names; "": none does."""
+    own = state.declared.executors.get(run.strategy)
+    if own is None:
+        return ""  # its offer is not known
+    commit = run.plan.steps[run.commit_index]
+    named = [*executors_of(run.plan)]
+    if isinstance(commit, Commit) and commit.image:
+        named.append((commit.image, run.source_host.name))
+    for executor, name in named:
+        host = state.hosts.by_name[name].description
+        if host.incarnation and executor not in host.executors:
+            brought_by = state.declared.brought_by.get(run.strategy) or "the plugin"
+            return (
+                f"{name} has no executor {executor!r}, which {run.strategy} needs there to move "
+                f"{run.process}: install {brought_by} on {name} and restart its slave"
+            )
+    return ""
+
+
 def proposed(
-    plugins: PluginCalls, name: str, move: Move, propose: Callable[[Move], Plan],
+    state: MasterState, name: str, move: Move, propose: Callable[[Move], Plan],
     aim: Aim = Aim.MOVE,
 ) -> Plan | str:  # fmt: skip
     """The plan of a strategy, or why there is none; a strategy that raises is named.
 
     Args:
-        plugins: guards the call.
+        state: guards the call, and says what the strategy's offer declares.
         name: of the strategy.
-        move: to be planned.
+        move: to be planned; it is given its options.
         propose: the strategy's own function.
         aim: of the plan.
     """
 
     def ask() -> Plan | str:
         try:
-            plan = required(propose(move), Plan)
+            given = replace(move, options=state.declared.options_of(name, move.spec))
+            plan = required(propose(given), Plan)
         except ValueError as reason:  # by its contract: the strategy cannot move this process
             return f"the migration strategy {name!r} gave no plan: {describe_fault(reason)}"
-        fault = plan_fault(plan, move, aim)
+        fault = plan_fault(plan, move, aim) or _strange_executor(state, name, plan)
         if fault:
             raise PluginError(f"an unsound plan: {fault}")
         json.dumps(plan_to_dict(plan))  # it goes into the journal
         return plan
 
     try:
-        return plugins.ask("migration", name, _HOOKS[aim], ask)
+        return state.plugins.ask("migration", name, _HOOKS[aim], ask)
     except PluginError as fault:
         return f"the migration strategy {name!r} gave no plan: {fault}"
+
+
+def _strange_executor(state: MasterState, name: str, plan: Plan) -> str:
+    """Return what is wrong with an executor of a plan that its own offer lacks; "": nothing."""
+    own = state.declared.executors.get(name)
+    images = [step.image for step in plan.steps if isinstance(step, Commit) and step.image]
+    for executor in [*(executor for executor, _ in executors_of(plan)), *images]:
+        if own is not None and executor not in own:
+            there = ", ".join(sorted(own)) or "none"
+            return f"it names the executor {executor!r}, which its offer lacks; its own: {there}"
+    return ""
 
 
 def destination_node(plan: Plan, move: Move) -> str:

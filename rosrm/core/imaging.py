@@ -11,7 +11,7 @@ from typing import Final
 
 from rosrm.core import abilities, images
 from rosrm.core.assigning import demand_to_restore, ranking_of
-from rosrm.core.begin import destination_node, proposed, why_busy
+from rosrm.core.begin import destination_node, proposed, why_busy, why_no_executor
 from rosrm.core.hosts import Host
 from rosrm.core.migration import Aim, Commit, Execute, Move
 from rosrm.core.model import InstanceId
@@ -149,7 +149,7 @@ def _begin(
     if not isinstance(imaging, Imaging):
         raise TypeError(f"{strategy!r} takes no images")
     make = imaging.checkpoint if aim is Aim.CHECKPOINT else imaging.restore
-    plan = proposed(state.plugins, strategy, move, make, aim)
+    plan = proposed(state, strategy, move, make, aim)
     if isinstance(plan, str):
         return plan
     host = state.hosts.by_name[move.source_host]
@@ -157,6 +157,9 @@ def _begin(
         process.name, plan, strategy, move.source, host, move.destination, host, cause, now,
         move.source_node, destination_node(plan, move), state.wall, aim=aim,
     )  # fmt: skip
+    lacking = why_no_executor(state, run)
+    if lacking:
+        return lacking
     state.runs[process.name] = run
     if ranking is not None:
         state.charge_ranked(run.destination, host, now, ranking)

@@ -160,7 +160,8 @@ def _choose(
     incarnation = host.description.incarnation
     known = (
         told is not None
-        and (told.number, told.incarnation, told.choice) == (process.owner, incarnation, choice)
+        and (told.number, told.incarnation) == (process.owner, incarnation)
+        and _is_same(told.choice, choice)
     )  # fmt: skip
     if told is not None:
         told.chosen = chosen
@@ -175,7 +176,7 @@ def _choose(
             keep_on=choice.hosts, keep_every=choice.every,
         )
     )  # fmt: skip
-    if not known and (told is None or told.choice.hosts != choice.hosts):
+    if not known and (told is None or set(told.choice.hosts) != set(choice.hosts)):
         where = ", ".join(choice.hosts) or "no other host"
         state.record(
             now, "kept_on", f"the state of {process.name} is kept on {where}",
@@ -190,6 +191,11 @@ def _as_kept(
     """Choose the other hosts whose slaves report a state of this life of the process."""
     kept = (name for name, one in holdings.items() if one.number >= process.born)
     return CheckpointChoice(tuple(sorted(name for name in kept if name != host.name)))
+
+
+def _is_same(one: CheckpointChoice, other: CheckpointChoice) -> bool:
+    """Return True if two choices differ at most in the order of their hosts."""
+    return set(one.hosts) == set(other.hosts) and one.every == other.every
 
 
 def _choice(

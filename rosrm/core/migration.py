@@ -29,6 +29,8 @@ class Move:
         fallback: an instance for starting again at the source, should a stop be undone.
         now: unix time, whole seconds (the alias of a handoff carries it).
         source_node: under which the node of the source runs: an alias, if it came by a handoff.
+        options: of the strategy for this process: those of the cluster with the process's own over
+            them, an object of the offer's `own_options` or `options`.
     """
 
     spec: ProcessSpec
@@ -39,6 +41,7 @@ class Move:
     fallback: InstanceId
     now: int
     source_node: str
+    options: Any = None
 
 
 class Aim(str, Enum):
@@ -209,6 +212,9 @@ class Plan:
 
 def plan_fault(plan: Plan, move: Move, aim: Aim = Aim.MOVE) -> str:
     """What is wrong with a plan that a strategy proposed for an aim; "" for a sound one."""
+    given: object = plan
+    if not isinstance(given, Plan):
+        return f"it is {'None' if given is None else type(given).__name__}, not a Plan"
     commits = sum(isinstance(step, Commit) for step in plan.steps)
     if commits != 1:
         return f"it has {commits} commit points, not one"
@@ -292,6 +298,13 @@ def _handoff_fault(step: Step) -> str:
     if step.phase is HandoffPhase.SWITCH and not aborts:
         return "it says SWITCH, and its undo is not ABORT"
     return ""
+
+
+def executors_of(plan: Plan) -> Iterator[tuple[str, str]]:
+    """Return the executors that a plan names, those of its undo too, with their hosts."""
+    for step in all_steps(plan.steps):
+        if isinstance(step, Execute):
+            yield step.executor, step.host
 
 
 def all_steps(steps: Iterable[Step]) -> Iterator[Step]:

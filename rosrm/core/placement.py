@@ -13,13 +13,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final
+from types import MappingProxyType
+from typing import Any, Final, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from rosrm.core.columns import BUSY, CAPACITY, LIMIT, BoolArray, FloatArray, IntArray
-from rosrm.core.hosts import HostTable
+from rosrm.core.declared import declared_spec
+from rosrm.core.hosts import Host, HostTable
 from rosrm.core.model import EMPTY, ProcessSpec
 from rosrm.core.plugin_calls import PluginCalls, required
 from rosrm.errors import PluginError
@@ -36,6 +38,8 @@ RUNNERS_UP: Final = 3
 #: Equal processes that a host may take one after the other are judged so many at a time.
 _AT_A_TIME: Final = 8
 
+T = TypeVar("T")
+
 #: A scoring policy with its name.
 NamedPolicy = tuple[str, ScoringPolicy]
 Columns = slice | IntArray
@@ -51,6 +55,7 @@ class Demand:
         excluded: host name to the reason why it must not go there.
         headroom: fraction by which a host must stay under each limit.
         near: hosts that are preferred, as by one more preferred label: a state is kept there.
+        reads: fields of the spec that scoring policies read beyond the standard ones.
         key: equal for processes that every host judges alike.
     """
 
@@ -60,15 +65,19 @@ class Demand:
     excluded: Mapping[str, str] = field(default_factory=lambda: EMPTY)
     headroom: float = 0.0
     near: tuple[str, ...] = ()
+    reads: tuple[str, ...] = ()
     key: tuple[Any, ...] = field(init=False, compare=False)
 
     def __post_init__(self) -> None:
         spec = self.spec
         key = (
-            spec.program, spec.namespace, spec.kind, spec.priority,
+            spec.package, spec.executable, spec.module, spec.command,
+            spec.namespace, spec.kind, spec.priority, _key(spec.needs),
             _key(self.amounts), self.estimated, _key(self.excluded), self.headroom,
             _key(spec.required_labels), _key(spec.preferred_labels), _key(spec.avoided_labels),
             self.near,
+            # As text, because 1, 1.0 and True are equal and a policy can tell them apart.
+            *(repr(getattr(spec, name)) for name in self.reads),
         )  # fmt: skip
         object.__setattr__(self, "key", key)
 
@@ -104,6 +113,7 @@ class Ranking:
         self.version = table.version
         self.need = table.fractions(demand.amounts, demand.estimated)
         self._left = list(policies)
+        self._spec = declared_spec(demand.spec, demand.reads)
         self._seen = len(table.touched)
         self._open = table.open() & eligible(table, demand)
         self._tier = _tiers(table, demand)
@@ -222,9 +232,9 @@ class Ranking:
             return np.where(fits, tie, np.inf)
         hosts = HostView(
             Names(table, columns), table.resources, _read_only(busy.T), _read_only(limit.T),
-            _read_only(cells[CAPACITY].T), _read_only(processes[:]),
+            _read_only(cells[CAPACITY].T), _read_only(processes[:]), Labels(table, columns),
         )  # fmt: skip
-        process = ProcessView(self.demand.spec, _read_only(need.T))
+        process = ProcessView(self._spec, _read_only(need.T))
         name, policy = self._left[0]
         try:
             value, veto = self.plugins.ask(
@@ -271,20 +281,38 @@ def sound(scores: Scores, hosts: HostView, fits: BoolArray) -> tuple[FloatArray,
     veto = None
     asked = fits
     if scores.veto is not None:
-        veto = np.asarray(scores.veto, np.bool_)
+        veto = np.asarray(scores.veto)
         if veto.shape != (size,):
             raise ValueError(f"vetoes of shape {veto.shape} for {size} hosts")
+        if veto.dtype != np.bool_:
+            raise ValueError(f"vetoes of type {veto.dtype}; booleans are wanted, True: vetoed")
         asked = fits & ~veto
     if np.count_nonzero(np.isfinite(value)) < size:
         wrong = np.flatnonzero(asked & ~np.isfinite(value))
         if len(wrong):
             name = hosts.names[int(wrong[0])]
-            raise ValueError(f"the score of host {name} is {value[wrong[0]]}")
+            raise ValueError(
+                f"the score of host {name} is {value[wrong[0]]}{_unmeasured(hosts, int(wrong[0]))}"
+            )
     return value, veto
 
 
-class Names(Sequence[str]):
-    """Host names on demand: a thousand of them are not listed for each decision."""
+def _unmeasured(hosts: HostView, row: int) -> str:
+    """Return what a host does not measure, as that is where a NaN comes from; "": nothing."""
+    names = [
+        name for name, usage in zip(hosts.resources, hosts.usage[row], strict=True)
+        if np.isnan(usage)
+    ]  # fmt: skip
+    if not names:
+        return ""
+    return (
+        f". It does not measure {', '.join(names)}, so `usage` and `capacity` are NaN there; "
+        "`column` is not"
+    )
+
+
+class _PerHost(Sequence[T]):
+    """Something of each host on demand: a thousand of them are not listed for each decision."""
 
     def __init__(self, table: HostTable, columns: Columns) -> None:
         self._hosts = table.hosts
@@ -301,8 +329,25 @@ class Names(Sequence[str]):
     def __getitem__(self, row: Any) -> Any:
         columns = self._list()[row]
         if isinstance(columns, int):
-            return self._hosts[columns].name
-        return [self._hosts[column].name for column in columns]
+            return self._of(self._hosts[columns])
+        return [self._of(self._hosts[column]) for column in columns]
+
+    def _of(self, host: Host) -> T:
+        raise NotImplementedError
+
+
+class Names(_PerHost[str]):
+    """The name of each host."""
+
+    def _of(self, host: Host) -> str:
+        return host.name
+
+
+class Labels(_PerHost[Mapping[str, str]]):
+    """The labels of each host."""
+
+    def _of(self, host: Host) -> Mapping[str, str]:
+        return MappingProxyType(dict(host.description.labels))
 
 
 def eligible(table: HostTable, demand: Demand) -> BoolArray:

@@ -106,9 +106,15 @@ def _submission_fault(state: MasterState, event: happened.SubmissionReceived) ->
 
 
 def _strategy_fault(state: MasterState, spec: ProcessSpec) -> str:
-    """What the strategy of a spec has against it, if it looks at specs; "" for nothing."""
+    """Return why the strategy of a spec cannot move the process; "": it can, by what is known."""
     name = spec.migration.strategy or ""
     strategy: object = state.strategies.get(name)
+    if strategy is None:
+        return ""
+    try:
+        state.declared.options_of(name, spec)
+    except ValueError as fault:
+        return str(fault)
     if not isinstance(strategy, SpecChecking):
         return ""
     checking = strategy

@@ -20,7 +20,7 @@ from typing import Final
 
 from rosrm.core import failover, handoffs, lifecycle
 from rosrm.core.assigning import demand_of, ranking_of
-from rosrm.core.begin import plan_move
+from rosrm.core.begin import plan_move, why_no_executor
 from rosrm.core.hosts import Host
 from rosrm.core.migration import HandoffPhase, ReportPhase, Start
 from rosrm.core.placement import Demand
@@ -65,8 +65,9 @@ def _begin(state: MasterState, process: Process, now: float) -> bool:
         return False
     host = state.hosts.hosts[column]
     run = plan_move(state, process, host, "standby", now)
-    if isinstance(run, str) or not _can_wait(run):
-        why = run if isinstance(run, str) else "its migration has no shadow that waits"
+    why = run if isinstance(run, str) else why_no_executor(state, run)
+    if isinstance(run, str) or why or not _can_wait(run):
+        why = why or "its migration has no shadow that waits"
         _wait(state, process, f"it can have no standby: {why}", now)
         return False
     state.standbys[process.name] = run
@@ -104,7 +105,7 @@ def _demand(state: MasterState, process: Process, primary: Host) -> Demand:
                 excluded.setdefault(host.name, f"it has no label {label!r}, by which it is apart")
             elif value == labels.get(label):
                 excluded.setdefault(host.name, f"{label}={value}, as where the primary is")
-    return Demand(process.spec, own.amounts, own.estimated, excluded)
+    return Demand(process.spec, own.amounts, own.estimated, excluded, reads=state.declared.reads)
 
 
 def _wait(state: MasterState, process: Process, why: str, now: float) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from rosrm.core.abilities import Abilities
 from rosrm.core.columns import FloatArray
 from rosrm.core.commands import Command
+from rosrm.core.declared import Declared
 from rosrm.core.fencing import fence_of
 from rosrm.core.holdings import Keeping
 from rosrm.core.hosts import Host, HostTable
@@ -74,6 +75,7 @@ class MasterState:
     """The state of the master's core, with the few moves that every handler shares.
 
     Attributes:
+        declared: what the offers of the selected plugins declare.
         over: names of the processes that are over, in the order in which they ended.
         standbys: process name to the handoff whose destination is its standby.
         wants_standby: names of the processes that ask for one and are not over.
@@ -90,8 +92,11 @@ class MasterState:
         strategies: Mapping[str, MigrationStrategy],
         epoch: int,
         fallback: tuple[str, ScoringPolicy] | None = None,
+        *,
+        declared: Declared | None = None,
     ) -> None:
         self.settings = settings
+        self.declared = declared or Declared()
         self.policy_name = policy_name
         self.policies: tuple[NamedPolicy, ...] = ((policy_name, policy),)
         if fallback is not None:

@@ -13,10 +13,11 @@ from typing import Any, Final
 import numpy as np
 
 from rosrm.core.columns import BUSY, CAPACITY, LIMIT, LOAD, USAGE, BoolArray, FloatArray, IntArray
+from rosrm.core.declared import declared_spec
 from rosrm.core.hosts import HostTable
 from rosrm.core.lazy import Lazy
 from rosrm.core.model import EMPTY
-from rosrm.core.placement import CLOSE, TIE, Demand, NamedPolicy, Names, Ranking, eligible
+from rosrm.core.placement import CLOSE, TIE, Demand, Labels, NamedPolicy, Names, Ranking, eligible
 from rosrm.core.plugin_calls import PluginCalls, required
 from rosrm.errors import PluginError
 from rosrm.ports import HostView, ProcessView, Scores
@@ -79,8 +80,10 @@ class Moment:
         hosts = HostView(
             Names(self.table, self.columns), self.resources, self.cells[BUSY].T,
             self.cells[LIMIT].T, self.cells[CAPACITY].T, self.processes,
+            Labels(self.table, self.columns),
         )  # fmt: skip
-        (name, policy), process = self.policy, ProcessView(self.demand.spec, self.need.T)
+        spec = declared_spec(self.demand.spec, self.demand.reads)
+        (name, policy), process = self.policy, ProcessView(spec, self.need.T)
         try:
             return self.plugins.ask(
                 "scoring", name, "score", lambda: required(policy.score(hosts, process), Scores)

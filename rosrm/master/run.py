@@ -30,7 +30,10 @@ def serve(handover: Handover) -> int:
     checkpoint = registry.checkpoint(_installed_policy(config, registry), config.checkpoint.options)
     rows = registry.rows("scoring", "migration", "checkpoint")
     fallback = fallback_of(registry, name)
-    return MasterRuntime(config, policy, strategies, rows, fallback, checkpoint).run()
+    declared = registry.declared(name, config.migration.strategies)
+    return MasterRuntime(
+        config, policy, strategies, rows, fallback, checkpoint, declared=declared
+    ).run()
 
 
 def _installed_policy(config: ClusterConfig, registry: Registry) -> str | None:

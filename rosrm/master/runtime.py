@@ -26,6 +26,7 @@ from rosrm.core.commands import (
     Reply,
     Withdraw,
 )
+from rosrm.core.declared import Declared
 from rosrm.core.master import step
 from rosrm.core.state import MasterState
 from rosrm.core.views import PluginRow
@@ -86,6 +87,7 @@ class MasterRuntime:
         plugins: what `rosrm plugins` shows of the master.
         fallback: the scoring policy that decides where the first fails, with its name.
         checkpoint: the policy that keeps states; None: they are kept on their own hosts alone.
+        declared: what the offers of all these declare.
 
     Raises:
         Refused: another master runs on this domain, or on this state directory.
@@ -101,10 +103,13 @@ class MasterRuntime:
         plugins: Sequence[PluginRow] = (),
         fallback: tuple[str, ScoringPolicy] | None = None,
         checkpoint: CheckpointPolicy | None = None,
+        *,
+        declared: Declared | None = None,
     ) -> None:
         self._config = config
         self._fallback = fallback
         self._checkpoint = checkpoint
+        self._declared = declared
         self._plugins = list(plugins)
         self._started = time.monotonic()
         self._stopping = ""
@@ -147,7 +152,7 @@ class MasterRuntime:
         epoch += 1
         state = MasterState(
             self._config.core(), self._config.scoring.policy or "", policy, strategies, epoch,
-            self._fallback,
+            self._fallback, declared=self._declared,
         )  # fmt: skip
         state.plugins.limit = Deadlines()
         state.wall = time.time()

@@ -25,8 +25,9 @@ from rosrm.core.commands import (
     Reply,
     Withdraw,
 )
+from rosrm.core.declared import Declared
 from rosrm.core.master import step
-from rosrm.core.model import InstanceId
+from rosrm.core.model import EMPTY, InstanceId
 from rosrm.core.placement import NamedPolicy
 from rosrm.core.settings import CoreSettings
 from rosrm.core.state import MasterState
@@ -65,6 +66,7 @@ class Simulation:
         settings: of the master's core.
         policy: that orders the hosts, with its name.
         strategies: by name.
+        declared: what their offers declare. A simulated host has all executors.
     """
 
     def __init__(
@@ -73,11 +75,15 @@ class Simulation:
         settings: CoreSettings,
         policy: NamedPolicy,
         strategies: Mapping[str, MigrationStrategy],
+        declared: Declared | None = None,
     ) -> None:
         self.workload = workload
         self.meter = Meter(workload.until)
         self.agenda = Agenda()
-        self.state = MasterState(settings, policy[0], policy[1], strategies, epoch=1)
+        self.state = MasterState(
+            settings, policy[0], policy[1], strategies, epoch=1,
+            declared=replace(declared or Declared(), executors=EMPTY),
+        )  # fmt: skip
         self.machines: dict[str, Machine] = {}
         plans = {plan.name: plan for plan in workload.processes}
         self._hosting = Hosting(self.agenda, workload.model, plans, self._tell)

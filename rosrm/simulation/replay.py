@@ -9,6 +9,7 @@ from typing import Final
 
 from rosrm.core import lost_tail
 from rosrm.core.commands import Command
+from rosrm.core.declared import Declared
 from rosrm.core.master import step
 from rosrm.core.placement import NamedPolicy
 from rosrm.core.restore import restore
@@ -63,7 +64,7 @@ class Replay:
 def replay(
     recording: Recording, settings: CoreSettings, policy: NamedPolicy,
     strategies: Mapping[str, MigrationStrategy], watcher: Watcher | None = None,
-    until: float = inf,
+    until: float = inf, *, declared: Declared | None = None,
 ) -> Replay:  # fmt: skip
     """Tell a core again everything that a record holds, at the same times.
 
@@ -78,9 +79,10 @@ def replay(
         watcher: is shown each event with what came of it.
         until: seconds from the beginning of the record: the run is measured up to here. All of it
             is replayed nonetheless.
+        declared: what the offers of policy and strategies declare.
     """
     header = recording.header
-    state = MasterState(settings, policy[0], policy[1], strategies, header.epoch)
+    state = MasterState(settings, policy[0], policy[1], strategies, header.epoch, declared=declared)
     restore(state, lambda table: header.intents.get(table, {}), header.started)
     tail = header.intents.get("cluster", {}).get("tail")
     if tail is not None:

@@ -15,7 +15,7 @@ For readable failures, `pytest.register_assert_rewrite("rosrm.testing")` in a co
 
 from rosrm.testing.checkpoints import CheckpointContract
 from rosrm.testing.journals import JournalContract, MemoryJournal
-from rosrm.testing.migrations import MigrationContract, before_commit
+from rosrm.testing.migrations import MigrationContract, before_commit, with_options
 from rosrm.testing.probes import (
     FakeClock,
     FakeProbe,
@@ -43,4 +43,5 @@ __all__ = [
     "probe_context",
     "process_view",
     "vetoes",
+    "with_options",
 ]

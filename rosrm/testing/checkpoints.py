@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, ClassVar
+from itertools import islice, permutations
+from typing import Any, ClassVar, Final
 
 from rosrm.core.model import EMPTY, MigrationPolicy, ProcessSpec
 from rosrm.ports import (
@@ -15,6 +16,9 @@ from rosrm.ports import (
     MemoryPacing,
     MemoryView,
 )
+
+#: Orders of the hosts that keep a state, of those that are tried.
+_ORDERS: Final = 24
 
 
 class CheckpointContract:
@@ -69,13 +73,18 @@ class CheckpointContract:
             assert policy.choose(view) == policy.choose(view) == twin.choose(view)
 
     def test_stays_with_its_choice(self) -> None:
-        """Once its hosts keep the state, nothing travels to another one."""
+        """Once its hosts keep the state, nothing travels to another one.
+
+        In whatever order they are listed: the newest goes first, and that changes by the second.
+        """
         for view in self.views():
             choice = self.make().choose(view)
             if choice is not None:
-                kept = replace(view, age=0.1, kept_on=choice.hosts)
-                again = self.make().choose(kept)
-                assert again is None or set(again.hosts) == set(choice.hosts)
+                for order in islice(permutations(choice.hosts), _ORDERS):
+                    again = self.make().choose(replace(view, age=0.1, kept_on=order))
+                    assert again is None or set(again.hosts) == set(choice.hosts), (
+                        f"kept on {', '.join(order)} it chooses {', '.join(again.hosts)}"
+                    )
 
     def test_sets_a_pace_for_dumps_of_memory(self) -> None:
         """Of a policy that does: seconds, more than none, the same for the same view, or none."""

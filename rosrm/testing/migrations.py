@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import fields, replace
 from math import inf
-from typing import Any, ClassVar
+from pathlib import Path
+from typing import Any, ClassVar, Final, get_type_hints
 
+from rosrm.config.own_options import merged_options
+from rosrm.config.plain import to_plain
 from rosrm.core.migration import (
     Aim,
     Commit,
@@ -26,6 +30,23 @@ from rosrm.core.model import EMPTY, InstanceId, ProcessSpec
 from rosrm.core.plans import plan_from_dict, plan_to_dict
 from rosrm.ports import Imaging, MigrationOffer, MigrationStrategy, PeriodicImaging
 
+#: A unit of each quantity that an option may have.
+_UNITS: Final = {"duration": "s", "size": "B", "cores": "cores"}
+
+
+def with_options(move: Move, offer: MigrationOffer, **cluster: Any) -> Move:
+    """Return a move with the options that the master would give it.
+
+    Args:
+        move: of a process that may have options of its own, as text or numbers.
+        offer: of the strategy.
+        cluster: its options for all processes, by name; the others have their defaults.
+    """
+    migration, wanted = move.spec.migration, offer.own_options or offer.options
+    own = migration.options if migration.strategy in (None, offer.name) else EMPTY
+    plain = to_plain(offer.options(**cluster))
+    return replace(move, options=merged_options(wanted, plain, own))
+
 
 class MigrationContract:
     """What the master relies on in a migration strategy.
@@ -34,11 +55,13 @@ class MigrationContract:
         offer: what is tested.
         options: settings by name; the others have their defaults.
         spec: of a process that the strategy can move.
+        not_called: executors that a test cannot call, by name, with the reason.
     """
 
     offer: ClassVar[MigrationOffer]
     options: ClassVar[Mapping[str, Any]] = EMPTY
     spec: ClassVar[ProcessSpec] = ProcessSpec("p", command=("true",))
+    not_called: ClassVar[Mapping[str, str]] = EMPTY
 
     def make(self) -> MigrationStrategy:
         """A new strategy; override it where more is needed."""
@@ -57,7 +80,12 @@ class MigrationContract:
             source_node=self.spec.name,
         )
         policies = [replace(self.spec.migration, overlap=overlap) for overlap in (True, False)]
-        return [replace(move, spec=replace(self.spec, migration=policy)) for policy in policies]
+        moves = [replace(move, spec=replace(self.spec, migration=policy)) for policy in policies]
+        return [self.with_options(move) for move in moves]
+
+    def with_options(self, move: Move) -> Move:
+        """Return a move with its options, as the master gives it."""
+        return with_options(move, self.offer, **self.options)
 
     def test_plan_is_sound(self) -> None:
         """One commit point, hosts of this move only, a time-out for every wait."""
@@ -187,6 +215,58 @@ class MigrationContract:
                 if isinstance(step, Execute):
                     assert step.executor in self.offer.executors
                     json.dumps(dict(step.arguments))
+
+    def test_executors_answer_with_json_objects(self, tmp_path: Path) -> None:
+        """Each that a plan names is called as on a slave; one may raise, for that is a failed step.
+
+        Those in `not_called` are left out.
+        """
+        for move in self.moves():
+            results: dict[str, Any] = {}
+            for step in self.make().propose(move).steps:
+                if not isinstance(step, Execute) or step.executor in self.not_called:
+                    continue
+                pids = {str(move.source): os.getpid()}
+                here = {
+                    "host": step.host, "state": str(tmp_path), "pids": pids,
+                    "instances": list(pids),
+                }  # fmt: skip
+                told = json.loads(json.dumps({**step.arguments, "results": results, "here": here}))
+                try:
+                    answer: object = self.offer.executors[step.executor](told)
+                except Exception:  # noqa: BLE001, S112 - to raise is to fail the step, and allowed
+                    continue
+                given = "None" if answer is None else repr(answer)
+                assert isinstance(answer, Mapping), (
+                    f"the executor {step.executor!r} answered {given}; a mapping is wanted, as {{}}"
+                )
+                assert all(isinstance(key, str) for key in answer), answer
+                results[step.executor] = json.loads(json.dumps(dict(answer), allow_nan=False))
+
+    def test_options_of_a_process_are_read_from_the_move(self) -> None:
+        """A work file may write the same quantities with their units: the plan stays the same.
+
+        `spec.migration.options` has them as text; `move.options` has them parsed.
+        """
+        wanted = self.offer.own_options or self.offer.options
+        for move in self.moves():
+            text = dict(quantities_as_text(move.options if move.options is not None else wanted()))
+            policy = replace(move.spec.migration, options={**move.spec.migration.options, **text})
+            written = self.with_options(replace(move, spec=replace(move.spec, migration=policy)))
+            assert written.options == move.options
+            assert self.make().propose(written) == self.make().propose(move), (
+                f"the plan is another one where the process's own options are written {text}"
+            )
+
+
+def quantities_as_text(options: Any) -> Iterator[tuple[str, str]]:
+    """Return the options that are quantities, each written with its unit, as "2.0s"."""
+    hints = get_type_hints(type(options), include_extras=True)
+    for f in fields(options):
+        for mark in getattr(hints[f.name], "__metadata__", ()):
+            unit = _UNITS.get(getattr(mark, "measures", ""))
+            if unit is not None:
+                yield f.name, f"{getattr(options, f.name)!r}{unit}"
 
 
 def shadows(plan: Plan) -> Sequence[Start]:

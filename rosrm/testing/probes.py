@@ -14,7 +14,7 @@ from unittest import SkipTest
 from rosrm.core.model import EMPTY, Reading, ResourceDescription
 from rosrm.errors import SkipPlugin
 from rosrm.ports import Probe, ProbeContext, ProbeOffer
-from rosrm.registry import MadeProbe
+from rosrm.registry import MadeProbe, resource_fault
 
 
 class FakeClock:
@@ -129,17 +129,18 @@ class ProbeContract:
             raise SkipTest(f"{self.offer.name} is absent here: {absent}") from absent
 
     def test_resources_are_well_described(self) -> None:
-        """Names are unique and not empty, capacities finite and above 0."""
+        """Each by its type, names unique and declared by the offer, capacities above 0."""
         probe = self.make()
         resources = list(probe.resources)
         probe.close()
         names = [resource.name for resource in resources]
         assert resources, "a probe that reads nothing should raise SkipPlugin"
-        assert all(names), f"a resource without a name: {names}"
-        assert len(set(names)) == len(names), f"two resources of one name: {names}"
         for resource in resources:
-            assert math.isfinite(resource.capacity), resource
-            assert resource.capacity > 0, resource
+            assert resource_fault(resource) == "", resource
+        assert len(set(names)) == len(names), f"two resources of one name: {names}"
+        assert set(names) <= set(self.offer.resources), (
+            f"ProbeOffer.resources is {self.offer.resources}, and it reads {names}"
+        )
 
     def test_reads_each_resource_once(self) -> None:
         """Every read brings one sane reading of each resource, and of nothing else."""

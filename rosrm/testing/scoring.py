@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Final
 
 import numpy as np
 
-from rosrm.core.model import EMPTY, ProcessSpec
+from rosrm.core.declared import SPEC_FIELDS, declared_spec
+from rosrm.core.model import EMPTY, Kind, MigrationPolicy, ProcessSpec
 from rosrm.ports import (
     BoolArray,
     FloatArray,
@@ -26,6 +27,7 @@ def host_view(
     limit: float = 1.0,
     capacity: float = 1.0,
     processes: Sequence[int] = (),
+    labels: Sequence[Mapping[str, str]] = (),
 ) -> HostView:
     """Hosts h0, h1, ... for a scoring policy.
 
@@ -34,6 +36,7 @@ def host_view(
         limit: of every resource on every host, fraction.
         capacity: base units, likewise.
         processes: by host; (): none anywhere.
+        labels: by host; (): none has any.
     """
     # The core keeps one row a resource; a policy sees the transpose, as here.
     table = np.array(list(usage.values()), np.float64).reshape(len(usage), -1)
@@ -46,22 +49,46 @@ def host_view(
         limit=np.full_like(table, limit).T,
         capacity=np.where(missing, np.nan, capacity).T,
         processes=np.array(processes or [0] * hosts, np.int64),
+        labels=labels or [EMPTY] * hosts,
     )
 
 
-def process_view(hosts: HostView, needs: Mapping[str, float] = EMPTY) -> ProcessView:
+def process_view(
+    hosts: HostView,
+    needs: Mapping[str, float] = EMPTY,
+    *,
+    reads: tuple[str, ...] = SPEC_FIELDS,
+    **spec: Any,
+) -> ProcessView:
     """A process to place, for a scoring policy.
 
     Args:
         hosts: where it could go.
         needs: base units by resource.
+        reads: fields of the spec that the policy's offer declares; the default is all of them.
+        spec: fields of the spec, as `name="camera_0"` or `environment={"GROUP": "camera"}`.
     """
+    fields = {"name": "p", "command": ("true",), "needs": dict(needs), **spec}
     need = np.zeros(hosts.usage.shape[::-1])
     for name, amount in needs.items():
         if name in hosts.resources:
             row = hosts.resources.index(name)
             need[row] = amount / hosts.capacity[:, row]
-    return ProcessView(ProcessSpec("p", command=("true",), needs=dict(needs)), need.T)
+    return ProcessView(declared_spec(ProcessSpec(**fields), reads), need.T)
+
+
+#: Specs that a policy must be able to judge, by the fields that differ.
+_SPECS: Final[Sequence[Mapping[str, Any]]] = (
+    {"needs": {"memory": 0.05, "cpu": 0.1}},
+    {
+        "name": "camera_0", "namespace": "/robot", "priority": 5, "kind": Kind.JOB,
+        "environment": {"GROUP": "camera"}, "arguments": ("-v",), "parameters": {"rate": 10.0},
+        "required_labels": {"rack": "1"}, "ros": True,
+        "migration": MigrationPolicy("relaunch", options={"settle": "2s"}),
+    },
+    {"name": "9.lives-", "command": (), "module": "pkg.main", "needs": {"gpu": 1.0}},
+    {"command": (), "package": "demo", "executable": "talker"},
+)  # fmt: skip
 
 
 class ScoringContract:
@@ -87,12 +114,18 @@ class ScoringContract:
             usage = {name: chance.random(count) * 1.2 for name in ("memory", "cpu", "disk", "gpu")}
             usage["gpu"][chance.random(count) < 0.5] = np.nan
             hosts = host_view({name: list(column) for name, column in usage.items()}, limit=0.9)
-            cases.append((hosts, process_view(hosts, {"memory": 0.05, "cpu": 0.1})))
+            labels = [{"rack": str(n % 3)} if n % 4 else {} for n in range(count)]
+            hosts = replace(hosts, labels=labels)
+            cases += [(hosts, self._process(hosts, **spec)) for spec in _SPECS]
         lean = host_view({"memory": [0.2, 0.4]})
-        cases.append((lean, process_view(lean)))
+        cases.append((lean, self._process(lean)))
         bare = host_view({"something": [0.2, 0.4]})
-        cases.append((bare, process_view(bare)))
+        cases.append((bare, self._process(bare)))
         return cases
+
+    def _process(self, hosts: HostView, **spec: Any) -> ProcessView:
+        """Return a process whose spec gives what the offer declares, as that of the master."""
+        return process_view(hosts, reads=tuple(self.offer.reads), **spec)
 
     def test_scores_every_host(self) -> None:
         """One number a host, finite where it is not vetoed, and never NaN."""
@@ -100,6 +133,9 @@ class ScoringContract:
             scores = self.make().score(hosts, process)
             count = len(hosts.names)
             assert np.shape(scores.value) == (count,)
+            if scores.veto is not None:
+                assert np.shape(scores.veto) == (count,)
+                assert np.asarray(scores.veto).dtype == np.bool_ or not count, "no booleans"
             assert not np.isnan(scores.value).any()
             assert np.isfinite(scores.value[~vetoes(scores, count)]).all()
 
@@ -141,7 +177,7 @@ class ScoringContract:
     def test_no_hosts(self) -> None:
         """None to judge is no error."""
         hosts = host_view({"memory": [], "cpu": []})
-        assert len(self.make().score(hosts, process_view(hosts)).value) == 0
+        assert len(self.make().score(hosts, self._process(hosts)).value) == 0
 
 
 def vetoes(scores: Scores, count: int) -> BoolArray:
@@ -163,5 +199,6 @@ def one_row(hosts: HostView, process: ProcessView, row: int) -> tuple[HostView, 
         part(hosts.limit),
         part(hosts.capacity),
         hosts.processes[one],
+        hosts.labels[one],
     )
     return alone, replace(process, need=part(process.need))

@@ -3,8 +3,10 @@
 from dataclasses import replace
 from typing import ClassVar
 
+import pytest
+
 from rosrm.core.model import ProcessSpec
-from rosrm.ports import CheckpointChoice, CheckpointView, MemoryView
+from rosrm.ports import CheckpointChoice, CheckpointOffer, CheckpointView, MemoryView
 from rosrm.testing import CheckpointContract
 from rosrm_checkpoint import plugin
 from rosrm_checkpoint.other_host import OtherHost, OtherHostOptions
@@ -74,3 +76,21 @@ def test_a_process_that_stood_still_for_long_runs_for_longer():
     assert policy.pace(MemoryView(spec, "h0", 60.0, 0, 0.0)) == 60.0
     assert policy.pace(MemoryView(spec, "h0", 60.0, 1000, 0.5)) == 60.0
     assert policy.pace(MemoryView(spec, "h0", 60.0, 1000, 9.0)) == 180.0
+
+
+def test_a_policy_that_follows_the_order_of_the_copies_is_caught():
+    """`kept_on` changes its order by the second, so the copies would travel to and fro."""
+
+    class Follows:
+        def choose(self, process):
+            others = [name for name in process.hosts if name != process.host]
+            first = [name for name in process.kept_on if name in others][:1]
+            rest = [name for name in others if name not in first]
+            at = (others.index(first[0]) + 1) % len(rest) if first else 0
+            return CheckpointChoice((*first, *rest[at : at + 2 - len(first)]))
+
+    contract = CheckpointContract()
+    contract.offer = CheckpointOffer("follows", lambda options: Follows())
+    contract.test_chooses_hosts_that_are_there()
+    with pytest.raises(AssertionError, match="it chooses"):
+        contract.test_stays_with_its_choice()

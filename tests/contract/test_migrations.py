@@ -1,10 +1,11 @@
 """Every shipped migration strategy holds the contract that a third party's holds."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import pytest
 
+from rosrm.config.units import PositiveSeconds
 from rosrm.core.migration import (
     AwaitReady,
     Commit,
@@ -37,6 +38,7 @@ class TestHandoffAsInThePaper(MigrationContract):
     offer = OFFERS["handoff"]
     options: ClassVar = {"protocol": "paper", "state": "/p/state", "type": "std_msgs/msg/Int64"}
     spec = ProcessSpec("p", command=("true",), ros=True)
+    not_called: ClassVar = {"handoff_watch": "needs a ROS graph: tests/ros/test_watching.py"}
 
     def moves(self):
         """Only of one that may overlap: for a moment both are active."""
@@ -45,6 +47,7 @@ class TestHandoffAsInThePaper(MigrationContract):
 
 class TestCriu(MigrationContract):
     offer = OFFERS["criu"]
+    not_called: ClassVar = dict.fromkeys(offer.executors, "needs CRIU: tests/ros/test_criu_moves")
     spec = ProcessSpec("p", command=("true",), ros=True, restart=RestartPolicy("on-failure"))
 
     def test_nothing_joins_before_the_commit(self):
@@ -156,3 +159,63 @@ def test_contract_catches(propose, test):
     (named,) = (name for name in dir(contract) if name.startswith(test))
     with pytest.raises((AssertionError, TypeError)):
         getattr(contract, named)()
+
+
+@dataclass(frozen=True)
+class _Options:
+    pause: PositiveSeconds = 2.0
+
+
+class _Sleepy:
+    """Executes on the source, then moves; `raw`: reads the options of the process as text."""
+
+    def __init__(self, *, raw=False):
+        self._raw = raw
+
+    def propose(self, move):
+        pause = move.options.pause
+        if self._raw:
+            pause = float(move.spec.migration.options.get("pause", 2.0))
+        plan = _sound(move) if move.spec.migration.overlap else _stop_first(move)
+        wait = Execute("sleepy.wait", move.source_host, {"seconds": pause}, pause + 5.0)
+        return replace(plan, steps=(wait, *plan.steps))
+
+
+def _stop_first(move):
+    stop = Stop(
+        move.source, move.source_host, 10.0, undo=Start(move.fallback, move.source_host, 10.0)
+    )
+    return Plan((stop, *_sound(move).steps[:3]))
+
+
+def _sleepy(answer, **how):
+    contract = MigrationContract()
+    contract.offer = MigrationOffer(
+        "sleepy", lambda options: _Sleepy(**how), _Options, executors={"sleepy.wait": answer}
+    )
+    return contract
+
+
+@pytest.mark.parametrize("answer", [None, 5, ["a"], {1: 2}, {"a": object()}, {"a": float("nan")}])
+def test_an_executor_that_answers_no_json_object_is_caught(answer, tmp_path):
+    """Also one that forgets to return anything."""
+    with pytest.raises((AssertionError, TypeError, ValueError)):
+        _sleepy(lambda _: answer).test_executors_answer_with_json_objects(tmp_path)
+
+
+def test_an_executor_gets_what_a_slave_gives_it(tmp_path):
+    """Its arguments, the results of earlier ones, and its host."""
+    seen = []
+    contract = _sleepy(lambda told: seen.append(told) or {})
+    contract.test_executors_answer_with_json_objects(tmp_path)
+    assert seen[0]["seconds"] == 2.0
+    assert seen[0]["results"] == {}
+    assert seen[0]["here"]["host"] == "a"
+    assert list(seen[0]["here"]["pids"]) == seen[0]["here"]["instances"] == ["p#1"]
+
+
+def test_a_strategy_that_reads_a_processs_options_as_text_is_caught():
+    """The work file has "2s" where the options have 2.0."""
+    _sleepy(dict).test_options_of_a_process_are_read_from_the_move()
+    with pytest.raises(ValueError, match=r"'2\.0s'"):
+        _sleepy(dict, raw=True).test_options_of_a_process_are_read_from_the_move()

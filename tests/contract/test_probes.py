@@ -71,7 +71,12 @@ def test_each_shipped_probe_is_here():
 class TestFake(ProbeContract):
     """The fake of `rosrm.testing` is a probe as well."""
 
-    offer = ProbeOffer("fake", lambda options, context: FakeProbe(a=0.5, b=0.1), summary="a fake")
+    offer = ProbeOffer(
+        "fake",
+        lambda options, context: FakeProbe(a=0.5, b=0.1),
+        summary="a fake",
+        resources=("a", "b"),
+    )
 
 
 class _Leaking(FakeProbe):
@@ -88,6 +93,10 @@ class _Nameless(FakeProbe):
     resources = (ResourceDescription("", "1", 1.0),)
 
 
+class _Unitless(FakeProbe):
+    resources = (ResourceDescription("a", None, 1.0),)
+
+
 class _Boundless(FakeProbe):
     resources = (ResourceDescription("a", "1", 0.0),)
 
@@ -102,6 +111,8 @@ class _Chatty(FakeProbe):
     [
         (_Nameless, "test_resources_are_well_described"),
         (_Boundless, "test_resources_are_well_described"),
+        (_Unitless, "test_resources_are_well_described"),
+        (lambda: FakeProbe(undeclared=0.1), "test_resources_are_well_described"),
         (lambda: FakeProbe(a=float("nan")), "test_reads_each_resource_once"),
         (lambda: FakeProbe(a=-0.1), "test_reads_each_resource_once"),
         (lambda: _Chatty(a=0.1), "test_reads_each_resource_once"),
@@ -111,7 +122,9 @@ class _Chatty(FakeProbe):
 def test_contract_catches(make, test):
     """A probe that breaks the contract fails the test of that clause."""
     contract = ProbeContract()
-    contract.offer = ProbeOffer("bad", lambda options, context: make(), summary="bad")
+    contract.offer = ProbeOffer(
+        "bad", lambda options, context: make(), summary="bad", resources=("a",)
+    )
     try:
         with pytest.raises(AssertionError):
             getattr(contract, test)()

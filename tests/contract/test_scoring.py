@@ -62,11 +62,37 @@ class _Mutating:
         return Scores(np.zeros(len(hosts.names)))
 
 
+class _ByName:
+    def score(self, hosts, process):
+        return Scores(np.full(len(hosts.names), float(len(process.spec.name))))
+
+
+class _Words:
+    def score(self, hosts, process):
+        return Scores(np.zeros(len(hosts.names)), ["no"] * len(hosts.names))
+
+
+def test_a_declared_field_can_be_read():
+    """The contract gives what the offer declares, as the master does."""
+    contract = ScoringContract()
+    contract.offer = ScoringOffer("named", lambda options: _ByName(), reads=("name",))
+    contract.test_scores_every_host()
+
+
+def test_an_undeclared_field_fails_the_contract_with_its_name():
+    """And with how to declare it."""
+    contract = ScoringContract()
+    contract.offer = ScoringOffer("named", lambda options: _ByName())
+    with pytest.raises(LookupError, match=r"'name'.*ScoringOffer\(\.\.\., reads=\('name',\)\)"):
+        contract.test_scores_every_host()
+
+
 @pytest.mark.parametrize(
     ("policy", "test"),
     [
         (_Relative, "test_rows_are_independent"),
         (_NaN, "test_scores_every_host"),
+        (_Words, "test_scores_every_host"),
         (_Standing, "test_is_pure"),
         (_Mutating, "test_is_pure"),
     ],

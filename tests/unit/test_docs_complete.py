@@ -13,17 +13,20 @@ from typing import Annotated, get_args, get_origin, get_type_hints
 import pytest
 import typer.main
 
-from rosrm import hookspecs, ports
+from rosrm import hookspecs, plans, ports
 from rosrm.cli.commands import app
 from rosrm.config import ClusterConfig, HostConfig, load_cluster, load_host, load_work
 from rosrm.config.process import ProcessInFile
 from rosrm.core import migration, views
+from rosrm.core.declared import SPEC_FIELDS
 from rosrm.core.model import HostDescription
 from rosrm.loading import HOOKS
 from rosrm_checkpoint.other_host import OtherHostOptions
 from rosrm_migration.criu import CriuOptions
 from rosrm_migration.handoff import HandoffOptions
 from rosrm_migration.relaunch import RelaunchOptions
+from rosrm_scoring.threshold import ThresholdOptions
+from rosrm_scoring.weighted import WeightedOptions
 
 REFERENCE = Path(__file__).resolve().parents[2] / "docs" / "reference"
 
@@ -77,6 +80,16 @@ def test_every_option_of_the_checkpoint_policy_is_documented():
     text = section(page("configuration.md"), "Options of the checkpoint policy")
     named = set(re.findall(r"^\| `(\w+)` \|", text, re.MULTILINE))
     assert named == {field.name for field in fields(OtherHostOptions)}
+
+
+@pytest.mark.parametrize("options", [WeightedOptions, ThresholdOptions])
+def test_every_option_of_a_scoring_policy_is_documented(options):
+    text = section(page("configuration.md"), "Options of the scoring policies")
+    name = options.__name__.removesuffix("Options").lower()
+    table = text[text.index(f"| `{name}` | default |") :].split("\n\n")[0]
+    named = {word for cell in re.findall(r"^\| ([^|]+) \|", table, re.MULTILINE)
+             for word in re.findall(r"`(\w+)`", cell)}  # fmt: skip
+    assert named - {name} == {field.name for field in fields(options)}
 
 
 @pytest.mark.parametrize("options", [RelaunchOptions, HandoffOptions, CriuOptions])
@@ -181,6 +194,25 @@ def test_every_step_of_a_plan_is_documented():
     text = section(page("plugins.md"), "`MigrationOffer`")
     for step in get_args(migration.Step):
         assert f"`{step.__name__}`" in text
+
+
+def test_every_step_of_a_plan_is_public_and_its_arguments_are_documented():
+    text = " ".join(section(page("plugins.md"), "`MigrationOffer`").split())
+    for step in get_args(migration.Step):
+        assert getattr(plans, step.__name__) is step
+        assert step.__name__ in plans.__all__
+        shown = re.search(rf"`{step.__name__}\(([^`]*)\)`", text)
+        names = [f.name for f in fields(step) if (step, f.name) not in _OF_NO_USE]
+        assert re.findall(r"(\w+)(?:=[^,]+)?(?:,|$)", shown[1]) == names
+
+
+def test_every_field_of_a_spec_that_a_policy_may_read_is_documented():
+    text = section(page("plugins.md"), "`ScoringOffer`")
+    assert {name for name in SPEC_FIELDS if f"`{name}`" not in text} == set()
+
+
+#: A commit is done at once and stays: it takes no time and has no way back.
+_OF_NO_USE = {(migration.Commit, "timeout"), (migration.Commit, "undo")}
 
 
 def commands(group, before: str = "rosrm") -> Iterator[tuple[str, object]]:

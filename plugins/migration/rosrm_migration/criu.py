@@ -13,13 +13,22 @@ from math import inf
 from typing import Any, Final
 
 from rosrm.config.units import Bytes, PositiveSeconds, Seconds
-from rosrm.core.migration import Commit, Execute, Move, Plan, SetRestart, Start, Stop
-from rosrm.core.model import InstanceId, ProcessSpec
 from rosrm.criu.fitting import mismatch
+from rosrm.plans import (
+    Commit,
+    Execute,
+    InstanceId,
+    Move,
+    Plan,
+    ProcessSpec,
+    SetRestart,
+    Start,
+    Stop,
+    options_of,
+)
 from rosrm_migration.criu_building import execute, suspend
 from rosrm_migration.criu_kept import checkpoint_plan, restore_plan
 from rosrm_migration.criu_periodic import SWEEP, periodic_step
-from rosrm_migration.options import check_seconds, options_of
 
 #: Under which it is selected.
 NAME: Final = "criu"
@@ -62,11 +71,7 @@ class CriuOptions:
     reserve: Bytes = 256 << 20
 
     def __post_init__(self) -> None:
-        """Refuse a wait that is no time, and a rate that is none."""
-        check_seconds(
-            self, "start_timeout", "leave_timeout", "dump_timeout", "transfer_timeout",
-            "restore_timeout", "join_timeout",
-        )  # fmt: skip
+        """Refuse a rate that is none."""
         if self.max_rate < 0:
             raise ValueError(f"max_rate is {self.max_rate} bytes/s; allowed: 0 (no bound) or more")
         if self.reserve < 0:
@@ -114,10 +119,6 @@ class Criu:
 
     def spec_fault(self, spec: ProcessSpec) -> str:
         """Why a process cannot be moved so; "" if it can."""
-        try:
-            self._own(spec)
-        except ValueError as fault:
-            return str(fault)
         if not spec.ros_node:
             return (
                 "it moves ROS nodes that leave and join by themselves (rosrm.node.PortableNode), "
@@ -133,15 +134,15 @@ class Criu:
         fault = self.spec_fault(move.spec)
         if fault:
             raise ValueError(fault)
-        return _Draft(move, self._own(move.spec)).plan()
+        return _Draft(move, move.options).plan()
 
     def checkpoint(self, move: Move) -> Plan:
         """Dump it where it runs, ROS node or not, and end it; no node is asked to leave."""
-        return checkpoint_plan(move, self._options_for(move.spec))
+        return checkpoint_plan(move, move.options)
 
     def restore(self, move: Move) -> Plan:
         """Restore it where its image lies."""
-        return restore_plan(move, self._options_for(move.spec))
+        return restore_plan(move, move.options)
 
     def checkpoint_every(self, spec: ProcessSpec) -> float:
         """As its own options say."""
@@ -155,10 +156,6 @@ class Criu:
     def discard(self) -> str:
         """The executor that removes what has no use any more."""
         return SWEEP
-
-    def _options_for(self, spec: ProcessSpec) -> CriuOptions:
-        """Its own where it moves so; those of another strategy mean something else."""
-        return self._own(spec) if spec.migration.strategy == NAME else self._options
 
     def _own(self, spec: ProcessSpec) -> OwnCriuOptions:
         return options_of(spec, self._options, OwnCriuOptions)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-from rosrm.core.migration import Execute, Move, SetRestart, Step
-from rosrm.core.model import RestartPolicy
+from rosrm.plans import Execute, Move, RestartPolicy, SetRestart, Step
 
 #: Seconds that the master waits longer than an executor, which knows what it waited for.
 LONGER: Final = 5.0

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any, Final, Literal
 
 from rosrm.config.units import PositiveSeconds
-from rosrm.core.migration import (
+from rosrm.plans import (
     AwaitReleased,
     Commit,
     Configure,
@@ -22,12 +22,13 @@ from rosrm.core.migration import (
     HandoffPhase,
     Move,
     Plan,
+    ProcessSpec,
+    RestartPolicy,
     SetRestart,
     Start,
     Stop,
+    options_of,
 )
-from rosrm.core.model import ProcessSpec, RestartPolicy
-from rosrm_migration.options import check_seconds, options_of
 
 #: Name of the executor that hears when a destination of the paper's protocol speaks.
 WATCH: Final = "handoff_watch"
@@ -69,11 +70,7 @@ class HandoffOptions:
     type: str = ""
 
     def __post_init__(self) -> None:
-        """Refuse a wait that is no time, and a watch that could not begin."""
-        check_seconds(
-            self, "start_timeout", "ready_timeout", "switch_timeout", "abort_timeout",
-            "resume_timeout", "release_timeout",
-        )  # fmt: skip
+        """Refuse a watch that could not begin."""
         if self.protocol not in ("rosrm", "paper"):
             raise ValueError(f"protocol {self.protocol!r}; allowed: rosrm, paper")
         if self.protocol == "rosrm":
@@ -99,27 +96,24 @@ class Handoff:
 
     def spec_fault(self, spec: ProcessSpec) -> str:
         """Why a process cannot be moved so; "" if it can."""
-        try:
-            options = options_of(spec, self._options)
-        except ValueError as fault:
-            return str(fault)
-        if not spec.ros:
-            return "it moves ROS nodes, and this process is none: say `ros: true`"
-        if options.protocol == "paper" and not spec.migration.overlap:
-            return (
-                "with `protocol: paper` both are active for a moment, and `overlap: false` is set"
-            )
-        return ""
+        return _fault(spec, options_of(spec, self._options))
 
     def propose(self, move: Move) -> Plan:
         """Shadow, switch, commit, stop; with the paper's protocol: listen, commit, stop."""
-        fault = self.spec_fault(move.spec)
+        fault = _fault(move.spec, move.options)
         if fault:
             raise ValueError(fault)
-        options = options_of(move.spec, self._options)
-        if options.protocol == "paper":
-            return _as_in_the_paper(move, options)
-        return _handing_over(move, options)
+        if move.options.protocol == "paper":
+            return _as_in_the_paper(move, move.options)
+        return _handing_over(move, move.options)
+
+
+def _fault(spec: ProcessSpec, options: HandoffOptions) -> str:
+    if not spec.ros:
+        return "it moves ROS nodes, and this process is none: say `ros: true`"
+    if options.protocol == "paper" and not spec.migration.overlap:
+        return "with `protocol: paper` both are active for a moment, and `overlap: false` is set"
+    return ""
 
 
 def _handing_over(move: Move, options: HandoffOptions) -> Plan:

@@ -11,9 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from rosrm.config.units import PositiveSeconds
-from rosrm.core.migration import AwaitReady, Commit, Move, Plan, Start, Stop
-from rosrm.core.model import ProcessSpec
-from rosrm_migration.options import check_seconds, options_of
+from rosrm.plans import AwaitReady, Commit, Move, Plan, Start, Stop
 
 
 @dataclass(frozen=True)
@@ -29,31 +27,18 @@ class RelaunchOptions:
     start_timeout: PositiveSeconds = 10.0
     settle: PositiveSeconds = 1.0
 
-    def __post_init__(self) -> None:
-        """Refuse a wait that is no time."""
-        check_seconds(self, "start_timeout", "settle")
-
 
 class Relaunch:
     """Plans a stateless move."""
 
-    def __init__(self, options: RelaunchOptions) -> None:
-        self._options = options
-
-    def spec_fault(self, spec: ProcessSpec) -> str:
-        """Why a process cannot be moved so; "" if it can."""
-        try:
-            options_of(spec, self._options)
-        except ValueError as fault:
-            return str(fault)
-        return ""
+    def __init__(self, _options: RelaunchOptions) -> None:
+        """Take nothing: each move brings its options."""
 
     def propose(self, move: Move) -> Plan:
         """Start there, be ready there, commit, stop here; or stop here first."""
-        options = options_of(move.spec, self._options)
         if move.spec.migration.overlap:
-            return _start_first(move, options)
-        return _stop_first(move, options.start_timeout)
+            return _start_first(move, move.options)
+        return _stop_first(move, move.options.start_timeout)
 
 
 def _start_first(move: Move, options: RelaunchOptions) -> Plan:

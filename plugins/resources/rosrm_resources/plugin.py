@@ -44,6 +44,7 @@ def register_probes() -> Sequence[ProbeOffer]:
             period=0.5,
             deadline=2.0,
             default=True,
+            resources=("gpu", "gpu_memory"),
         ),
         ProbeOffer(
             name="network",

@@ -22,8 +22,9 @@ from typing import Annotated, Final
 import numpy as np
 from annotated_types import Ge, Gt, Le
 
+from rosrm.config.units import ResourceName
 from rosrm.ports import FloatArray, HostView, ProcessView, Scores
-from rosrm_scoring.weighted import DEFAULT_WEIGHTS, Weight, WeightedSum, known
+from rosrm_scoring.weighted import DEFAULT_WEIGHTS, Missing, Weight, WeightedSum
 
 #: Stands for a limit of 0, which nothing can be divided by.
 _SMALLEST_LIMIT: Final = 1e-9
@@ -35,17 +36,19 @@ class ThresholdOptions:
 
     Attributes:
         weights: of Eq. 1, as those of the policy `weighted`.
+        missing: as that of the policy `weighted`; what is not measured vetoes no host.
         enter: fraction of its limit above which a resource vetoes its host.
         leave: fraction of its limit up to which a resource costs nothing beyond Eq. 1.
         steepness: cost just below `enter`, where Eq. 1 gives at most the sum of the weights.
         watch: resources that veto; those that a process declares to need are watched for it too.
     """
 
-    weights: Mapping[str, Weight] = field(default_factory=lambda: DEFAULT_WEIGHTS)
+    weights: Mapping[ResourceName, Weight] = field(default_factory=lambda: DEFAULT_WEIGHTS)
+    missing: Missing = "worst"
     enter: Annotated[float, Gt(0), Le(1)] = 0.95
     leave: Annotated[float, Ge(0), Le(1)] = 0.8
     steepness: Annotated[float, Gt(0), Le(1e6)] = 10.0
-    watch: tuple[str, ...] = ("memory", "cpu", "disk")
+    watch: tuple[ResourceName, ...] = ("memory", "cpu", "disk")
 
     def __post_init__(self) -> None:
         """Refuse a band without a width."""
@@ -62,7 +65,7 @@ class Threshold:
 
     def __init__(self, options: ThresholdOptions) -> None:
         self._options = options
-        self._sum = WeightedSum(options.weights)
+        self._sum = WeightedSum(options.weights, options.missing)
         # More than Eq. 1 can differ between two hosts below the band.
         self._step = 1.0 + self._sum.largest
 
@@ -95,11 +98,11 @@ class Threshold:
         """(N,) how near to its limit the nearest watched resource would be; 1 is at the limit."""
         nearest: FloatArray | None = None
         for index in self._watched(hosts, process):
-            fill = known(hosts.usage[:, index]) + process.need[:, index]
+            fill = hosts.column(hosts.resources[index]) + process.need[:, index]
             fill /= np.maximum(hosts.limit[:, index], _SMALLEST_LIMIT)
             # `fmax` passes over NaN: a need of what the host has not is the core's to refuse.
             nearest = fill if nearest is None else np.fmax(nearest, fill, out=nearest)
-        return np.zeros(len(hosts.usage)) if nearest is None else known(nearest)
+        return np.zeros(len(hosts.usage)) if nearest is None else np.nan_to_num(nearest)
 
     def _watched(self, hosts: HostView, process: ProcessView) -> list[int]:
         """Columns that count for this process. A busy GPU is no reason to refuse who needs none."""
@@ -123,7 +126,7 @@ class Threshold:
         """The watched resource of one host that would be nearest to its limit, and how near."""
         fills = [("nothing", 0.0)]
         for index in self._watched(hosts, process):
-            used = known(hosts.usage[row : row + 1, index]) + process.need[row : row + 1, index]
-            fill = used / np.maximum(hosts.limit[row : row + 1, index], _SMALLEST_LIMIT)
-            fills.append((hosts.resources[index], float(known(fill)[0])))
+            used = np.nan_to_num(hosts.usage[row, index]) + process.need[row, index]
+            fill = used / max(hosts.limit[row, index], _SMALLEST_LIMIT)
+            fills.append((hosts.resources[index], float(np.nan_to_num(fill))))
         return max(fills, key=lambda named: named[1])

@@ -5,22 +5,29 @@ disk 0: memory that runs out kills processes, so it counts most; cpu that runs o
 and its reading swings, so it counts half, which is enough to keep jobs that compute off a host that
 computes already; how full a disk is says little about what one more process would find there. The
 limits hold whatever the weights are.
+
+A host that does not measure a resource that weighs counts as full of it (`missing: worst`):
+otherwise a host without the probe would look emptier than every host that has it.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Annotated, Final
+from typing import Annotated, Final, Literal
 
 import numpy as np
 from annotated_types import Ge, Le
 
+from rosrm.config.units import ResourceName
 from rosrm.ports import FloatArray, HostView, ProcessView, Scores
 
 Weight = Annotated[float, Ge(0), Le(1)]
+Missing = Literal["worst", "ignore"]
+
+#: The usage that counts where a host does not measure a resource.
+_COUNTS_AS: Final[Mapping[Missing, float]] = {"worst": 1.0, "ignore": 0.0}
 
 DEFAULT_WEIGHTS: Final[Mapping[str, Weight]] = MappingProxyType(
     {"memory": 1.0, "cpu": 0.5, "disk": 0.0}
@@ -34,9 +41,12 @@ class WeightedOptions:
     Attributes:
         weights: by resource, 0..1; a resource that is not named weighs 0, so what is given here
             replaces the defaults as a whole.
+        missing: how a resource counts that a host does not measure: "worst", as if it were full, or
+            "ignore", as if it were empty, for what some hosts do not have by design.
     """
 
-    weights: Mapping[str, Weight] = field(default_factory=lambda: DEFAULT_WEIGHTS)
+    weights: Mapping[ResourceName, Weight] = field(default_factory=lambda: DEFAULT_WEIGHTS)
+    missing: Missing = "worst"
 
 
 class Weighted:
@@ -47,7 +57,7 @@ class Weighted:
     """
 
     def __init__(self, options: WeightedOptions) -> None:
-        self._sum = WeightedSum(options.weights)
+        self._sum = WeightedSum(options.weights, options.missing)
 
     def score(self, hosts: HostView, process: ProcessView) -> Scores:  # noqa: ARG002 - by usage alone
         """The weighted sum of the usages; the host with the most room has the lowest."""
@@ -59,14 +69,16 @@ class WeightedSum:
 
     Args:
         weights: by resource, 0..1.
+        missing: as in `WeightedOptions`.
     """
 
-    def __init__(self, weights: Mapping[str, float]) -> None:
+    def __init__(self, weights: Mapping[str, float], missing: Missing = "worst") -> None:
+        self._missing = _COUNTS_AS[missing]
         self._weights = {name: weight for name, weight in weights.items() if weight > 0}
         self.largest: Final = sum(self._weights.values())
 
     def of(self, hosts: HostView) -> FloatArray:
-        """(N,) the sum for each host; what a host has not, it does not use.
+        """(N,) the sum for each host; what no host measures makes no difference.
 
         One column after another, never as a matrix product: its rounding depends on the number of
         rows, and a host must score alike alone and among others.
@@ -75,7 +87,8 @@ class WeightedSum:
         for name, weight in self._weights.items():
             if name not in hosts.resources:
                 continue
-            term = known(hosts.usage[:, hosts.resources.index(name)]) * weight
+            term = hosts.column(name, self._missing)
+            term *= weight
             total = term if total is None else np.add(total, term, out=total)
         return np.zeros(len(hosts.usage)) if total is None else total
 
@@ -85,13 +98,8 @@ class WeightedSum:
         for name, weight in self._weights.items():
             if name in hosts.resources:
                 usage = float(hosts.usage[row, hosts.resources.index(name)])
-                terms.append(f"{weight:g} x {name} {0.0 if math.isnan(usage) else usage:.1%}")
+                said = f"{usage:.1%}"
+                if np.isnan(usage):
+                    said = f"{self._missing:.1%} (not measured there)"
+                terms.append(f"{weight:g} x {name} {said}")
         return " + ".join(terms) or "no resource that weighs is read on any host"
-
-
-def known(column: FloatArray) -> FloatArray:
-    """A column with 0 where a host has no such resource (NaN)."""
-    # One product tells whether there is any NaN, in a tenth of the time that replacing takes.
-    if math.isnan(column.dot(column)):
-        return np.nan_to_num(column, nan=0.0)
-    return column

@@ -65,7 +65,7 @@ def test_a_migration_strategy_is_installed_and_chosen_by_name(environment):
     write(environment, "work.yaml", "processes: [{name: a, command: x, migration: teleport}]\n")
     said = environment.shell("rosrm config check cluster.yaml work.yaml")
     assert said.stdout.splitlines() == [
-        "cluster.yaml: ok, a cluster: scoring weighted, migration teleport",
+        "cluster.yaml: ok, a cluster: scoring weighted, migration teleport, checkpoint other-host",
         "work.yaml: ok, work: 0 jobs and 1 services",
     ], said.stderr
 
@@ -77,7 +77,10 @@ def test_a_migration_strategy_is_installed_and_chosen_by_name(environment):
         "registry = Registry.discover()\n"
         "config = ClusterConfig.from_json(load_cluster('cluster.yaml', registry).to_json())\n"
         "strategy = registry.migrations(config.migration.strategies)['teleport']\n"
-        "move = MigrationContract().moves()[0]\n"
+        "contract = MigrationContract()\n"
+        "contract.offer = registry.offer('migration', 'teleport')\n"
+        "contract.options = config.migration.strategies['teleport']\n"
+        "move = contract.moves()[0]\n"
         "plan = strategy.propose(move)\n"
         "print([type(step).__name__ for step in plan.steps], plan.steps[0].timeout)\n"
         "print(repr(plan_fault(plan, move)))\n"

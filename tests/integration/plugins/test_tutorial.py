@@ -1,4 +1,4 @@
-"""The tutorial, done as it is written: files made, commands run, answers compared."""
+"""The tutorials of plugins, done as written: files made, commands run, answers compared."""
 
 from __future__ import annotations
 
@@ -7,7 +7,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-TUTORIAL = Path(__file__).resolve().parents[3] / "docs/tutorials/your-own-scoring-plugin.md"
+import pytest
+
+TUTORIALS = Path(__file__).resolve().parents[3] / "docs/tutorials"
+SCORING = TUTORIALS / "your-own-scoring-plugin.md"
+MIGRATION = TUTORIALS / "your-own-migration-strategy.md"
 
 _BLOCK = re.compile(
     r"<!-- (?P<what>file|run)(: (?P<about>[^>]*?))? -->\n```\w+\n(?P<text>.*?)```", re.DOTALL
@@ -23,9 +27,9 @@ class Command:
     code: int
 
 
-def blocks() -> Iterator[tuple[str, str] | Command]:
-    """The files (name and text) and the commands of the tutorial, in its order."""
-    for block in _BLOCK.finditer(TUTORIAL.read_text(encoding="utf-8")):
+def blocks(page: Path) -> Iterator[tuple[str, str] | Command]:
+    """The files (name and text) and the commands of a tutorial, in its order."""
+    for block in _BLOCK.finditer(page.read_text(encoding="utf-8")):
         about, text = block["about"] or "", block["text"]
         if block["what"] == "file":
             yield about, text
@@ -39,14 +43,14 @@ def blocks() -> Iterator[tuple[str, str] | Command]:
 def matches(shown: str, given: str) -> bool:
     """`...` in the page stands for anything, and every run of spaces for any other."""
     parts = [re.escape(part.strip()) for part in shown.split("...")]
-    pattern = ".*".join(part.replace(r"\ ", r"\s+").replace("\n", r"\s+") for part in parts)
+    pattern = ".*".join(part.replace(r"\ ", r"\s+").replace("\\\n", r"\s+") for part in parts)
     return re.fullmatch(pattern, given.strip(), re.DOTALL) is not None
 
 
-def test_the_tutorial_does_what_it_says(environment):
-    """An empty folder becomes a policy that is pip-installed and selected by name."""
+def do(page: Path, environment) -> list[str]:
+    """Make the files of a tutorial and run its commands; returns these."""
     folder, done = environment.folder, []
-    for block in blocks():
+    for block in blocks(page):
         if isinstance(block, Command):
             if block.line.startswith("cd "):
                 folder /= block.line.removeprefix("cd ")
@@ -59,6 +63,20 @@ def test_the_tutorial_does_what_it_says(environment):
         else:
             name, text = block
             (folder / name).write_text(text, encoding="utf-8")
+    return done
+
+
+def test_the_tutorial_of_a_strategy_does_what_it_says(environment):
+    """An empty folder becomes a strategy that keeps the contract and is selected by name."""
+    done = do(MIGRATION, environment)
+    assert "python -m pytest -q test_roomy.py" in done
+    assert "rosrm config check cluster.yaml work.yaml" in done
+    assert len(done) == 4
+
+
+def test_the_tutorial_does_what_it_says(environment):
+    """An empty folder becomes a policy that is pip-installed and selected by name."""
+    done = do(SCORING, environment)
     assert "pip install --quiet ." in done
     assert "rosrm config check cluster.yaml" in done
     assert len(done) == 6
@@ -75,8 +93,9 @@ def test_the_tutorial_does_what_it_says(environment):
     assert environment.python(code).split() == ["rosrm_fewest", "20"]
 
 
-def test_every_marked_block_is_found():
+@pytest.mark.parametrize(("page", "only_shown"), [(SCORING, 1), (MIGRATION, 0)])
+def test_every_marked_block_is_found(page, only_shown):
     """A block whose mark is misspelt would silently not be tested."""
-    text = TUTORIAL.read_text(encoding="utf-8")
+    text = page.read_text(encoding="utf-8")
     assert text.count("<!--") == len(list(_BLOCK.finditer(text)))
-    assert text.count("```") == 2 * (text.count("<!--") + 1)  # one block is only shown
+    assert text.count("```") == 2 * (text.count("<!--") + only_shown)

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import pytest
 
+from rosrm.hookspecs import hookimpl
+from rosrm.ports import CheckpointOffer, MigrationOffer, ScoringOffer
 from rosrm.registry import Registry
 
 from .test_starting import OURS
@@ -26,7 +30,10 @@ def file(tmp_path):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("scoring: {policy: weighted}", "ok, a cluster: scoring weighted, migration relaunch\n"),
+        (
+            "scoring: {policy: weighted}",
+            "ok, a cluster: scoring weighted, migration relaunch, checkpoint none\n",
+        ),
         ("host: h1\nros: {domain: 1}", "ok, a host: h1, probes cpu\n"),
         ("processes: [{name: a, command: x, kind: job}]", "ok, work: 1 jobs and 0 services\n"),
         ("defaults: {kind: job}\nprocesses: [{name: a, command: x}]", "ok, work: 1 jobs and 0"),
@@ -61,3 +68,37 @@ def test_every_wrong_file_is_said_and_nothing_else_is_lost(rosrm, file):
     assert "a.yaml:1:11: unknown scoring policy 'wieghted'; did you mean 'weighted'?" in result.err
     assert "c.yaml:2:10: unknown probe 'lidar'. Installed: cpu." in result.err
     assert "d.yaml:1:46: unknown migration strategy 'criu'. Installed: relaunch." in result.err
+
+
+def test_plugins_that_cannot_be_made_are_found(rosrm, file, monkeypatch):
+    """All of a cluster's, with the place of their definition, before a master starts."""
+
+    def fails(options):
+        raise KeyError("weight")
+
+    @hookimpl
+    def register_scoring_policies():
+        return [ScoringOffer("s", fails)]
+
+    @hookimpl
+    def register_checkpoint_policies():
+        return [CheckpointOffer("c", lambda options: None)]
+
+    @hookimpl
+    def register_migration_strategies():
+        return [MigrationOffer("m", lambda options: SimpleNamespace(proposes=1))]
+
+    ours = SimpleNamespace(
+        register_scoring_policies=register_scoring_policies,
+        register_checkpoint_policies=register_checkpoint_policies,
+        register_migration_strategies=register_migration_strategies,
+    )
+    monkeypatch.setattr(Registry, "discover", lambda: Registry.of(ours=ours))
+    text = "scoring: {policy: s}\nmigration: {strategies: [m]}\ncheckpoint: {policy: c}\n"
+    result = rosrm("config", "check", file(text))
+    assert result.code == 2
+    assert "f.yaml: scoring: scoring policy 's' of plugin 'ours': `create` (" in result.err
+    assert "raised KeyError: 'weight'" in result.err
+    assert "which has no `propose`; is its `proposes` misspelt?" in result.err
+    assert "made None; an object with `choose` is wanted" in result.err
+    assert "test_checking.py:" in result.err

@@ -24,12 +24,12 @@ def register_probes():
 
 @hookimpl
 def register_scoring_policies():
-    return [ScoringOffer("weighted", lambda options: None)]
+    return [ScoringOffer("weighted", lambda options: SimpleNamespace(score=None))]
 
 
 @hookimpl
 def register_migration_strategies():
-    return [MigrationOffer("relaunch", lambda options: None)]
+    return [MigrationOffer("relaunch", lambda options: SimpleNamespace(propose=None))]
 
 
 OURS = SimpleNamespace(
@@ -63,11 +63,11 @@ def test_a_master_starts_with_the_settings_of_its_file(rosrm, becomes, tmp_path)
 
 
 def test_a_slave_starts_with_the_settings_of_its_file(rosrm, becomes, tmp_path):
-    (tmp_path / "h.yaml").write_text("host: h1\nlimits: {memory: 0.7}\n", encoding="utf-8")
+    (tmp_path / "h.yaml").write_text("host: h1\nlimits: {cpu: 0.7}\n", encoding="utf-8")
     result = rosrm("slave", "--config", tmp_path / "h.yaml")
     assert result.code == 0
     assert "slave of 'h1': domain " in result.err
-    assert "limits memory 70%, cpu 90%, disk 90%" in result.err
+    assert "limits memory 80%, cpu 70%, disk 90%" in result.err
     ((module, settings),) = becomes
     assert module == "rosrm.slave.run"
     assert HostConfig.from_json(settings).host == "h1"

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import Annotated
 
@@ -10,10 +11,10 @@ import pytest
 from annotated_types import Le
 
 from rosrm.config import ClusterConfig, load_cluster
-from rosrm.config.units import Fraction, Seconds
+from rosrm.config.units import Fraction, ResourceName, Seconds
 from rosrm.core.settings import CoreSettings
 from rosrm.hookspecs import hookimpl
-from rosrm.ports import MigrationOffer, ScoringOffer
+from rosrm.ports import MigrationOffer, ProbeOffer, ScoringOffer
 from rosrm.registry import Registry
 
 
@@ -27,9 +28,16 @@ class Weights:
     order: tuple[str, ...] = ()
 
 
+class Made:
+    """The policy that the offer makes."""
+
+    def __init__(self, options):
+        self.score = options
+
+
 @hookimpl
 def register_scoring_policies():
-    return [ScoringOffer("weighted", lambda options: options, Weights)]
+    return [ScoringOffer("weighted", Made, Weights)]
 
 
 @hookimpl
@@ -189,7 +197,9 @@ def test_options_are_checked_against_the_plugin_and_kept_in_base_units(file, reg
     )
     assert config.scoring.policy == "weighted"
     assert config.scoring.options == {"mem": 0.5, "cpu": 0.0, "window": 120.0, "order": ["a"]}
-    assert registry.scoring("weighted", config.scoring.options) == Weights(0.5, 0.0, 120.0, ("a",))
+    assert registry.scoring("weighted", config.scoring.options).score == Weights(
+        0.5, 0.0, 120.0, ("a",)
+    )
 
 
 def test_a_wrong_option_names_plugin_option_allowed_ones_and_place(refusal, registry):
@@ -216,3 +226,44 @@ def test_a_default_plugin_that_is_not_installed_is_said_too(refusal):
     said = refusal(load_cluster, "", Registry.of())
     assert "unknown scoring policy 'weighted'. None is installed; rosrm-scoring brings" in said
     assert "unknown migration strategy 'relaunch'" in said
+
+
+@dataclass(frozen=True)
+class ByResource:
+    """Options that name resources."""
+
+    weights: Mapping[ResourceName, float] = field(default_factory=dict)
+    watch: tuple[ResourceName, ...] = ()
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (
+            "scoring: {policy: w, options: {weights: {memroy: 1.0}}}",
+            "weights: unknown resource 'memroy'; did you mean 'memory'? Allowed: memory (what",
+        ),
+        (
+            "scoring: {policy: w, options: {watch: [memory, dsk]}}",
+            "f.yaml:1:48: options of scoring policy 'w': watch: unknown resource 'dsk'. Allowed",
+        ),
+        ("scoring: {policy: w}\ndefaults: {needs: {memroy: 1MB}}", "2:20: defaults.needs: unknown"),
+    ],
+)
+def test_a_resource_that_no_probe_reads_is_refused(refusal, text, said):
+    """In options that are marked to name resources, and where needs are assumed."""
+
+    @hookimpl
+    def register_probes():
+        return [ProbeOffer("memory", lambda options, context: None)]
+
+    @hookimpl
+    def register_scoring_policies():
+        return [ScoringOffer("w", lambda options: options, ByResource)]
+
+    ours = SimpleNamespace(
+        register_probes=register_probes,
+        register_scoring_policies=register_scoring_policies,
+        register_migration_strategies=register_migration_strategies,
+    )
+    assert said in refusal(load_cluster, text, Registry.of(ours=ours))

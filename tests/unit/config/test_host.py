@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from rosrm.config import HostConfig, load_host
+from rosrm.errors import SkipPlugin
 from rosrm.hookspecs import hookimpl
 from rosrm.ports import ProbeOffer
 from rosrm.registry import Registry
@@ -23,7 +24,12 @@ class DiskOptions:
 
 @hookimpl
 def register_probes():
-    return [ProbeOffer("disk", lambda options, context: options, DiskOptions, default=True)]
+    return [
+        ProbeOffer(
+            "disk", lambda options, context: options, DiskOptions, default=True,
+            resources=("disk", "memory", "cpu", "gpu"),
+        )
+    ]  # fmt: skip
 
 
 @pytest.fixture
@@ -125,3 +131,54 @@ def test_other_values_are_refused_with_what_is_allowed(refusal):
         "f.yaml:8:13: labels.a: text is wanted, not a list",
     ):
         assert expected in said
+
+
+FDS = ProbeOffer("fds", lambda options, context: options)
+
+
+@pytest.fixture
+def with_fds():
+    """A probe that is installed and not read by default."""
+
+    @hookimpl
+    def register_probes():
+        return [FDS, ProbeOffer("disk", lambda options, context: options, default=True)]
+
+    return Registry.of(ours=SimpleNamespace(register_probes=register_probes))
+
+
+@pytest.mark.parametrize("section", ["limits", "budget"])
+def test_a_resource_that_no_probe_reads_is_refused_with_the_nearest(refusal, with_fds, section):
+    said = refusal(load_host, f"{section}: {{dsik: 0.5}}", with_fds)
+    assert said == (
+        f"f.yaml:1:{len(section) + 4}: {section}: unknown resource 'dsik'; did you mean 'disk'? "
+        "Allowed: disk, fds (what the probes that are installed here read)"
+    )
+
+
+def test_a_limit_of_a_probe_that_is_not_chosen_is_refused(refusal, file, with_fds):
+    """Nothing would ever be compared with it."""
+    said = refusal(load_host, "limits: {fds: 0.9}", with_fds)
+    assert "limits: 'fds' is read by the probe 'fds', which is not among `probes`" in said
+    assert load_host(file("limits: {fds: 0.9}\nprobes: [fds]"), with_fds).limits["fds"] == 0.9
+
+
+def test_a_limit_of_a_probe_that_may_be_absent_on_the_host_is_taken(file):
+    """Nothing is made: it is known by the offer what it would read."""
+
+    def absent(options, context):
+        raise SkipPlugin("no driver")
+
+    @hookimpl
+    def register_probes():
+        return [ProbeOffer("gpu", absent, default=True, resources=("gpu", "gpu_memory"))]
+
+    registry = Registry.of(ours=SimpleNamespace(register_probes=register_probes))
+    assert load_host(file("limits: {gpu_memory: 0.9}"), registry).limits["gpu_memory"] == 0.9
+
+
+@pytest.mark.parametrize("probes", ["[default, fds]", "[fds, default]", "{fds: {}, default: }"])
+def test_default_among_the_probes_stands_for_the_default_ones(file, with_fds, probes):
+    config = load_host(file(f"probes: {probes}"), with_fds)
+    assert config.probes == {"disk": {}, "fds": {}}
+    assert HostConfig.from_json(config.to_json()) == config

@@ -16,6 +16,8 @@ from typing import Any
 
 import numpy as np
 
+from rosrm.config.own_options import merged_options
+from rosrm.config.plain import to_plain
 from rosrm.core import events as happened
 from rosrm.core import listing, slave
 from rosrm.core.commands import (
@@ -27,6 +29,7 @@ from rosrm.core.commands import (
     Reply,
     Withdraw,
 )
+from rosrm.core.declared import Declared
 from rosrm.core.master import step
 from rosrm.core.migration import (
     AwaitReady,
@@ -54,6 +57,7 @@ from rosrm.core.restore import restore
 from rosrm.core.settings import CoreSettings
 from rosrm.core.state import MasterState, Process
 from rosrm.ports import HostView, Intent, ProcessView, Record, Scores
+from rosrm_migration.plugin import register_migration_strategies
 from tests.unit.core.machine import GIB, MIB, Machine
 from tests.unit.core.nodes import Air, Node
 
@@ -65,6 +69,7 @@ __all__ = [
     "HandOver",
     "Machine",
     "StartFirstOrStopFirst",
+    "declared_by",
     "job",
     "movable",
     "node",
@@ -155,6 +160,23 @@ class HandOver:
         )
 
 
+_SHIPPED = {offer.name: offer for offer in register_migration_strategies()}
+
+
+def declared_by(strategies: Mapping[str, Any]) -> Declared:
+    """Return the declarations of the shipped strategies among these: their options."""
+
+    def options_of(name: str, spec: ProcessSpec) -> Any:
+        offer = _SHIPPED.get(name)
+        if offer is None or type(strategies[name]) is not offer.create:
+            return None
+        cluster = getattr(strategies[name], "_options", offer.options())
+        own = spec.migration.options if spec.migration.strategy == name else {}
+        return merged_options(offer.own_options or offer.options, to_plain(cluster), own)
+
+    return Declared(options_of=options_of)
+
+
 # --- the cluster ------------------------------------------------------------------------------
 
 
@@ -171,7 +193,7 @@ class Cluster:
 
     def __init__(
         self, *machines: Machine | str, policy: Any = None, strategies: Mapping[str, Any] = EMPTY,
-        fallback: Any = None, **settings: Any,
+        fallback: Any = None, declared: Declared | None = None, **settings: Any,
     ) -> None:  # fmt: skip
         self.now = 100.0
         self.settings = CoreSettings(**{"settle": 1e9, **settings})
@@ -182,6 +204,7 @@ class Cluster:
             "handoff": HandOver(),
             **strategies,
         }
+        self.declared = declared or declared_by(self.strategies)
         self.state = self._new_state(epoch=1)
         self.machines: dict[str, Machine] = {}
         self.air = Air(self.machines.values)
@@ -195,8 +218,9 @@ class Cluster:
 
     def _new_state(self, epoch: int) -> MasterState:
         state = MasterState(
-            self.settings, "eq1", self.policy, self.strategies, epoch, self.fallback
-        )
+            self.settings, "eq1", self.policy, self.strategies, epoch, self.fallback,
+            declared=self.declared,
+        )  # fmt: skip
         state.wall = self.wall
         return state
 

@@ -91,6 +91,19 @@ def test_the_policys_choice_is_told_once():
     assert len(cluster.orders("keep")) == told
 
 
+def test_the_order_of_the_hosts_that_are_chosen_makes_no_difference():
+    """A policy that lists them as `kept_on` does gives no order and makes no event."""
+    policy = Asked()
+    cluster = running(policy)
+    one, two = others(cluster)
+    policy.answer = CheckpointChoice((one, two))
+    cluster.wait(3.0)
+    told, recorded = len(cluster.orders("keep")), cluster.told("kept_on")
+    policy.answer = CheckpointChoice((two, one))
+    cluster.wait(10.0)
+    assert (len(cluster.orders("keep")), cluster.told("kept_on")) == (told, recorded)
+
+
 def test_what_the_policy_sees():
     """The hosts that are up with their labels, what is kept, and how old it is."""
     policy = Asked()

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from typing import Any
 
 import pytest
 
 from rosrm.core import events as happened
 from rosrm.core import slave
+from rosrm.core.commands import Order
+from rosrm.core.declared import Declared
 from rosrm.core.migration import AwaitReady, Commit, Execute, Move, Plan, Start, Stop
-from rosrm.core.model import InstanceId, InstanceState, MigrationPolicy
+from rosrm.core.model import InstanceId, InstanceState, MigrationPolicy, ProcessSpec
 from tests.unit.core.cluster import Cluster, Machine, StartFirstOrStopFirst, job, movable, process
 
 
@@ -378,6 +381,79 @@ def test_a_strategy_that_cannot_move_a_process_does_not_fail() -> None:
     cluster.submit(process("p", migration=MigrationPolicy("strange")))
     assert "ValueError: not on a Sunday" in cluster.migrate("p").message
     assert cluster.told("plugin_failed") == []
+
+
+def waits_first(move: Move) -> Plan:
+    """Runs an executor on both hosts, then stops first."""
+    plan = StartFirstOrStopFirst().propose(replace(move, spec=movable("p", overlap=False)))
+    wait = Execute("sleepy.wait", move.source_host, {}, 5.0)
+    there = replace(wait, host=move.destination_host)
+    return replace(plan, steps=(replace(wait, undo=there), *plan.steps))
+
+
+def sleepy(*executors: str) -> Cluster:
+    """A strategy whose offer has an executor; of two hosts only `a` has it, too."""
+    machines = [Machine("a"), Machine("b", busy={"memory": 0.5})]
+    machines[0].executors["sleepy.wait"] = lambda arguments: {}
+    cluster = Cluster(
+        *machines, strategies={"sleepy": Strange(waits_first)},
+        declared=Declared(
+            executors={"sleepy": frozenset(executors)}, brought_by={"sleepy": "rosrm-sleepy 1.0"}
+        ),
+    )  # fmt: skip
+    cluster.submit(process("p", migration=MigrationPolicy("sleepy")))
+    return cluster
+
+
+def test_a_plan_is_refused_before_its_first_step_where_a_host_lacks_an_executor() -> None:
+    """By its undo too. Nothing was stopped, and the reply names what to install on which host."""
+    cluster = sleepy("sleepy.wait")
+    orders = sum(isinstance(one, Order) for one in cluster.carried)
+    reply = cluster.migrate("p")
+    assert not reply.accepted
+    assert reply.message == (
+        "b has no executor 'sleepy.wait', which sleepy needs there to move p: install "
+        "rosrm-sleepy 1.0 on b and restart its slave"
+    )
+    assert sum(isinstance(one, Order) for one in cluster.carried) == orders
+    assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
+    assert cluster.state.hosts.processes.tolist() == [1, 0]
+
+
+def test_a_plan_that_names_an_executor_that_its_offer_lacks_is_unsound() -> None:
+    """A misspelt one is found when the plan is checked, whatever the hosts have."""
+    reply = sleepy("sleepy.wiat").migrate("p")
+    assert not reply.accepted
+    assert (
+        "an unsound plan: it names the executor 'sleepy.wait', which its offer lacks; "
+        "its own: sleepy.wiat"
+    ) in reply.message
+
+
+def test_a_move_brings_the_options_of_its_process() -> None:
+    """As the offer declares them; options that it does not take are refused at submission."""
+    moves = []
+
+    def propose(move: Move) -> Plan:
+        moves.append(move.options)
+        return StartFirstOrStopFirst().propose(move)
+
+    def options_of(strategy: str, spec: ProcessSpec) -> str:
+        if "speed" in spec.migration.options:
+            raise ValueError("unknown speed; allowed: pause")
+        return f"{strategy} of {spec.name}"
+
+    cluster = Cluster(
+        "a", Machine("b", busy={"memory": 0.5}), strategies={"strange": Strange(propose)},
+        declared=Declared(options_of=options_of),
+    )  # fmt: skip
+    wrong = process("q", migration=MigrationPolicy("strange", options={"speed": 1}))
+    assert cluster.submit(wrong).message == (
+        "q: migration by 'strange': unknown speed; allowed: pause. Nothing was queued"
+    )
+    cluster.submit(process("p", migration=MigrationPolicy("strange")))
+    assert cluster.migrate("p").accepted
+    assert moves == ["strange of p"]
 
 
 def test_a_plan_without_undo_leaves_no_instance_behind() -> None:

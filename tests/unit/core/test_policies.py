@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rosrm.core.declared import STANDARD_FIELDS, Declared
 from rosrm.core.model import ResourceDescription
 from rosrm.ports import HostView, ProcessView, Scores
-from tests.unit.core.cluster import Cluster, Eq1, Machine, process
+from tests.unit.core.cluster import Cluster, Eq1, Machine, node, process
 
 
 class Policy:
@@ -61,6 +62,24 @@ def wrong_veto(hosts: HostView, process: ProcessView) -> Scores:
     return Scores(np.zeros(len(hosts.names)), np.zeros(1, np.bool_))
 
 
+def veto_in_words(hosts: HostView, process: ProcessView) -> Scores:
+    return Scores(np.zeros(len(hosts.names)), ["no"] * len(hosts.names))  # type: ignore[arg-type]
+
+
+def by_name(hosts: HostView, process: ProcessView) -> Scores:
+    """Groups of processes by the beginning of their name, each on a host of its own."""
+    group = process.spec.name.split("_")[0]
+    return Scores(np.array([float(name != group) for name in hosts.names]))
+
+
+def by_name_with_a_default(hosts: HostView, process: ProcessView) -> Scores:
+    return Scores(np.full(len(hosts.names), float(len(getattr(process.spec, "name", "")))))
+
+
+def by_no_field(hosts: HostView, process: ProcessView) -> Scores:
+    return Scores(np.full(len(hosts.names), process.spec.nmae))  # type: ignore[attr-defined]
+
+
 def writes(hosts: HostView, process: ProcessView) -> Scores:
     hosts.usage[:] = 0.0
     return Scores(np.zeros(len(hosts.names)))
@@ -76,6 +95,10 @@ BROKEN = [
     (exits, "SystemExit: 3"),
     (words, "ValueError"),
     (wrong_veto, "vetoes of shape (1,) for 3 hosts"),
+    (veto_in_words, "vetoes of type <U2; booleans are wanted, True: vetoed"),
+    (by_name, "'name' of the spec, which its offer does not declare: say ScoringOffer(..., reads="),
+    (by_name_with_a_default, "UndeclaredField"),
+    (by_no_field, "AttributeError: a spec has no field 'nmae'; it has name, namespace"),
     (writes, "read-only"),
 ]
 
@@ -183,6 +206,94 @@ def test_a_reason_that_raises_harms_no_decision() -> None:
     (chosen, *_) = cluster.explain("p")["decision"]["hosts"]
     assert (chosen["name"], chosen["verdict"]) == ("b", "chosen")
     assert "ZeroDivisionError" in chosen["reason"]
+
+
+@pytest.mark.parametrize("batched", [True, False])
+def test_a_policy_judges_the_process_that_it_is_asked_about(*, batched: bool) -> None:
+    """By a field that its offer declares, in one submission as in many."""
+    cluster = three(policy=Policy(by_name), declared=Declared(reads=("name",)))
+    specs = [process(f"{group}_{n}") for n in range(2) for group in "cab"]
+    for batch in [specs] if batched else [[spec] for spec in specs]:
+        cluster.submit(*batch)
+    assert {spec.name: cluster.where(spec.name) for spec in specs} == {
+        spec.name: [spec.name[0]] for spec in specs
+    }
+
+
+def test_values_that_are_equal_and_not_alike_are_told_apart() -> None:
+    """1, 1.0 and True: what is declared is compared as it is written."""
+    seen = []
+
+    def look(hosts: HostView, process: ProcessView) -> Scores:
+        seen.append(repr(process.spec.parameters["a"]))
+        return Scores(hosts.column("memory"))
+
+    cluster = three(policy=Policy(look), declared=Declared(reads=("parameters",)))
+    cluster.submit(*(node(f"p{n}", parameters={"a": a}) for n, a in enumerate((1, 1.0, True))))
+    assert set(seen) == {"1", "1.0", "True"}
+
+
+def test_processes_that_differ_in_nothing_that_is_read_share_a_ranking() -> None:
+    """A queue of equal processes is judged once, as ever."""
+    cluster = three()
+    cluster.submit(*(process(f"p{n}") for n in range(5)))
+    assert len(cluster.state.demands) == 1
+
+
+def test_a_policy_may_read_what_decides_where_a_process_may_go() -> None:
+    """Without a declaration: what runs, namespace, kind, priority, needs and labels."""
+    read: dict[str, object] = {}
+
+    def look(hosts: HostView, process: ProcessView) -> Scores:
+        read.update({name: getattr(process.spec, name) for name in STANDARD_FIELDS})
+        read["program"] = process.spec.program
+        return Scores(hosts.column("memory"))
+
+    cluster = three(policy=Policy(look))
+    spec = process("p", memory=1, priority=3)
+    cluster.submit(spec)
+    assert cluster.explain("p")["decision"]["policy"] == "eq1"
+    assert read == {name: getattr(spec, name) for name in read}
+
+
+def test_a_policy_sees_the_labels_of_hosts() -> None:
+    """Those that they registered with, row by row; it cannot change them."""
+    policy = Policy(
+        lambda hosts, process: Scores(
+            np.array([float(labels.get("rack") != "2") for labels in hosts.labels])
+        )
+    )
+    cluster = Cluster(Machine("a"), Machine("b", labels={"rack": "2"}), policy=policy)
+    cluster.submit(process("p"))
+    assert cluster.where("p") == ["b"]
+    with pytest.raises(TypeError):
+        policy.seen[0].labels[0]["rack"] = "1"  # type: ignore[index]
+
+
+def test_a_column_is_zero_or_what_is_said_where_a_host_has_no_such_resource() -> None:
+    """So a policy that weighs the GPU decides on a cluster in which some have none."""
+    memory, gpu = ResourceDescription("memory", "B", 1e9), ResourceDescription("gpu", "1", 1.0)
+    policy = Policy(lambda hosts, process: Scores(hosts.column("gpu", missing=0.5)))
+    cluster = Cluster(
+        Machine("a", resources=(memory,)), Machine("b", resources=(memory, gpu)), policy=policy
+    )
+    cluster.submit(process("p"))
+    assert (cluster.where("p"), cluster.explain("p")["decision"]["policy"]) == (["b"], "eq1")
+    view = policy.seen[0]
+    assert view.column("gpu").tolist() == [0.0, 0.0]
+    assert view.column("none", 1.0).tolist() == [1.0, 1.0]
+
+
+def test_a_nan_of_a_host_that_does_not_measure_is_explained() -> None:
+    """The message says where it comes from, and which call has none."""
+    memory, gpu = ResourceDescription("memory", "B", 1e9), ResourceDescription("gpu", "1", 1.0)
+    policy = Policy(lambda hosts, process: Scores(hosts.usage.sum(axis=1)))
+    cluster = Cluster(
+        Machine("a", resources=(memory,)), Machine("b", resources=(memory, gpu)), policy=policy
+    )
+    cluster.submit(process("p"))
+    said = cluster.explain("p")["decision"]["policy"]
+    assert "the score of host a is nan. It does not measure gpu, so `usage` and" in said
 
 
 def test_a_policy_sees_nan_where_a_host_has_no_such_resource() -> None:

@@ -26,7 +26,7 @@ def broken(options):
 
 def test_the_default_policy_stands_in_for_another() -> None:
     """It is made with its own default options."""
-    weighted = object()
+    weighted = SimpleNamespace(score=None)
     registry = registry_of(weighted=lambda options: weighted, other=lambda options: object())
     assert fallback_of(registry, "other") == ("weighted", weighted)
 

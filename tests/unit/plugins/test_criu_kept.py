@@ -5,16 +5,19 @@ from __future__ import annotations
 from rosrm.core.migration import Aim, Execute, Move, Plan, Start, plan_fault
 from rosrm.core.model import InstanceId, MigrationPolicy, ProcessSpec
 from rosrm.ports import Imaging
+from rosrm.testing import with_options
 from rosrm_migration.criu import Criu, CriuOptions
 from rosrm_migration.criu_kept import DROP, KEEP
 from rosrm_migration.plugin import register_migration_strategies
 
+OFFER = next(one for one in register_migration_strategies() if one.name == "criu")
 CRIU = Criu(CriuOptions(dump_timeout=7.0))
 
 
 def move(spec: ProcessSpec, source_node: str = "p") -> Move:
     one, two, three = (InstanceId("p", number) for number in (1, 2, 3))
-    return Move(spec, one, "a", two, "a", three, 0, source_node)
+    asked = Move(spec, one, "a", two, "a", three, 0, source_node)
+    return with_options(asked, OFFER, dump_timeout=7.0)
 
 
 def timeout_of(plan: Plan, executor: str) -> float:
@@ -51,9 +54,8 @@ def test_a_node_keeps_its_alias() -> None:
 
 def test_every_executor_is_there() -> None:
     """Of all that the plans and their undo name, and what removes an image."""
-    offer = next(one for one in register_migration_strategies() if one.name == "criu")
     asked = move(ProcessSpec("p"))
     steps = [*CRIU.checkpoint(asked).steps, *CRIU.restore(asked).steps]
     named = {one.executor for one in steps if isinstance(one, Execute)}
     undone = {one.undo.executor for one in steps if isinstance(one.undo, Execute)}
-    assert named | undone | {DROP} <= set(offer.executors)
+    assert named | undone | {DROP} <= set(OFFER.executors)

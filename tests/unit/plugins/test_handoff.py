@@ -9,8 +9,12 @@ import pytest
 
 from rosrm.core.migration import AwaitReleased, Configure, Execute, Move, Plan, Start, Stop
 from rosrm.core.model import InstanceId, MigrationPolicy, ProcessSpec, StopPolicy
+from rosrm.testing import with_options
 from rosrm_migration.handoff import Handoff, HandoffOptions, alias_of
+from rosrm_migration.plugin import register_migration_strategies
+from tests.unit.core.cluster import Cluster, process
 
+OFFER = next(one for one in register_migration_strategies() if one.name == "handoff")
 PAPER = {"protocol": "paper", "state": "/counter/state", "type": "std_msgs/msg/Int64"}
 
 
@@ -21,7 +25,8 @@ def move(name: str = "counter", source_node: str = "counter", **options: Any) ->
         stop=StopPolicy(1.0, 2.0),
     )  # fmt: skip
     numbered = [InstanceId(name, number) for number in (1, 2, 3)]
-    return Move(spec, numbered[0], "a", numbered[1], "b", numbered[2], 1_700_000_000, source_node)
+    one = Move(spec, numbered[0], "a", numbered[1], "b", numbered[2], 1_700_000_000, source_node)
+    return with_options(one, OFFER)
 
 
 def of_kind(plan: Plan, kind: type) -> Any:
@@ -50,8 +55,8 @@ def test_a_long_name_is_cut() -> None:
 
 def test_options_of_a_process_go_over_those_of_the_cluster() -> None:
     """The others stay."""
-    strategy = Handoff(HandoffOptions(start_timeout=3.0, ready_timeout=4.0))
-    plan = strategy.propose(move(ready_timeout=60.0))
+    asked = with_options(move(ready_timeout=60.0), OFFER, start_timeout=3.0, ready_timeout=4.0)
+    plan = Handoff(HandoffOptions()).propose(asked)
     waits = {step.phase.name: step.timeout for step in plan.steps if isinstance(step, Configure)}
     assert waits == {"SHADOW": 60.0, "SWITCH": 10.0, "DONE": 3.0}
     assert of_kind(plan, Start).timeout == 3.0
@@ -86,7 +91,7 @@ def test_a_state_below_the_nodes_own_name_stays_there_under_the_alias() -> None:
     ("given", "said"),
     [
         ({"fast": True}, "unknown fast"),
-        ({"ready_timeout": -1.0}, "ready_timeout is -1 s"),
+        ({"ready_timeout": -1.0}, "ready_timeout: -1.0 is not greater than 0"),
         ({"ready_timeout": "soon"}, "ready_timeout: 'soon' is not a number, or text"),
         ({"protocol": "mine"}, "protocol 'mine'; allowed: rosrm, paper"),
         ({"protocol": "paper"}, "names the topic"),
@@ -96,12 +101,13 @@ def test_a_state_below_the_nodes_own_name_stays_there_under_the_alias() -> None:
     ],
 )
 def test_nonsense_is_refused_when_the_process_is_submitted(given: Any, said: str) -> None:
-    """And no plan is made of it."""
-    strategy = Handoff(HandoffOptions())
-    asked = move(**given)
-    assert said in strategy.spec_fault(asked.spec)
-    with pytest.raises(ValueError, match=r"."):
-        strategy.propose(asked)
+    """By the master, which merges the options before it asks the strategy anything."""
+    cluster = Cluster("a", strategies={"handoff": Handoff(HandoffOptions())})
+    policy = MigrationPolicy("handoff", options=given)
+    reply = cluster.submit(process("counter", ros=True, migration=policy))
+    assert not reply.accepted
+    assert reply.message.startswith("counter: migration by 'handoff': ")
+    assert said in reply.message
 
 
 def test_what_is_no_node_has_no_alias() -> None:

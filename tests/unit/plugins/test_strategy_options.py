@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from rosrm.core.model import MigrationPolicy, ProcessSpec
+from rosrm.plans import options_of
 from rosrm_migration.criu import CriuOptions, OwnCriuOptions
-from rosrm_migration.options import options_of
 
 
 def options(**given: object) -> OwnCriuOptions:

@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rosrm.testing import host_view, one_row, process_view
+from rosrm_scoring.threshold import Threshold, ThresholdOptions
 from rosrm_scoring.weighted import Weighted, WeightedOptions
 
 usages = st.one_of(st.floats(0, 2), st.just(float("nan")))
@@ -48,17 +49,27 @@ def test_named_weights_replace_all_defaults():
     assert score(view, cpu=1.0).value == pytest.approx([0.2])
 
 
-def test_absent_resource_is_not_used():
-    """A host without a GPU uses none, so it goes before one whose GPU is in use."""
+@pytest.mark.parametrize("policy", [Weighted, Threshold])
+@pytest.mark.parametrize(("missing", "value"), [("worst", 1.5), ("ignore", 0.5)])
+def test_a_host_that_does_not_measure_counts_as_full_unless_that_is_ignored(policy, missing, value):
+    """So a host without a probe is not preferred to those that have it."""
+    options = WeightedOptions if policy is Weighted else ThresholdOptions
     view = host_view({"memory": [0.5, 0.5], "gpu": [float("nan"), 0.2]})
-    assert score(view, memory=1.0, gpu=1.0).value == pytest.approx([0.5, 0.7])
+    made = policy(options({"memory": 1.0, "gpu": 1.0}, missing=missing))
+    assert made.score(view, process_view(view)).value == pytest.approx([value, 0.7])
+
+
+def test_what_is_not_measured_counts_as_full_by_default():
+    """`missing` is `worst`."""
+    view = host_view({"memory": [0.5, 0.5], "fds": [float("nan"), 0.9]})
+    assert score(view, memory=1.0, fds=0.3).value.argmin() == 1
 
 
 def test_reason_is_the_sum_written_out():
     """The score of a host is explained by its terms."""
     view = host_view({"memory": [0.5, 0.25], "cpu": [0.1, float("nan")]})
     assert score(view).reason(0) == "1 x memory 50.0% + 0.5 x cpu 10.0%"
-    assert score(view).reason(1) == "1 x memory 25.0% + 0.5 x cpu 0.0%"
+    assert score(view).reason(1) == "1 x memory 25.0% + 0.5 x cpu 100.0% (not measured there)"
     assert "no resource" in score(view, network=1.0).reason(0)
 
 

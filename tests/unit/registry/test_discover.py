@@ -16,7 +16,10 @@ from rosrm.ports import ScoringOffer
 
 @hookimpl
 def register_scoring_policies():
-    return [ScoringOffer("{name}", lambda options: "made", summary="one line")]
+    return [ScoringOffer("{name}", lambda options: Made(), summary="one line")]
+
+class Made:
+    score = "made"
 """
 
 
@@ -48,7 +51,7 @@ def test_an_installed_plugin_is_found_with_its_distribution(install):
     (row,) = rows_of(registry, "vx")
     assert (row.kind, row.distribution, row.state) == ("scoring", "vx-good 1.0", "available")
     assert row.reason == "one line"
-    assert registry.scoring("vx") == "made"
+    assert registry.scoring("vx").score == "made"
 
 
 @pytest.mark.parametrize(
@@ -69,7 +72,7 @@ def test_a_plugin_that_does_not_import_is_broken_and_the_others_go_on(install, c
     assert (bad.state, bad.distribution) == ("broken", "vx-bad 1.0")
     assert said in bad.reason
     with pytest.raises(ConfigError, match=r"Broken: .*plugin 'vx_bad' of vx-bad 1.0: does not imp"):
-        registry.scoring("lost")
+        registry.scoring("bad")
 
 
 def test_two_distributions_with_one_name_are_both_named(install):

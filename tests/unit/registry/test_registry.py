@@ -19,6 +19,7 @@ class Options:
     """Options of a plugin."""
 
     ratio: float = 0.5
+    score = propose = choose = None
 
 
 class Probe:
@@ -88,13 +89,91 @@ def test_an_unknown_name_is_refused_with_what_is_there_and_what_is_broken():
         bad=plugin(register_scoring_policies=OSError("no such table")),
     )
     with pytest.raises(ConfigError) as refused:
-        registry.scoring("wieghted")
+        registry.scoring("bad")
     said = str(refused.value)
-    assert (
-        "unknown scoring policy 'wieghted'; did you mean 'weighted'? Installed: weighted." in said
-    )
+    assert "unknown scoring policy 'bad'. Installed: weighted." in said
     assert "Broken: plugin 'bad': register_scoring_policies (" in said
     assert "failed with OSError: no such table" in said
+
+
+def test_of_broken_plugins_only_the_one_that_is_meant_is_told():
+    """By the name of its offer, or its own; of the others their number and where they stand."""
+    nameless = plugin(register_scoring_policies=OSError("no such table"))
+    bare = ScoringOffer("s", lambda options: None, options=dict)
+    registry = Registry.of(
+        rosrm_rack=nameless, other=nameless, third=plugin(register_scoring_policies=[bare])
+    )
+    with pytest.raises(ConfigError) as refused:
+        registry.scoring("rack")
+    assert "Broken: plugin 'rosrm_rack': " in str(refused.value)
+    assert str(refused.value).endswith("2 plugins are broken besides: see `rosrm plugins --local`.")
+    assert "'other'" not in str(refused.value)
+    with pytest.raises(ConfigError, match=r"Broken: plugin 'third': .* `options` is not a datacla"):
+        registry.scoring("s")
+    with pytest.raises(ConfigError) as refused:
+        registry.scoring("weighted")
+    assert "3 plugins are broken: see" in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("made", "said"),
+    [
+        (None, "made None; an object with `score` is wanted (does it lack a `return`?)"),
+        (SimpleNamespace(scores=1), "which has no `score`; is its `scores` misspelt?"),
+        (SimpleNamespace(), "made a SimpleNamespace, which has no `score`"),
+    ],
+)
+def test_what_lacks_its_method_is_refused_when_it_is_made(made, said):
+    """At the start, and not at the first decision."""
+    offer = ScoringOffer("s", lambda options: made)
+    registry = Registry.of(ours=plugin(register_scoring_policies=[offer]))
+    with pytest.raises(PluginError) as refused:
+        registry.scoring("s")
+    assert said in str(refused.value)
+    assert "test_registry.py:" in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("reads", "said"),
+    [
+        (("nmae",), "`reads` has no field 'nmae'; did you mean 'name'? Allowed: name, namespace"),
+        ("name", "`reads` is 'name'; a tuple of field names is wanted"),
+        (None, "`reads` is None; a tuple"),
+    ],
+)
+def test_fields_that_a_spec_lacks_cannot_be_declared(reads, said):
+    """The offer is broken, and says so when plugins are loaded."""
+    offer = ScoringOffer("s", lambda options: None, reads=reads)
+    (broken,) = Registry.of(ours=plugin(register_scoring_policies=[offer])).broken
+    assert said in broken.reason
+    assert broken.name == "s"
+
+
+@pytest.mark.parametrize(
+    ("described", "said"),
+    [
+        (ResourceDescription("a", None, 1.0), "gives 'a' the unit None; text is wanted"),
+        (ResourceDescription("a", "B", 1.0, None), "gives 'a' the scope None; text is wanted"),
+        (ResourceDescription("Open Files", "1", 1.0), "names a resource 'Open Files'. Allowed"),
+        (ResourceDescription("a", "B", "10"), "gives 'a' a capacity of '10'; a number above 0"),
+        ("a", "describes a resource by 'a', which is not a ResourceDescription"),
+    ],
+)
+def test_a_resource_that_no_message_can_carry_is_refused(context, described, said):
+    """Its probe is left out by name, and the others are made."""
+    probe = Probe("a")
+    probe.resources = [described]
+    result = probes(offered("a", lambda options, context: probe)).probes({"a": {}}, context)
+    assert result.made == ()
+    assert said in result.absent["a"]
+
+
+def test_a_probe_reads_only_what_its_offer_declares(context):
+    """So that names of resources in a file can be checked before anything is made."""
+    registry = probes(offered("fds", lambda options, context: Probe("files")))
+    absent = registry.probes({"fds": {}}, context).absent
+    assert "which its offer does not declare: say ProbeOffer(..., resources=(" in absent["fds"]
+    assert registry.resources() == ("fds",)
 
 
 def test_a_wrong_option_is_refused_with_what_is_allowed():
@@ -152,6 +231,7 @@ def test_a_name_offered_twice_belongs_to_neither_and_both_are_named():
         ([ProbeOffer("p", Probe, options=Reading)], "'p': option 'resource' has no default"),
         (SystemExit(1), "failed with SystemExit: 1"),
         (ValueError("x"), "failed with ValueError: x"),
+        (None, "returned None, not a list of ProbeOffer"),
     ],
 )
 def test_a_hook_that_answers_nonsense_is_broken_and_the_others_go_on(answer, said):
@@ -227,7 +307,9 @@ def test_an_unknown_probe_stops_the_slave_at_its_start(context):
 def described(**fields):
     """A probe whose description cannot travel: sent so, it would end the slave's registration."""
     return SimpleNamespace(
-        resources=[ResourceDescription(**{"name": "b", "unit": "1", "capacity": 1.0, **fields})]
+        resources=[ResourceDescription(**{"name": "b", "unit": "1", "capacity": 1.0, **fields})],
+        read=None,
+        close=None,
     )
 
 
@@ -235,21 +317,25 @@ def described(**fields):
     ("second", "said"),
     [
         (Probe("a"), "reads 'a', as 'first' does already"),
-        (Probe("b", capacity=0.0), "gives 'b' a capacity of 0.0, not above 0"),
+        (Probe("b", capacity=0.0), "gives 'b' a capacity of 0.0; a number above 0"),
         (Probe("b", capacity=float("nan")), "gives 'b' a capacity of nan"),
         (Probe(*(f"r{i}" for i in range(16))), "more than 16"),
-        (SimpleNamespace(), "its `resources` raised AttributeError"),
-        (described(unit=None), "gives a resource the unit None; a text is required"),
-        (described(scope=None), "gives a resource the scope None; a text is required"),
-        (described(name=3), "gives a resource the name 3; a text is required"),
-        (described(capacity="10"), "gives 'b' the capacity '10'; a number is required"),
-        (SimpleNamespace(resources=["b"]), "gives 'b' as a resource; a ResourceDescription"),
+        (SimpleNamespace(), "made a SimpleNamespace, which has no `resources`"),
+        (described(unit=None), "gives 'b' the unit None; text is wanted"),
+        (described(scope=None), "gives 'b' the scope None; text is wanted"),
+        (described(name=3), "names a resource 3"),
+        (described(capacity="10"), "gives 'b' a capacity of '10'; a number above 0"),
+        (SimpleNamespace(resources=["b"], read=None, close=None), "describes a resource by 'b'"),
     ],
 )
 def test_a_probe_whose_resources_cannot_be_taken_is_closed_and_left_out(context, second, said):
     registry = probes(
-        offered("first", lambda options, context: Probe("a")),
-        offered("second", lambda options, context: second),
+        offered("first", lambda options, context: Probe("a"), resources=("a",)),
+        offered(
+            "second",
+            lambda options, context: second,
+            resources=("a", "b", *(f"r{i}" for i in range(16))),
+        ),
     )
     result = registry.probes({"first": {}, "second": {}}, context)
     assert [made.name for made in result.made] == ["first"]
@@ -273,6 +359,15 @@ def test_executors_come_from_every_migration_offer_and_a_shared_name_is_left_out
     )
     assert both.executors() == {}
     assert "the executor 'x' is left out: a and b both register it" in caplog.text
+
+
+def test_an_ability_that_is_no_executor_of_the_offer_is_refused():
+    """Otherwise every host would count as one on which the plugin is not installed."""
+    able = SimpleNamespace(propose=None, ability="m.abel", host_fault=max)
+    offer = MigrationOffer("m", lambda options: able, executors={"m.able": dict})
+    registry = Registry.of(ours=plugin(register_migration_strategies=[offer]))
+    with pytest.raises(PluginError, match=r"`ability` is 'm\.abel', no executor .*are: m\.able"):
+        registry.migrations({"m": {}})
 
 
 def test_options_that_cannot_be_read_are_the_plugins_fault():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import pytest
 from hypothesis import given, settings
@@ -16,10 +17,22 @@ from rosrm.recording.reading import Header, Recording
 from rosrm.simulation.agreement import compare
 from rosrm.simulation.engine import Simulation
 from rosrm.simulation.extraction import Extraction
-from rosrm.simulation.replay import replay
+from rosrm.simulation.replay import replay as replay_declared
 from rosrm_scoring.weighted import Weighted, WeightedOptions
 
-from .workloads import EQ1, MIB, STRATEGIES, host, plan, read, recorded, simulation
+from .workloads import (
+    EQ1,
+    MIB,
+    STRATEGIES,
+    declared_by,
+    host,
+    plan,
+    read,
+    recorded,
+    simulation,
+)
+
+replay = partial(replay_declared, declared=declared_by(STRATEGIES))
 
 BY_CPU = ("weighted", Weighted(WeightedOptions({"cpu": 1.0})))
 
@@ -152,7 +165,7 @@ def test_a_workload_made_of_a_record_gives_nearly_the_same_run(record):
     extraction = Extraction(record)
     first = replay(record, CoreSettings(), EQ1, STRATEGIES, extraction.watch).outcome
     workload = extraction.workload()
-    second = Simulation(workload, CoreSettings(), EQ1, STRATEGIES).run()
+    second = Simulation(workload, CoreSettings(), EQ1, STRATEGIES, declared_by(STRATEGIES)).run()
 
     assert {one.name for one in workload.hosts} == {"a", "b", "c", "d"}
     by_name = {one.name: one for one in workload.hosts}

@@ -85,7 +85,7 @@ def test_variants_say_their_own_word_over_the_settings(load):
     )  # fmt: skip
     base, calm, threshold, five = made.variants
     assert (base.name, calm.name) == ("as given", "calm")
-    assert base.cluster.scoring.options == {"weights": {"cpu": 1.0}}
+    assert base.cluster.scoring.options == {"weights": {"cpu": 1.0}, "missing": "worst"}
     assert (calm.cluster.migration.automatic, calm.cluster.migration.cooldown) == (False, 7.0)
     assert calm.cluster.scoring == base.cluster.scoring
     assert (threshold.name, threshold.cluster.scoring.policy) == (

@@ -17,6 +17,7 @@ from rosrm.simulation.workload import Curve, HostPlan, ProcessPlan, Workload
 from rosrm_migration.handoff import Handoff, HandoffOptions
 from rosrm_migration.relaunch import Relaunch, RelaunchOptions
 from rosrm_scoring.weighted import Weighted, WeightedOptions
+from tests.unit.core.cluster import declared_by
 
 MIB = 2.0**20
 EQ1 = ("weighted", Weighted(WeightedOptions()))
@@ -49,7 +50,7 @@ def plan(
 
 def simulation(hosts, plans, *, until: float = inf, requests=(), **settings) -> Simulation:
     workload = Workload("test", tuple(hosts), tuple(plans), requests=tuple(requests), until=until)
-    return Simulation(workload, CoreSettings(**settings), EQ1, STRATEGIES)
+    return Simulation(workload, CoreSettings(**settings), EQ1, STRATEGIES, declared_by(STRATEGIES))
 
 
 def run(hosts, plans, **more):

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from rosrm.config.units import PositiveSeconds
-from rosrm.core.migration import AwaitReady, Commit, Execute, Move, Plan, Start, Stop
 from rosrm.hookspecs import hookimpl
+from rosrm.plans import AwaitReady, Commit, Execute, Move, Plan, Start, Stop
 from rosrm.ports import MigrationOffer
 
 
@@ -26,12 +26,12 @@ class TeleportOptions:
 class Teleport:
     """Stops the source first, after the destination was told."""
 
-    def __init__(self, options: TeleportOptions) -> None:
-        self._patience = options.patience
+    def __init__(self, _options: TeleportOptions) -> None:
+        """Take nothing: each move brings its options."""
 
     def propose(self, move: Move) -> Plan:
         """Tell, stop here, start there, be ready there."""
-        wait = self._patience
+        wait = move.options.patience
         back = Start(move.fallback, move.source_host, wait)
         undo = Stop(move.destination, move.destination_host, wait)
         return Plan(

@@ -9,10 +9,9 @@ from typing import Annotated
 
 from annotated_types import Gt, Le
 
-from rosrm.core.model import Reading, ResourceDescription
 from rosrm.errors import SkipPlugin
 from rosrm.hookspecs import hookimpl
-from rosrm.ports import ProbeContext, ProbeOffer
+from rosrm.ports import ProbeContext, ProbeOffer, Reading, ResourceDescription
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,11 @@
-"""A process's own options of a strategy, over those of the cluster."""
+"""A process's own options of a migration strategy, merged over those of the cluster.
+
+Imports no pydantic: the master merges them for each move.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from math import inf
 from typing import Any, TypeVar, get_type_hints, overload
 
 from rosrm.config.plain import from_plain, to_plain
@@ -23,7 +25,7 @@ def options_of(spec: ProcessSpec, cluster: Any, own: type[Own]) -> Own: ...
 
 
 def options_of(spec: ProcessSpec, cluster: Any, own: type[Any] | None = None) -> Any:
-    """What holds for one process.
+    """Return the options that hold for one process, as `Move.options` has them.
 
     Args:
         spec: its `migration.options` are given by name, as the work file has them: who submits it
@@ -34,32 +36,32 @@ def options_of(spec: ProcessSpec, cluster: Any, own: type[Any] | None = None) ->
     Raises:
         ValueError: for an unknown option, or a value that makes no sense.
     """
-    given = spec.migration.options
-    wanted = own or type(cluster)
+    wanted, given = own or type(cluster), spec.migration.options
     if not given and wanted is type(cluster):
         return cluster
-    return from_plain(wanted, {**to_plain(cluster), **_in_base_units(wanted, given)})
+    return merged_options(wanted, to_plain(cluster), given)
+
+
+def merged_options(wanted: type[T], cluster: Mapping[str, Any], own: Mapping[str, Any]) -> T:
+    """Return options of a type from those of the cluster, checked, and a process's own, as text.
+
+    Raises:
+        ValueError: as `options_of`.
+    """
+    return from_plain(wanted, {**cluster, **_in_base_units(wanted, own)})
 
 
 def _in_base_units(wanted: type[Any], given: Mapping[str, Any]) -> dict[str, Any]:
-    """With a number for "5s" and the like."""
-    hints = get_type_hints(wanted, include_extras=True)
+    """With a number for "5s" and the like; what is out of its range is refused."""
+    hints = get_type_hints(wanted, include_extras=True) if given else {}
     return {name: _number(name, hints.get(name), value) for name, value in given.items()}
 
 
 def _number(name: str, hint: Any, value: Any) -> Any:
     for mark in getattr(hint, "__metadata__", ()):
-        if isinstance(mark, Quantity) and isinstance(value, str):
+        if isinstance(mark, Quantity) and isinstance(value, (str, int, float)):
             try:
                 return mark.parse(value)
             except ValueError as error:
                 raise ValueError(f"{name}: {error}") from None
     return value
-
-
-def check_seconds(options: Any, *names: str) -> None:
-    """Raise `ValueError` for a wait that is no time."""
-    for name in names:
-        seconds = getattr(options, name)
-        if not 0.0 < seconds < inf:
-            raise ValueError(f"{name} is {seconds:g} s; allowed: more than 0")
