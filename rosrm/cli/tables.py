@@ -72,12 +72,13 @@ def processes(rows: Iterable[ProcessRow]) -> Table:
             formats.duration(row.since),
             f"{row.cpu:.2f}" if runs else "",
             formats.size(row.memory) if runs else "",
-            Text(_why(row)),
+            Text(why(row)),
         )
     return made
 
 
-def _why(row: ProcessRow) -> str:
+def why(row: ProcessRow) -> str:
+    """Say in one line why a process is in its state, and what it went through."""
     parts = [f"no. {row.queue_position} in the queue"] if row.queue_position else []
     if row.reason:
         parts.append(row.reason)
