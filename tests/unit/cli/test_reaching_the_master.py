@@ -45,7 +45,7 @@ def test_a_command_looks_for_a_master_until_3_s_after_its_start(monkeypatch, ela
 
     class MasterClient:
         @staticmethod
-        def connect(settings, *, name, timeout):
+        def connect(settings, *, name, timeout, joined, begun):
             seen.update(name=name, timeout=timeout)
 
     module = SimpleNamespace(MasterClient=MasterClient)
