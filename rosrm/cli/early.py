@@ -6,10 +6,10 @@ tables, takes as long to import. Both run side by side because the participant c
 
 from __future__ import annotations
 
-import os
 from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Final
 
+from rosrm.ros import names
 from rosrm.ros.settings import RosSettings
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ def join(arguments: Sequence[str], environment: Mapping[str, str]) -> None:
     try:
         from rosrm.ros.participant import Participant  # noqa: PLC0415 - the first import of ROS
 
-        _made.append(Participant(RosSettings(), node_name()))
+        _made.append(Participant(RosSettings(), names.client_node()))
     except Exception:  # noqa: BLE001 - `connect` tries again, and reports the fault to the user
         _made.clear()
 
@@ -59,8 +59,3 @@ def drop() -> None:
     """Close a participant that no command took: the command line was wrong, for example."""
     while _made:
         _made.pop().close()
-
-
-def node_name() -> str:
-    """Return the name of this command's node."""
-    return f"rosrm_client_{os.getpid()}"

@@ -212,7 +212,7 @@ class _Copy:
         if row is not None:
             reason = f": {row.reason}" if row.reason else ""
             since = formats.duration(row.since)
-            known = f". {name} is {formats.words(row.state)} since {since}{reason}"
+            known = f". {name} has been {formats.words(row.state)} for {since}{reason}"
         raise Refused(
             f"the log of {name} is on {host}, and {self._away[host]}{known}. `rosrm events "
             f"--process {name}` shows what happened; `--host HOST` reads an older part elsewhere"

@@ -217,7 +217,7 @@ class MasterClient:
             Refused: it is of another version.
         """
         begun = time.monotonic() if begun is None else begun
-        participant = joined or Participant(settings, f"rosrm_client_{os.getpid()}")
+        participant = joined or Participant(settings, names.client_node())
         try:
             hello = _greet(participant, name, timeout, begun)
         except BaseException:

@@ -139,10 +139,14 @@ class _Log:
 
     def note(self, size: int, pid: int) -> None:
         """Put into the index that the log has so many bytes now."""
-        self.size = size
         now = time.time()
+        if size < self.size:
+            # The log was cut by hand, or by a supervisor that was killed before it noted so.
+            self.base += self.size
+            self._has_index = False
+        self.size = size
         try:
-            if not self._has_index and size > 0:
+            if not self._has_index and self.base + size > 0:
                 log_index.begin(self.path, Mark(now, self.base, 0))
             log_index.add(self.path, Mark(now, self.base + size, pid))
             self._has_index = True

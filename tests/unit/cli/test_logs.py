@@ -218,7 +218,7 @@ def test_a_host_that_is_away_is_not_asked(rosrm, client, slaves, state):
         f"the log of talker is on alpha, and alpha {'has' if state == 'left' else 'is'}"
         in result.err
     )
-    assert "talker is unreachable since 12 s: alpha is lost" in result.err
+    assert "talker has been unreachable for 12 s: alpha is lost" in result.err
     assert ("read_log", "alpha") not in client.asked
 
 

@@ -226,6 +226,17 @@ def test_offsets_continue_in_another_supervisor(tmp_path, keeper, died) -> None:
     assert everything(tmp_path) == (b"y" * 100 + b"z", [(0, 170)])
 
 
+def test_a_log_that_was_cut_without_a_note_is_read_on(tmp_path, keeper) -> None:
+    """By hand, or by a supervisor that was killed in the middle of a rotation."""
+    start(keeper, 7, b"first\n")
+    keeper.look(1e9)
+    log_path(tmp_path, P).write_bytes(b"2\n")
+    keeper = LogKeeper(str(tmp_path), LogLimits(max_bytes=100, keep=1))
+    keeper.watch((P.process, P.number), 0.0)
+    keeper.look(2e9)
+    assert everything(tmp_path) == (b"2\n", [(0, 6)])
+
+
 def test_a_log_from_before_there_were_times(tmp_path, keeper) -> None:
     """Its bytes count; their time is that of the first look."""
     log_path(tmp_path, P).write_bytes(b"old\n")
