@@ -1,4 +1,4 @@
-"""When which bytes of a log were written, and where a start of its process begins.
+"""Index of a log: by which time which bytes were written, and where a program was started.
 
 Beside each log file lies `FILE.times`: records of 24 bytes, ascending::
 

@@ -75,7 +75,7 @@ def test_each_command_that_asks_the_master_joins_ros_early():
 
 @pytest.fixture
 def joined(monkeypatch):
-    """What became of participants that were made early."""
+    """Fates of the participants that were made early."""
     became = []
 
     class Participant:
@@ -151,7 +151,7 @@ def test_without_a_master_the_discovery_server_is_asked_after(monkeypatch, serve
 
 
 def test_commands_do_not_load_the_generator_of_messages():
-    """It costs 60 ms, and only builds of interfaces use it."""
+    """The generator costs 60 ms, and only builds of interfaces use it."""
     code = (
         "import sys; from rosrm.ros import client; from rosrm_msgs import srv\n"
         "srv.List.__class__.__import_type_support__.__get__(srv.List)()\n"
