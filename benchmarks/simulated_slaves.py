@@ -47,7 +47,7 @@ from rosrm.core.model import (
 from rosrm.errors import Refused, RosrmError
 from rosrm.loopback import settings_on_this_machine
 from rosrm.ros.settings import RosSettings
-from rosrm.ros.slave_endpoint import Link, LogSlice, SlaveEndpoint
+from rosrm.ros.slave_endpoint import Link, LogQuery, LogSlice, SlaveEndpoint
 
 #: Most seconds between two looks at standard input.
 _LOOK = 0.05
@@ -166,7 +166,7 @@ class SimulatedSlave:
 
     # ruff: noqa: ARG002 - the endpoint calls them so, with or without a process
 
-    def read_log(self, process: str, number: int, offset: int, max_bytes: int) -> LogSlice:
+    def read_log(self, query: LogQuery) -> LogSlice:
         """No process, no log."""
         raise Refused(f"{self.name} is simulated: it has no logs", "unknown")
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 import typer
 
+from rosrm.cli import early
 from rosrm.cli.app import BEGUN
 from rosrm.cli.options import Common
 from rosrm.errors import RosrmError
@@ -68,4 +69,6 @@ def connect(settings: RosSettings) -> MasterClient:
         ) from None
     timeout = max(LEAST, SAID_WITHIN - (time.monotonic() - BEGUN))
     who = f"{getpass.getuser()}@{socket.gethostname()}:{os.getpid()}"
-    return MasterClient.connect(settings, name=who, timeout=round(timeout, 1))
+    return MasterClient.connect(
+        settings, name=who, timeout=timeout, joined=early.take(settings), begun=BEGUN
+    )

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from rosrm.cli import connection
-from rosrm.cli.options import AsJson, Domain, Name
-from rosrm.errors import NoMaster
+from rosrm.cli.options import AsJson, Domain, Names
 
 if TYPE_CHECKING:
     from rosrm.core.views import Snapshot
@@ -67,64 +66,72 @@ def _later(client: MasterClient, before: Snapshot, process: str, host: str) -> S
     return client.list(events=True, process=process, host=host, after=before.last_sequence)
 
 
-def logs(
+def logs(  # noqa: PLR0917 - an argument for each option
     ctx: typer.Context,
-    name: Name,
+    names: Names,
     follow: Follow = False,
     tail: Annotated[
+        int | None,
+        typer.Option("--tail", metavar="N", min=1, help="Only the last N lines of each."),
+    ] = None,
+    since: Annotated[
         str,
-        typer.Option("--tail", metavar="SIZE", help="Only the end, such as 64kB."),
+        typer.Option("--since", metavar="TIME", help="Only what was written since, e.g. 10min."),
     ] = "",
+    timestamps: Annotated[
+        bool,
+        typer.Option("--timestamps", "-t", help="Begin lines with their time, by their host."),
+    ] = False,
     host: Annotated[
-        str,
-        typer.Option("--host", metavar="HOST", help="Of the instance on this host."),
+        str, typer.Option("--host", metavar="HOST", help="Only what was written on this host.")
     ] = "",
     domain: Domain = None,
 ) -> None:
-    """Print what a process wrote.
+    """Print what processes wrote, from their hosts.
 
-    With -f also what it writes from now on, on whichever host, until it ends.
+    The output is complete, over restarts and moves; a line tells where the bound on logs dropped
+    something, and how much. With -f it continues until the processes have ended.
     """
-    from rosrm.cli.log_following import bytes_of, copy_log
+    from rosrm.cli.log_following import Wanted, copy_logs, since_of
+    from rosrm.cli.log_writing import Stream
 
-    end = bytes_of(tail)
+    wanted = Wanted(tail or 0, since_of(since), host, follow)
+    width = max(map(len, names)) if len(names) > 1 else 0
+    streams = [
+        Stream(name, f"{name:<{width}} | ".encode() if width else b"", timestamps)
+        for name in dict.fromkeys(names)
+    ]
     with connection.master(ctx, domain) as client:
-        copy_log(client, name, host, end, follow=follow)
+        copy_logs(client, streams, wanted)
 
 
 def top(
     ctx: typer.Context,
     period: Annotated[
-        float, typer.Option("--period", metavar="SECONDS", min=0.1, help="Between two pictures.")
-    ] = 1.0,
+        str,
+        typer.Option("--period", metavar="TIME", help="Time between two pictures, e.g. 2s."),
+    ] = "1s",
     count: Annotated[
         int, typer.Option("--count", "-n", metavar="N", min=0, help="End after N; 0: never.")
     ] = 0,
+    sort: Annotated[
+        str,
+        typer.Option("--sort", metavar="KEY", help="Order: state, cpu, memory or name."),
+    ] = "state",
     domain: Domain = None,
 ) -> None:
-    """Show a live table until Ctrl-C."""
-    from rich.live import Live
+    """Show a live table until q or Ctrl-C.
 
-    from rosrm.cli import live, tables
+    In a terminal the keys s, c, m and n sort the processes by state, CPU, memory and name.
+    """
+    from rosrm.cli import live_screen
 
+    seconds, order = live_screen.period_of(period), live_screen.sort_of(sort)
     with connection.master(ctx, domain) as client:
-        snapshot, note, shown = _picture(client), "", 0
-        with Live(console=tables.console(), auto_refresh=False) as screen:
-            while True:
-                rows = max(5, screen.console.height - 12 - len(snapshot.hosts))
-                screen.update(live.render(snapshot, rows=rows, note=note), refresh=True)
-                shown += 1
-                if shown == count:
-                    return
-                time.sleep(period)
-                try:
-                    snapshot, note = _picture(client), ""
-                except NoMaster:
-                    note = "the master does not answer"
-
-
-def _picture(client: MasterClient) -> Snapshot:
-    return client.list(hosts=True, processes=True, events=True, newest=4)
+        live_screen.show(
+            lambda: client.list(hosts=True, processes=True, events=True, newest=4),
+            seconds, count, order,
+        )  # fmt: skip
 
 
 COMMANDS: Final = (events, logs, top)

@@ -1,26 +1,34 @@
 """The live table: hosts with their usage against their limits, processes, queue, newest events.
 
-A pure function of a `Snapshot`: `rosrm top` and `make demo` show it.
+A pure function of a `Snapshot` and the width: `rosrm top` and `make demo` show it. Where room is
+short, the reasons shrink first, then bars, then columns leave; names stay whole.
 """
 
 from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from typing import Final
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
 
-from rich.console import Group, RenderableType
-from rich.table import Table
+from rich.cells import cell_len
+from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 from rich.text import Text
 
 from rosrm.cli import formats, tables
 from rosrm.core.views import HostRow, ProcessRow, ResourceRow, Snapshot
 
 _BAR: Final = 14
+_LEAST_BAR: Final = 4
+#: Of what stands beside a bar: " 100%".
+_NUMBER: Final = 5
 _MOST_RESOURCES: Final = 3
 #: Near its limit: from this part of it on.
 _NEAR: Final = 0.9
+_GAP: Final = 2
+#: A reason that is shorter than this says nothing: a column makes room for it.
+_LEAST_REASON: Final = 20
 
 #: Before all others where there is too little room.
 _FIRST: Final = ("memory", "cpu", "gpu", "disk")
@@ -42,31 +50,55 @@ _ORDER: Final = (
     "finished",
 )
 _OVER: Final = ("failed", "cancelled", "finished")
+#: Columns of the processes that leave where room is short, the first one first.
+_LEAVE: Final = ("MEMORY", "CPU", "SINCE", "HOST")
+#: Columns of numbers.
+_RIGHT: Final = ("SINCE", "CPU", "MEMORY")
 
 
-def render(snapshot: Snapshot, *, rows: int = 18, events: int = 4, note: str = "") -> Group:
-    """What a snapshot shows.
+@dataclass(frozen=True)
+class Picture:
+    """The table of a snapshot, for a rich console of any width."""
+
+    snapshot: Snapshot
+    rows: int
+    events: int
+    note: str
+    sort: str
+    foot: str
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Draw the parts below one another."""
+        width, snapshot = options.max_width, self.snapshot
+        yield _title(snapshot, self.note)
+        yield Text()
+        yield from _hosts(snapshot.hosts, width)
+        yield Text()
+        yield from _processes(snapshot.processes, self.rows, self.sort, width)
+        newest = list(snapshot.events)[-self.events :] if self.events else []
+        if newest:
+            yield Text()
+            for event in newest:
+                yield Text(tables.event_line(event), "dim", no_wrap=True, overflow="ellipsis")
+        if self.foot:
+            yield Text(self.foot, "dim italic", no_wrap=True, overflow="ellipsis")
+
+
+def render(
+    snapshot: Snapshot, *, rows: int = 18, events: int = 4, note: str = "", sort: str = "state",
+    foot: str = "",
+) -> RenderableType:  # fmt: skip
+    """Return the picture of a snapshot.
 
     Args:
         snapshot: with hosts and processes; events are shown where it has any.
         rows: most processes shown.
         events: most events shown.
         note: goes beside the title.
+        sort: order of the processes, a key of `SORTS`.
+        foot: the last line.
     """
-    return Group(*_parts(snapshot, rows, events, note))
-
-
-def _parts(snapshot: Snapshot, rows: int, events: int, note: str) -> Iterator[RenderableType]:
-    yield _title(snapshot, note)
-    yield Text()
-    yield _hosts(snapshot.hosts)
-    yield Text()
-    yield from _processes(snapshot.processes, rows)
-    newest = list(snapshot.events)[-events:] if events else []
-    if newest:
-        yield Text()
-        for event in newest:
-            yield Text(tables.event_line(event), "dim", no_wrap=True, overflow="ellipsis")
+    return Picture(snapshot, rows, events, note, sort, foot)
 
 
 def _title(snapshot: Snapshot, note: str) -> Text:
@@ -81,18 +113,28 @@ def _title(snapshot: Snapshot, note: str) -> Text:
     return text
 
 
-def _hosts(hosts: Sequence[HostRow]) -> RenderableType:
+# --- hosts ------------------------------------------------------------------------------------
+
+
+def _hosts(hosts: Sequence[HostRow], width: int) -> Iterator[Text]:
     if not hosts:
-        return Text("no host yet", "yellow")
+        yield Text("no host yet", "yellow")
+        return
     found = dict.fromkeys(resource.name for row in hosts for resource in row.resources)
     first = [name for name in _FIRST if name in found]
     names = [*first, *(name for name in found if name not in first)][:_MOST_RESOURCES]
-    made = tables.table("HOST", "RUNS", *(name.upper() for name in names), right=("RUNS",))
-    for row in hosts:
-        by_name = {resource.name: resource for resource in row.resources}
-        bars = [bar(by_name[name]) if name in by_name else Text("-") for name in names]
-        made.add_row(_host(row), str(row.processes), *bars)
-    return made
+    cells = {"HOST": [_host(row) for row in hosts], "RUNS": [Text(str(r.processes)) for r in hosts]}
+    free = width - _total(cells)
+    while len(names) > 1 and free // len(names) < _GAP + _LEAST_BAR + _NUMBER:
+        names.pop()
+    room = free // max(1, len(names)) - _GAP - _NUMBER
+    length = min(_BAR, max(_LEAST_BAR, room))
+    by_host = [{resource.name: resource for resource in row.resources} for row in hosts]
+    for name in names:
+        cells[name.upper()] = [
+            bar(by_name[name], length) if name in by_name else Text("-") for by_name in by_host
+        ]
+    yield from _lines(cells, width, ("RUNS",))
 
 
 def _host(row: HostRow) -> Text:
@@ -136,26 +178,7 @@ def _style(resource: ResourceRow) -> str:
     return "yellow" if resource.usage > _NEAR * resource.limit else "green"
 
 
-def _processes(processes: Sequence[ProcessRow], most: int) -> Iterator[RenderableType]:
-    if not processes:
-        yield Text("no process", "dim")
-        return
-    ordered = sorted(processes, key=lambda row: (_rank(row.state), _recency(row)))
-    made = Table.grid(padding=(0, 2))
-    for _ in range(6):
-        made.add_column(no_wrap=True, overflow="ellipsis")
-    for row in ordered[:most]:
-        made.add_row(
-            Text(row.name),
-            tables.state(row.state),
-            Text(row.host),
-            formats.duration(row.since),
-            formats.size(row.memory) if row.pid else "",
-            Text(row.reason, "dim"),
-        )
-    yield made
-    if len(ordered) > most:
-        yield Text(f"and {len(ordered) - most} more", "dim")
+# --- processes --------------------------------------------------------------------------------
 
 
 def _rank(word: str) -> int:
@@ -167,3 +190,69 @@ def _recency(row: ProcessRow) -> float:
     if row.queue_position:
         return row.queue_position
     return row.since if row.state in _OVER else 0.0
+
+
+#: Orders of the processes, by name.
+SORTS: Final[Mapping[str, Callable[[ProcessRow], Any]]] = {
+    "state": lambda row: (_rank(row.state), _recency(row)),
+    "cpu": lambda row: (row.pid == 0, -row.cpu),
+    "memory": lambda row: (row.pid == 0, -row.memory),
+    "name": lambda row: row.name,
+}
+
+
+def _processes(
+    processes: Sequence[ProcessRow], most: int, sort: str, width: int
+) -> Iterator[RenderableType]:
+    if not processes:
+        yield Text("no process", "dim")
+        return
+    shown = sorted(processes, key=SORTS[sort])[:most]
+    cells = {
+        "NAME": [Text(row.name) for row in shown],
+        "STATE": [tables.state(row.state) for row in shown],
+        "HOST": [Text(row.host) for row in shown],
+        "SINCE": [Text(formats.duration(row.since)) for row in shown],
+        "CPU": [Text(f"{row.cpu:.2f}" if row.pid else "") for row in shown],
+        "MEMORY": [Text(formats.size(row.memory) if row.pid else "") for row in shown],
+    }
+    reasons = [Text(" ".join(tables.why(row).split()), "dim") for row in shown]
+    wanted = min(_LEAST_REASON, max(reason.cell_len for reason in reasons))
+    leaving = iter(_LEAVE)
+    while width - _total(cells) - _GAP < wanted and (column := next(leaving, "")):
+        del cells[column]
+    yield from _lines({**cells, "WHY": reasons}, width, _RIGHT)
+    if len(processes) > len(shown):
+        yield Text(f"and {len(processes) - len(shown)} more", "dim")
+
+
+# --- columns ----------------------------------------------------------------------------------
+
+
+def _width(head: str, cells: Sequence[Text]) -> int:
+    return max(cell_len(head), *(cell.cell_len for cell in cells))
+
+
+def _total(columns: Mapping[str, Sequence[Text]]) -> int:
+    """Width of columns with the gaps between them."""
+    return sum(_width(*column) + _GAP for column in columns.items()) - _GAP
+
+
+def _lines(
+    columns: Mapping[str, Sequence[Text]], width: int, right: Sequence[str]
+) -> Iterator[Text]:
+    """Lay out columns below their heads; what is too long for the width is cut at its right end."""
+    widths = {head: _width(head, cells) for head, cells in columns.items()}
+    heads = {head: Text(head, "bold") for head in columns}
+    count = len(next(iter(columns.values())))
+    rows = [heads, *({head: cells[at] for head, cells in columns.items()} for at in range(count))]
+    for row in rows:
+        line = Text(no_wrap=True)
+        for head, cell in row.items():
+            pad = " " * (widths[head] - cell.cell_len)
+            line.append(" " * _GAP if line else "")
+            line.append_text(Text(pad).append_text(cell) if head in right else cell.copy())
+            line.append("" if head in right else pad)
+        line.rstrip()
+        line.truncate(width, overflow="ellipsis")
+        yield line

@@ -1,132 +1,270 @@
-"""`rosrm logs`: finds the slave that holds a log, copies it, and follows it."""
+"""`rosrm logs`: finds the slaves that hold the logs of processes, copies them, and follows them.
+
+The numbers of instances ascend over all hosts, so that they order what a process wrote.
+"""
 
 from __future__ import annotations
 
-import sys
 import time
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 import typer
 
+from rosrm.cli import formats
+from rosrm.cli.log_writing import Stream
 from rosrm.config.units import Quantity
-from rosrm.errors import ConfigError, Refused
+from rosrm.errors import ConfigError, Refused, RosrmError
 
 if TYPE_CHECKING:
+    from rosrm.core.views import HostRow, ProcessRow, Snapshot
     from rosrm.ros.client import LogPart, MasterClient
 
 _CHUNK: Final = 256 * 1024
-#: Seconds between two looks at a log that has nothing new.
+#: Seconds between two looks at logs that have nothing new.
 PERIOD: Final = 0.3
 #: States in which nothing more will be written anywhere.
 _OVER: Final = frozenset({"finished", "failed", "cancelled"})
+#: Newest events by which the hosts of a process are found.
+_EVENTS: Final = 200
 
 
 @dataclass(frozen=True)
-class Holder:
-    """Who holds the log of a process: its host and instance (0: the newest there)."""
+class Wanted:
+    """Options of `rosrm logs`.
 
-    host: str
-    number: int
-    over: bool
-
-
-def bytes_of(text: str) -> int | None:
-    """The option --tail in bytes; None where it is not given. Raises `ConfigError`."""
-    try:
-        return int(Quantity("size", whole=True, above=True).parse(text)) if text else None
-    except ValueError as error:
-        raise ConfigError(f"--tail: {error}") from None
-
-
-def find_holder(client: MasterClient, name: str, host: str) -> Holder:
-    """Where the log of a process is; raises `Refused` where there can be none."""
-    listed = client.list(processes=True, events=True, process=name, newest=100)
-    row = next((row for row in listed.processes if row.name == name), None)
-    over = row is None or row.state in _OVER
-    if host:
-        return Holder(host, row.number if row and row.host == host else 0, over)
-    if row is not None and row.host:
-        return Holder(row.host, row.number, over)
-    last = next((event.host for event in reversed(listed.events) if event.host), "")
-    if last:
-        return Holder(last, 0, over)
-    if row is None:
-        raise Refused(f"there is no process {name!r}; `rosrm ps --all` lists them")
-    raise Refused(f"{name} has not run yet: it is {row.state.replace('_', ' ')}. {row.reason}")
-
-
-def copy_log(client: MasterClient, name: str, host: str, tail: int | None, *, follow: bool) -> None:
-    """Copy a log to standard output.
-
-    Args:
-        client: of the master.
-        name: of the process.
-        host: that holds the log; "": where the process is or was last.
-        tail: only so many bytes of its end; None: all.
-        follow: go on as it grows, and on the host that the process moves to.
+    Attributes:
+        tail: the last lines only, so many; 0: all.
+        since: unix time (s): only what was written then or later; 0.0: all.
+        host: only what was written there; "": everywhere.
+        follow: until the processes have ended.
     """
-    holder = find_holder(client, name, host)
-    while True:
-        _copy_instance(client, name, holder, tail, follow=follow)
-        if not follow or host:
-            return
-        after = _next_holder(client, name, holder)
-        if after is None:
-            return
-        typer.echo(f"--- {name} now runs on {after.host} ---", err=True)
-        holder, tail = after, None
+
+    tail: int = 0
+    since: float = 0.0
+    host: str = ""
+    follow: bool = False
 
 
-def _next_holder(client: MasterClient, name: str, before: Holder) -> Holder | None:
-    """Where a process goes on after an instance has ended; None: nowhere."""
-    while True:
-        now = find_holder(client, name, "")
-        if now.over:
-            return None
-        if now.number and (now.host, now.number) != (before.host, before.number):
-            return now
-        time.sleep(PERIOD)
+def since_of(text: str) -> float:
+    """Return the option --since as unix time, 0.0 where it is not given; raises `ConfigError`."""
+    try:
+        ago = Quantity("duration", above=True).parse(text) if text else 0.0
+    except ValueError as error:
+        raise ConfigError(f"--since: {error}. It is a time until now, such as 10min") from None
+    return time.time() - ago if ago else 0.0
 
 
-def _copy_instance(
-    client: MasterClient, name: str, holder: Holder, tail: int | None, *, follow: bool
-) -> None:
-    start = -tail if tail else 0
-    part = _first_part(client, name, holder, start, follow=follow and not holder.over)
-    while True:
-        _write(part.content)
-        before = part
-        part = client.read_log(holder.host, name, holder.number, before.next_offset, _CHUNK)
-        if part.generation != before.generation:
-            part = client.read_log(holder.host, name, holder.number, 0, _CHUNK)
-        elif not part.content:
-            if part.ended or not follow:
-                return
-            time.sleep(PERIOD)
+def copy_logs(client: MasterClient, streams: Sequence[Stream], wanted: Wanted) -> None:
+    """Copy the logs of processes to standard output, one after the other, and follow all of them.
 
-
-def _first_part(
-    client: MasterClient, name: str, holder: Holder, start: int, *, follow: bool
-) -> LogPart:
-    """With `follow`, of an assigned process that its host is only about to start, too."""
-    while True:
+    Raises:
+        RosrmError: there is no log of one, or its newest part is out of reach.
+    """
+    copies, troubles = [], []
+    for stream in streams:
+        copy = _Copy(client, stream, wanted)
         try:
-            return client.read_log(holder.host, name, holder.number, start, _CHUNK)
-        except Refused as refusal:
-            if not follow or refusal.code != "unknown" or _no_longer(client, name, holder):
-                raise
+            copy.begin()
+            copies.append(copy)
+        except RosrmError as error:
+            troubles.append(error)
+        if not wanted.follow:
+            stream.close()
+    while wanted.follow and copies:
+        news = [copy.look() for copy in copies]
+        copies = [copy for copy in copies if not copy.over]
+        if copies and not any(news):
             time.sleep(PERIOD)
+    for stream in streams:
+        stream.close()
+    for trouble in troubles[:-1]:
+        typer.echo(f"rosrm: {trouble}", err=True)
+    if troubles:
+        raise troubles[-1]
 
 
-def _no_longer(client: MasterClient, name: str, holder: Holder) -> bool:
-    now = find_holder(client, name, "")
-    return now.over or (now.host, now.number) != (holder.host, holder.number)
+@dataclass
+class _Copy:
+    """The copy of the logs of one process."""
+
+    client: MasterClient
+    stream: Stream
+    wanted: Wanted
+    over: bool = False
+    _host: str = ""
+    _number: int = 0
+    _offset: int = 0
+    _started: bool = False
+    _away: dict[str, str] = field(default_factory=dict)
+
+    def begin(self) -> None:
+        """Copy what there is; raises `RosrmError`."""
+        found = self._find()
+        for host, number, tail in self._chosen(found):
+            part = self._read(host, number, 0, tail=tail, since=self.wanted.since)
+            self._started = self._started or any(pid for _, _, pid in part.marks)
+            self._take(host, part)
+            self._rest()
+        if not self.stream.wrote:
+            self._explain_nothing(found)
+
+    def look(self) -> bool:
+        """Copy what is new; return False if there was nothing."""
+        part = self._read(self._host, self._number, self._offset) if self._host else None
+        if part is not None and part.content:
+            self._take(self._host, part)
+            return True
+        return (part is None or part.ended) and self._find_next()
+
+    # --- one instance ------------------------------------------------------------------------
+
+    def _chosen(self, found: Sequence[tuple[str, int]]) -> list[tuple[str, int, int]]:
+        """Return the instances to be shown, the oldest first, and how many of their last lines."""
+        left = self.wanted.tail
+        if not left:
+            return [(host, number, 0) for host, number in found]
+        chosen: list[tuple[str, int, int]] = []
+        for host, number in reversed(found):
+            if left <= 0:
+                break
+            chosen.insert(0, (host, number, left))
+            left -= self._count(host, number, left)
+        return chosen
+
+    def _count(self, host: str, number: int, tail: int) -> int:
+        """Return how many of the last lines that are asked for an instance has."""
+        lines, last = 0, b"\n"
+        part = self._read(host, number, 0, tail=tail)
+        while part.content:
+            lines, last = lines + part.content.count(b"\n"), part.content[-1:]
+            part = self._read(host, number, part.next_offset)
+        return lines + (last != b"\n")
+
+    def _rest(self) -> None:
+        """Copy what follows the newest part, up to the end of its instance."""
+        while (part := self._read(self._host, self._number, self._offset)).content:
+            self._take(self._host, part)
+
+    def _read(
+        self, host: str, number: int, offset: int, *, tail: int = 0, since: float = 0.0
+    ) -> LogPart:
+        name = self.stream.name
+        return self.client.read_log(host, name, number, offset, _CHUNK, tail=tail, since=since)
+
+    def _take(self, host: str, part: LogPart) -> None:
+        new = (host, part.number) != (self._host, self._number)
+        whole = not (self.wanted.tail or self.wanted.since)
+        expected = (0 if whole else part.offset) if new else self._offset
+        if new:
+            self.stream.enter(host)
+        if part.offset > expected:
+            self.stream.say(f"{formats.size(part.offset - expected)} before this were dropped")
+        self.stream.write(part.content, part.offset, part.marks)
+        self._host, self._number, self._offset = host, part.number, part.next_offset
+
+    # --- where -------------------------------------------------------------------------------
+
+    def _find(self) -> list[tuple[str, int]]:
+        """Return host and number of every instance within reach, the oldest first."""
+        name, row, hosts, events = self._ask()
+        if self.wanted.host:
+            names = [self.wanted.host]
+        else:
+            here = [row.host] if row is not None and row.host else []
+            names = list(dict.fromkeys([*here, *(host for host in events if host)]))
+        if not names and row is None:
+            raise Refused(f"there is no process {name!r}; `rosrm ps --all` lists them")
+        found = []
+        for host in names:
+            away = _why_away(hosts.get(host), host)
+            if away:
+                self._away[host] = away
+                continue
+            try:
+                part = self.client.read_log(host, name, 0, 0, 1)
+            except Refused as refusal:
+                if refusal.code != "unknown":
+                    raise
+                continue
+            found += [(host, number) for number in part.numbers or (part.number,)]
+        owner = row.host if row is not None and not self.wanted.host else self.wanted.host
+        if owner in self._away:
+            self._refuse(row, owner)
+        for away in self._away.values():
+            typer.echo(f"rosrm: {name}: what it wrote there is out of reach: {away}", err=True)
+        return sorted(found, key=lambda one: one[1])
+
+    def _ask(self) -> tuple[str, ProcessRow | None, dict[str, HostRow], list[str]]:
+        name = self.stream.name
+        listed: Snapshot = self.client.list(
+            hosts=True, processes=True, events=True, process=name, newest=_EVENTS
+        )
+        row = next((row for row in listed.processes if row.name == name), None)
+        hosts = {row.description.name: row for row in listed.hosts}
+        return name, row, hosts, _hosts_of(listed)
+
+    def _refuse(self, row: ProcessRow | None, host: str) -> None:
+        """Say at once that the newest part is out of reach, with what the master knows."""
+        name = self.stream.name
+        known = ""
+        if row is not None:
+            reason = f": {row.reason}" if row.reason else ""
+            since = formats.duration(row.since)
+            known = f". {name} has been {formats.words(row.state)} for {since}{reason}"
+        raise Refused(
+            f"the log of {name} is on {host}, and {self._away[host]}{known}. `rosrm events "
+            f"--process {name}` shows what happened; `--host HOST` reads an older part elsewhere"
+        )
+
+    def _explain_nothing(self, found: Sequence[tuple[str, int]]) -> None:
+        """Say why nothing is shown; raises `Refused` where no program was started."""
+        name, row, _, _ = self._ask()
+        if self.wanted.follow and row is not None and row.state not in _OVER:
+            return
+        where = f" on {self.wanted.host}" if self.wanted.host else ""
+        if found and (self._started or self.wanted.since):
+            since = " since then" if self.wanted.since else ""
+            typer.echo(f"rosrm: {name} has written nothing{where}{since}", err=True)
+            return
+        state = "not known to the master any more" if row is None else formats.words(row.state)
+        reason = f": {row.reason}" if row is not None and row.reason else ""
+        gone = "it was not started, or its log has been removed"
+        raise Refused(f"{name} has no log{where}: {gone}. It is {state}{reason}")
+
+    def _find_next(self) -> bool:
+        """Copy the beginning of the next instance; return False if there is none, or none yet."""
+        _, row, _, _ = self._ask()
+        if row is None or row.state in _OVER or self.wanted.host:
+            self.over = True
+            return False
+        if not row.number or not row.host or (row.host, row.number) == (self._host, self._number):
+            return False
+        try:
+            self._take(row.host, self._read(row.host, row.number, 0))
+        except Refused as refusal:
+            if refusal.code != "unknown":  # its host is about to begin the log
+                raise
+            return False
+        return True
 
 
-def _write(content: bytes) -> None:
-    sys.stdout.buffer.write(content)
-    sys.stdout.flush()
+def _hosts_of(listed: Snapshot) -> list[str]:
+    """Return the hosts that the events of a process name, the newest first."""
+    hosts: list[str] = []
+    for event in reversed(listed.events):
+        hosts += [event.host, str(event.facts.get("from", ""))]
+    return hosts
 
 
-__all__ = ["Holder", "LogPart", "bytes_of", "copy_log", "find_holder"]
+def _why_away(row: HostRow | None, host: str) -> str:
+    """Say why a host cannot be asked; "" if it can."""
+    if row is None:
+        return f"the master knows no host {host}"
+    if row.state == "up":
+        return ""
+    if row.state == "left":
+        return f"{host} has left: no slave runs there"
+    silent = formats.duration(row.reading_age)
+    return f"{host} is {row.state}: the master received its last reading {silent} ago"

@@ -85,7 +85,7 @@ def processes(rows: Iterable[ProcessRow]) -> Table:
             formats.duration(row.since),
             _age(row, f"{row.cpu:.2f}") if runs else "",
             _age(row, formats.size(row.memory)) if runs else "",
-            Text(_why(row)),
+            Text(why(row)),
         )
     return made
 
@@ -95,7 +95,8 @@ def _age(row: ProcessRow, reading: str) -> Text:
     return Text(f"?{reading}", "dim") if row.stale else Text(reading)
 
 
-def _why(row: ProcessRow) -> str:
+def why(row: ProcessRow) -> str:
+    """Say in one line why a process is in its state, and what it went through."""
     parts = [f"no. {row.queue_position} in the queue"] if row.queue_position else []
     if row.reason:
         parts.append(row.reason)

@@ -38,19 +38,27 @@ _UNKNOWN_EPOCH: Final = 0
 
 @dataclass(frozen=True, slots=True)
 class LogPart:
-    """A part of a log.
+    """A part of what an instance of a process wrote.
 
     Attributes:
-        content: bytes of the log file.
+        number: of the instance.
+        numbers: of all instances of the process whose logs the host holds, ascending.
+        content: the bytes.
+        offset: of the content, from the first byte that the instance wrote. What lies between the
+            offset that was asked for and this one was dropped.
         next_offset: where to read on.
-        generation: changes when the log was rotated; then read from 0.
         ended: the instance has ended and nothing more will come.
+        marks: looks at the log: (unix time, offset, pid). Everything before the offset had been
+            written by that time; a pid not 0 is that of a process whose output begins there.
     """
 
+    number: int
+    numbers: Sequence[int]
     content: bytes
+    offset: int
     next_offset: int
-    generation: int
     ended: bool
+    marks: Sequence[tuple[float, int, int]]
 
 
 def wait_for_service(participant: Participant, client: Any, deadline: float) -> bool:
@@ -147,18 +155,29 @@ def _ask_until_answered(
     return answers
 
 
-def _greet(participant: Participant, name: str, timeout: float) -> srv.Handshake.Response:
+def _greet(
+    participant: Participant, name: str, timeout: float, begun: float
+) -> srv.Handshake.Response:
     """The master's greeting; raises `NoMaster` or `Refused`."""
     hello = find_master(participant, f"client {name}", timeout)
     settings = participant.settings
     if hello is None:
         raise NoMaster(
-            f"no master answered within {timeout:g} s ({settings.describe()}, namespace "
-            f"{settings.namespace}). Is `rosrm master` running there, with the same domain?"
+            f"no master answered within {time.monotonic() - begun:.1f} s ({settings.describe()}, "
+            f"namespace {settings.namespace}). {_to_check(settings)}"
         )
     if not hello.accepted:
         raise Refused(hello.message, "version")
     return hello
+
+
+def _to_check(settings: RosSettings) -> str:
+    """Return a question that tells the user where to look when no master answers."""
+    server = {**os.environ, **settings.environment()}.get("ROS_DISCOVERY_SERVER", "")
+    master = "`rosrm master` running there, with the same domain"
+    if server:
+        return f"Is the discovery server at {server} running, and {master} and server?"
+    return f"Is {master}?"
 
 
 class MasterClient:
@@ -180,20 +199,27 @@ class MasterClient:
         self._clients: dict[str, Any] = {}
 
     @classmethod
-    def connect(cls, settings: RosSettings, *, name: str, timeout: float = 3.0) -> MasterClient:
+    def connect(
+        cls, settings: RosSettings, *, name: str, timeout: float = 3.0,
+        joined: Participant | None = None, begun: float | None = None,
+    ) -> MasterClient:  # fmt: skip
         """Find the master.
 
         Args:
+            settings: with which to join ROS.
             name: of this client, for the master's messages.
             timeout: seconds for finding it; a request is given as many, or 10.
+            joined: a participant that was made before, which the client then owns.
+            begun: since when the user waits (monotonic seconds), for the message; None: since now.
 
         Raises:
             NoMaster: none answered; the message says what was looked for.
             Refused: it is of another version.
         """
-        participant = Participant(settings, f"rosrm_client_{os.getpid()}")
+        begun = time.monotonic() if begun is None else begun
+        participant = joined or Participant(settings, names.client_node())
         try:
-            hello = _greet(participant, name, timeout)
+            hello = _greet(participant, name, timeout, begun)
         except BaseException:
             participant.close()
             raise
@@ -291,16 +317,31 @@ class MasterClient:
         return story
 
     def read_log(
-        self, host: str, process: str, number: int, offset: int, max_bytes: int
-    ) -> LogPart:
-        """A part of a log, from the slave that holds it."""
+        self, host: str, process: str, number: int = 0, offset: int = 0, max_bytes: int = 0, *,
+        tail: int = 0, since: float = 0.0,
+    ) -> LogPart:  # fmt: skip
+        """Read a part of a log from the slave that holds it.
+
+        Args:
+            host: of the slave.
+            process: that wrote.
+            number: of the instance; 0: the newest on that host.
+            offset: where to begin, bytes.
+            max_bytes: 0: as many as one answer holds.
+            tail: begin so many lines before the end instead; 0: at `offset`.
+            since: begin with what was written at this unix time or later; 0: at `offset`.
+        """
         request = srv.ReadLog.Request(
             protocol_version=PROTOCOL_VERSION, process=process, number=number, offset=offset,
-            max_bytes=max_bytes,
+            max_bytes=max_bytes, tail=tail, since=since,
         )  # fmt: skip
         path = self._names.of_host(host, names.READ_LOG)
         answer = self._call(srv.ReadLog, path, request, f"the slave of {host}")
-        return LogPart(bytes(answer.content), answer.next_offset, answer.generation, answer.ended)
+        marks = zip(answer.mark_times, answer.mark_offsets, answer.mark_pids, strict=True)
+        return LogPart(
+            answer.number, tuple(answer.numbers), bytes(answer.content), answer.offset,
+            answer.next_offset, answer.ended, tuple(marks),
+        )  # fmt: skip
 
     # --- how -----------------------------------------------------------------------------
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import zlib
 from dataclasses import dataclass
@@ -23,6 +24,11 @@ def token(name: str) -> str:
     digest = f"{zlib.crc32(name.encode('utf-8', 'surrogatepass')):08x}"
     fit = _UNFIT.sub("_", name)[:_LONGEST].strip("_")
     return f"{fit}_{digest}" if fit[:1].isalpha() else f"host_{fit}_{digest}".replace("__", "_")
+
+
+def client_node() -> str:
+    """Return the name of the node of this process, if it is a client of the master."""
+    return f"rosrm_client_{os.getpid()}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,11 +20,11 @@ from rosrm.ros.control import Call, ControlClient, Gate, version_refusal
 from rosrm.ros.journal_seen import JournalSeen, Seen
 from rosrm.ros.participant import Participant
 from rosrm.ros.reporting import Reporter
-from rosrm.ros.slave_services import Host, LogSlice, SlaveServices
+from rosrm.ros.slave_services import Host, LogQuery, LogSlice, SlaveServices
 from rosrm.version import PROTOCOL_VERSION, __version__
 from rosrm_msgs import msg, srv
 
-__all__ = ["Host", "Link", "LogSlice", "SlaveEndpoint"]
+__all__ = ["Host", "Link", "LogQuery", "LogSlice", "SlaveEndpoint"]
 
 #: Seconds for one request to the master.
 _PATIENCE: Final = 3.0

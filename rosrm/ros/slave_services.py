@@ -16,13 +16,28 @@ from rosrm_msgs import srv
 
 
 @dataclass(frozen=True, slots=True)
-class LogSlice:
-    """A part of a log file, as `ReadLog` answers it."""
+class LogQuery:
+    """Which part of a log is wanted; the fields are those of `ReadLog`."""
 
+    process: str
+    number: int = 0
+    offset: int = 0
+    tail: int = 0
+    since: float = 0.0
+    max_bytes: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class LogSlice:
+    """A part of a log, as `ReadLog` answers it; a mark is (time, offset, pid)."""
+
+    number: int
+    numbers: Sequence[int]
     content: bytes
+    offset: int
     next_offset: int
-    generation: int
     ended: bool
+    marks: Sequence[tuple[float, int, int]]
 
 
 class Host(Protocol):
@@ -37,7 +52,7 @@ class Host(Protocol):
     def kept_states(self) -> Sequence[KeptState]:
         """All the states that this host keeps."""
 
-    def read_log(self, process: str, number: int, offset: int, max_bytes: int) -> LogSlice:
+    def read_log(self, query: LogQuery) -> LogSlice:
         """A part of a log; raises `Refused`."""
 
     def set_restart(
@@ -138,16 +153,22 @@ class SlaveServices:
             return
         try:
             part = self._host.read_log(
-                request.process, request.number, request.offset, request.max_bytes
-            )
+                LogQuery(
+                    request.process, request.number, request.offset, request.tail, request.since,
+                    request.max_bytes,
+                )
+            )  # fmt: skip
         except Refused as refusal:
             answer = refused(refusal.code, str(refusal))
             open_request.answer(srv.ReadLog.Response(answer=answer))
             return
         open_request.answer(
             srv.ReadLog.Response(
-                answer=accepted(), content=part.content, next_offset=part.next_offset,
-                generation=part.generation, ended=part.ended,
+                answer=accepted(), number=part.number, numbers=list(part.numbers),
+                content=part.content, offset=part.offset, next_offset=part.next_offset,
+                ended=part.ended, mark_times=[mark[0] for mark in part.marks],
+                mark_offsets=[mark[1] for mark in part.marks],
+                mark_pids=[mark[2] for mark in part.marks],
             )
         )  # fmt: skip
 

@@ -121,6 +121,7 @@ def _write_parameters(assignment: Assignment, state_directory: Path) -> str | No
     path = log_path(state_directory, assignment.instance).with_suffix(".parameters.yaml")
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        path.touch(0o600)
         path.write_text(text, encoding="utf-8")
     except OSError as error:
         raise LaunchError(f"the parameters cannot be written to {path}: {error}") from None

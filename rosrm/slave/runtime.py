@@ -10,6 +10,7 @@ import socket
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -34,11 +35,11 @@ from rosrm.ros.journal_seen import JournalSeen
 from rosrm.ros.kept_endpoint import KeptEndpoint
 from rosrm.ros.names import token
 from rosrm.ros.participant import Participant
-from rosrm.ros.slave_endpoint import Link, LogSlice, SlaveEndpoint
+from rosrm.ros.slave_endpoint import Link, LogQuery, LogSlice, SlaveEndpoint
 from rosrm.slave.executing import Done, Here, execute
 from rosrm.slave.health import HealthWatch
 from rosrm.slave.keeping import Keeping
-from rosrm.slave.log_reading import NOTHING_YET, newest_instance, read_log
+from rosrm.slave.log_reading import newest_instance, nothing_yet, read_log
 from rosrm.slave.sampling import ProbeReport, Sampler
 from rosrm.slave.sessions import SessionTable
 from rosrm.slave.starting import Starter
@@ -339,17 +340,18 @@ class SlaveRuntime:
         """Tell the user."""
         _log.info("%s", message)
 
-    def read_log(self, process: str, number: int, offset: int, max_bytes: int) -> LogSlice:
+    def read_log(self, query: LogQuery) -> LogSlice:
         """A part of a log; raises `Refused`."""
-        instance = InstanceId(process, number) if number else self._newest_instance(process)
-        held = self._state.held.get(instance)
+        if not query.number:
+            query = replace(query, number=self._newest_instance(query.process).number)
+        held = self._state.held.get(InstanceId(query.process, query.number))
         ended = held is None or held.status.state.ended
         try:
-            return read_log(self._supervisor.state, instance, offset, max_bytes, ended=ended)
+            return read_log(self._supervisor.state, query, ended=ended)
         except Refused:
             if ended:
                 raise
-            return NOTHING_YET
+            return nothing_yet(query)
 
     def _newest_instance(self, process: str) -> InstanceId:
         held = [one.number for one in self._state.held if one.process == process]

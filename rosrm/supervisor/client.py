@@ -54,6 +54,7 @@ __all__ = [
     "SupervisorSilent",
     "Told",
     "log_path",
+    "logged_instances",
     "newest_log",
 ]
 
@@ -81,13 +82,18 @@ def log_path(state_directory: Path, instance: InstanceId) -> Path:
     return Path(paths.log_file(str(state_directory), instance.process, instance.number))
 
 
-def newest_log(state_directory: Path, process: str) -> InstanceId | None:
-    """The newest instance of a process that has a log; None: there is none (any more)."""
+def logged_instances(state_directory: Path, process: str) -> list[int]:
+    """Return the numbers of the instances of a process that have a log, ascending."""
     wanted = paths.safe_name(process)
     folder = Path(paths.log_folder(str(state_directory)))
     found = [paths.log_number(path.name) for path in folder.glob("*.log")]
-    numbers = [log[1] for log in found if log is not None and log[0] == wanted]
-    return InstanceId(process, max(numbers)) if numbers else None
+    return sorted(log[1] for log in found if log is not None and log[0] == wanted)
+
+
+def newest_log(state_directory: Path, process: str) -> InstanceId | None:
+    """The newest instance of a process that has a log; None: there is none (any more)."""
+    numbers = logged_instances(state_directory, process)
+    return InstanceId(process, numbers[-1]) if numbers else None
 
 
 class SupervisorClient:

@@ -2,17 +2,20 @@
 
 A process holds its log open for appending, so a full log is copied and then cut to nothing; what it
 writes between the two is lost. A process that floods can exceed the bound by what it writes in one
-interval.
+interval. What is dropped shows in the offsets of the index beside each file (`log_index`), which
+also says when what was written: each look that finds a log grown adds a record.
 """
 
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Collection, Container, Iterable
 from typing import Final, NamedTuple
 
 from rosrm.core.supervision import Key
-from rosrm.supervisor import own_log, paths
+from rosrm.supervisor import log_index, own_log, paths
+from rosrm.supervisor.log_index import Mark
 
 #: Seconds between two looks while logs grow, and while they do not.
 BUSY: Final = 0.2
@@ -45,7 +48,8 @@ class LogKeeper:
     def __init__(self, state: str, limits: LogLimits) -> None:
         self.limits = limits
         self._state = state
-        self._sizes: dict[Key, int] = {}
+        self._logs: dict[Key, _Log] = {}
+        self._opened: dict[Key, int] = {}
         self._due: float | None = None
         self._shelf = Shelf(state)
 
@@ -61,20 +65,32 @@ class LogKeeper:
             os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC,
             0o600,
         )
+        self._opened[instance] = os.fstat(log).st_size
         self._shelf.add(instance, known, self.limits)
         self._shelf.remove_old_processes(known, self.limits)
         return log
 
-    def watch(self, instance: Key, now: float) -> None:
-        """The instance runs."""
-        self._sizes[instance] = 0
+    def watch(self, instance: Key, now: float, started: int = 0) -> None:
+        """Look after the log of an instance that runs.
+
+        Args:
+            instance: that runs.
+            now: monotonic seconds.
+            started: pid of the process that was started after `open`; 0: it ran before.
+        """
+        log = self._logs[instance] = _Log(paths.log_file(self._state, *instance))
+        opened = self._opened.pop(instance, 0)
+        if started:
+            log.note(opened, started)
         self._due = now + BUSY
 
     def release(self, instance: Key) -> None:
         """The instance has ended: a last look at its log."""
-        if self._sizes.pop(instance, None) is not None:
-            self._look(instance)
-        if not self._sizes:
+        self._opened.pop(instance, None)
+        log = self._logs.pop(instance, None)
+        if log is not None:
+            log.look(self.limits)
+        if not self._logs:
             self._due = None
 
     def deadline(self) -> float | None:
@@ -85,26 +101,57 @@ class LogKeeper:
         """Rotate what has grown too large."""
         if self._due is None or now < self._due:
             return
-        grown = False
-        for instance, size in self._sizes.items():
-            new = self._look(instance)
-            grown = grown or new != size
-            self._sizes[instance] = new
+        grown = [log for log in self._logs.values() if log.look(self.limits)]
         self._due = now + (BUSY if grown else QUIET)
 
-    def _look(self, instance: Key) -> int:
-        path = paths.log_file(self._state, *instance)
+
+class _Log:
+    """The log of one instance that runs.
+
+    Attributes:
+        base: bytes that the instance had written before the first one in the current file.
+        size: bytes in the current file that are in the index.
+    """
+
+    def __init__(self, path: str) -> None:
+        self.path = path
+        with log_index.Index(path) as index:
+            self.base = index.mark(0).offset if index.count else 0
+            self.size = index.mark(index.count - 1).offset - self.base if index.count else 0
+            self._has_index = index.count > 0
+
+    def look(self, limits: LogLimits) -> bool:
+        """Note growth, and rotate what is too large; return True if the log has grown."""
         try:
-            size = os.stat(path).st_size
+            size = os.stat(self.path).st_size
         except OSError:
-            return 0  # somebody removed it; the process writes on into nothing
-        if size <= self.limits.max_bytes:
-            return size
+            return False  # it was removed; the process writes into a file without a name
+        if size == self.size:
+            return False
+        self.note(size, 0)
+        if size > limits.max_bytes:
+            try:
+                rotate(self.path, size, limits)
+            except OSError as error:
+                own_log.say(f"{self.path} was cut, but not kept: {error}")
+            self.base, self.size = log_index.base(self.path) or 0, 0
+        return True
+
+    def note(self, size: int, pid: int) -> None:
+        """Put into the index that the log has so many bytes now."""
+        now = time.time()
+        if size < self.size:
+            # The log was cut by hand, or by a supervisor that was killed before it noted so.
+            self.base += self.size
+            self._has_index = False
+        self.size = size
         try:
-            rotate(path, size, self.limits)
+            if not self._has_index and self.base + size > 0:
+                log_index.begin(self.path, Mark(now, self.base, 0))
+            log_index.add(self.path, Mark(now, self.base + size, pid))
+            self._has_index = True
         except OSError as error:
-            own_log.say(f"{path} was cut, but not kept: {error}")
-        return 0
+            own_log.say(f"the times of {self.path} were not kept: {error}")
 
 
 class Shelf:
@@ -151,35 +198,56 @@ class Shelf:
         log = os.path.join(paths.log_folder(self._state), f"{name}.{number}.log")
         for extra in FILES_BESIDE:
             _unlink(f"{log[: -len('.log')]}{extra}")
+        _unlink(log_index.path_of(log))
         _unlink(log)
         older = 1
         while _unlink(f"{log}.{older}"):
+            _unlink(log_index.path_of(f"{log}.{older}"))
             older += 1
 
 
 def rotate(path: str, size: int, limits: LogLimits) -> None:
-    """Keep the newest `max_bytes` of a log aside and cut it to nothing."""
-    for number in range(limits.keep - 1, 0, -1):
-        if os.path.exists(f"{path}.{number}"):
-            os.replace(f"{path}.{number}", f"{path}.{number + 1}")
+    """Keep the newest `max_bytes` of a log aside and cut it to nothing.
+
+    Args:
+        path: of the log.
+        size: bytes in it.
+        limits: how much is kept.
+    """
+    base = log_index.base(path) or 0
+    start = max(0, size - limits.max_bytes)
     with open(path, "rb+", buffering=0) as log:
         try:
             if limits.keep > 0:
-                _copy_end(log.fileno(), f"{path}.1", size, limits.max_bytes)
+                _copy(log.fileno(), f"{path}.new", start, size)
+                log_index.copy_from(path, base + start, f"{path}.new")
+                for number in range(limits.keep - 1, 0, -1):
+                    _rename(f"{path}.{number}", f"{path}.{number + 1}")
+                _rename(f"{path}.new", f"{path}.1")
         finally:
+            _unlink(f"{path}.new")
+            written = os.fstat(log.fileno()).st_size
             log.truncate(0)  # above all when the disk is full
+            log_index.begin(path, Mark(time.time(), base + written, 0))
 
 
-def _copy_end(log: int, target: str, size: int, most: int) -> None:
-    offset = max(0, size - most)
-    with open(target, "wb", buffering=0) as copy:
-        if offset:
-            copy.write(b"[rosrm: %d bytes before this were dropped]\n" % offset)
-        while offset < size:
-            sent = os.sendfile(copy.fileno(), log, offset, size - offset)
+def _copy(log: int, target: str, offset: int, end: int) -> None:
+    copy = os.open(target, os.O_WRONLY | os.O_TRUNC | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    try:
+        while offset < end:
+            sent = os.sendfile(copy, log, offset, end - offset)
             if sent == 0:
                 break
             offset += sent
+    finally:
+        os.close(copy)
+
+
+def _rename(log: str, to: str) -> None:
+    """Rename a log file with its index, if there is one."""
+    for source, target in ((log, to), (log_index.path_of(log), log_index.path_of(to))):
+        if os.path.exists(source):
+            os.replace(source, target)
 
 
 def _unlink(path: str) -> bool:

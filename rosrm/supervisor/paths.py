@@ -8,6 +8,7 @@ One folder holds all of one host::
     instances.jsonl                the durable record
     heard                          when the master last heard this host
     logs/PROCESS.NUMBER.log        what an instance writes; .log.1 is older, and so on
+    logs/PROCESS.NUMBER.log*.times when what was written (`log_index`)
     logs/PROCESS.NUMBER.*          further files of that instance (its parameters)
     work/                          working directory of the processes that name none
 

@@ -181,7 +181,7 @@ class Server:
             self._happened(SpawnFailed(key, str(error), error.transient))
             return
         self._family.add_child(key, pid, birth)
-        self._logs.watch(key, time.monotonic())
+        self._logs.watch(key, time.monotonic(), pid)
         self._happened(Spawned(key, pid))
 
     def _spawn_process(self, key: Key) -> int:

@@ -10,8 +10,10 @@ import select
 import signal
 import subprocess
 import sys
+import termios
 import time
 from collections.abc import Iterator
+from datetime import datetime
 from pathlib import Path
 
 import pytest
@@ -52,8 +54,8 @@ class Terminal:
     def start(self, *words: str, **options) -> subprocess.Popen:
         return subprocess.Popen(
             [sys.executable, "-m", "rosrm.cli", *words], env=self.environment, text=True,
-            stdin=subprocess.DEVNULL, stderr=subprocess.PIPE,
-            **{"stdout": subprocess.PIPE, **options},
+            stderr=subprocess.PIPE,
+            **{"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, **options},
         )  # fmt: skip
 
     def run(self, *words: str, code: int = 0) -> str:
@@ -205,8 +207,13 @@ def test_plugins(rosrm) -> None:
 def test_logs(rosrm) -> None:
     """All, or the end, of one that runs and of one that has ended."""
     assert rosrm.run("logs", "counter") == "1\n2\n3\n"
-    assert rosrm.run("logs", "counter", "--tail", "2B") == "3\n"
+    assert rosrm.run("logs", "counter", "--tail", "1") == "3\n"
+    assert rosrm.run("logs", "counter", "--since", "1h") == "1\n2\n3\n"
     assert rosrm.run("logs", "talker") == "hello from talker\n"
+    lines = rosrm.run("logs", "talker", "counter", "-t").splitlines()
+    assert [line.split()[0] for line in lines] == ["talker", *["counter"] * 3]
+    written = [datetime.fromisoformat(line.split()[2]).timestamp() for line in lines]
+    assert all(0.0 < time.time() - when < PATIENCE * 10 for when in written)
     assert "no process" in rosrm.run("logs", "nobody", code=1)
 
 
@@ -268,6 +275,26 @@ def test_top_in_a_terminal(rosrm) -> None:
             assert "Traceback" not in process.stderr.read()
         finally:
             process.kill()
+            os.close(screen)
+
+
+def test_top_sorts_and_ends_by_a_key(rosrm) -> None:
+    """A key is not shown, `q` ends it with 0, and the terminal echoes again afterwards."""
+    rosrm.run("status")  # a master can be found in time now
+    screen, inside = os.openpty()
+    usual = termios.tcgetattr(inside)
+    terminal = {"stdin": inside, "stdout": inside}
+    with rosrm.start("top", "--period", "30s", start_new_session=True, **terminal) as process:
+        try:
+            assert "talker" in read_until(screen, "q quits")
+            os.write(screen, b"m")  # the next picture comes at once, not after 30 s
+            assert "talker" in read_until(screen, "q quits")
+            os.write(screen, b"q")
+            assert process.wait(PATIENCE) == 0, process.stderr.read()
+            assert termios.tcgetattr(inside) == usual
+        finally:
+            process.kill()
+            os.close(inside)
             os.close(screen)
 
 

@@ -322,7 +322,7 @@ def test_a_flood_of_output_is_bounded(cluster) -> None:
         assert cluster.run(job(f"beside-{time.monotonic()}", "true"))[0].state == "finished"
     cluster.cancel("flood")
     logs = cluster.directory / "hosts" / row.host / "supervisor" / "logs"
-    files = [path for path in logs.iterdir() if path.name.startswith("flood.")]
+    files = [path for path in logs.glob("flood.*") if path.suffix != ".times"]
     assert len(files) <= 3
     assert sum(path.stat().st_size for path in files) < 3 * 25_000
 
@@ -346,7 +346,7 @@ def test_reading_and_following_a_log(cluster) -> None:
         cluster.wait_for_log("teller", "second")
         after = cluster.client.read_log(row.host, "teller", row.number, part.next_offset, 0)
         assert after.content == b"second\n"
-        assert cluster.client.read_log(row.host, "teller", 0, -4, 0).content == b"ond\n"
+        assert cluster.client.read_log(row.host, "teller", tail=1).content == b"second\n"
     assert cluster.ended("teller").state == "finished"
     last = cluster.client.read_log(row.host, "teller", row.number, after.next_offset, 0)
     assert (last.content, last.ended) == (b"", True)

@@ -297,3 +297,27 @@ def test_top_outlives_a_master_that_is_away_for_a_while(rosrm, client, monkeypat
     result = rosrm("top", "--count", 2)
     assert result.code == 0
     assert "the master does not answer" in result.out
+
+
+def test_top_ends_each_picture_with_a_line_end_and_takes_a_unit(rosrm, client, monkeypatch):
+    """A prompt stands below the picture, not behind it."""
+    slept = []
+    monkeypatch.setattr("time.sleep", slept.append)
+    result = rosrm("top", "--period", "1500ms", "-n", 2)
+    assert result.code == 0
+    assert result.out.endswith("\n")
+    assert slept == [1.5]
+
+
+@pytest.mark.parametrize(
+    ("option", "says"),
+    [
+        (["--period", "2 parsecs"], "--period: unknown unit 'parsecs'"),
+        (["--period", "0"], "--period: '0' is not at least 0.1"),
+        (["--sort", "mem"], "--sort: 'mem' is not one of state, cpu, memory, name"),
+    ],
+)
+def test_top_refuses_what_it_does_not_know(rosrm, client, option, says):
+    result = rosrm("top", *option)
+    assert (result.code, says in result.err) == (2, True), result.err
+    assert not client.asked

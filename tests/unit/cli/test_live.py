@@ -38,6 +38,66 @@ def test_it_keeps_to_the_width_of_the_terminal(width):
     assert "and 22 more" in text
 
 
+LONG = "no host may take it: shelf: it lacks the label camera=front; desk: it lacks it too; " * 3
+
+
+@pytest.mark.parametrize("width", [60, 80, 120])
+def test_a_long_reason_is_cut_and_names_stay_whole(width):
+    """Every name and state stands there whole, one line a process, whatever a reason says."""
+    names = ["camera_driver_front", "sleeper", "mapkeeper"]
+    rows = [
+        process("camera_driver_front", "set_aside", "", reason=LONG),
+        process("sleeper", reason=LONG, restarts=3),
+        process("mapkeeper", "migrating", reason=f"to shelf: {LONG}"),
+    ]
+    lines = drawn(Snapshot("lab", 1.0, 1, HOSTS, rows), width).splitlines()
+    assert max(map(len, lines)) <= width
+    for name, state in zip(names, ("set aside", "running", "migrating"), strict=True):
+        (line,) = [line for line in lines if line.startswith(f"{name} ")]
+        assert state in line
+    (moving,) = [line for line in lines if line.startswith("mapkeeper ")]
+    assert "to shelf: no host" in moving
+
+
+@pytest.mark.parametrize("width", [50, 60, 80, 120])
+def test_bars_keep_their_numbers(width):
+    """A bar becomes shorter before a resource leaves; its percentage is never cut."""
+    robots = [host(f"robot-{i}", resources=[resource(n) for n in ("memory", "cpu", "disk")])
+              for i in range(2)]  # fmt: skip
+    lines = drawn(Snapshot("lab", 1.0, 1, robots, []), width).splitlines()
+    shown = len(next(line for line in lines if line.startswith("HOST")).split()) - 2
+    assert shown >= (3 if width >= 60 else 2)
+    assert [line.count(" 40%") for line in lines if line.startswith("robot-")] == [shown, shown]
+
+
+def test_processes_have_a_head_cpu_and_a_reason():
+    """As `rosrm ps` has; a process that moves says where to and why."""
+    lines = drawn(Snapshot("lab", 1.0, 1, HOSTS, [process("a", migrations=2)])).splitlines()
+    (head,) = [line for line in lines if line.startswith("NAME")]
+    assert head.split() == ["NAME", "STATE", "HOST", "SINCE", "CPU", "MEMORY", "WHY"]
+    (line,) = [line for line in lines if line.startswith("a ")]
+    assert "0.50" in line
+    assert "moved 2x" in line
+
+
+@pytest.mark.parametrize(
+    ("sort", "order"),
+    [
+        ("state", ["idle", "busy", "big"]), ("cpu", ["busy", "idle", "big"]),
+        ("memory", ["big", "idle", "busy"]), ("name", ["big", "busy", "idle"]),
+    ],
+)  # fmt: skip
+def test_sorting(sort, order):
+    """By state as a rule; by use the greatest first."""
+    rows = [
+        process("idle", cpu=0.2, memory=200),
+        process("busy", cpu=0.9, memory=100),
+        process("big", cpu=0.1, memory=900),
+    ]
+    lines = drawn(Snapshot("lab", 1.0, 0, [], rows), sort=sort).splitlines()
+    assert [line.split()[0] for line in lines if line.split()[1:2] == ["running"]] == order
+
+
 def test_an_empty_cluster_is_a_picture_too():
     text = drawn(Snapshot("lab", 1.0, 0), note="the master does not answer")
     assert "no host yet" in text

@@ -1,101 +1,262 @@
-"""`rosrm logs`: finds the slave that holds the log, copies it, and follows the process."""
+"""`rosrm logs`: finds the slaves that hold the logs, copies them, and follows the processes.
+
+The slaves are folders here, read by the slave's own reader.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import re
+import time
+from datetime import datetime
 
 import pytest
 
+from rosrm.cli import log_following
+from rosrm.core.model import InstanceId
 from rosrm.errors import Refused
+from rosrm.ros.slave_services import LogQuery
+from rosrm.slave.log_reading import newest_instance, read_log
+from rosrm.supervisor import log_index
+from rosrm.supervisor.client import log_path
+from rosrm.supervisor.log_index import Mark
+from rosrm.supervisor.logs import LogLimits, rotate
 
-from .conftest import event, process
+from .conftest import event, host, process
+
+NOON = 1_700_000_000.0
 
 
-@dataclass(frozen=True)
-class LogPart:
-    content: bytes
-    next_offset: int
-    generation: int
-    ended: bool
+class Slaves:
+    """Logs of instances below a folder; `live` are those that have not ended."""
 
+    def __init__(self, folder):
+        self.folder, self.live = folder, set()
 
-class Log:
-    """One log file on a slave."""
+    def path(self, on, number, name="talker"):
+        path = log_path(self.folder / on, InstanceId(name, number))
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return path
 
-    def __init__(self, content=b"", *, ended=True):
-        self.content, self.generation, self.ended = content, 1, ended
+    def start(self, on, number, name="talker", *, at=NOON):
+        """A program is started; it has written nothing."""
+        path = self.path(on, number, name)
+        path.touch()
+        log_index.add(str(path), Mark(at, self.end(path), 77))
 
-    def read(self, offset, most):
-        start = max(0, len(self.content) + offset) if offset < 0 else offset
-        part = self.content[start : start + most]
-        end = start + len(part)
-        return LogPart(part, end, self.generation, self.ended and end == len(self.content))
+    def write(self, on, number, content, name="talker", *, at=NOON):
+        """A program writes, and the supervisor looks."""
+        path = self.path(on, number, name)
+        if not path.exists():
+            self.start(on, number, name, at=at)
+        with path.open("ab") as log:
+            log.write(content)
+        log_index.add(str(path), Mark(at, self.end(path), 0))
+
+    def end(self, path):
+        return (log_index.base(str(path)) or 0) + path.stat().st_size
+
+    def rotate(self, on, number, name="talker", *, most=1 << 20, keep=2):
+        path = self.path(on, number, name)
+        rotate(str(path), path.stat().st_size, LogLimits(most, keep))
+
+    def read(self, on, name, number=0, offset=0, max_bytes=0, *, tail=0, since=0.0):
+        state = self.folder / on
+        number = number or newest_instance(state, name).number
+        ended = (on, number) not in self.live
+        return read_log(state, LogQuery(name, number, offset, tail, since, max_bytes), ended=ended)
 
 
 @pytest.fixture
-def slave(client, monkeypatch):
+def slaves(client, tmp_path):
     """Logs by host and instance; the client reads from them."""
-    logs = {}
+    made = Slaves(tmp_path)
+    client.hosts = [host("alpha"), host("beta")]
 
-    def read_log(host, process, number, offset, max_bytes):
-        client.asked.append(("read_log", host, process, number))
-        return logs[host, number].read(offset, max_bytes)
+    def read(on, *query, **more):
+        client.asked.append(("read_log", on))
+        return made.read(on, *query, **more)
 
-    client.read_log = read_log
-    return logs
+    client.read_log = read
+    client.events = []
+    return made
 
 
-def test_a_log_is_copied_byte_by_byte_in_parts(rosrm, client, slave, monkeypatch):
+# --- all of it --------------------------------------------------------------------------------
+
+
+def test_a_log_is_copied_byte_by_byte_in_parts(rosrm, client, slaves, monkeypatch):
     monkeypatch.setattr("rosrm.cli.log_following._CHUNK", 3)
-    slave["alpha", 1] = Log("one\ntwo ä\n".encode(), ended=False)
+    slaves.write("alpha", 1, "one\ntwo ä\nend".encode())
     result = rosrm("logs", "talker")
-    assert (result.code, result.out) == (0, "one\ntwo ä\n")
+    assert (result.code, result.out) == (0, "one\ntwo ä\nend")
 
 
-def test_only_the_end_is_shown_with_tail(rosrm, client, slave):
-    slave["alpha", 1] = Log(b"x" * 5000 + b"end\n")
-    assert rosrm("logs", "talker", "--tail", "4").out == "end\n"
-    assert rosrm("logs", "talker", "--tail", "1kB").out == "x" * 996 + "end\n"
-    result = rosrm("logs", "talker", "--tail", "much")
-    assert (result.code, "--tail: 'much' is not a number" in result.err) == (2, True)
+def test_rotated_files_are_part_of_it(rosrm, client, slaves):
+    for word in (b"one\n", b"two\n"):
+        slaves.write("alpha", 1, word)
+        slaves.rotate("alpha", 1)
+    slaves.write("alpha", 1, b"three\n")
+    assert rosrm("logs", "talker").out == "one\ntwo\nthree\n"
 
 
-def test_the_log_of_an_ended_process_is_found_by_its_events(rosrm, client, slave):
+def test_what_was_dropped_is_said_with_its_size(rosrm, client, slaves):
+    """At the beginning, where files were removed, and between two files."""
+    slaves.write("alpha", 1, b"x" * 2000 + b"\n")
+    slaves.rotate("alpha", 1, keep=1)
+    slaves.write("alpha", 1, b"y" * 999 + b"\nkept\n")
+    slaves.rotate("alpha", 1, keep=1, most=5)
+    slaves.write("alpha", 1, b"new\n")
+    out = rosrm("logs", "talker").out
+    assert out == "--- talker: 3.0 kB before this were dropped ---\nkept\nnew\n"
+
+
+def test_restarts_and_former_instances_stand_apart(rosrm, client, slaves):
+    """In the order of their numbers, also on other hosts, with a line before each other start."""
+    client.events = [event(1, host="beta"), event(2, host="alpha")]
+    slaves.write("beta", 1, b"on beta\n")
+    slaves.write("alpha", 2, b"oh no\n")
+    slaves.start("alpha", 2)
+    slaves.write("alpha", 2, b"oh no\n")
+    out = rosrm("logs", "talker").out
+    out, marks = re.subn(r" at 2023-11-1.T..:..:..\.. ---", "", out)
+    assert marks == 2
+    again = "--- talker: started on alpha\n"
+    assert out == f"on beta\n{again}oh no\n{again}oh no\n"
+    assert rosrm("logs", "talker", "--host", "beta").out == "on beta\n"
+
+
+def test_the_log_of_an_ended_process_is_found_by_its_events(rosrm, client, slaves):
     client.processes = [process("job", "finished", "", number=0, kind="job")]
-    client.events = [event(1, process="job", host="beta"), event(2, process="job", host="")]
-    slave["beta", 0] = Log(b"done\n")
+    client.events = [event(1, process="job", host="alpha"), event(2, process="job", host="")]
+    slaves.write("alpha", 1, b"done\n", "job")
     assert rosrm("logs", "job").out == "done\n"
 
 
-def test_another_host_may_be_named(rosrm, client, slave):
-    slave["beta", 0] = Log(b"earlier\n")
-    assert rosrm("logs", "talker", "--host", "beta").out == "earlier\n"
+# --- a part of it -----------------------------------------------------------------------------
 
 
-def test_a_process_that_has_not_run_or_is_unknown_is_said(rosrm, client, slave):
-    client.events = []
+def test_tail_counts_lines_over_rotations_and_instances(rosrm, client, slaves):
+    slaves.write("alpha", 1, b"a\nb\n")
+    slaves.write("alpha", 2, b"c\n")
+    slaves.rotate("alpha", 2)
+    slaves.write("alpha", 2, b"d\ne")
+    slaves.start("alpha", 3)
+    for tail, lines in ((1, "e"), (2, "d\ne"), (3, "c\nd\ne")):
+        assert rosrm("logs", "talker", "--tail", tail).out == lines
+    out = rosrm("logs", "talker", "--tail", "4").out
+    assert [line for line in out.splitlines() if "---" not in line] == ["b", "c", "d", "e"]
+    result = rosrm("logs", "talker", "--tail", "64kB")
+    assert (result.code, "--tail" in result.err) == (2, True)
+
+
+def test_since_begins_at_a_time(rosrm, client, slaves):
+    """Within an instance, and without the instances before."""
+    now = time.time()
+    slaves.write("alpha", 1, b"hours ago\n", at=now - 9000)
+    slaves.write("alpha", 2, b"an hour ago\n", at=now - 3600)
+    slaves.write("alpha", 2, b"a minute ago\n", at=now - 60)
+    slaves.write("alpha", 2, b"now\n", at=now)
+    assert rosrm("logs", "talker", "--since", "10min").out == "a minute ago\nnow\n"
+    assert rosrm("logs", "talker", "--since", "2h").out.endswith("an hour ago\na minute ago\nnow\n")
+    assert "hours ago" not in rosrm("logs", "talker", "--since", "2h").out.splitlines()
+    result = rosrm("logs", "talker", "--since", "noon")
+    assert (result.code, "such as 10min" in result.err) == (2, True)
+
+
+def test_lines_have_times_and_names(rosrm, client, slaves):
+    """Each line has the time by which it was written; with several names each has its process."""
+    slaves.write("alpha", 1, b"one\ntwo\n")
+    slaves.write("alpha", 1, b"three", at=NOON + 5.25)
+    lines = rosrm("logs", "talker", "-t").out.splitlines()
+    assert [line.split(" ", 1)[1] for line in lines] == ["one", "two", "three"]
+    times = [datetime.fromisoformat(line.split()[0]).timestamp() for line in lines]
+    assert times == pytest.approx([NOON, NOON, NOON + 5.2])
+    client.processes = [*client.processes, process("ear")]
+    slaves.write("alpha", 2, b"heard\n", "ear")
+    out = rosrm("logs", "talker", "ear").out
+    assert out == "talker | one\ntalker | two\ntalker | three\near    | heard\n"
+
+
+# --- nothing ----------------------------------------------------------------------------------
+
+
+def test_a_program_that_was_never_started_is_said_with_its_reason(rosrm, client, slaves):
+    """Its log may exist, and is empty."""
+    client.processes = [process("talker", "failed", number=1, reason="no executable 'x' exists")]
+    slaves.path("alpha", 1).touch()
+    result = rosrm("logs", "talker")
+    assert result.code == 1
+    assert "it was not started" in result.err
+    assert "It is failed: no executable 'x' exists" in result.err
+
+
+def test_a_program_that_wrote_nothing_is_said(rosrm, client, slaves):
+    slaves.start("alpha", 1)
+    result = rosrm("logs", "talker")
+    assert (result.code, result.out) == (0, "")
+    assert "talker has written nothing" in result.err
+
+
+def test_a_process_that_waits_or_is_unknown_is_said(rosrm, client, slaves):
     result = rosrm("logs", "next")
     assert result.code == 1
-    assert "next has not run yet: it is queued. no host has room" in result.err
+    assert "next has no log: it was not started" in result.err
+    assert "It is queued: no host has room" in result.err
     result = rosrm("logs", "nobody")
     assert result.code == 1
     assert "there is no process 'nobody'" in result.err
 
 
-def test_follow_shows_what_is_added_and_a_rotated_log_from_its_start(
-    rosrm, client, slave, monkeypatch
-):
-    log = slave["alpha", 1] = Log(b"one\n", ended=False)
+@pytest.mark.parametrize("state", ["lost", "suspect", "left"])
+def test_a_host_that_is_away_is_not_asked(rosrm, client, slaves, state):
+    """The answer comes from the master's knowledge, at once, in the name of the host."""
+    client.hosts = [host("alpha", state)]
+    client.processes = [process("talker", "unreachable", reason="alpha is lost")]
+    result = rosrm("logs", "talker")
+    assert result.code == 1
+    assert (
+        f"the log of talker is on alpha, and alpha {'has' if state == 'left' else 'is'}"
+        in result.err
+    )
+    assert "talker has been unreachable for 12 s: alpha is lost" in result.err
+    assert ("read_log", "alpha") not in client.asked
+
+
+def test_older_parts_out_of_reach_are_said(rosrm, client, slaves):
+    client.hosts = [host("alpha"), host("beta", "lost")]
+    client.events = [event(1, host="beta"), event(2, host="alpha")]
+    slaves.write("alpha", 2, b"new\n")
+    result = rosrm("logs", "talker")
+    assert (result.code, result.out) == (0, "new\n")
+    assert "talker: what it wrote there is out of reach: beta is lost" in result.err
+
+
+def test_one_name_that_fails_does_not_keep_the_others(rosrm, client, slaves):
+    slaves.write("alpha", 1, b"one\n")
+    result = rosrm("logs", "nobody", "talker")
+    assert result.code == 1
+    assert result.out == "talker | one\n"
+    assert "there is no process 'nobody'" in result.err
+
+
+# --- on and on --------------------------------------------------------------------------------
+
+
+def test_follow_shows_what_is_added_over_a_rotation(rosrm, client, slaves, monkeypatch):
+    slaves.write("alpha", 1, b"one\n")
+    slaves.live.add(("alpha", 1))
     steps = iter(["grow", "rotate", "end"])
 
     def later(seconds):
         step = next(steps)
         if step == "grow":
-            log.content += b"two\n"
+            slaves.write("alpha", 1, b"two\n")
         elif step == "rotate":
-            log.content, log.generation = b"three\n", 2
+            slaves.write("alpha", 1, b"thr")
+            slaves.rotate("alpha", 1)
+            slaves.write("alpha", 1, b"ee\n")
         else:
-            log.ended = True
+            slaves.live.clear()
             client.processes = [process("talker", "finished")]
 
     monkeypatch.setattr("time.sleep", later)
@@ -103,9 +264,9 @@ def test_follow_shows_what_is_added_and_a_rotated_log_from_its_start(
     assert (result.code, result.out) == (0, "one\ntwo\nthree\n")
 
 
-def test_follow_goes_on_where_the_process_moves_to(rosrm, client, slave, monkeypatch):
-    slave["alpha", 1] = Log(b"on alpha\n")
-    slave["beta", 2] = Log(b"on beta\n")
+def test_follow_continues_where_the_process_moves_to(rosrm, client, slaves, monkeypatch):
+    slaves.write("alpha", 1, b"on alpha\n")
+    slaves.write("beta", 2, b"on beta\n")
     moves = iter([process("talker", "running", "beta", number=2), process("talker", "finished")])
 
     def later(seconds):
@@ -113,24 +274,46 @@ def test_follow_goes_on_where_the_process_moves_to(rosrm, client, slave, monkeyp
 
     monkeypatch.setattr("time.sleep", later)
     result = rosrm("logs", "talker", "-f")
-    assert (result.code, result.out) == (0, "on alpha\non beta\n")
-    assert "--- talker now runs on beta ---" in result.err
+    assert result.code == 0
+    first, mark, last = result.out.splitlines()
+    assert (first, last) == ("on alpha", "on beta")
+    assert mark.startswith("--- talker: started on beta at ")
 
 
-def test_follow_waits_for_a_log_that_its_host_is_about_to_begin(rosrm, client, slave, monkeypatch):
-    there = client.read_log
+def test_follow_waits_for_a_log_that_its_host_is_about_to_begin(rosrm, client, slaves, monkeypatch):
+    client.processes = [process("talker", "assigned")]
 
-    def read_log(host, process, number, offset, max_bytes):
-        if not slave:
-            raise Refused("this host has no log of talker", "unknown")
-        return there(host, process, number, offset, max_bytes)
+    def refuse(*_, **__):
+        raise Refused("this host has no log of talker", "unknown")
 
-    def later(seconds):
-        slave["alpha", 1] = Log(b"begun\n")
+    there, client.read_log = client.read_log, refuse
+    assert rosrm("logs", "talker").code == 1
+
+    def appear(seconds):
+        client.read_log = there
+        slaves.write("alpha", 1, b"begun\n")
+        monkeypatch.setattr("time.sleep", end)
+
+    def end(seconds):
         client.processes = [process("talker", "finished")]
 
-    client.read_log = read_log
-    assert rosrm("logs", "talker").code == 1
-    monkeypatch.setattr("time.sleep", later)
+    monkeypatch.setattr("time.sleep", appear)
     result = rosrm("logs", "talker", "-f")
     assert (result.code, result.out) == (0, "begun\n")
+
+
+def test_several_are_followed_at_once(rosrm, client, slaves, monkeypatch):
+    client.processes = [process("talker"), process("ear", number=2)]
+    slaves.write("alpha", 1, b"one\n")
+    slaves.write("alpha", 2, b"a\n", "ear")
+    slaves.live |= {("alpha", 1), ("alpha", 2)}
+
+    def later(seconds):
+        slaves.write("alpha", 1, b"two\n")
+        slaves.write("alpha", 2, b"b\n", "ear")
+        slaves.live.clear()
+        client.processes = [process("talker", "finished"), process("ear", "finished")]
+
+    monkeypatch.setattr(log_following.time, "sleep", later)
+    lines = rosrm("logs", "talker", "ear", "-f").out.splitlines()
+    assert lines == ["talker | one", "ear    | a", "talker | two", "ear    | b"]

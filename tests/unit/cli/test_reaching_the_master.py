@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import builtins
 import os
+import subprocess
 import sys
 import time
 from types import SimpleNamespace
 
 import pytest
+from typer.main import get_command
 
-from rosrm.cli import connection
-from rosrm.errors import RosrmError
+from rosrm.cli import connection, early
+from rosrm.cli.commands import app
+from rosrm.errors import NoMaster, RosrmError
+from rosrm.ros import client as client_module
 from rosrm.ros.settings import RosSettings
 
 
@@ -45,7 +49,7 @@ def test_a_command_looks_for_a_master_until_3_s_after_its_start(monkeypatch, ela
 
     class MasterClient:
         @staticmethod
-        def connect(settings, *, name, timeout):
+        def connect(settings, *, name, timeout, joined, begun):
             seen.update(name=name, timeout=timeout)
 
     module = SimpleNamespace(MasterClient=MasterClient)
@@ -54,6 +58,109 @@ def test_a_command_looks_for_a_master_until_3_s_after_its_start(monkeypatch, ela
     connection.connect(RosSettings())
     assert least <= seen["timeout"] <= most
     assert str(os.getpid()) in seen["name"]
+
+
+# --- before the command line is parsed ---------------------------------------------------------
+
+
+def test_each_command_that_asks_the_master_joins_ros_early():
+    """Those with a domain, but for master and slave, which become other programs."""
+    tree = get_command(app).commands
+    asking = {
+        name for name, command in tree.items()
+        if any(option.name == "domain" for option in command.params)
+    }  # fmt: skip
+    assert asking - {"master", "slave"} == early.ASKING
+
+
+@pytest.fixture
+def joined(monkeypatch):
+    """Fates of the participants that were made early."""
+    became = []
+
+    class Participant:
+        def __init__(self, settings, name):
+            self.settings = settings
+            became.append("made")
+
+        def close(self):
+            became.append("closed")
+
+    module = SimpleNamespace(Participant=Participant)
+    monkeypatch.setitem(sys.modules, "rosrm.ros.participant", module)
+    yield became
+    early.drop()
+
+
+@pytest.mark.parametrize(
+    ("line", "environment", "joins"),
+    [
+        (["ps", "--json"], {}, True),
+        (["events", "--host", "h"], {}, True),
+        (["ps", "-h"], {}, False),
+        (["ps", "--domain=3"], {}, False),
+        (["plugins", "--local"], {}, False),
+        (["--cluster", "c.yaml", "ps"], {}, False),
+        (["ps"], {"ROSRM_CLUSTER": "c.yaml"}, False),
+        (["config", "check", "ps"], {}, False),
+        ([], {}, False),
+    ],
+)
+def test_ros_is_joined_early_only_where_it_is_sure_how(joined, line, environment, joins):
+    """An option or a file may say that ROS is joined otherwise, or not at all."""
+    early.join(line, environment)
+    assert joined == ["made"] * joins
+
+
+def test_a_participant_is_handed_over_or_closed(joined):
+    """To one connection with the same settings; else its end closes it."""
+    early.join(["ps"], {})
+    assert early.take(RosSettings(domain=7)) is None
+    early.drop()
+    assert joined == ["made", "closed"]
+    early.join(["ps"], {})
+    assert early.take(RosSettings()) is not None
+    assert early.take(RosSettings()) is None
+    early.drop()
+    assert joined == ["made", "closed", "made"]
+
+
+def test_a_fault_of_ros_is_left_to_the_connection(monkeypatch):
+    """The connection meets the fault again and reports it."""
+    monkeypatch.setitem(sys.modules, "rosrm.ros.participant", None)
+    early.join(["ps"], {})
+    assert early.take(RosSettings()) is None
+
+
+@pytest.mark.parametrize("server", ["", "desk:11811"])
+def test_without_a_master_the_discovery_server_is_asked_after(monkeypatch, server):
+    """And the time is that since the user began to wait."""
+    settings = RosSettings(domain=3, discovery_server=server)
+    closed = []
+    participant = SimpleNamespace(settings=settings, close=lambda: closed.append(True))
+    monkeypatch.delenv("ROS_DISCOVERY_SERVER", raising=False)
+    monkeypatch.setattr(client_module, "find_master", lambda *_: None)
+    with pytest.raises(NoMaster) as refusal:
+        client_module.MasterClient.connect(
+            settings, name="x", timeout=1.6, joined=participant, begun=time.monotonic() - 3.0
+        )
+    assert "no master answered within 3.0 s" in str(refusal.value)
+    assert ("Is the discovery server at desk:11811 running" in str(refusal.value)) == bool(server)
+    assert "`rosrm master` running there" in str(refusal.value)
+    assert closed
+
+
+def test_commands_do_not_load_the_generator_of_messages():
+    """The generator costs 60 ms, and only builds of interfaces use it."""
+    code = (
+        "import sys; from rosrm.ros import client; from rosrm_msgs import srv\n"
+        "srv.List.__class__.__import_type_support__.__get__(srv.List)()\n"
+        "print('em' in sys.modules, 'rosidl_generator_py' in sys.modules)"
+    )
+    said = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
+    )
+    assert said.stdout.split() == ["False", "True"], said.stderr
 
 
 def test_without_ros_a_command_says_how_to_get_it(monkeypatch):

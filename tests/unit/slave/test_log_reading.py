@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import os
+import stat
+
 import pytest
 
 from rosrm.core.model import InstanceId
 from rosrm.errors import Refused
+from rosrm.ros.slave_services import LogQuery
+from rosrm.slave import log_reading
 from rosrm.slave.log_reading import newest_instance, read_log
+from rosrm.supervisor import log_index
 from rosrm.supervisor.client import LogLimits, log_path
-from rosrm.supervisor.logs import rotate
+from rosrm.supervisor.log_index import Mark
+from rosrm.supervisor.logs import LogKeeper, rotate
 
 P = InstanceId("robot/p", 3)
+LINES = b"".join(b"line %d\n" % number for number in range(1000))
 
 
 @pytest.fixture
@@ -21,8 +29,22 @@ def log(tmp_path):
     return path
 
 
-def read(tmp_path, offset=0, most=0, *, ended=False):
-    return read_log(tmp_path, P, offset, most, ended=ended)
+def read(tmp_path, offset=0, most=0, *, ended=False, **more):
+    query = LogQuery(P.process, P.number, offset, max_bytes=most, **more)
+    return read_log(tmp_path, query, ended=ended)
+
+
+def everything(tmp_path, **more):
+    """All content, with the offsets at which bytes are missing and how many."""
+    part = read(tmp_path, 0, **more)
+    content, gaps = part.content, [(0, part.offset)] if part.offset and not more else []
+    while part.content:
+        at = part.next_offset
+        part = read(tmp_path, at)
+        content += part.content
+        if part.content and part.offset > at:
+            gaps.append((at, part.offset - at))
+    return content, gaps
 
 
 @pytest.mark.parametrize(
@@ -33,13 +55,10 @@ def read(tmp_path, offset=0, most=0, *, ended=False):
         (4, 4, b"4567", 8),
         (8, 4, b"89", 10),
         (10, 4, b"", 10),
-        (-3, 0, b"789", 10),
-        (-3, 2, b"78", 9),
-        (-99, 0, b"0123456789", 10),
     ],
 )
 def test_parts(tmp_path, log, offset, most, content, after) -> None:
-    """From an offset, or from the end; the next offset continues without gap or repetition."""
+    """From an offset; the next offset continues without gap or repetition."""
     part = read(tmp_path, offset, most)
     assert (part.content, part.next_offset) == (content, after)
 
@@ -51,26 +70,89 @@ def test_ended_only_with_everything_read(tmp_path, log) -> None:
     assert not read(tmp_path, 4, ended=False).ended
 
 
-def test_what_is_appended_is_read_on(tmp_path, log) -> None:
-    """Following reads only what is new."""
-    first = read(tmp_path)
-    log.write_bytes(log.read_bytes() + b"ab")
-    assert read(tmp_path, first.next_offset).content == b"ab"
-    assert read(tmp_path, first.next_offset).generation == first.generation
-
-
 @pytest.mark.parametrize("keep", [0, 1, 2])
-def test_a_rotation_is_noticed(tmp_path, log, keep) -> None:
-    """The log was cut meanwhile: the generation changes, or the part begins at its start again."""
-    first = read(tmp_path)
-    rotate(str(log), 10, LogLimits(max_bytes=5, keep=keep))
+def test_a_rotation_changes_no_offset(tmp_path, log, keep) -> None:
+    """A reader continues at its offset; bytes that were not kept are a gap of known size."""
+    rotate(str(log), 10, LogLimits(max_bytes=6, keep=keep))
     log.write_bytes(b"new")
-    second = read(tmp_path, first.next_offset)
+    part = read(tmp_path, 2)
     if keep:
-        assert second.generation != first.generation
-        assert read(tmp_path, 0).content == b"new"
-    else:
-        assert second.content == b"new"
+        assert (part.content, part.offset, part.next_offset) == (b"456789", 4, 10)
+        part = read(tmp_path, 10)
+    assert (part.content, part.offset, part.next_offset) == (b"new", 10, 13)
+
+
+def test_what_is_written_while_a_log_is_cut_is_counted(tmp_path, log, monkeypatch) -> None:
+    """These bytes cannot be kept; the reader sees how many they were."""
+    copy = log_index.copy_from
+
+    def copy_late(*arguments):
+        with log.open("ab") as program:
+            program.write(b"late")
+        copy(*arguments)
+
+    monkeypatch.setattr(log_index, "copy_from", copy_late)
+    rotate(str(log), 10, LogLimits(max_bytes=10, keep=1))
+    log.write_bytes(b"new")
+    assert everything(tmp_path) == (b"0123456789new", [(10, 4)])
+
+
+@pytest.mark.parametrize("tail", [1, 2, 3, 250, 999, 1000, 2000])
+@pytest.mark.parametrize("end", [b"", b"unfinished"])
+def test_tail(tmp_path, log, monkeypatch, tail, end) -> None:
+    """So many lines, over files and blocks; one that is not finished counts."""
+    monkeypatch.setattr(log_reading, "_BLOCK", 50)
+    log.write_bytes(LINES[:5000])
+    rotate(str(log), 5000, LogLimits())
+    log.write_bytes(LINES[5000:] + end)
+    wanted = [*LINES.splitlines(keepends=True), *([end] if end else [])][-tail:]
+    assert everything(tmp_path, tail=tail)[0] == b"".join(wanted)
+
+
+def test_tail_of_a_log_that_was_just_rotated(tmp_path, log) -> None:
+    """The current file is empty: the lines are those of the one before."""
+    log.write_bytes(LINES)
+    rotate(str(log), len(LINES), LogLimits())
+    assert everything(tmp_path, tail=2)[0] == b"line 998\nline 999\n"
+
+
+def test_since(tmp_path, log) -> None:
+    """From the first byte that may have been written at that time on."""
+    log.write_bytes(b"abcdef")
+    log_index.begin(str(log), Mark(10.0, 0, 7))
+    for when, offset in ((11.0, 2), (13.0, 6)):
+        log_index.add(str(log), Mark(when, offset, 0))
+    rotate(str(log), 6, LogLimits())
+    log.write_bytes(b"gh")
+    log_index.add(str(log), Mark(4e9, 8, 0))
+    for since, content in (
+        (9.0, b"abcdefgh"),
+        (10.5, b"abcdefgh"),
+        (12.0, b"cdefgh"),
+        (3e9, b"gh"),
+    ):
+        assert everything(tmp_path, since=since)[0] == content
+    assert everything(tmp_path, since=5e9)[0] == b""
+
+
+def test_marks_cover_a_part(tmp_path, log) -> None:
+    """Each byte has a later mark, the newest ones the time of reading; starts have their pid."""
+    log_index.begin(str(log), Mark(10.0, 0, 7))
+    log_index.add(str(log), Mark(11.0, 4, 0))
+    log_index.add(str(log), Mark(12.0, 4, 8))
+    part = read(tmp_path)
+    assert part.marks[:3] == [(10.0, 0, 7), (11.0, 4, 0), (12.0, 4, 8)]
+    assert part.marks[3][1] == 10
+    assert [mark[1] for mark in read(tmp_path, 2, 2).marks] == [4]
+
+
+def test_a_loop_of_crashes_without_output_is_read_to_its_end(tmp_path, log, monkeypatch) -> None:
+    """More starts at one place than fit into an answer do not keep the reader there."""
+    monkeypatch.setattr(log_reading, "_MOST_MARKS", 5)
+    log_index.begin(str(log), Mark(10.0, 0, 1))
+    for pid in range(2, 20):
+        log_index.add(str(log), Mark(10.0, 0, pid))
+    assert everything(tmp_path)[0] == b"0123456789"
 
 
 def test_one_answer_is_bounded(tmp_path, log) -> None:
@@ -94,7 +176,79 @@ def test_newest_instance(tmp_path, log) -> None:
         log_path(tmp_path, InstanceId("robot/p", number)).write_bytes(b"")
     for process in ("robot", "robot/p.11", "p", "robot/p/12"):
         log_path(tmp_path, InstanceId(process, 99)).write_bytes(b"")
-    for suffix in (".1", ".parameters.yaml"):
+    for suffix in (".1", ".parameters.yaml", ".times"):
         path = log_path(tmp_path, InstanceId("robot/p", 11))
         path.with_name(path.name + suffix).write_bytes(b"")
     assert newest_instance(tmp_path, "robot/p") == InstanceId("robot/p", 10)
+    assert read(tmp_path).numbers == (3, 9, 10)
+
+
+# --- what the supervisor writes ---------------------------------------------------------------
+
+
+@pytest.fixture
+def keeper(tmp_path):
+    log_path(tmp_path, P).parent.mkdir(parents=True)
+    return LogKeeper(str(tmp_path), LogLimits(max_bytes=100, keep=1))
+
+
+def start(keeper, pid, content=b""):
+    key = (P.process, P.number)
+    program = keeper.open(key, ())
+    keeper.watch(key, 0.0, pid)
+    os.write(program, content)
+    os.close(program)
+
+
+def test_starts_and_growth_are_noted(tmp_path, keeper) -> None:
+    """A restart writes into the same file; the supervisor knows where it begins."""
+    start(keeper, 7, b"oh no\n")
+    keeper.look(1e9)
+    start(keeper, 8, b"oh no\n")
+    keeper.release((P.process, P.number))
+    marks = read(tmp_path, ended=True).marks
+    assert [mark[1:] for mark in marks] == [(0, 7), (6, 0), (6, 8), (12, 0)]
+
+
+@pytest.mark.parametrize("died", [False, True])
+def test_offsets_continue_in_another_supervisor(tmp_path, keeper, died) -> None:
+    """Rotations before and after it count alike."""
+    start(keeper, 7, b"x" * 150)
+    keeper.look(1e9)
+    if died:
+        keeper = LogKeeper(str(tmp_path), LogLimits(max_bytes=100, keep=1))
+        keeper.watch((P.process, P.number), 0.0)
+    with log_path(tmp_path, P).open("ab") as program:
+        program.write(b"y" * 120)
+    keeper.look(2e9)
+    with log_path(tmp_path, P).open("ab") as program:
+        program.write(b"z")
+    assert everything(tmp_path) == (b"y" * 100 + b"z", [(0, 170)])
+
+
+def test_a_log_that_was_cut_without_a_note_is_read_on(tmp_path, keeper) -> None:
+    """By hand, or by a supervisor that was killed in the middle of a rotation."""
+    start(keeper, 7, b"first\n")
+    keeper.look(1e9)
+    log_path(tmp_path, P).write_bytes(b"2\n")
+    keeper = LogKeeper(str(tmp_path), LogLimits(max_bytes=100, keep=1))
+    keeper.watch((P.process, P.number), 0.0)
+    keeper.look(2e9)
+    assert everything(tmp_path) == (b"2\n", [(0, 6)])
+
+
+def test_a_log_from_before_there_were_times(tmp_path, keeper) -> None:
+    """Its bytes count; their time is that of the first look."""
+    log_path(tmp_path, P).write_bytes(b"old\n")
+    start(keeper, 7, b"new\n")
+    keeper.look(1e9)
+    assert everything(tmp_path) == (b"old\nnew\n", [])
+
+
+def test_all_files_are_for_their_owner_alone(tmp_path, keeper) -> None:
+    """Rotated logs and indices are as private as the current log."""
+    start(keeper, 7, b"x" * 150)
+    keeper.look(1e9)
+    files = list(log_path(tmp_path, P).parent.iterdir())
+    assert len(files) == 4
+    assert {stat.S_IMODE(file.stat().st_mode) for file in files} == {0o600}

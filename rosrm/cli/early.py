@@ -1,0 +1,61 @@
+"""A DDS participant that is made before the command line is parsed.
+
+Discovery of the master takes 0.1 to 0.3 s of waiting, in threads of DDS. Parsing, and drawing of
+tables, takes as long to import. Both run side by side because the participant comes first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from typing import TYPE_CHECKING, Final
+
+from rosrm.ros import names
+from rosrm.ros.settings import RosSettings
+
+if TYPE_CHECKING:
+    from rosrm.ros.participant import Participant
+
+#: Commands that ask the master.
+ASKING: Final = frozenset({
+    "submit", "cancel", "restart", "migrate", "checkpoint", "restore",
+    "cordon", "uncordon", "drain", "status", "ps", "hosts", "plugins", "explain",
+    "events", "logs", "top",
+})  # fmt: skip
+#: Options with which a command joins ROS in another way, or not at all.
+_OTHERWISE: Final = ("-h", "--help", "--domain", "--cluster", "--local")
+
+_made: list[Participant] = []
+
+
+def join(arguments: Sequence[str], environment: Mapping[str, str]) -> None:
+    """Join ROS if a command is sure to want it, in the way that the environment says.
+
+    Args:
+        arguments: of the command line.
+        environment: may name a file with the settings of ROS; `connect` reads that.
+    """
+    if not _is_wanted(arguments, environment):
+        return
+    try:
+        from rosrm.ros.participant import Participant  # noqa: PLC0415 - the first import of ROS
+
+        _made.append(Participant(RosSettings(), names.client_node()))
+    except Exception:  # noqa: BLE001 - `connect` tries again, and reports the fault to the user
+        _made.clear()
+
+
+def _is_wanted(arguments: Collection[str], environment: Mapping[str, str]) -> bool:
+    first = next(iter(arguments), "")
+    otherwise = any(argument.startswith(_OTHERWISE) for argument in arguments)
+    return first in ASKING and not otherwise and not environment.get("ROSRM_CLUSTER")
+
+
+def take(settings: RosSettings) -> Participant | None:
+    """Hand over the participant if it was made with the same settings; the caller closes it."""
+    return _made.pop() if _made and _made[0].settings == settings else None
+
+
+def drop() -> None:
+    """Close a participant that no command took: the command line was wrong, for example."""
+    while _made:
+        _made.pop().close()
