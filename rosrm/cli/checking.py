@@ -24,6 +24,7 @@ class KindOfFile(str, Enum):
     CLUSTER = "cluster"
     HOST = "host"
     WORK = "work"
+    SIMULATION = "simulation"
 
 
 @config.callback()
@@ -34,11 +35,14 @@ def _group() -> None:
 @config.command()
 def check(
     files: Annotated[
-        list[Path], typer.Argument(metavar="FILE...", help="cluster.yaml, host.yaml or work.yaml.")
+        list[Path],
+        typer.Argument(
+            metavar="FILE...", help="cluster.yaml, host.yaml, work.yaml or a simulation's workload."
+        ),
     ],
     kind: Annotated[
         KindOfFile | None,
-        typer.Option("--kind", help="What the files are; by default their keys tell."),
+        typer.Option("--kind", help="What the files are; by default their keys or names tell."),
     ] = None,
 ) -> None:
     """Check files before they are used.
@@ -99,6 +103,12 @@ def _checked(file: Path, kind: KindOfFile | None, registry: Registry) -> str:
             host = load_host(file, registry)
             probes = ", ".join(registry.default_probes() if host.probes is None else host.probes)
             return f"a host: {host.host}, probes {probes or 'none'}"
+        case "simulation":
+            from rosrm.config.workload import load_workload
+
+            comparison = load_workload(file, registry)
+            hosts, processes = len(comparison.workload.hosts), len(comparison.workload.processes)
+            return f"a simulation: {hosts} hosts, {processes} processes"
         case _:
             specs = load_work(file, registry)
             jobs = sum(spec.kind.value == "job" for spec in specs)

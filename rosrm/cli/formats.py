@@ -7,15 +7,17 @@ import time
 from typing import Final
 
 _SIZES: Final = ("B", "kB", "MB", "GB", "TB", "PB")
+_BINARY_SIZES: Final = ("B", "KiB", "MiB", "GiB", "TiB", "PiB")
 
 
-def size(amount: float) -> str:
-    """Bytes: "512 B", "64.1 MB"."""
+def size(amount: float, *, binary: bool = False) -> str:
+    """Bytes: "512 B", "64.1 MB"; in powers of 1024 "61.1 MiB"."""
+    units, factor = (_BINARY_SIZES, 1024.0) if binary else (_SIZES, 1000.0)
     exponent = 0
-    while abs(amount) >= 999.5 and exponent < len(_SIZES) - 1:
-        amount, exponent = amount / 1000.0, exponent + 1
+    while abs(amount) >= factor - 0.5 and exponent < len(units) - 1:
+        amount, exponent = amount / factor, exponent + 1
     digits = 0 if exponent == 0 or abs(amount) >= 99.5 else 1
-    return f"{amount:.{digits}f} {_SIZES[exponent]}"
+    return f"{amount:.{digits}f} {units[exponent]}"
 
 
 def amount(value: float, unit: str) -> str:

@@ -142,7 +142,10 @@ def execute(
 
 @lab.command()
 def cut(host: Host, direction: Direction = Way.BOTH, name: Named = "lab") -> None:
-    """Cut a host's network, in one direction or both."""
+    """Cut a host's network, in one direction or both.
+
+    Cuts add up: after `--direction in` and `--direction out` both are cut. `heal` ends them.
+    """
     opened(name).cut(host, direction.value)
     _say_link(name, host)
 
@@ -187,9 +190,14 @@ def kill(host: Host, name: Named = "lab") -> None:
 
 @lab.command()
 def boot(host: Host, name: Named = "lab") -> None:
-    """Switch a host on again after `kill`. Its disk is as it was; nothing runs yet."""
+    """Switch a host on again after `kill`.
+
+    Its disk is as it was, and so is its network, cut or not; nothing runs yet.
+    """
     opened(name).boot(host)
-    typer.echo(f"{host} is up")
+    network = _network(name, host)
+    still = f"; its network is as before: {network}" if network else ""
+    typer.echo(f"{host} is up{still}")
 
 
 @lab.command()
@@ -306,6 +314,8 @@ def _host(name: str, limits: dict[str, str]) -> HostPlan:
     return HostPlan(name, None if memory is None else int(memory), cpu, int(disk))
 
 
+#: A limit that is a whole number of these was given in powers of 1024, and is shown so.
+_MIB = 2**20
 #: As `rosrm.config.units` calls what is measured.
 _MEASURES = {"memory": "size", "cpu": "cores", "disk": "size"}
 
@@ -347,8 +357,13 @@ def _check_rights() -> None:
 
 
 def _say_link(name: str, host: str) -> None:
+    typer.echo(f"{host}: {_network(name, host) or 'the network is as it should be'}")
+
+
+def _network(name: str, host: str) -> str:
+    """Return the faults of a host's network in words; "": none."""
     (row,) = [row for row in opened(name).status() if row.name == host]
-    typer.echo(f"{host}: {row.network or 'the network is as it should be'}")
+    return row.network
 
 
 def _table(rows: Iterable[HostStatus]) -> Any:
@@ -356,7 +371,7 @@ def _table(rows: Iterable[HostStatus]) -> Any:
 
     from rosrm.cli import tables
 
-    numbers = ("MEMORY", "CPU", "DISK", "RUNS")
+    numbers = ("MEMORY", "CPU", "DISK", "PROCESSES")
     made = tables.table("LAB", "HOST", "STATE", "ADDRESS", *numbers, "NETWORK", right=numbers)
     for row in rows:
         made.add_row(
@@ -376,5 +391,6 @@ def _table(rows: Iterable[HostStatus]) -> Any:
 def _used(used: int | None, limit: int | None) -> str:
     from rosrm.cli import formats
 
-    said = "?" if used is None else formats.size(used)
-    return said if limit is None else f"{said}/{formats.size(limit)}"
+    binary = limit is not None and limit % _MIB == 0
+    said = "?" if used is None else formats.size(used, binary=binary)
+    return said if limit is None else f"{said}/{formats.size(limit, binary=binary)}"

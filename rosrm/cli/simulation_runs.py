@@ -21,6 +21,7 @@ from rosrm.config.variants import (
     read_variants,
     settings_node,
     variant_in_text,
+    variant_of_option,
 )
 from rosrm.config.workload import load_workload
 from rosrm.core.declared import Declared
@@ -108,11 +109,8 @@ def _changes(request: Request) -> list[Node]:
     return [
         *listed,
         *map(variant_in_text, request.variant),
-        *(
-            variant_in_text(f"scoring: {{policy: {json.dumps(name)}}}", "--policy")
-            for name in request.policy
-        ),
-        *(variant_in_text(f"hosts: {count}", "--hosts") for count in request.hosts),
+        *(variant_of_option("--policy", ("scoring", "policy"), name) for name in request.policy),
+        *(variant_of_option("--hosts", ("hosts",), count) for count in request.hosts),
     ]
 
 

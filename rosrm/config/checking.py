@@ -21,7 +21,7 @@ from typing import (
 
 from pydantic import BaseModel, ConfigDict, ValidationError, create_model
 
-from rosrm.config.documents import Node, Problems
+from rosrm.config.documents import Node, Place, Problems
 from rosrm.config.units import UnfitAmount
 from rosrm.spelling import get_close_matches
 
@@ -73,6 +73,35 @@ def validated(wanted: type[T], node: Node, problems: Problems, where: str = "") 
             _note(wanted, node, dict(found), problems, where)
         return None
     return cast(T, holder.value)
+
+
+def salvaged(wanted: type[T], node: Node, problems: Problems) -> tuple[T | None, frozenset[str]]:
+    """Read the correct members of a document, and note every problem.
+
+    Returns:
+        The value, with the defaults of wrong members (None: a member without a default is wrong),
+        and the keys of the wrong members. An unknown key counts as the known one closest to it.
+    """
+    faults = Problems()
+    value = validated(wanted, node, faults)
+    problems.found.update(faults.found)
+    if value is not None:
+        return value, frozenset()
+    known = [f.name for f in fields(cast(Any, wanted)) if f.init]
+    right = {
+        name: item for name, item in node.items.items()
+        if name in known and not any(_lies_in(item, place) for place, _ in faults.found)
+    }  # fmt: skip
+    wrong = set(node.items) - set(right)
+    meant = {close for name in wrong - set(known) for close in get_close_matches(name, known, 1)}
+    value = validated(wanted, Node(right, node.place, node.key_place), Problems())
+    return value, frozenset(wrong & set(known) | meant)
+
+
+def _lies_in(node: Node, place: Place) -> bool:
+    """Return True if a place is that of the value, of its key, or of anything in the value."""
+    inner = node.value if isinstance(node.value, tuple) else node.items.values()
+    return place in (node.place, node.key_place) or any(_lies_in(one, place) for one in inner)
 
 
 def described(value: Any) -> str:

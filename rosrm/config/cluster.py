@@ -7,13 +7,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
-from rosrm.config.checking import validated
+from rosrm.config.checking import salvaged
 from rosrm.config.documents import Node, Problems, parse, read
+from rosrm.config.kinds import check_kind
 from rosrm.config.options import PluginCheck
 from rosrm.config.rules import check_amounts, check_name, settled
 from rosrm.config.settings import ClusterConfig
 from rosrm.registry import Registry
 
+#: Sections that the rules about times read.
+_OF_TIME: Final = ("liveness", "control")
 #: Beat periods, in which a quiet slave is heard once, that a silence must outlast.
 _BEATS: Final = 3
 #: Three times 0.2 s is a little more than 0.6 s.
@@ -39,8 +42,9 @@ def default_cluster(registry: Registry | None = None) -> ClusterConfig:
 def checked_cluster(root: Node, path: str | Path, registry: Registry | None) -> ClusterConfig:
     """A master's settings from a document that was read; otherwise as `load_cluster`."""
     problems = Problems()
-    config = validated(ClusterConfig, root, problems)
-    _check_rules(root, config, problems)
+    check_kind(root, "cluster")
+    config, wrong = salvaged(ClusterConfig, root, problems)
+    _check_rules(root, config if wrong.isdisjoint(_OF_TIME) else None, problems)
     plugins = PluginCheck(registry, problems)
     plugins.check_resources(root.get("defaults", "needs"), "defaults.needs")
     config = _with_options(root, config or ClusterConfig(), plugins)

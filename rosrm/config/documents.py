@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Union
@@ -23,14 +23,14 @@ MOST_VALUES: Final = 200_000
 
 @dataclass(frozen=True, slots=True, order=True)
 class Place:
-    """Where something stands; line and column count from 1."""
+    """A line and a column of a file, from 1; line 0: an option of the command line."""
 
     file: str
     line: int
     column: int
 
     def __str__(self) -> str:
-        return f"{self.file}:{self.line}:{self.column}"
+        return f"{self.file}:{self.line}:{self.column}" if self.line else self.file
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,13 +100,22 @@ class Problems:
         """Raise one `ConfigError` for all of them, if there are any."""
         if not self.found:
             return
-        lines = [f"{place}: {text}" for place, text in sorted(self.found)]
+        lines = list(_allowed_once(f"{place}: {text}" for place, text in sorted(self.found)))
         if len(lines) == 1:
             raise ConfigError(lines[0])
         raise ConfigError("\n  ".join([f"{len(lines)} errors in {self._file()}", *lines]))
 
     def _file(self) -> str:
         return next(iter(self.found))[0].file
+
+
+def _allowed_once(lines: Iterable[str]) -> Iterator[str]:
+    """Yield the lines; each list of what is allowed is given with the first of them alone."""
+    said = set()
+    for line in lines:
+        fault, mark, allowed = line.partition(" Allowed: ")
+        yield fault if allowed in said else line
+        said.update([allowed] if mark else [])
 
 
 def read(path: str | Path) -> Node:

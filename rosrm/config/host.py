@@ -7,6 +7,7 @@ from pathlib import Path
 
 from rosrm.config.checking import validated
 from rosrm.config.documents import Node, Problems, read
+from rosrm.config.kinds import check_kind
 from rosrm.config.options import PluginCheck
 from rosrm.config.rules import check_amounts, check_name, settled
 from rosrm.config.settings import HostConfig
@@ -25,6 +26,7 @@ def load_host(path: str | Path, registry: Registry | None = None) -> HostConfig:
             as they are.
     """
     root, problems = read(path), Problems()
+    check_kind(root, "host")
     config = validated(HostConfig, root, problems)
     _check_rules(root, problems)
     chosen = root.get("probes")

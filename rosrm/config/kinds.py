@@ -1,35 +1,81 @@
-"""Tells by its keys what a file configures."""
+"""The kind of a configuration file, by its keys or else by its name."""
 
 from __future__ import annotations
 
+from collections.abc import Set as AbstractSet
 from dataclasses import fields
+from pathlib import Path
 from typing import Final
 
 from rosrm.config.documents import Node
 from rosrm.config.settings import ClusterConfig, HostConfig
 from rosrm.errors import ConfigError
 
+#: Keys of each kind of file.
 _KEYS: Final = {
     "cluster": {f.name for f in fields(ClusterConfig)},
     "host": {f.name for f in fields(HostConfig)},
     "work": {"processes", "defaults"},
+    "simulation": {
+        "name", "seed", "until", "hosts", "processes", "model", "cluster", "variants",
+    },
+}  # fmt: skip
+#: A file without this key is of another kind.
+_NEEDED: Final = {"work": "processes", "simulation": "hosts"}
+#: End of a file's name, before `.yaml`.
+_NAMES: Final = {"cluster": "cluster", "host": "host", "work": "work", "sim": "simulation"}
+#: What uses a file of each kind.
+_COMMANDS: Final = {
+    "cluster": "rosrm master --config",
+    "host": "rosrm slave --config",
+    "work": "rosrm submit",
+    "simulation": "rosrm simulate",
 }
 
 
 def kind_of(root: Node) -> str:
-    """The kind of file: "cluster", "host" or "work".
+    """Return the kind of file: "cluster", "host", "work" or "simulation".
 
     Raises:
-        ConfigError: its keys fit none, or several as well.
+        ConfigError: its keys fit none, or several as well, and its name tells none.
     """
-    given = set(root.items)
-    fits = {kind: len(given & keys) for kind, keys in _KEYS.items()}
-    most = max(fits.values())
-    best = [kind for kind, count in fits.items() if count == most]
-    if most and len(best) == 1:
+    best = _best(set(root.items))
+    if len(best) == 1:
         return best[0]
-    if most:
+    stem = Path(root.place.file).stem.replace("-", ".").replace("_", ".")
+    named = _NAMES.get(stem.rsplit(".", 1)[-1])
+    if named is not None and (named in best or not best):
+        return named
+    if best:
         said = f"its keys fit a {' and a '.join(best)} file alike"
     else:
-        said = "it has no key of a cluster, host or work file"
+        said = "it has no key of a cluster, host, work or simulation file"
     raise ConfigError(f"{root.place}: {said}; say which with --kind")
+
+
+def check_kind(root: Node, wanted: str) -> None:
+    """Raise `ConfigError` if most keys are those of another kind of file."""
+    given = set(root.items)
+    best = _best(given)
+    if len(best) != 1 or best[0] == wanted:
+        return
+    there = _belonging(given, best[0])
+    if len(there) * 2 > len(given):
+        file, keys = root.place.file, ", ".join(key for key in root.items if key in there)
+        raise ConfigError(
+            f"{file}: a {wanted} file is wanted, and this is a {best[0]} file, by its keys {keys}; "
+            f"it is for `{_COMMANDS[best[0]]} {file}`"
+        )
+
+
+def _best(given: AbstractSet[str]) -> list[str]:
+    """Return the kinds with most of the keys; none if no kind has any of them."""
+    fits = {kind: len(_belonging(given, kind)) for kind in _KEYS}
+    most = max(fits.values())
+    return [kind for kind, count in fits.items() if count == most > 0]
+
+
+def _belonging(given: AbstractSet[str], kind: str) -> AbstractSet[str]:
+    """Return the keys that a kind of file has; none if its needed key is missing."""
+    without = kind in _NEEDED and _NEEDED[kind] not in given
+    return frozenset() if without else given & _KEYS[kind]

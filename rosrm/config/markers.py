@@ -6,9 +6,11 @@ imported without it.
 
 from __future__ import annotations
 
+import json
+import re
 import shlex
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 
 @dataclass(frozen=True)
@@ -102,6 +104,24 @@ class Words:
         if not isinstance(given, str):
             return tuple(given) if isinstance(given, list) else given
         try:
-            return tuple(shlex.split(given))
+            words = tuple(shlex.split(given))
         except ValueError as error:
             raise ValueError(f"{given!r} cannot be split into words: {error}") from None
+        found = _SHELL_SYNTAX.search(_QUOTED.sub(_blank, given))
+        if found:
+            raise ValueError(
+                f"{given!r} has {found[0].strip()!r} outside quotes, and no shell reads it. Write "
+                f"[bash, -c, {json.dumps(given)}] for a shell, or quote {found[0].strip()!r} to "
+                "pass it to the program as it is"
+            )
+        return words
+
+
+#: Quoted and escaped parts of a text.
+_QUOTED: Final = re.compile(r"""\\.|'[^']*'|"(?:\\.|[^"\\])*\"""", re.DOTALL)
+#: Syntax that a shell would act on, `~` at the start of an argument included.
+_SHELL_SYNTAX: Final = re.compile(r"&&|\|\||>>|<<|[|&;<>`*]|\$[\w{(]+|(?<=\s)~(?=/|\s|$)")
+
+
+def _blank(quoted: re.Match[str]) -> str:
+    return "_" * len(quoted[0])

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field, fields, replace
 from typing import Annotated, Any, Final, Literal
 
@@ -217,22 +218,32 @@ class Complaint:
     text: str
 
 
-def complaints(process: ProcessInFile) -> Iterator[Complaint]:
-    """Every rule that a well-formed process breaks."""
-    yield from _about_program(process)
-    if process.is_ros:
-        yield from _about_node(process)
-    else:
-        yield from _about_others(process)
-    yield from _about_surroundings(process)
+def complaints(
+    process: ProcessInFile, wrong: AbstractSet[str] = frozenset()
+) -> Iterator[Complaint]:
+    """Yield every rule that a process breaks.
+
+    Args:
+        process: as far as it could be read.
+        wrong: keys whose values could not be read; rules that read them are left out.
+    """
+    for rule, keys in _RULES:
+        if wrong.isdisjoint(keys):
+            yield from rule(process)
+
+
+def _about_ros(process: ProcessInFile) -> Iterator[Complaint]:
+    yield from _about_node(process) if process.is_ros else _about_others(process)
+
+
+def _about_restarts(process: ProcessInFile) -> Iterator[Complaint]:
     if process.restart.max_delay < process.restart.delay:
         text = "restart.max_delay must not be less than restart.delay"
         yield Complaint(("restart", "max_delay"), text)
-    yield from _about_faults(process)
 
 
 def _about_faults(process: ProcessInFile) -> Iterator[Complaint]:
-    standby, health = process.standby, process.health
+    standby = process.standby
     if standby.wanted and process.migration.strategy != "handoff":
         text = "a standby follows the state as in a handoff: say `migration: handoff`"
         yield Complaint(("standby",), text)
@@ -245,11 +256,12 @@ def _about_faults(process: ProcessInFile) -> Iterator[Complaint]:
     if process.host_loss.delay and process.host_loss.then == "wait":
         text = "host_loss.delay goes with `then: elsewhere` or `stop`"
         yield Complaint(("host_loss", "delay"), text)
-    if health is not None:
-        yield from _about_health(process, health)
 
 
-def _about_health(process: ProcessInFile, health: HealthInFile) -> Iterator[Complaint]:
+def _about_health(process: ProcessInFile) -> Iterator[Complaint]:
+    health = process.health
+    if health is None:
+        return
     if bool(health.topic) != bool(health.rate):
         text = "health.topic and health.rate (Hz, above 0) go together"
         yield Complaint(("health",), text)
@@ -310,11 +322,8 @@ def _about_node(process: ProcessInFile) -> Iterator[Complaint]:
 
 def _about_surroundings(process: ProcessInFile) -> Iterator[Complaint]:
     directory = process.working_directory
-    if directory is not None and not directory.startswith(("/", "~")):
-        text = (
-            f"working_directory: {directory!r} is not absolute. It is one of the host that runs "
-            "the process; leave it out for a directory of the process's own"
-        )
+    if directory == "":
+        text = 'working_directory: "" is no directory; leave it out for one of the process\'s own'
         yield Complaint(("working_directory",), text)
     for name, value in process.environment.items():
         if not name or "=" in name or "\0" in name + value:
@@ -331,3 +340,16 @@ def _fault_of_parameter(value: Any) -> str:
     if any(isinstance(item, float) and not math.isfinite(item) for item in items):
         return "a finite number is wanted"
     return "a list of ROS holds values of one type" if len(kinds) > 1 else ""
+
+
+_Rule = Callable[[ProcessInFile], Iterator[Complaint]]
+_PROGRAM: Final = ("package", "executable", "module", "command")
+#: Each rule, and the keys that it reads.
+_RULES: Final[tuple[tuple[_Rule, tuple[str, ...]], ...]] = (
+    (_about_program, _PROGRAM),
+    (_about_ros, ("name", "ros", *_PROGRAM, *_ROS_ONLY, "readiness")),
+    (_about_surroundings, ("working_directory", "environment")),
+    (_about_restarts, ("restart",)),
+    (_about_faults, ("standby", "migration", "kind", "isolation", "host_loss")),
+    (_about_health, ("health", "ros", *_PROGRAM)),
+)

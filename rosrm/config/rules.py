@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 from typing import Final
@@ -44,3 +45,12 @@ def check_amounts(
 def settled(directory: Path, file: str | Path) -> Path:
     """A directory that a file names: `~` is the user's, a relative one is beside the file."""
     return Path(file).absolute().parent / directory.expanduser()
+
+
+def settled_on_host(path: str, file: str | Path) -> str:
+    """Return a path for the host that runs a process.
+
+    A relative path is beside the file. `~` stays for the slave, because the home of its user may
+    be another one there.
+    """
+    return path if path.startswith("~") else os.path.normpath(Path(file).absolute().parent / path)

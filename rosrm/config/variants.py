@@ -10,7 +10,7 @@ from typing import Annotated, Any, Final
 
 from rosrm.config.checking import near, validated
 from rosrm.config.cluster import checked_cluster
-from rosrm.config.documents import Node, Problems, parse, read
+from rosrm.config.documents import Node, Place, Problems, parse, read
 from rosrm.config.merging import in_depth
 from rosrm.config.settings import ClusterConfig
 from rosrm.config.units import Quantity
@@ -59,9 +59,18 @@ def read_variants(path: str | Path) -> list[Node]:
     return variants_of(root)
 
 
-def variant_in_text(text: str, option: str = "--variant") -> Node:
-    """A variant that is given on the command line, by an option."""
-    return parse(text, option)
+def variant_in_text(text: str) -> Node:
+    """A variant that is given on the command line as text."""
+    return parse(text, "--variant")
+
+
+def variant_of_option(option: str, path: tuple[str, ...], value: str | int) -> Node:
+    """Return the variant that sets one value, given by an option of the command line."""
+    place = Place(f"{option} {value}", 0, 0)
+    node = Node(value, place)
+    for key in reversed(path):
+        node = Node({key: node}, place)
+    return node
 
 
 def settings_node(config: Mapping[str, Any], name: str) -> Node:

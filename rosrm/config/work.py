@@ -7,14 +7,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from rosrm.config.checking import near, validated
+from rosrm.config.checking import near, salvaged
 from rosrm.config.documents import Node, Problems, read
 from rosrm.config.foreach import rows_of, substituted
+from rosrm.config.kinds import check_kind
 from rosrm.config.merging import merged, written_out
 from rosrm.config.namesakes import refuse_namesakes
 from rosrm.config.options import PluginCheck
 from rosrm.config.process import ProcessInFile, complaints
-from rosrm.config.rules import check_amounts, check_name
+from rosrm.config.rules import check_amounts, check_name, settled_on_host
 from rosrm.core.model import ProcessSpec
 from rosrm.registry import Registry
 
@@ -32,6 +33,7 @@ def load_work(path: str | Path, registry: Registry | None = None) -> tuple[Proce
             are taken as they are (the master checks them).
     """
     root, problems = read(path), Problems()
+    check_kind(root, "work")
     entries = _entries(root, problems)
     defaults = _defaults(root, problems)
     plugins = PluginCheck(registry, problems)
@@ -40,7 +42,7 @@ def load_work(path: str | Path, registry: Registry | None = None) -> tuple[Proce
         for entry in entries
         for node in _expanded(merged(defaults, written_out(entry)), problems)
     ]
-    specs = [_process(node, plugins, problems) for node in nodes]
+    specs = [_process(node, path, plugins, problems) for node in nodes]
     refuse_namesakes(nodes, "process", problems)
     problems.raise_any()
     return tuple(spec for spec in specs if spec is not None)
@@ -88,14 +90,17 @@ def _expanded(entry: Node, problems: Problems) -> Iterator[Node]:
             yield made
 
 
-def _process(node: Node, plugins: PluginCheck, problems: Problems) -> ProcessSpec | None:
+def _process(
+    node: Node, path: str | Path, plugins: PluginCheck, problems: Problems
+) -> ProcessSpec | None:
     check_name(node.get("name"), "process", problems)
     check_amounts(node.get("needs"), "needs", problems)
-    process = validated(ProcessInFile, node, problems)
+    process, wrong = salvaged(ProcessInFile, node, problems)
     if process is None:
         return None
-    for complaint in complaints(process):
+    for complaint in complaints(process, wrong):
         problems.add(node.deepest(complaint.path).place, complaint.text)
+    process = _on_host(process, path)
     strategy = process.migration.strategy
     if strategy is None:
         return process.spec()
@@ -106,3 +111,13 @@ def _process(node: Node, plugins: PluginCheck, problems: Problems) -> ProcessSpe
     said = given.items if given is not None else {}
     options = {name: value for name, value in checked.items() if name in said}
     return replace(process, migration=replace(process.migration, options=options)).spec()
+
+
+def _on_host(process: ProcessInFile, path: str | Path) -> ProcessInFile:
+    """Return the process with its program and directory as `settled_on_host` writes them."""
+    directory, command = process.working_directory, process.command
+    if directory:
+        process = replace(process, working_directory=settled_on_host(directory, path))
+    if command and "/" in command[0]:
+        process = replace(process, command=(settled_on_host(command[0], path), *command[1:]))
+    return process

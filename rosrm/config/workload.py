@@ -13,6 +13,7 @@ import numpy as np
 from rosrm.config.checking import near, validated
 from rosrm.config.documents import Node, Problems, read
 from rosrm.config.foreach import rows_of, substituted
+from rosrm.config.kinds import check_kind
 from rosrm.config.merging import merged, written_out
 from rosrm.config.namesakes import refuse_namesakes
 from rosrm.config.options import PluginCheck
@@ -146,6 +147,7 @@ def load_workload(
         seed: instead of the file's.
     """
     root, problems = read(path), Problems()
+    check_kind(root, "simulation")
     check_keys(root, _PARTS, "", problems)
     hosts = [_host(node, problems) for node in _listed(root, "hosts", problems)]
     nodes = list(_listed(root, "processes", problems))

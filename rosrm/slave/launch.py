@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
@@ -14,6 +15,7 @@ from rosrm.errors import CriuError, LaunchError
 from rosrm.slave import ament_index
 from rosrm.slave.environment import Whereabouts, process_environment
 from rosrm.slave.ros_arguments import join_arguments, parameters_text, ros_arguments
+from rosrm.supervisor.children import SpawnError, find_executable
 from rosrm.supervisor.client import LaunchOrder, log_path
 
 #: Seconds for a restore, at most: whoever ordered it gives up sooner.
@@ -47,6 +49,8 @@ def launch_order(
     spec = assignment.spec
     environment = process_environment(assignment, base_environment, where)
     command = _command(spec, environment, python)
+    if spec.checkpointed:  # else the program that restores it would start, and then fail
+        _check_program(command[0], environment)
     if spec.ros_node:
         parameters_file = _write_parameters(assignment, state_directory)
         ros = ros_arguments(spec, assignment.node_name, parameters_file)
@@ -90,13 +94,20 @@ def _by_way_of_images(
 
 
 def _working_directory(spec: ProcessSpec) -> str | None:
-    """Where it runs, "~" being the home of the slave's user on this host."""
+    """Return the directory that the process runs in; None: the supervisor's default."""
     if spec.working_directory is None:
         return None
+    return _at_home(spec.working_directory, "working_directory")
+
+
+def _at_home(path: str, where: str) -> str:
+    """Replace a leading `~` by the home of the slave's user on this host."""
+    if not path.startswith("~"):
+        return path
     try:
-        return str(Path(spec.working_directory).expanduser())
+        return str(Path(path).expanduser())
     except RuntimeError as error:
-        raise LaunchError(f"working_directory {spec.working_directory!r}: {error}") from None
+        raise LaunchError(f"{where} {path!r}: {error}") from None
 
 
 def _command(spec: ProcessSpec, environment: Mapping[str, str], python: str) -> tuple[str, ...]:
@@ -110,7 +121,18 @@ def _command(spec: ProcessSpec, environment: Mapping[str, str], python: str) -> 
         return (python, "-m", spec.module)
     if not spec.command:
         raise LaunchError(f"{spec.name!r} says nothing to run: package, module or command")
-    return spec.command
+    program, *words = spec.command
+    return (_at_home(program, "command"), *words)
+
+
+def _check_program(word: str, environment: Mapping[str, str]) -> None:
+    """Raise `LaunchError` if a command's program is missing on this host."""
+    try:
+        path = find_executable(word, environment)
+    except SpawnError as error:
+        raise LaunchError(str(error)) from None
+    if path.startswith("/") and not os.access(path, os.X_OK):
+        raise LaunchError(f"no executable {path!r} exists")
 
 
 def _write_parameters(assignment: Assignment, state_directory: Path) -> str | None:

@@ -64,7 +64,7 @@ def spawn(
         )
     except OSError as error:
         transient = error.errno in _TRANSIENT
-        raise SpawnError(_why(path, error), transient=transient) from None
+        raise SpawnError(_why(path, directory, error), transient=transient) from None
     except ValueError as error:  # a NUL byte in an argument, a "=" in a variable's name
         raise SpawnError(f"{argv[0]!r} cannot be started: {error}") from None
     finally:
@@ -94,7 +94,8 @@ def find_executable(word: str, environment: Mapping[str, str]) -> str:
     raise SpawnError(f"no executable {word!r} was found in PATH, {search}{passed_over}")
 
 
-def _why(path: str, error: OSError) -> str:
+def _why(path: str, directory: str, error: OSError) -> str:
+    path = os.path.join(directory, path)
     if error.errno == errno.ENOENT and os.path.exists(path):
         return f"{path} cannot be started: the interpreter in its first line does not exist"
     if error.errno == errno.ENOENT:

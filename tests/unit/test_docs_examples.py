@@ -4,20 +4,25 @@ from __future__ import annotations
 
 import re
 import xml.etree.ElementTree as ET
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import typer.main
+import yaml
+from typer.testing import CliRunner
 
 from rosrm.cli.commands import app
-from rosrm.config import load_cluster, load_host, load_work
 from rosrm.registry import Registry
 from rosrm.ros import names
+from tests import pages
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
 PAGES = sorted([*ROOT.glob("*.md"), *DOCS.rglob("*.md"), *ROOT.glob("*/README.md")])
+
+TREE = typer.main.get_command(app)
 
 _FENCE = re.compile(
     r"(?:^<!-- ([^\n]*) -->\n)?^```(\w+)([^\n]*)\n(.*?)^```$", re.MULTILINE | re.DOTALL
@@ -40,13 +45,6 @@ def blocks(page: Path, language: str) -> Iterator[tuple[str, str, str]]:
 # --- files ------------------------------------------------------------------------------------
 
 
-def loader_of(title: str):
-    """A file is told by the end of its name."""
-    if title.endswith("cluster.yaml"):
-        return load_cluster
-    return load_work if title.endswith("work.yaml") else load_host
-
-
 FILES = [
     pytest.param(title, text, id=f"{name_of(page)}:{title}:{number}")
     for page in PAGES
@@ -61,10 +59,25 @@ def registry() -> Registry:
 
 
 @pytest.mark.parametrize(("title", "text"), FILES)
-def test_every_file_that_is_shown_loads(title, text, tmp_path, registry):
+def test_every_file_that_is_shown_is_right(title, text, tmp_path, monkeypatch, registry):
+    """By `rosrm config check FILE`, without its kind: keys or name tell it."""
     file = tmp_path / title
     file.write_text(text, encoding="utf-8")
-    loader_of(title)(file, registry)
+    monkeypatch.setattr(Registry, "discover", lambda: registry)
+    done = CliRunner().invoke(app, ["config", "check", str(file)])
+    assert done.exit_code == 0, done.exception
+    assert f"{title}: ok" in done.output
+
+
+def test_no_two_pages_have_clusters_of_one_name():
+    """They would find each other's processes in the journal, which lies below the name."""
+    pages = {}
+    for page in PAGES:
+        for _, title, text in blocks(page, "yaml"):
+            given = yaml.safe_load(text) if title.endswith("cluster.yaml") else {}
+            if "state" not in given:
+                pages.setdefault(given.get("name"), set()).add(name_of(page))
+    assert {name: where for name, where in pages.items() if name and len(where) > 1} == {}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
@@ -133,8 +146,6 @@ def test_every_file_of_the_documentation_is_reached_from_its_index():
 
 # --- commands ---------------------------------------------------------------------------------
 
-TREE = typer.main.get_command(app)
-
 
 def shown_commands(page: Path) -> Iterator[list[str]]:
     """The words of each `rosrm` command line in the console blocks of a page."""
@@ -161,6 +172,45 @@ def test_every_command_that_is_shown_exists(page):
         assert {word for word in here if word.startswith("-")} <= known, words
 
 
+def test_every_page_with_commands_is_run_or_says_why_not():
+    """The lists in `tests/pages.py` are all there is."""
+    run = {*pages.RUN, pages.RUN_IN_LAB}
+    assert run.isdisjoint(pages.NOT_RUN)
+    assert all(pages.NOT_RUN.values())
+    assert pages.pages_with_commands() == {*run, *pages.NOT_RUN}
+
+
+@pytest.mark.parametrize("page", [*pages.RUN, pages.RUN_IN_LAB])
+def test_every_block_that_is_not_run_says_why(page):
+    """And of every page that is run, something is."""
+    typed = [block for block in pages.blocks(page) if block.language == "console"]
+    assert all(block.about for block in typed if block.mark)
+    assert any(block.mark != "not run" for block in typed)
+    marked = re.findall(r"<!-- (?:not run|sample|until)", (ROOT / page).read_text("utf-8"))
+    assert len(marked) == sum(bool(block.mark) for block in typed)
+
+
+SHOWN = """
+NAME        STATE     HOST    SINCE    CPU   MEMORY   WHY
+────────────────────────────────
+sleeper_0   running   desk    3.1 s   0.00   1.7 MB
+"""
+
+
+@pytest.mark.parametrize(
+    ("given", "same"),
+    [
+        (SHOWN.replace("3.1 s", "12 s").replace("1.7 MB", "900 kB").replace("──", "───"), True),
+        (SHOWN.replace("running", "assigned"), False),
+        (SHOWN.replace("sleeper_0", "sleeper_1"), False),
+        (SHOWN + "one more line", False),
+    ],
+)
+def test_an_answer_is_compared_but_for_what_differs_each_time(given, same):
+    assert pages.matches(SHOWN, given) is same
+    assert pages.matches("NAME ... desk ...", given)
+
+
 # --- names ------------------------------------------------------------------------------------
 
 TOPICS = {
@@ -180,6 +230,15 @@ def test_the_protocol_page_has_every_name():
     text = (DOCS / "reference" / "protocol.md").read_text(encoding="utf-8")
     assert all(re.search(rf"`(host/HOST/)?{name}`", text) for name in NAMES)
     assert names.token("robot-1") in text
+
+
+def test_the_protocol_page_says_how_a_host_gets_its_name():
+    """Done by the page's own words, its example comes out as it is shown, and as rosrm has it."""
+    text = (DOCS / "reference" / "protocol.md").read_text(encoding="utf-8")
+    example = re.search(r"`(robot-1)` becomes `(\w+)`", text)
+    assert "`_` and the CRC-32 (as in zlib; 8 hex digits) of the name in UTF-8" in text
+    by_the_page = f"{example[1].replace('-', '_')}_{zlib.crc32(example[1].encode()):08x}"
+    assert example[2] == by_the_page == names.token(example[1])
 
 
 def test_the_security_policy_has_every_name_and_no_other():

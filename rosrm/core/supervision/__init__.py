@@ -9,7 +9,8 @@
               AmendOrdered     -                                             refused
     starting  Spawned          -                                             running
                                a stop came in between: SIGINT                stopping
-              SpawnFailed      final, or by policy where it may pass         failed, backoff
+              SpawnFailed      this host cannot start it: -                  refused
+                               transient: by policy                          failed, backoff
               StopOrdered      Unspawn (one in hand is stopped later)        starting
               FencePassed      Unspawn (one in hand is stopped later)        starting
               FenceOrdered     Unspawn (one in hand is killed later)         starting

@@ -13,6 +13,7 @@ from rosrm.core.supervision.instance import (
     FAILED,
     FENCED,
     KILL_AGAIN,
+    REFUSED,
     RUNNING,
     STARTING,
     STEPS,
@@ -74,8 +75,8 @@ def _spawn_failed(instance: Instance, event: Event, now: float) -> list[Command]
         _end_as_meant(instance, "stopped before it was started")
     elif event.transient:
         _by_policy(instance, event.message, succeeded=False, now=now)
-    else:
-        end(instance, FAILED, event.message)
+    else:  # the program or its directory is missing here: the master tries another host
+        end(instance, REFUSED, event.message)
     return [Tell(instance.key)]
 
 

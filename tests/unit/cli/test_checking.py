@@ -51,7 +51,48 @@ def test_a_file_that_may_be_either_wants_the_kind(rosrm, file):
     assert "its keys fit a cluster and a host file alike; say which with --kind" in result.err
     assert rosrm("config", "check", "--kind", "cluster", file("ros: {domain: 1}")).code == 0
     result = rosrm("config", "check", file(""))
-    assert "it has no key of a cluster, host or work file" in result.err
+    assert "it has no key of a cluster, host, work or simulation file" in result.err
+
+
+SIMULATION = "hosts: [{name: a, memory: 1GiB, cpu: 1}]\nprocesses: [{name: p, duration: 1s}]"
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        ("cluster.yaml", "ros: {domain: 1}", "ok, a cluster"),
+        ("lab.cluster.yaml", "ros: {domain: 1}", "ok, a cluster"),
+        ("host.yaml", "ros: {domain: 1}", "ok, a host"),
+        ("evening.sim.yaml", SIMULATION, "ok, a simulation: 1 hosts, 1 processes"),
+        ("f.yaml", f"name: evening\nseed: 1\n{SIMULATION}", "ok, a simulation"),
+    ],
+)
+def test_the_name_tells_the_kind_where_the_keys_do_not(rosrm, file, name, text, said):
+    result = rosrm("config", "check", file(text, name))
+    assert (result.code, result.err) == (0, "")
+    assert said in result.out
+
+
+HOST = "host: desk\nscope: slice\nbudget: {memory: 1GiB, cpu: 1}\nlimts: {cpu: 1}"
+WORK = "processes: [{name: a, command: x}]"
+
+
+@pytest.mark.parametrize(
+    ("command", "text", "said"),
+    [
+        (["submit"], HOST, "a work file is wanted, and this is a host file, by its keys host, "),
+        (["submit"], f"seed: 1\n{SIMULATION}", "is a simulation file, by its keys seed, hosts"),
+        (["simulate"], WORK, "a simulation file is wanted, and this is a work file"),
+        (["master", "--config"], HOST, "a cluster file is wanted, and this is a host file"),
+        (["slave", "--config"], "name: x\nscoring: {}", "it is for `rosrm master --config "),
+    ],
+)
+def test_a_file_of_another_kind_is_named_once(rosrm, file, command, text, said):
+    """Not key by key."""
+    result = rosrm(*command, file(text))
+    assert result.code == 2
+    assert said in result.err
+    assert len(result.err.splitlines()) == 1
 
 
 def test_every_wrong_file_is_said_and_nothing_else_is_lost(rosrm, file):

@@ -18,6 +18,14 @@ def test_sizes_have_three_digits(value, text):
 
 @pytest.mark.parametrize(
     ("value", "text"),
+    [(1023, "1023 B"), (1024, "1.0 KiB"), (2**30, "1.0 GiB"), (850 * 2**20, "850 MiB")],
+)
+def test_sizes_in_powers_of_1024(value, text):
+    assert formats.size(value, binary=True) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
     [(0.04, "0.0 s"), (9.94, "9.9 s"), (65, "65 s"), (3600, "60 min"), (7500, "2 h 5 min"),
      (200_000, "2 d"), (float("inf"), "?"), (-1, "0.0 s")],
 )  # fmt: skip

@@ -6,7 +6,7 @@ import pytest
 
 from rosrm.cli.lab import fraction, planned
 from rosrm.errors import ConfigError
-from rosrm.lab import GIB, MIB, HostPlan, needs
+from rosrm.lab import GIB, MIB, HostPlan, HostStatus, needs
 
 LIMITS = {"memory": "1GiB", "cpu": "0.5", "disk": "2GiB"}
 
@@ -119,3 +119,42 @@ def test_bad_input_is_refused_before_anything_is_looked_at(rosrm, without_rights
     result = rosrm("lab", *words)
     assert result.code == 2
     assert said in result.err
+
+
+# --- what is shown ----------------------------------------------------------------------------
+
+
+class OneHost:
+    """A lab that was made with `--memory 1GiB`; its host was cut before it was switched off."""
+
+    def boot(self, host):
+        assert host == "host1"
+
+    def status(self):
+        return [
+            HostStatus("lab", "host1", "up", "10.213.0.1", GIB, 100 * MIB, 0.5, 2 * 10**9,
+                       10**6, 3, "cut")
+        ]  # fmt: skip
+
+
+@pytest.fixture
+def one_host(monkeypatch):
+    monkeypatch.setattr("rosrm.cli.lab.opened", lambda name: OneHost())
+    monkeypatch.setattr("rosrm.cli.lab._check_rights", lambda: None)
+
+
+def test_a_size_is_shown_in_the_units_that_it_was_given_in(rosrm, one_host):
+    out = rosrm("lab", "status", "--lab", "lab").out
+    assert "100 MiB/1.0 GiB" in out
+    assert "1.0 MB/2.0 GB" in out
+
+
+def test_all_processes_of_a_host_are_not_called_the_runs_of_rosrm(rosrm, one_host):
+    """`rosrm hosts` counts those that rosrm runs, under RUNS."""
+    header = rosrm("lab", "status", "--lab", "lab").out.splitlines()[0]
+    assert "PROCESSES" in header
+    assert "RUNS" not in header
+
+
+def test_boot_says_that_the_network_is_still_cut(rosrm, one_host):
+    assert rosrm("lab", "boot", "host1").out == "host1 is up; its network is as before: cut\n"

@@ -198,10 +198,10 @@ def test_one_that_is_cut_short_can_be_used_as_far_as_it_goes(rosrm, tmp_path, co
     [
         (
             ["--policy", "wieghted"],
-            "--policy:1:11: unknown scoring policy 'wieghted'; did you mean",
+            "--policy wieghted: unknown scoring policy 'wieghted'; did you mean",
         ),
-        (["--hosts", "0"], "--hosts:1:8: hosts: 0 is not within 1..10000"),
-        (["--hosts", "-2"], "--hosts:1:8: hosts: -2 is not within 1..10000"),
+        (["--hosts", "0"], "--hosts 0: hosts: 0 is not within 1..10000"),
+        (["--hosts", "-2"], "--hosts -2: hosts: -2 is not within 1..10000"),
         (["--until", "-5s"], "--until: '-5s' is not greater than 0"),
         (["--variant", "[1"], "--variant:1:3: unreadable YAML"),
         (["--cut"], "--cut is for records"),

@@ -138,6 +138,7 @@ def test_everything_wrong_is_said_at_once_each_with_its_place(refusal):
         "f.yaml:5:23: migration.headroom: 5 is not within 0..1 (a fraction: 0.8 means 80 %)",
         'f.yaml:5:37: migration.automatic: true or false is wanted, not "yes"',
         "f.yaml:5:54: migration.strategies: 'a' is named twice",
+        "f.yaml:6:21: liveness.suspect (20 s) must be less than liveness.lease (10 s)",
         "f.yaml:7:9: journal: a mapping is wanted, not nothing (null)",
         "f.yaml:8:8: queue: a mapping is wanted, not a list",
         "f.yaml:9:25: defaults.needs.cpu: unknown unit 'MB'. Allowed: core, cores",

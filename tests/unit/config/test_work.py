@@ -199,7 +199,7 @@ def test_duplicate_names_are_refused_naming_both_places(refusal):
         ("name: a, module: x, ros: true, parameters: {b: }", "parameters.b: a value is wanted"),
         ("name: a, module: x, ros: true, parameters: {b: [1, a]}", "values of one type"),
         ("name: a, module: x, ros: true, parameters: {b: .nan}", "a finite number is wanted"),
-        ("name: a, command: x, working_directory: d", "f.yaml:1:54: working_directory: 'd' is"),
+        ("name: a, command: x, working_directory: ''", "f.yaml:1:54: working_directory: "),
         ("name: a, command: x, environment: {A=B: c}", "'A=B' cannot be a variable"),
         ("name: a, command: x, restart: sometimes", 'restart.when: "sometimes" is unknown'),
         ("name: a, command: x, restart: {when: always, delay: 1h}", "max_delay must not be less"),
@@ -214,6 +214,115 @@ def test_duplicate_names_are_refused_naming_both_places(refusal):
 )
 def test_a_wrong_entry_is_refused_with_its_place(refusal, entry, said):
     assert said in refusal(load_work, f"processes: [{{{entry}}}]")
+
+
+@pytest.mark.parametrize(
+    ("entry", "said"),
+    [
+        ("command: x, module: y, prioritty: 1", "and module and command is given"),
+        ("command: x, health: {topic: /scan}, prioritty: 1", "health.topic and health.rate"),
+        ("command: x, isolation: {after: 1s}, priority: high", "isolation.after goes with"),
+        ("command: x, migration: relunch, prioritty: 1", "unknown migration strategy 'relunch'"),
+    ],
+)
+def test_what_several_keys_break_is_said_along_with_a_wrong_key(refusal, entry, said):
+    """All that is wrong at once, not one stage of the check after the other."""
+    registry = Registry.of(
+        ours=SimpleNamespace(register_migration_strategies=register_migration_strategies)
+    )
+    found = refusal(load_work, f"processes: [{{name: a, {entry}}}]", registry)
+    assert said in found
+    assert "priori" in found
+
+
+@pytest.mark.parametrize(
+    "entry", ["comand: x", "package: [p], executable: e, parameters: {b: 1}", "module: 5, ros: 3"]
+)
+def test_a_key_that_cannot_be_read_is_not_said_to_be_missing(refusal, entry):
+    """Errors that only follow from the first one are left out."""
+    said = refusal(load_work, f"processes: [{{name: a, {entry}}}]")
+    assert "exactly one of" not in said
+    assert "only a ROS node" not in said
+
+
+def test_the_allowed_keys_are_listed_once(refusal):
+    said = refusal(load_work, "processes: [{name: a, comand: x, nam: b, lables: {}}]")
+    assert said.count("unknown key") == 3
+    assert said.count("Allowed:") == 1
+
+
+# --- paths and programs -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("entry", "command", "directory"),
+    [
+        ("command: ./run.sh -v", ("{here}/run.sh", "-v"), None),
+        ("command: [bin/run, ./map.yaml]", ("{here}/bin/run", "./map.yaml"), None),
+        ("command: [python3, brain.py], working_directory: .", ("python3", "brain.py"), "{here}"),
+        ("command: x, working_directory: ../data", ("x",), "{above}/data"),
+        ("command: ~/run.sh, working_directory: ~/maps", ("~/run.sh",), "~/maps"),
+        ("command: /bin/true, working_directory: /tmp", ("/bin/true",), "/tmp"),
+    ],
+)
+def test_a_relative_program_or_directory_is_beside_the_file(
+    file, monkeypatch, entry, command, directory
+):
+    """The slave replaces `~` by the home of its user. Arguments are passed as they are."""
+    path = file(f"processes: [{{name: a, {entry}}}]")
+    monkeypatch.chdir(path.parent)
+    (spec,) = load_work(path.name)  # the file's own path may be relative, too
+
+    def there(text):
+        return text and text.format(here=path.parent, above=path.parent.parent)
+
+    assert spec.command == tuple(map(there, command))
+    assert spec.working_directory == there(directory)
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("echo hi && echo done", "&&"),
+        ("echo a; echo b", ";"),
+        ("ls *.bag", "*"),
+        ("echo $HOME", "$HOME"),
+        ("echo ${HOME}", "${HOME"),
+        ("make > log", ">"),
+        ("dmesg | tail", "|"),
+        ("echo `date`", "`"),
+        ("python3 ~/brain.py", "~"),
+        ("sleep 600 &", "&"),
+    ],
+)
+def test_what_a_shell_would_read_is_pointed_out(refusal, text, found):
+    """No shell reads a command, so that it would be passed on as it is written."""
+    for key in ("command", "arguments"):
+        program = "module: m, " if key == "arguments" else ""
+        said = refusal(load_work, f"processes: [{{name: a, {program}{key}: '{text}'}}]")
+        assert f"{found!r} outside quotes, and no shell reads it" in said
+        assert f'[bash, -c, "{text}"]' in said
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ("'bash -c \"cd /tmp && echo $HOME\"'", ("bash", "-c", "cd /tmp && echo $HOME")),
+        ("[echo, a && b, $HOME, ~/state]", ("echo", "a && b", "$HOME", "~/state")),
+        ("\"grep 'a|b*' log\"", ("grep", "a|b*", "log")),
+        ("'find . -name \\*.py'", ("find", ".", "-name", "*.py")),
+        (
+            "ros2 topic echo /a~ [1,2] x?y a#b",
+            ("ros2", "topic", "echo", "/a~", "[1,2]", "x?y", "a#b"),
+        ),
+    ],
+)
+def test_quoted_words_and_lists_are_passed_as_they_are(file, given, words):
+    (spec,) = load_work(file(f"processes:\n  - name: a\n    command: {given}\n"))
+    assert spec.command == words
+
+
+# --- files ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -99,7 +99,7 @@ def test_variants_say_their_own_word_over_the_settings(load):
     ("text", "place", "said"),
     [
         (BOTH + "host: 3", "3:1", "unknown key 'host'; did you mean 'hosts'?"),
-        (PROCESS, "1:1", "hosts: a list of at least one host is wanted"),
+        ("seed: 1\n" + PROCESS, "1:1", "hosts: a list of at least one host is wanted"),
         ("hosts: []\n" + PROCESS, "1:8", "hosts: a list of at least one host is wanted"),
         (HOST, "1:1", "processes: a list of at least one process is wanted"),
         (of_process("arrives: -1s"), "2:32", "arrives: '-1s' is not at least 0"),
@@ -150,7 +150,7 @@ def test_every_example_loads(path, registry):
 
 def test_the_workload_in_the_how_to_loads_and_runs(load):
     text = (ROOT / "docs" / "how-to" / "simulate.md").read_text(encoding="utf-8")
-    (block,) = re.findall(r"<!-- workload -->\n```yaml\n(.*?)```", text, re.DOTALL)
+    (block,) = re.findall(r"<!-- workload -->\n```yaml[^\n]*\n(.*?)```", text, re.DOTALL)
     made = load(block)
     assert [one.name for one in made.variants] == ["as given", "by memory alone", "hosts 4"]
     assert len(made.workload.processes) == 21

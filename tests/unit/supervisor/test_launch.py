@@ -78,6 +78,23 @@ def test_a_plain_command_gets_nothing_added(tmp_path):
     assert order(tmp_path, command=("sleep", "3"), arguments=("x",)).argv == ("sleep", "3", "x")
 
 
+def test_the_home_of_a_program_and_directory_is_that_of_the_slaves_user(tmp_path, monkeypatch):
+    """Arguments are passed as they are."""
+    monkeypatch.setenv("HOME", "/home/robot")
+    made = order(tmp_path, command=("~/run.sh", "~/x"), working_directory="~/maps")
+    assert made.argv == ("/home/robot/run.sh", "~/x")
+    assert made.working_directory == "/home/robot/maps"
+
+
+@pytest.mark.parametrize("program", ["no-such-program", "/no/such/program"])
+def test_a_program_that_is_to_be_checkpointed_is_looked_for(tmp_path, program):
+    """The wrapper that is started in its place would fail on each host, one after the other."""
+    options = {"checkpoint_every": 10.0}
+    migration = MigrationPolicy("criu", options=options)
+    with pytest.raises(LaunchError, match=f"no executable '{program}'"):
+        order(tmp_path, command=(program,), ros=True, migration=migration)
+
+
 def test_a_module_is_run_by_the_given_python(tmp_path):
     """`module` is `python -m`."""
     assert order(tmp_path, module="a.b", arguments=("x",)).argv == (

@@ -388,11 +388,11 @@ def test_leftovers_of_a_killed_leader_are_killed_at_once():
 
 
 def test_final_spawn_failure_is_not_repeated():
-    """A missing executable does not come by waiting: no restart, whatever the policy."""
+    """A missing executable does not come by waiting: another host may have it."""
     core = sv.Supervision()
     core.handle(sv.StartOrdered(TALKER, sv.RestartRule("always"), sv.StopRule()), 0.0)
     core.handle(sv.SpawnFailed(TALKER, "no executable"), 0.0)
-    assert core.instances[TALKER].phase == sv.FAILED
+    assert core.instances[TALKER].phase == sv.REFUSED
 
 
 def test_transient_spawn_failure_follows_the_policy():

@@ -1,0 +1,292 @@
+"""The pages of the documentation as a reader follows them: files are saved, commands are typed.
+
+Of a page, each fenced block that has a title is a file, and each `console` block is what is typed
+at the prompts `$` and `#` (root), and answered. What the page shows as an answer is compared: `...`
+stands for anything, and numbers with units, times and addresses for any others. A command that
+fails, or that shows another answer than yet, is given again for a while, as by a reader who waits
+for what the page promises. What stays (`rosrm master`, `slave`, `events -f`) has its own terminal.
+
+A mark in the line above a console block says what is different about it:
+
+    <!-- not run: REASON -->      a reader follows it elsewhere: another machine, root, a long time
+    <!-- sample: REASON -->       it is run, and of its answers only the first line is compared
+    <!-- until: TEXT -->          it is followed by waiting for TEXT in the terminal opened last
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+from rosrm.bootstrapper import without_bootstrapper
+
+ROOT: Final = Path(__file__).resolve().parents[1]
+#: Seconds for what a page promises, on a busy machine; for what `until` waits for.
+PATIENCE: Final = 40.0
+LONG_PATIENCE: Final = 120.0
+
+
+@dataclass(frozen=True)
+class Page:
+    """The cluster and the files that the reader of a page has before.
+
+    Attributes:
+        hosts: that have slaves, beside those of the page.
+        cluster: settings of their master.
+        files: that lie there already.
+    """
+
+    hosts: tuple[str, ...] = ()
+    cluster: str = "name: before"
+    files: Mapping[str, str] = field(default_factory=dict)
+
+
+#: The pages whose commands are run, on a cluster of slices.
+RUN: Final[Mapping[str, Page]] = {
+    "README.md": Page(),
+    "docs/tutorials/first-cluster.md": Page(),
+    "docs/how-to/limits-and-migration.md": Page(hosts=("robot-1", "robot-2")),
+    "docs/how-to/stateful-node.md": Page(hosts=("desk", "shelf")),
+    "docs/how-to/portable-node.md": Page(
+        hosts=("robot",), cluster="migration: {strategies: [criu]}"
+    ),
+    "docs/how-to/simulate.md": Page(),
+}
+#: The pages that are run on virtual hosts, where root is.
+RUN_IN_LAB: Final = "docs/how-to/lab.md"
+#: The pages whose commands no test here runs, and why.
+NOT_RUN: Final[Mapping[str, str]] = {
+    "docs/tutorials/your-own-scoring-plugin.md": "tests/integration/plugins/test_tutorial.py does",
+    "docs/how-to/criu.md": "CRIU and what it needs come from the network; tests/integration/criu",
+    "docs/how-to/two-machines.md": "two machines",
+    "docs/how-to/docker-or-cgroup.md": "docker",
+    "docs/how-to/many-hosts-discovery.md": "a server at an address of its own network",
+    "docs/how-to/security.md": "a ROS 2 with DDS security, which the wheels lack",
+    "docs/how-to/ubuntu-24.04-with-apt-ros.md": "apt",
+    "docs/evaluation.md": "40 minutes; tests/integration/test_paper.py runs its parts",
+}
+
+_BLOCK: Final = re.compile(
+    r"(?:^<!-- (?P<mark>[^\n]*) -->\n)?^```(?P<language>\w+)(?P<info>[^\n]*)\n(?P<text>.*?)^```$",
+    re.MULTILINE | re.DOTALL,
+)
+_PROMPT: Final = re.compile(r"^[$#] ", re.MULTILINE)
+_MARKS: Final = ("not run", "sample", "until")
+
+
+@dataclass(frozen=True)
+class Block:
+    """A fenced block: a file with a title, or what is typed."""
+
+    language: str
+    title: str
+    mark: str
+    about: str
+    text: str
+
+    def commands(self) -> Iterator[tuple[str, str]]:
+        """Each line that is typed, without the remark behind it, and its answer."""
+        for shown in _PROMPT.split(self.text)[1:]:
+            line, _, answer = shown.partition("\n")
+            while line.endswith("\\"):
+                more, _, answer = answer.partition("\n")
+                line = line[:-1] + more.strip()
+            yield re.sub(r"\s+# .*", "", line).strip(), answer.strip()
+
+
+def blocks(page: str) -> Iterator[Block]:
+    """The files and commands of a page, in its order."""
+    for found in _BLOCK.finditer((ROOT / page).read_text(encoding="utf-8")):
+        title = re.search(r'title="([^"]+)"', found["info"])
+        mark, _, about = (found["mark"] or "").partition(": ")
+        known = mark if mark in _MARKS else ""
+        yield Block(
+            found["language"], title[1] if title else "", known, about if known else "",
+            found["text"],
+        )  # fmt: skip
+
+
+def pages_with_commands() -> set[str]:
+    """The names of all pages that show something to type."""
+    every = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *ROOT.glob("*/README.md")]
+    names = (str(page.relative_to(ROOT)) for page in every)
+    return {name for name in names if any(one.language == "console" for one in blocks(name))}
+
+
+# --- answers ----------------------------------------------------------------------------------
+
+_MASKS: Final = (
+    (re.compile(r"\b\d+\.\d+\.\d+\.\d+\b"), "ADDRESS"),
+    (re.compile(r"─+"), "─"),
+    (re.compile(r"\b\d+(\.\d+)? ?(kB|[KMG]i?B|B|ms|s|min|h|%)(?!\w)"), "#"),
+    (re.compile(r"\??\b\d+/\d+\b"), "#"),
+    (re.compile(r"\b\d+(\.\d+|x)\b"), "#"),
+)
+
+
+def masked(text: str) -> str:
+    """Replace the parts of a text that differ each time."""
+    for pattern, word in _MASKS:
+        text = pattern.sub(word, text)
+    return "\n".join(filter(None, (" ".join(line.split()) for line in text.splitlines())))
+
+
+def matches(shown: str, given: str) -> bool:
+    """Return True if an answer is the one that a page shows."""
+    parts = [re.escape(masked(part)) for part in shown.split("...")]
+    return re.fullmatch(r"\s*.*\s*".join(parts), masked(given), re.DOTALL) is not None
+
+
+# --- a reader ---------------------------------------------------------------------------------
+
+#: What keeps its terminal until Ctrl-C.
+_STAYS: Final = re.compile(r"(.* )?rosrm (--\S+ \S+ )?(master|slave|events -f)\b")
+
+
+@dataclass
+class Reader:
+    """A reader who follows a page in a folder, with a terminal for each part that stays.
+
+    Attributes:
+        called: names of this machine, and what the page calls them.
+    """
+
+    folder: Path
+    domain: int
+    environment: dict[str, str] = field(init=False)
+    called: dict[str, str] = field(default_factory=dict)
+    terminals: list[tuple[str, subprocess.Popen[bytes], Path]] = field(default_factory=list)
+    typed: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        kept = {
+            name: value for name, value in without_bootstrapper(os.environ).items()
+            if not name.startswith(("ROSRM_", "XDG_"))
+        }  # fmt: skip
+        self.environment = {
+            **kept, "PATH": f"{Path(sys.executable).parent}:{kept.get('PATH', '')}",
+            "HOME": str(self.folder / "home"), "ROS_DOMAIN_ID": str(self.domain),
+            "COLUMNS": "140", "NO_COLOR": "1", "PYTHONUNBUFFERED": "1",
+        }  # fmt: skip
+        (self.folder / "home").mkdir(parents=True, exist_ok=True)
+
+    def follow(self, page: str, setup: Page) -> None:
+        """Save the files of a page and type its commands; what it promises must hold."""
+        self._prepare(setup)
+        for block in blocks(page):
+            if block.mark == "not run":
+                continue
+            if block.title:
+                (self.folder / block.title).write_text(block.text, encoding="utf-8")
+            elif block.language == "console":
+                for line, answer in block.commands():
+                    self.type(line, answer.partition("\n")[0] if block.mark == "sample" else answer,
+                              whole=block.mark != "sample")  # fmt: skip
+                if block.mark == "until":
+                    self._await(block.about)
+
+    def _prepare(self, setup: Page) -> None:
+        for name, text in setup.files.items():
+            (self.folder / name).write_text(text, encoding="utf-8")
+        if not setup.hosts:
+            return
+        (self.folder / "before.cluster.yaml").write_text(setup.cluster, encoding="utf-8")
+        self.type("rosrm master --config before.cluster.yaml")
+        for host in setup.hosts:
+            budget = "{memory: 2GiB, cpu: 2.0, disk: 4GiB}"
+            text = f"host: {host}\nscope: slice\nbudget: {budget}\n"
+            (self.folder / f"before-{host}.host.yaml").write_text(text, encoding="utf-8")
+            self.type(f"rosrm slave --config before-{host}.host.yaml")
+
+    def type(self, line: str, answer: str = "", *, whole: bool = True) -> None:
+        """Give a command, and see that it does and says what the page shows."""
+        self.typed.append(line)
+        if line.startswith("export "):
+            shown = dict(word.split("=", 1) for word in line.split()[1:])
+            shown.pop("ROS_DOMAIN_ID", None)  # the page's may be taken on this machine
+            self.environment.update(shown)
+        elif _STAYS.match(line):
+            self._open(line)
+        else:
+            self._ask(line, answer, whole=whole)
+
+    def _ask(self, line: str, answer: str, *, whole: bool) -> None:
+        deadline = time.monotonic() + PATIENCE
+        while True:
+            done = subprocess.run(
+                ["bash", "-c", line], cwd=self.folder, env=self.environment, text=True,
+                stdin=subprocess.DEVNULL, capture_output=True, timeout=LONG_PATIENCE, check=False,
+            )  # fmt: skip
+            said = done.stdout if whole else done.stdout.strip().partition("\n")[0]
+            for here, name in self.called.items():
+                said = said.replace(here, name)
+            assert "Traceback" not in done.stdout + done.stderr, self._story(line, done)
+            right = not answer or matches(answer, said)
+            if done.returncode == 0 and right:
+                return
+            changed = done.returncode == 0 and not _LOOKS.search(line)
+            assert not changed and time.monotonic() < deadline, (  # noqa: PT018 - one reason
+                f"{self._story(line, done)}\nthe page shows:\n{answer or 'nothing'}"
+            )
+            time.sleep(0.5)
+
+    def _open(self, line: str) -> None:
+        """Start what stays, and wait until a slave is up."""
+        log = self.folder / f"terminal-{len(self.terminals)}.log"
+        with log.open("wb") as sink:
+            process = subprocess.Popen(
+                ["bash", "-c", f"exec {line}"], cwd=self.folder, env=self.environment,
+                stdin=subprocess.DEVNULL, stdout=sink, stderr=sink, start_new_session=True,
+            )  # fmt: skip
+        self.terminals.append((line, process, log))
+        if "rosrm slave" in line:
+            # Of the pages' hosts the first to be started is the first to be given work.
+            before = line.partition("rosrm slave")[0]
+            slaves = sum("rosrm slave" in one for one, _, _ in self.terminals)
+            self._ask(f"test $({before}rosrm hosts | grep -cw up) -ge {slaves}", "", whole=True)
+
+    def _await(self, text: str) -> None:
+        line, process, log = self.terminals[-1]
+        deadline = time.monotonic() + LONG_PATIENCE
+        while text not in (said := log.read_text(errors="replace")):
+            assert process.poll() is None, f"$ {line}\nended with {process.returncode}:\n{said}"
+            assert time.monotonic() < deadline, f"$ {line}\nnever said {text!r}:\n{said}"
+            time.sleep(0.2)
+
+    def _story(self, line: str, done: subprocess.CompletedProcess[str]) -> str:
+        return (
+            f"$ {line}\n{done.stdout}{done.stderr}exit code {done.returncode}, after "
+            f"{'; '.join(self.typed[:-1])}\n{self.said()}"
+        )
+
+    def said(self) -> str:
+        """Return the ends of the outputs of all terminals."""
+        return "\n".join(
+            f"--- {line}\n{log.read_text(errors='replace')[-3000:]}"
+            for line, _, log in self.terminals
+        )
+
+    def close(self) -> None:
+        """Press Ctrl-C in each terminal, the newest first, as a page asks for at its end."""
+        for _, process, _ in reversed(self.terminals):
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGINT)
+            try:
+                process.wait(PATIENCE)
+            except subprocess.TimeoutExpired:
+                os.killpg(process.pid, signal.SIGKILL)
+                process.wait(PATIENCE)
+        assert "Traceback" not in self.said(), self.said()
+
+
+#: Commands that change nothing, and are given again until they show what the page does.
+_LOOKS: Final = re.compile(r"rosrm (lab )?(ps|hosts|status|explain|events|logs|top)\b")
