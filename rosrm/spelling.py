@@ -1,8 +1,12 @@
-"""Near matches for messages: "did you mean ...?"."""
+"""Words in messages: near matches ("did you mean ...?"), plurals, amounts with their units."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
+from typing import Final
+
+_SIZES: Final = ("B", "kB", "MB", "GB", "TB", "PB")
 
 
 def get_close_matches(
@@ -12,3 +16,32 @@ def get_close_matches(
     import difflib  # noqa: PLC0415 - the runtimes, whose memory is budgeted, seldom need it
 
     return difflib.get_close_matches(word, list(possibilities), n=n, cutoff=cutoff)
+
+
+def counted(number: int, singular: str, plural: str = "") -> str:
+    """Return a number with its noun: "1 process", "2 processes"; `plural` if "s" is not enough."""
+    return f"{number} {singular if number == 1 else plural or singular + 's'}"
+
+
+def listed(names: Iterable[str], word: str = "and") -> str:
+    """Return names as a sentence lists them: "a", "a and b", "a, b and c"."""
+    *first, last = names
+    return f"{', '.join(first)} {word} {last}" if first else last
+
+
+def size(amount: float) -> str:
+    """Return bytes with a unit: "512 B", "64.1 MB"."""
+    exponent = 0
+    while abs(amount) >= 999.5 and exponent < len(_SIZES) - 1:
+        amount, exponent = amount / 1000.0, exponent + 1
+    digits = 0 if exponent == 0 or abs(amount) >= 99.5 else 1
+    return f"{amount:.{digits}f} {_SIZES[exponent]}"
+
+
+def amount(value: float, unit: str) -> str:
+    """Return an amount of a resource, given in its base unit."""
+    if not math.isfinite(value):
+        return "?"
+    if unit in ("B", "B/s"):
+        return size(value) + unit[1:]
+    return f"{value:.3g}" + {"core": " cores", "1": "", "": ""}.get(unit, f" {unit}")

@@ -4,27 +4,10 @@ from __future__ import annotations
 
 import math
 import time
-from typing import Final
 
-_SIZES: Final = ("B", "kB", "MB", "GB", "TB", "PB")
+from rosrm.spelling import amount, size
 
-
-def size(amount: float) -> str:
-    """Bytes: "512 B", "64.1 MB"."""
-    exponent = 0
-    while abs(amount) >= 999.5 and exponent < len(_SIZES) - 1:
-        amount, exponent = amount / 1000.0, exponent + 1
-    digits = 0 if exponent == 0 or abs(amount) >= 99.5 else 1
-    return f"{amount:.{digits}f} {_SIZES[exponent]}"
-
-
-def amount(value: float, unit: str) -> str:
-    """An amount of a resource in its base unit."""
-    if not math.isfinite(value):
-        return "?"
-    if unit in ("B", "B/s"):
-        return size(value) + unit[1:]
-    return f"{value:.3g}" + {"core": " cores", "1": "", "": ""}.get(unit, f" {unit}")
+__all__ = ["amount", "clock", "duration", "percent", "size", "words"]
 
 
 def duration(seconds: float) -> str:
