@@ -1,4 +1,4 @@
-"""Words in messages: near matches ("did you mean ...?"), plurals, amounts with their units."""
+"""Words in messages: near matches ("did you mean ...?"), plurals, states, amounts with units."""
 
 from __future__ import annotations
 
@@ -7,6 +7,12 @@ from collections.abc import Iterable
 from typing import Final
 
 _SIZES: Final = ("B", "kB", "MB", "GB", "TB", "PB")
+_STANDING: Final = {
+    "backoff": "is in back-off",
+    "failed": "has failed",
+    "finished": "has finished",
+    "cancelled": "was cancelled",
+}
 
 
 def get_close_matches(
@@ -27,6 +33,11 @@ def listed(names: Iterable[str], word: str = "and") -> str:
     """Return names as a sentence lists them: "a", "a and b", "a, b and c"."""
     *first, last = names
     return f"{', '.join(first)} {word} {last}" if first else last
+
+
+def standing(state: str) -> str:
+    """Return the state of a process as a sentence has it: "is in back-off", "has failed"."""
+    return _STANDING.get(state, f"is {state.replace('_', ' ')}")
 
 
 def size(amount: float) -> str:

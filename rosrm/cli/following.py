@@ -48,6 +48,9 @@ def events(  # noqa: PLR0917 - an argument for each option
     with connection.master(ctx, domain) as client:
         snapshot = client.list(events=True, process=process, host=host, newest=newest)
         connection.say_trouble(snapshot)
+        if not snapshot.events:
+            _check_names(client, process, host)
+        console = tables.console()
         if as_json and not follow:
             json_forms.show(json_forms.forms(snapshot.events))
             return
@@ -55,12 +58,27 @@ def events(  # noqa: PLR0917 - an argument for each option
             for row in snapshot.events:
                 if as_json:
                     json_forms.show_line(json_forms.form(row))
+                elif console.is_terminal:
+                    console.print(tables.event(row))
                 else:
                     typer.echo(tables.event_line(row))
             if not follow:
+                _say_left_out(len(snapshot.events), newest)
                 return
             time.sleep(PERIOD)
             snapshot = _later(client, snapshot, process, host)
+
+
+def _check_names(client: MasterClient, process: str, host: str) -> None:
+    """Refuse the name of a process or host that the master does not know."""
+    known = client.list(hosts=True, processes=True)
+    connection.check_name("process", process, [row.name for row in known.processes])
+    connection.check_name("host", host, [row.description.name for row in known.hosts])
+
+
+def _say_left_out(shown: int, newest: int) -> None:
+    if shown >= newest:
+        typer.echo(f"rosrm: at most the newest {newest} are shown; -n N shows more", err=True)
 
 
 def _later(client: MasterClient, before: Snapshot, process: str, host: str) -> Snapshot:

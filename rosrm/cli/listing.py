@@ -43,8 +43,9 @@ def ps(
     from rosrm.cli import json_forms, tables
 
     with connection.master(ctx, domain) as client:
-        snapshot = client.list(processes=True)
+        snapshot = client.list(processes=True, hosts=bool(host))
     connection.say_trouble(snapshot)
+    connection.check_name("host", host, [row.description.name for row in snapshot.hosts])
     shown = [row for row in snapshot.processes if not host or row.host == host]
     if as_json:
         json_forms.show(json_forms.forms(shown))

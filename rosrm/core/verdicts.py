@@ -150,8 +150,8 @@ def decide(ranking: Ranking, *, chosen: int | None = None) -> Decision:
     named, fitting = len(moment.columns), int(np.count_nonzero(ranking.value < np.inf))
     named_fitting = sum(value < np.inf for value in moment.value.tolist())
     omitted = {
-        "fits with a higher score": fitting - named_fitting,
-        "does not fit now": hosts - fitting - (named - named_fitting),
+        "would take it at a higher score": fitting - named_fitting,
+        "cannot take it now": hosts - fitting - (named - named_fitting),
     }
     return Decision(column, ranking.policy_name, moment, omitted)
 

@@ -83,7 +83,7 @@ STORY = {
             {"name": "beta", "verdict": "full", "score": None, "reason": "memory 0.79 of 0.8"},
             {"name": "gamma", "verdict": "vetoed", "score": None, "reason": "too near its limit"},
         ],
-        "omitted": {"does not fit now": 5, "fits with a higher score": 0},
+        "omitted": {"cannot take it now": 5, "would take it at a higher score": 0},
     },
     "history": [{"elapsed": 62.0, "kind": "submitted", "message": "talker was submitted"}],
 }

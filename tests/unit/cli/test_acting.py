@@ -105,7 +105,7 @@ def test_submit_wait_fails_with_the_reason_when_a_process_failed(rosrm, client, 
     ]
     result = rosrm("submit", work, "--wait")
     assert result.code == 1
-    assert "a is failed: exit code 3" in result.err
+    assert "a has failed: exit code 3" in result.err
 
 
 def test_submit_wait_gives_up_after_its_time(rosrm, client, work, monkeypatch):
