@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from rosrm.spelling import counted
+
 if TYPE_CHECKING:
     from rosrm.registry import Registry
 
@@ -76,4 +78,4 @@ def _checked(file: Path, kind: KindOfFile | None, registry: Registry) -> str:
         case _:
             specs = load_work(file, registry)
             jobs = sum(spec.kind.value == "job" for spec in specs)
-            return f"work: {jobs} jobs and {len(specs) - jobs} services"
+            return f"work: {counted(jobs, 'job')} and {counted(len(specs) - jobs, 'service')}"

@@ -90,7 +90,7 @@ def _why(row: ProcessRow) -> str:
         parts.append(row.reason)
     elif row.state == "failed":
         parts.append(f"exit code {row.exit_code}")
-    if row.restarts:
+    if row.restarts and "restart" not in row.reason:
         parts.append(counted(row.restarts, "restart"))
     if row.migrations:
         parts.append(f"moved {row.migrations}x")

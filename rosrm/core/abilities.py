@@ -149,4 +149,4 @@ def fault(state: MasterState, strategy: str, source: Host, destination: Host) ->
     try:
         return str(checking.host_fault(*facts))
     except Exception as error:  # noqa: BLE001 - a third party's code: anything may come
-        return f"{strategy} cannot say whether it can go there: {type(error).__name__}: {error}"
+        return f"the check of the hosts by {strategy} failed: {type(error).__name__}: {error}"

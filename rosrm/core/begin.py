@@ -12,6 +12,7 @@ from rosrm.core.placement import Ranking
 from rosrm.core.plans import plan_to_dict
 from rosrm.core.state import MasterState, Process, ProcessPhase, Run
 from rosrm.core.steps import title
+from rosrm.spelling import standing
 
 
 def begin_move(
@@ -90,7 +91,9 @@ def why_immovable(state: MasterState, process: Process) -> str:
     if process.phase is ProcessPhase.CHECKPOINTED:
         return f"{process.name} is checkpointed: {reason_of(state, process)}; restore it first"
     if process.phase is not ProcessPhase.RUNNING:
-        return f"{process.name} is {process.phase.value}; only a running process can be moved"
+        return (
+            f"{process.name} {standing(process.phase.value)}; only a running process can be moved"
+        )
     standby = state.standbys.get(process.name)
     others = process.instances - {process.owner, standby.destination.number if standby else 0}
     if others:

@@ -45,7 +45,8 @@ def _what_follows(process: Process) -> str:
     if policy.then == "wait":
         return ""
     when = f" in {policy.delay:g} s" if policy.delay else ""
-    return f"; it goes elsewhere{when}" if policy.then == "elsewhere" else f"; it fails{when}"
+    what = "is started on another host" if policy.then == "elsewhere" else "fails"
+    return f"; the process {what}{when}"
 
 
 def regain_sight(state: MasterState, host: Host, now: float) -> None:

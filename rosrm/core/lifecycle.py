@@ -23,6 +23,7 @@ from rosrm.core.model import (
 )
 from rosrm.core.runs import End, Run
 from rosrm.core.state import WAITING, Instance, MasterState, Process, ProcessPhase, Wanted
+from rosrm.spelling import standing
 
 #: What the state of the owning instance means for the process.
 _PHASE: Final = {
@@ -76,7 +77,7 @@ def reconcile(
             continue
         if instance.state is None and (not registering or _yet_to_start(state, instance)):
             continue
-        gone(state, instance, now, f"{host.name} does not hold it any more")
+        gone(state, instance, now, f"{host.name} does not run it any more")
 
 
 def _yet_to_start(state: MasterState, instance: Instance) -> bool:
@@ -130,7 +131,7 @@ def _follow(
         kind = "ready" if phase is ProcessPhase.RUNNING else phase.value
         kind = "reachable" if repeated else kind
         state.record(
-            now, kind, f"{process.name} is {kind} on {instance.host.name}"
+            now, kind, f"{process.name} {standing(kind)} on {instance.host.name}"
             + (f": {status.message}" if status.message else ""),
             process=process.name, host=instance.host.name,
             facts={"number": instance.id.number, "pid": status.pid, "restarts": status.restarts},
@@ -162,10 +163,10 @@ def _take_stranger(state: MasterState, host: Host, status: InstanceStatus, now: 
             state.emit(Order(state.order_id(), host.host_id, "stop", status.instance))
         return
     followed = coming_back.has_successor(state, status)
-    how = "its successor owns the name: fenced" if followed else "stopped"
+    how = "has it killed: another instance owns its name" if followed else "stops it"
     state.record(
-        now, "fenced" if followed else "stranger_stopped",
-        f"{status.instance} is not meant to run on {host.name}: {how}",
+        now, "fenced" if followed else "unassigned_stopped",
+        f"{status.instance} is not assigned to {host.name}: the master {how}",
         process=status.instance.process, host=host.name,
     )  # fmt: skip
     stranger = adopt_to_stop(state, status.instance, host, now)
@@ -256,7 +257,7 @@ def conclude(state: MasterState, process: Process, end: End, host: Host, now: fl
     elif end.gone:
         _requeue(state, process, host, now, status.message)
     elif end.ordered:
-        _requeue(state, process, host, now, f"it was ended on {host.name}")
+        _requeue(state, process, host, now, f"its instance on {host.name} was stopped")
     elif status.state is InstanceState.FENCED and process.spec.host_loss.then != "stop":
         _requeue(state, process, host, now, status.message)
     elif status.state is InstanceState.REFUSED:
@@ -320,7 +321,7 @@ def _wait_for_ends(state: MasterState, process: Process, now: float) -> None:
     state.unqueue(process)
     process.wanted = Wanted.REQUEUE
     left = ", ".join(f"{one.id} on {one.host.name}" for one in state.instances_of(process))
-    state.set_phase(process, ProcessPhase.STOPPING, now, f"waits for the end of {left}")
+    state.set_phase(process, ProcessPhase.STOPPING, now, f"waits until {left} has ended")
     state.save(process)
 
 
@@ -361,7 +362,7 @@ def assignment_withdrawn(
     """The slave never saw it: the process goes back to its place."""
     instance = state.instances.get(event.instance.number)
     if instance is not None:
-        gone(state, instance, now, f"{instance.host.name} did not take it up in time")
+        gone(state, instance, now, f"{instance.host.name} did not accept the assignment in time")
 
 
 def phase_in_sight(state: MasterState, process: Process, owner: Instance) -> ProcessPhase:

@@ -21,7 +21,7 @@ are stopped. When neither source nor destination is left, the process returns to
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, Final
 
 from rosrm.core import abilities, handoffs, images, imaging, keeping, lifecycle, periodic
 from rosrm.core import events as happened
@@ -39,6 +39,13 @@ from rosrm.core.steps import (
     timed_out,
     title,
 )
+
+#: What a commit means.
+_COMMITTED: Final = {
+    Aim.MOVE: "the destination owns the name; the move is not undone any more",
+    Aim.CHECKPOINT: "the image owns the name; the checkpoint is not undone any more",
+    Aim.RESTORE: "the restored instance owns the name; the restore is not undone any more",
+}
 
 # --- go on ------------------------------------------------------------------------------------
 
@@ -132,8 +139,9 @@ def _outcome(state: MasterState, run: Run, step: Step, now: float) -> str | None
 
 
 def _next(state: MasterState, run: Run, step: Step, now: float) -> None:
+    what = _COMMITTED[run.aim] if isinstance(step, Commit) else f"{title(step)} is done"
     state.record(
-        now, "migration_step", f"{run.process}: {title(step)} done", process=run.process,
+        now, "migration_step", f"{run.process}: {what}", process=run.process,
         facts={"step": title(step), "back": run.undo is not None},
     )  # fmt: skip
     process = state.processes[run.process]
@@ -206,20 +214,23 @@ def _failed(state: MasterState, run: Run, step: Step, reason: str, now: float) -
     run.retry_at = now + state.settings.order_retry
     if not run.stuck:
         run.stuck = True
-        way = "forward" if run.undo is None else "back"
+        end = "finished" if run.undo is None else "undone"
         process = state.processes[run.process]
-        state.set_phase(process, ProcessPhase.STUCK, now, f"no way {way}: {reason}; tried again")
-        state.record(
-            now, "migration_stuck", f"{run.process} is STUCK on its way {way}: {reason}",
-            process=run.process,
-        )  # fmt: skip
+        why = f"its {run.aim.value} cannot be {end} yet: {reason}; the master tries again"
+        state.set_phase(process, ProcessPhase.STUCK, now, why)
+        state.record(now, "migration_stuck", f"{run.process} is stuck: {why}", process=run.process)
 
 
 def _turn_back(state: MasterState, run: Run, reason: str, now: float) -> None:
     """Before the commit: undo every step so far, the one in hand included, newest first."""
     run.failure = reason
     run.turn_back()
-    state.record(now, "migration_undone", f"{run.process} stays: {reason}", process=run.process)
+    state.record(
+        now,
+        "migration_undone",
+        f"the {run.aim.value} of {run.process} is undone: {reason}",
+        process=run.process,
+    )
     state.save_run(run)
 
 
@@ -229,9 +240,9 @@ def _go_forward(state: MasterState, run: Run, now: float) -> None:
     run.retry_at = now
     if run.stuck:
         _not_stuck(state, run, now)
-    what = "moves" if run.aim is Aim.MOVE else "goes on"
     state.record(
-        now, "migration_redone", f"{run.process} {what} after all: {run.destination} is active",
+        now, "migration_redone",
+        f"the {run.aim.value} of {run.process} is finished after all: {run.destination} is active",
         process=run.process,
     )  # fmt: skip
     state.save_run(run)
@@ -247,7 +258,7 @@ def _why_turn_back(state: MasterState, run: Run) -> str:
     excused = (
         _told_to_stop(run, run.source) or handoffs.is_switching(run) or _has_left_in_image(run)
     )
-    return f"{run.source} ended by itself" if end.completed or not excused else ""
+    return f"{run.source} ended during the {run.aim.value}" if end.completed or not excused else ""
 
 
 def _has_left_in_image(run: Run) -> bool:
@@ -332,7 +343,7 @@ def _end_of_owner(process: Process, run: Run) -> End:
     if process.owner == run.source.number and _told_to_stop(run, run.source) and not end.completed:
         return replace(end, ordered=True)
     if process.owner in run.suspended and lifecycle.restarts_after(policy, end.status):
-        how = end.status.message or f"it ended on a signal or with code {process.exit_code}"
+        how = end.status.message or f"it ended on a signal or with exit code {process.exit_code}"
         why = f"restart by policy {policy.when!r}: {how}"
         return replace(end, gone=True, status=replace(end.status, message=why))
     return end

@@ -15,6 +15,7 @@ from rosrm.core.model import ProcessSpec
 from rosrm.core.relief import try_move
 from rosrm.core.state import WAITING, MasterState, Process, ProcessPhase, Wanted
 from rosrm.ports import SpecChecking
+from rosrm.spelling import counted
 
 
 def _refuse(state: MasterState, request: int, message: str, code: str = "invalid") -> None:
@@ -101,7 +102,7 @@ def _strategy_fault(state: MasterState, spec: ProcessSpec) -> str:
     try:
         return strategy.spec_fault(spec)
     except Exception as error:  # noqa: BLE001 - a third party's code: anything may come
-        return f"it cannot say whether it moves this process: {type(error).__name__}: {error}"
+        return f"its check of this process failed: {type(error).__name__}: {error}"
 
 
 def _names(names: Iterable[str]) -> str:
@@ -110,7 +111,7 @@ def _names(names: Iterable[str]) -> str:
 
 
 def _count(number: int) -> str:
-    return "1 process" if number == 1 else f"{number} processes"
+    return counted(number, "process", "processes")
 
 
 # --- cancel, restart --------------------------------------------------------------------------
@@ -184,6 +185,8 @@ def restart_requested(state: MasterState, event: happened.RestartRequested, now:
 
 
 def _restart_fault(state: MasterState, process: Process) -> str:
+    if process.phase is ProcessPhase.SET_ASIDE:
+        return f"{process.name} is set aside: {process.reason}"
     if process.phase in WAITING:
         return f"{process.name} waits in the queue already"
     if process.name in state.runs:
@@ -198,7 +201,9 @@ def _restart_fault(state: MasterState, process: Process) -> str:
 
 
 def _restart(state: MasterState, process: Process, now: float) -> None:
-    state.record(now, "restart_requested", f"{process.name} is restarted", process=process.name)
+    state.record(
+        now, "restart_requested", f"a restart of {process.name} was requested", process=process.name
+    )
     if process.phase.over or process.image is not None:
         images.drop(state, process)
         keeping.begin_anew(state, process)
@@ -293,6 +298,7 @@ def host_state_requested(
         host, cordoned=event.action != "uncordon", draining=event.action == "drain"
     )
     host.told.clear()
+    host.blocked.clear()
     save_host(state, host)
     state.record(now, f"host_{done}", f"{host.name} is {done}", host=host.name)
     reconsider_set_aside(state, now)

@@ -63,7 +63,7 @@ PROCESSES = [
     process("done", "finished", kind="job"),
 ]
 PLUGINS = [
-    PluginRow("scoring", "weighted", "rosrm-scoring 0.1.0", "selected", "Eq. 1 of the paper"),
+    PluginRow("scoring", "weighted", "rosrm-scoring 0.1.0", "selected", "weight x usage, summed"),
     PluginRow("probe", "gpu", "rosrm-resources 0.1.0", "absent", "no NVIDIA driver", "alpha"),
 ]
 EVENTS = [event(1, "submitted", host=""), event(2)]

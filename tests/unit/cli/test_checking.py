@@ -28,8 +28,8 @@ def file(tmp_path):
     [
         ("scoring: {policy: weighted}", "ok, a cluster: scoring weighted, migration relaunch\n"),
         ("host: h1\nros: {domain: 1}", "ok, a host: h1, probes cpu\n"),
-        ("processes: [{name: a, command: x, kind: job}]", "ok, work: 1 jobs and 0 services\n"),
-        ("defaults: {kind: job}\nprocesses: [{name: a, command: x}]", "ok, work: 1 jobs and 0"),
+        ("processes: [{name: a, command: x, kind: job}]", "ok, work: 1 job and 0 services\n"),
+        ("defaults: {kind: job}\nprocesses: [{name: a, command: x}]", "ok, work: 1 job and 0"),
     ],
 )
 def test_the_kind_of_a_right_file_is_known_by_its_keys(rosrm, file, text, said):

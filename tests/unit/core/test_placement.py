@@ -99,7 +99,7 @@ def test_a_declared_need_of_a_resource_that_a_host_has_not_excludes_it() -> None
     cluster = Cluster("a")
     cluster.submit(process("p", needs={"gpu": 0.5}))
     assert cluster.phase("p") == "set_aside"
-    assert "it has no gpu" in cluster["p"].reason
+    assert "no host reports the resource 'gpu'" in cluster["p"].reason
     cluster.add(gpu)
     assert cluster.where("p") == ["g"]
 

@@ -78,7 +78,7 @@ def test_a_strategy_may_refuse_a_spec_before_it_is_queued() -> None:
 
     assert message("p", fast=1) == "1 process queued"
     assert message("q") == "q: migration by 'choosy': it wants options. Nothing was queued"
-    assert "cannot say whether it moves this process: RuntimeError: no idea" in message("raises")
+    assert "its check of this process failed: RuntimeError: no idea" in message("raises")
 
 
 def test_an_unknown_migration_strategy_refuses_all() -> None:
@@ -301,13 +301,13 @@ def test_restart_is_refused_where_it_makes_no_sense() -> None:
     """Waiting, being stopped, moving, out of reach: with the reason, and nothing is restarted."""
     cluster = Cluster("a", Machine("b", busy={"memory": 0.5}))
     cluster.machines["a"].stubborn.add("stops")
-    cluster.submit(process("stops"), movable("moves", ros=True), process("waits", memory=1e6))
+    cluster.submit(process("stops"), movable("moves", ros=True), process("huge", memory=1e6))
     cluster.machines["a"].seen_in_graph("moves", cluster.now)
     cluster.settle()
     cluster.migrate("moves")
     cluster.cancel("stops")
-    for name, said in (("waits", "waits in the queue"), ("stops", "is being stopped"),
-                       ("moves", "is moving")):  # fmt: skip
+    for name, said in (("huge", "huge is set aside: no host may take it"),
+                       ("stops", "is being stopped"), ("moves", "is moving")):  # fmt: skip
         reply = cluster.restart(name)
         assert not reply.accepted
         assert said in reply.message
@@ -405,7 +405,7 @@ def test_an_assignment_that_is_not_taken_up_is_withdrawn() -> None:
             cluster.set_host("a", "cordon")
     cluster.settle()
     assert cluster.where("p") == ["b"]
-    assert "a did not take it up in time" in cluster.told("queued")[0]
+    assert "a did not accept the assignment in time" in cluster.told("queued")[0]
 
 
 def test_one_that_was_fetched_and_never_heard_of_is_stopped_before_it_goes_elsewhere() -> None:
