@@ -10,6 +10,7 @@ from rosrm.core import images, imaging, keeping, lifecycle
 from rosrm.core.assigning import reconsider_set_aside
 from rosrm.core.begin import why_busy
 from rosrm.core.commands import Order, Reply
+from rosrm.core.graph_names import shared_nodes
 from rosrm.core.intake import save_host
 from rosrm.core.model import ProcessSpec
 from rosrm.core.relief import try_move
@@ -35,6 +36,8 @@ def submission_received(state: MasterState, event: happened.SubmissionReceived, 
     if fault:
         _refuse(state, event.request, fault)
         return
+    live = (one.spec for one in state.processes.values() if not one.phase.over)
+    shared = shared_nodes(event.specs, live)
     for spec in event.specs:
         process = Process(
             spec, state.next_order, ProcessPhase.QUEUED, now, born=state.next_instance
@@ -44,7 +47,8 @@ def submission_received(state: MasterState, event: happened.SubmissionReceived, 
         state.enqueue(process, now)
         state.record(now, "submitted", f"{spec.name} was submitted", process=spec.name)
         state.save(process)
-    state.emit(Reply(event.request, message=f"{_count(len(event.specs))} queued"))
+    warnings = "".join(f". Warning: {one}" for one in shared)
+    state.emit(Reply(event.request, message=f"{_count(len(event.specs))} queued{warnings}"))
 
 
 def _taken(state: MasterState, event: happened.SubmissionReceived) -> str:

@@ -61,3 +61,33 @@ def test_every_wrong_file_is_said_and_nothing_else_is_lost(rosrm, file):
     assert "a.yaml:1:11: unknown scoring policy 'wieghted'; did you mean 'weighted'?" in result.err
     assert "c.yaml:2:10: unknown probe 'lidar'. Installed: cpu." in result.err
     assert "d.yaml:1:46: unknown migration strategy 'criu'. Installed: relaunch." in result.err
+
+
+@pytest.mark.parametrize(
+    ("text", "warning"),
+    [
+        (
+            "processes: [{name: a, command: x, needs: {cpus: 1}}]",
+            "a: needs: no probe is named 'cpus'; did you mean 'cpu'?",
+        ),
+        (
+            """
+            defaults: {package: p, executable: e}
+            processes: [{name: a}, {name: b, arguments: [--ros-args, -r, '__node:=a']}]
+            """,
+            "a and b put the node /a into the ROS graph; give each node a name of its own",
+        ),
+    ],
+)
+def test_what_may_be_a_mistake_is_a_warning(rosrm, tmp_path, text, warning):
+    file = tmp_path / "w.yaml"
+    file.write_text(text, encoding="utf-8")
+    result = rosrm("config", "check", file)
+    assert result.code == 0
+    assert result.err == f"{file}: warning: {warning}\n"
+
+
+def test_a_resource_that_no_probe_here_measures_is_no_mistake(rosrm, tmp_path):
+    file = tmp_path / "w.yaml"
+    file.write_text("processes: [{name: a, command: x, needs: {gpu_memory: 1}}]", encoding="utf-8")
+    assert rosrm("config", "check", file).err == ""

@@ -238,6 +238,12 @@ def test_one_restart_is_singular(rosrm, client):
     assert "1 restarts" not in rosrm("ps").out
 
 
+def test_restarts_that_the_reason_counts_are_not_said_twice(rosrm, client):
+    reason = "exit code 3; its restart policy allows 3 restarts within 300 s"
+    client.processes = [process("crashed", "failed", restarts=3, reason=reason)]
+    assert rosrm("ps").out.count("3 restarts") == 1
+
+
 @pytest.mark.parametrize("command", ["events", "ps"])
 def test_a_host_that_is_not_there_is_refused(rosrm, client, command):
     result = rosrm(command, "--host", "alpa")

@@ -68,6 +68,24 @@ class Choosy:
         return "" if spec.migration.options else "it wants options"
 
 
+def test_processes_that_put_one_node_into_the_graph_are_mentioned() -> None:
+    """Taken nonetheless: ROS 2 lets both live."""
+    cluster = Cluster("a")
+    alias = ("--ros-args", "-r", "__node:=p", "-r", "__ns:=/robot")
+    cluster.submit(node("p", namespace="/robot"))
+    assert cluster.submit(node("other"), node("p2")).message == "2 processes queued"
+    reply = cluster.submit(node("q", arguments=alias))
+    assert reply.message == (
+        "1 process queued. Warning: q and p put the node /robot/p into the ROS graph; give each "
+        "node a name of its own"
+    )
+    cluster.cancel("p", "q")
+    cluster.settle()
+    run = {"command": ("ros2", "run", "demo_nodes_cpp", "talker")}
+    reply = cluster.submit(process("one", **run), process("two", **run))
+    assert "one and two put the default node of demo_nodes_cpp talker into" in reply.message
+
+
 def test_a_strategy_may_refuse_a_spec_before_it_is_queued() -> None:
     """With its reason; one that raises is named."""
     cluster = Cluster("a", strategies={"choosy": Choosy()})
