@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 #: Least likeness of two words that are taken for one misspelt; gpu_memory and memory have less.
 _NEAR: Final = 0.8
 
-config = typer.Typer(no_args_is_help=True, help="Look at configuration files.")
+config = typer.Typer(no_args_is_help=True, help="Check configuration files.")
 
 
 class KindOfFile(str, Enum):
@@ -34,7 +34,7 @@ class KindOfFile(str, Enum):
 
 @config.callback()
 def _group() -> None:
-    """Look at configuration files."""
+    """Check configuration files."""
 
 
 @config.command()
@@ -44,12 +44,12 @@ def check(
     ],
     kind: Annotated[
         KindOfFile | None,
-        typer.Option("--kind", help="What the files are; by default their keys tell."),
+        typer.Option("--kind", help="Kind of the files; default: told by their keys."),
     ] = None,
 ) -> None:
     """Check files before they are used.
 
-    Against all rules, and against the plugins that are installed here.
+    They are checked against all rules and against the plugins that are installed here.
     """
     from rosrm.errors import ConfigError
     from rosrm.registry import Registry

@@ -21,27 +21,29 @@ if TYPE_CHECKING:
 #: Seconds between two looks.
 PERIOD: Final = 0.5
 
-Follow = Annotated[bool, typer.Option("--follow", "-f", help="Go on until Ctrl-C.")]
+Follow = Annotated[
+    bool, typer.Option("--follow", "-f", help="Keep printing what is new until Ctrl-C.")
+]
 
 
 def events(  # noqa: PLR0917 - an argument for each option
     ctx: typer.Context,
     follow: Follow = False,
     process: Annotated[
-        str, typer.Option("--process", metavar="NAME", help="Only those of one process.")
+        str, typer.Option("--process", metavar="NAME", help="Show only events of this process.")
     ] = "",
     host: Annotated[
-        str, typer.Option("--host", metavar="HOST", help="Only those of one host.")
+        str, typer.Option("--host", metavar="HOST", help="Show only events of this host.")
     ] = "",
     newest: Annotated[
-        int, typer.Option("--newest", "-n", metavar="N", min=1, help="The newest N of them.")
+        int, typer.Option("--newest", "-n", metavar="N", min=1, help="Show the newest N events.")
     ] = 100,
     as_json: AsJson = False,
     domain: Domain = None,
 ) -> None:
-    """Show what happened, oldest first.
+    """Show events of the cluster, oldest first.
 
-    With -f it goes on; with -f and --json each event is an object on a line of its own.
+    With -f the command keeps printing; with --json too, each event is an object on its own line.
     """
     from rosrm.cli import json_forms, tables
 

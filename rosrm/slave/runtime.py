@@ -156,11 +156,11 @@ class SlaveRuntime:
     def _adopt(self) -> None:
         """Take over what a former run of this slave left with the supervisor."""
         held = self._supervisor.take_over()
+        self._work(time.monotonic())
         if held:
             live = self._state.live()
             ended = f"; {held - live} had ended" if held > live else ""
             self.say(f"{counted(live, 'process', 'processes')} re-adopted{ended}")
-        self._work(time.monotonic())
 
     # --- the loop ------------------------------------------------------------------------
 
