@@ -44,7 +44,7 @@ def check(
     ],
     kind: Annotated[
         KindOfFile | None,
-        typer.Option("--kind", help="Kind of the files; default: told by their keys."),
+        typer.Option("--kind", help="Kind of the files; default: their keys decide."),
     ] = None,
 ) -> None:
     """Check files before they are used.

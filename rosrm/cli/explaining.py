@@ -65,7 +65,7 @@ def _headline(story: Mapping[str, Any]) -> Text:
 
 
 def _kept(kept: list[Mapping[str, Any]]) -> Text:
-    """Where snapshots of the state are, and how far they are."""
+    """The hosts with a snapshot of the state, and the cycle of each."""
     places = [
         f"{one['host']} (cycle {one['sequence']}, {formats.size(one['size'])}, "
         f"{formats.duration(one['elapsed'])} ago)"

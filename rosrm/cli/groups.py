@@ -1,4 +1,4 @@
-"""How groups of commands present themselves: help, usage lines, hints after an unknown verb."""
+"""Groups of commands: their help, their usage lines, and hints after an unknown verb."""
 
 from __future__ import annotations
 

@@ -70,8 +70,8 @@ def up(  # noqa: PLR0917 - typer calls it, by name
         typer.Option(
             "--host",
             metavar="NAME[:LIMITS]",
-            help="One more host, or other limits for one: `desk:memory=none,cpu=2,disk=4GiB`. "
-            "What is not said is as for the others. May be repeated.",
+            help="Add a host, or change the limits of one: `desk:memory=none,cpu=2,disk=4GiB`. "
+            "Limits that are left out are those of the others. May be repeated.",
         ),
     ] = None,
     subnet: Annotated[

@@ -148,7 +148,7 @@ def event(row: EventRow) -> Table:
 
 
 def entry(when: str, kind: str, message: str) -> Table:
-    """When, which kind and what happened; a long message is wrapped below itself."""
+    """Time, kind and message of an event; a long message is wrapped below itself."""
     made = Table.grid(padding=(0, 1, 0, 0), pad_edge=False)
     made.add_row(Text(f"{when} "), Text(f"{formats.words(kind):<18}"), Text(message))
     return made

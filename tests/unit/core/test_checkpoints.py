@@ -615,7 +615,7 @@ MOVE = Move(process("p"), ONE, "a", TWO, "a", InstanceId("p", 3), 0, "p")
             (Start(TWO, "a", 1.0), Commit(image="x"), Stop(ONE, "a", 1.0)),
             "starts an instance",
         ),
-        (Aim.RESTORE, (Start(TWO, "a", 1.0), Commit()), "not from its image"),
+        (Aim.RESTORE, (Start(TWO, "a", 1.0), Commit()), "without its image"),
         (Aim.RESTORE, (Commit(),), "never starts or awaits"),
         (Aim.MOVE, (Start(TWO, "a", 1.0), Commit(image="x")), "commits to an image"),
     ],

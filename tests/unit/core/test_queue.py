@@ -99,7 +99,7 @@ def test_a_misspelt_resource_is_named_with_the_nearest_that_is_reported() -> Non
 
 
 def test_restart_of_a_process_that_waits_for_room_is_refused() -> None:
-    """It starts as soon as there is room anyway."""
+    """The process starts as soon as there is room anyway."""
     cluster = Cluster(full())
     cluster.submit(process("p"))
     assert cluster.restart("p").message == "p waits in the queue already. Nothing was restarted"
