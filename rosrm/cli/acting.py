@@ -52,7 +52,7 @@ def submit(
 
 
 def cancel(ctx: typer.Context, names: Names, domain: Domain = None) -> None:
-    """Take out of the queue, or stop for good."""
+    """Cancel processes: take them out of the queue, or stop them for good."""
     with connection.master(ctx, domain) as client:
         typer.echo(client.cancel(names))
 
@@ -60,7 +60,7 @@ def cancel(ctx: typer.Context, names: Names, domain: Domain = None) -> None:
 def restart(ctx: typer.Context, names: Names, domain: Domain = None) -> None:
     """Restart processes.
 
-    One that runs is restarted on its host; one that has ended is queued anew.
+    A running process is restarted on its host; one that has ended is queued again.
     """
     with connection.master(ctx, domain) as client:
         typer.echo(client.restart(names))
@@ -71,13 +71,13 @@ def migrate(
     name: Name,
     to: Annotated[
         str | None,
-        typer.Option("--to", metavar="HOST", help="Where to; by default the master chooses."),
+        typer.Option("--to", metavar="HOST", help="Destination; default: the master chooses."),
     ] = None,
     domain: Domain = None,
 ) -> None:
     """Move a process to another host.
 
-    It is moved by the migration strategy that its work file names.
+    The migration strategy that its work file names moves it.
     """
     with connection.master(ctx, domain) as client:
         typer.echo(client.migrate(name, to))
@@ -86,13 +86,13 @@ def migrate(
 def checkpoint(ctx: typer.Context, name: Name, wait: Wait = False, domain: Domain = None) -> None:
     """Stop a process, with its memory in an image on its host.
 
-    `rosrm restore` has it go on from there.
+    `rosrm restore` continues the process from there.
     """
     _through_image(ctx, name, "checkpoint", domain, wait=wait)
 
 
 def restore(ctx: typer.Context, name: Name, wait: Wait = False, domain: Domain = None) -> None:
-    """Have a process go on from its image, where that lies."""
+    """Restore a process from its image, on the host of the image."""
     _through_image(ctx, name, "restore", domain, wait=wait)
 
 
