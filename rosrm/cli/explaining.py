@@ -45,14 +45,13 @@ def _parts(story: Mapping[str, Any]) -> Iterator[RenderableType]:
             if count:
                 yield Text(f"and {counted(count, 'more host')} {reason}", "dim")
     history = story.get("history") or ()
-    if history:
-        yield Text()
-        if history[0]["kind"] != "submitted":
-            name = story["process"]
-            yield Text(f"Older events are left out: `rosrm events --process {name}`", "dim")
-        for entry in history:
-            ago = f"{formats.duration(entry['elapsed'])} ago"
-            yield tables.entry(f"{ago:>14}", entry["kind"], entry["message"])
+    yield Text()
+    if not history or history[0]["kind"] != "submitted":
+        name = story["process"]
+        yield Text(f"Older events are left out: `rosrm events --process {name}`", "dim")
+    for entry in history:
+        ago = f"{formats.duration(entry['elapsed'])} ago"
+        yield tables.entry(f"{ago:>14}", entry["kind"], entry["message"])
 
 
 def _headline(story: Mapping[str, Any]) -> Text:
