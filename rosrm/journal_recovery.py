@@ -23,6 +23,7 @@ from rosrm.disk_space import room_for
 from rosrm.errors import JournalBlocked, JournalError
 from rosrm.journal import SqliteJournal
 from rosrm.ports import Intent, Record
+from rosrm.spelling import counted
 
 _BESIDE: Final = ("-wal", "-shm")
 #: A damaged page hides all that is behind it in a scan. So events are read by a few, and from the
@@ -230,8 +231,10 @@ def _summary(found: _Found, aside: Path) -> str:
     processes = sum(table == "process" for table, _ in found.intents)
     hosts = sum(table == "host" for table, _ in found.intents)
     part = "all that was" if found.whole else "what could still be read:"
+    held = counted(processes, "process", "processes")
+    events = counted(len(found.events), "event")
     return (
-        f"the journal was recovered from a damaged one, {part} {processes} processes, {hosts} "
-        f"hosts and {len(found.events)} events; the damaged file is {aside}. Look at `rosrm ps` "
+        f"the journal was recovered from a damaged one, {part} {held}, {counted(hosts, 'host')} "
+        f"and {events}; the damaged file is {aside}. Look at `rosrm ps` "
         f"for what is missing, and submit it again: it is stopped where it still runs"
     )

@@ -1,8 +1,19 @@
-"""Near matches for messages: "did you mean ...?"."""
+"""Words in messages: near matches ("did you mean ...?"), plurals, states, amounts with units."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
+from typing import Final
+
+_SIZES: Final = ("B", "kB", "MB", "GB", "TB", "PB")
+_BINARY_SIZES: Final = ("B", "KiB", "MiB", "GiB", "TiB", "PiB")
+_STANDING: Final = {
+    "backoff": "is in back-off",
+    "failed": "has failed",
+    "finished": "has finished",
+    "cancelled": "was cancelled",
+}
 
 
 def get_close_matches(
@@ -17,3 +28,33 @@ def get_close_matches(
 def counted(number: int, singular: str, plural: str = "") -> str:
     """Return a number with its noun: "1 process", "2 processes"; `plural` if "s" is not enough."""
     return f"{number} {singular if number == 1 else plural or singular + 's'}"
+
+
+def listed(names: Iterable[str], word: str = "and") -> str:
+    """Return names as a sentence lists them: "a", "a and b", "a, b and c"."""
+    *first, last = names
+    return f"{', '.join(first)} {word} {last}" if first else last
+
+
+def standing(state: str) -> str:
+    """Return the state of a process as a sentence has it: "is in back-off", "has failed"."""
+    return _STANDING.get(state, f"is {state.replace('_', ' ')}")
+
+
+def size(amount: float, *, binary: bool = False) -> str:
+    """Return bytes with a unit: "512 B", "64.1 MB"; in powers of 1024 "61.1 MiB"."""
+    units, factor = (_BINARY_SIZES, 1024.0) if binary else (_SIZES, 1000.0)
+    exponent = 0
+    while abs(amount) >= factor - 0.5 and exponent < len(units) - 1:
+        amount, exponent = amount / factor, exponent + 1
+    digits = 0 if exponent == 0 or abs(amount) >= 99.5 else 1
+    return f"{amount:.{digits}f} {units[exponent]}"
+
+
+def amount(value: float, unit: str) -> str:
+    """Return an amount of a resource, given in its base unit."""
+    if not math.isfinite(value):
+        return "?"
+    if unit in ("B", "B/s"):
+        return size(value) + unit[1:]
+    return f"{value:.3g}" + {"core": " cores", "1": "", "": ""}.get(unit, f" {unit}")

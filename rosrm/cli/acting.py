@@ -81,7 +81,7 @@ def cancel(
     timeout: Timeout = "",
     domain: Domain = None,
 ) -> None:
-    """Take processes out of the queue, or stop them for good.
+    """Cancel processes: take them out of the queue, or stop them for good.
 
     Of a work file, those of its processes that have not ended.
     """
@@ -126,7 +126,7 @@ def restart(
 ) -> None:
     """Restart processes.
 
-    One that runs is restarted on its host; one that has ended is queued again.
+    A running process is restarted on its host; one that has ended is queued again.
     """
     from rosrm.cli.waiting import identity, interruptible, longest, over, restarted, wait_for
 
@@ -145,7 +145,7 @@ def migrate(
     name: Name,
     to: Annotated[
         str | None,
-        typer.Option("--to", metavar="HOST", help="Where to; by default the master chooses."),
+        typer.Option("--to", metavar="HOST", help="Destination; default: the master chooses."),
     ] = None,
     wait: Wait = False,
     timeout: Timeout = "",
@@ -153,7 +153,7 @@ def migrate(
 ) -> None:
     """Move a process to another host.
 
-    It is moved by the migration strategy that its work file names.
+    The migration strategy that its work file names moves it.
     """
     _with_ending(ctx, name, lambda client: client.migrate(name, to), domain, wait, timeout)
 
@@ -163,7 +163,7 @@ def checkpoint(
 ) -> None:
     """Stop a process, with its memory in an image on its host.
 
-    `rosrm restore` has it go on from there.
+    `rosrm restore` continues the process from there.
     """
     _with_ending(ctx, name, lambda client: client.checkpoint(name), domain, wait, timeout)
 
@@ -171,7 +171,7 @@ def checkpoint(
 def restore(
     ctx: typer.Context, name: Name, wait: Wait = False, timeout: Timeout = "", domain: Domain = None
 ) -> None:
-    """Have a process go on from its image, where that lies."""
+    """Restore a process from its image, on the host of the image."""
     _with_ending(ctx, name, lambda client: client.restore(name), domain, wait, timeout)
 
 

@@ -5,17 +5,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
+from rosrm.spelling import counted, get_close_matches
+
 if TYPE_CHECKING:
     from rosrm.config.settings import ClusterConfig
+    from rosrm.core.model import ProcessSpec
     from rosrm.registry import Registry
 
-config = typer.Typer(no_args_is_help=True, help="Look at configuration files.")
+#: Least likeness of two words that are taken for one misspelt; gpu_memory and memory have less.
+_NEAR: Final = 0.8
+
+config = typer.Typer(no_args_is_help=True, help="Check configuration files.")
 
 
 class KindOfFile(str, Enum):
@@ -29,7 +36,7 @@ class KindOfFile(str, Enum):
 
 @config.callback()
 def _group() -> None:
-    """Look at configuration files."""
+    """Check configuration files."""
 
 
 @config.command()
@@ -42,12 +49,12 @@ def check(
     ],
     kind: Annotated[
         KindOfFile | None,
-        typer.Option("--kind", help="What the files are; by default their keys or names tell."),
+        typer.Option("--kind", help="Kind of the files; default: their keys or names decide."),
     ] = None,
 ) -> None:
     """Check files before they are used.
 
-    Against all rules, and against the plugins that are installed here.
+    They are checked against all rules and against the plugins that are installed here.
     """
     from rosrm.errors import ConfigError
     from rosrm.registry import Registry
@@ -89,6 +96,7 @@ def _checked(file: Path, kind: KindOfFile | None, registry: Registry) -> str:
     from rosrm.config import load_cluster, load_host, load_work
     from rosrm.config.documents import read
     from rosrm.config.kinds import kind_of
+    from rosrm.core.graph_names import shared_nodes
 
     match kind.value if kind else kind_of(read(file)):
         case "cluster":
@@ -111,5 +119,20 @@ def _checked(file: Path, kind: KindOfFile | None, registry: Registry) -> str:
             return f"a simulation: {hosts} hosts, {processes} processes"
         case _:
             specs = load_work(file, registry)
+            for warning in (*shared_nodes(specs), *_misspelt_needs(specs, registry)):
+                typer.echo(f"{file}: warning: {warning}", err=True)
             jobs = sum(spec.kind.value == "job" for spec in specs)
-            return f"work: {jobs} jobs and {len(specs) - jobs} services"
+            return f"work: {counted(jobs, 'job')} and {counted(len(specs) - jobs, 'service')}"
+
+
+def _misspelt_needs(specs: Iterable[ProcessSpec], registry: Registry) -> Iterator[str]:
+    """Warn of resources in `needs` that are nearly named as a probe that is installed here.
+
+    Only a warning: another host may have a probe that this machine lacks.
+    """
+    probes = [row.name for row in registry.rows() if row.kind == "probe"]
+    for spec in specs:
+        for name in spec.needs:
+            near = get_close_matches(name, probes, n=1, cutoff=_NEAR)
+            if near and name not in probes:
+                yield f"{spec.name}: needs: no probe is named {name!r}; did you mean {near[0]!r}?"

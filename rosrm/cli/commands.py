@@ -17,19 +17,26 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from typer.core import TyperGroup
 
 from rosrm.cli import acting, checking, following, listing, simulate, starting
 from rosrm.cli.app import INTERRUPTED
 from rosrm.cli.criu import criu
+from rosrm.cli.groups import PlainCommand, PlainGroup, hint_after
 from rosrm.cli.lab import lab
 from rosrm.cli.options import Common, Domain
 from rosrm.errors import RosrmError
 from rosrm.version import PROTOCOL_VERSION, __version__
 
 
-class Guarded(TyperGroup):
+class Guarded(PlainGroup):
     """Says what a user did wrong without a traceback."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Find the command; a verb that other tools have gets the name of ours."""
+        hint = "" if args[0] in self.commands else hint_after(args[0])
+        if hint:
+            ctx.fail(f"No such command {args[0]!r}. {hint}")
+        return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command; turn our own errors into a message and an exit code."""
@@ -85,6 +92,8 @@ def common(
 for module in (starting, acting, listing, following, simulate):
     for function in module.COMMANDS:
         app.command()(function)
-app.add_typer(checking.config, name="config")
-app.add_typer(lab, name="lab")
-app.add_typer(criu, name="criu")
+for name, group in (("config", checking.config), ("lab", lab), ("criu", criu)):
+    app.add_typer(group, name=name, cls=PlainGroup)
+for group in (app, checking.config, lab, criu):
+    for command in group.registered_commands:
+        command.cls = PlainCommand

@@ -6,7 +6,7 @@ import getpass
 import os
 import socket
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
@@ -16,8 +16,9 @@ import typer
 from rosrm.cli import early
 from rosrm.cli.app import BEGUN
 from rosrm.cli.options import Common
-from rosrm.errors import RosrmError
+from rosrm.errors import Refused, RosrmError
 from rosrm.ros.settings import RosSettings
+from rosrm.spelling import get_close_matches, listed
 
 if TYPE_CHECKING:
     from rosrm.core.views import Snapshot
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 SAID_WITHIN: Final = 2.6
 #: However long the imports took, a master on this machine is found in this time.
 LEAST: Final = 1.5
+_LISTED_BY: Final = {"process": "ps --all", "host": "hosts"}
 
 
 def ros_settings(ctx: typer.Context, domain: int | None) -> RosSettings:
@@ -53,6 +55,22 @@ def say_trouble(snapshot: Snapshot) -> None:
     """Tell people beside the listing that the master takes no new work, and why."""
     if snapshot.trouble:
         typer.echo(f"rosrm: {snapshot.trouble}", err=True)
+
+
+def check_name(kind: str, name: str, known: Iterable[str]) -> None:
+    """Refuse a name that is not among the known ones, with the nearest; "" is no name.
+
+    Args:
+        kind: "process" or "host".
+        name: from the command line.
+        known: names that the master has.
+    """
+    names = list(known)
+    if not name or name in names:
+        return
+    near = [repr(one) for one in get_close_matches(name, names)]
+    hint = f"did you mean {listed(near, 'or')}?" if near else f"see `rosrm {_LISTED_BY[kind]}`"
+    raise Refused(f"no such {kind}: {name!r}; {hint}", "unknown")
 
 
 def connect(settings: RosSettings) -> MasterClient:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 criu = typer.Typer(
     no_args_is_help=True,
-    help="CRIU, which moves a process with its whole memory: install it, or see what it can do.",
+    help="Install or check CRIU, which moves a process with its whole memory.",
 )
 
 Prefix = Annotated[
@@ -28,14 +28,14 @@ Prefix = Annotated[
     typer.Option(
         "--prefix",
         metavar="FOLDER",
-        help="Where it is, or goes; default: ROSRM_CRIU_PREFIX, or below the user's data.",
+        help="Folder of CRIU; default: ROSRM_CRIU_PREFIX, or below the user's data.",
     ),
 ]
 
 
 @criu.callback()
 def _group() -> None:
-    """CRIU, which moves a process with its whole memory."""
+    """Install or check CRIU, which moves a process with its whole memory."""
 
 
 @criu.command()
@@ -46,7 +46,7 @@ def install(
         typer.Option(
             "--from",
             metavar="PATH",
-            help="Packages (*.deb) that are there already: a folder of them, or a file.",
+            help="Packages (*.deb) instead of a download: a file, or a folder of them.",
         ),
     ] = None,
     mirror: Annotated[
@@ -54,7 +54,7 @@ def install(
         typer.Option(
             "--mirror",
             metavar="URL",
-            help="Of the distribution's archive, instead of what apt's sources say.",
+            help="Archive of the distribution to download from; default: apt's sources.",
         ),
     ] = None,
 ) -> None:
@@ -87,7 +87,7 @@ def install(
 
 @criu.command()
 def check(prefix: Prefix = None, as_json: AsJson = False) -> None:
-    """Try it here: dump and restore a process, and say what works and what does not.
+    """Dump and restore a process here, and say what works and what does not.
 
     The exit code is 0 only if it works, and images can be sent.
     """

@@ -9,13 +9,15 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from rosrm.cli import formats, tables
+from rosrm.spelling import counted, listed
 
-_SAID: Final = {
-    "assigned": "was given to",
-    "migrated": "was moved to",
-    "stayed": "was to move to",
-    "waits": "waits",
-    "set_aside": "is set aside",
+#: What the master decided about a process.
+_DECIDED: Final = {
+    "assigned": "The master assigned {process} to {host}{ago}",
+    "migrated": "The master chose {host} as the destination of a move of {process}{ago}",
+    "stayed": "The master chose {host} as the destination of a move{ago}, and the move was undone",
+    "waits": "{process} waits for a host",
+    "set_aside": "No host may take {process}",
 }
 _STYLES: Final = {"chosen": "green", "vetoed": "yellow", "excluded": "red", "full": "yellow"}
 _UNITS: Final = {"memory": "B", "disk": "B", "cpu": "core"}
@@ -35,24 +37,25 @@ def _parts(story: Mapping[str, Any]) -> Iterator[RenderableType]:
     decision = story.get("decision")
     if decision:
         yield Text()
-        yield _sentence(decision)
+        yield _sentence(story["process"], decision)
         yield _needs(decision.get("need") or {})
         if decision.get("hosts"):
             yield _hosts(decision["hosts"])
         for reason, count in (decision.get("omitted") or {}).items():
             if count:
-                yield Text(f"and {count} more: {reason}", "dim")
+                yield Text(f"and {counted(count, 'more host')} {reason}", "dim")
     history = story.get("history") or ()
-    if history:
-        yield Text()
-        for entry in history:
-            ago = f"{formats.duration(entry['elapsed'])} ago"
-            yield Text(f"{ago:>14}  {formats.words(entry['kind']):<18} {entry['message']}")
+    yield Text()
+    if not history or history[0]["kind"] != "submitted":
+        name = story["process"]
+        yield Text(f"Older events are left out: `rosrm events --process {name}`", "dim")
+    for entry in history:
+        ago = f"{formats.duration(entry['elapsed'])} ago"
+        yield tables.entry(f"{ago:>14}", entry["kind"], entry["message"])
 
 
 def _headline(story: Mapping[str, Any]) -> Text:
-    text = Text(f"{story['process']} is ")
-    text.append_text(tables.state(story["state"]))
+    text = tables.sentence(story["process"], story["state"])
     if story.get("host"):
         text.append(f" on {story['host']}")
     if story.get("reason"):
@@ -61,39 +64,39 @@ def _headline(story: Mapping[str, Any]) -> Text:
 
 
 def _kept(kept: list[Mapping[str, Any]]) -> Text:
-    """Where its state is kept, and how far it is."""
+    """The hosts with a snapshot of the state, and the cycle of each."""
     places = [
         f"{one['host']} (cycle {one['sequence']}, {formats.size(one['size'])}, "
         f"{formats.duration(one['elapsed'])} ago)"
         for one in kept
     ]
-    return Text(f"Its state is kept on {', '.join(places)}.")
+    return Text(f"Snapshots of its state are on {listed(places)}.")
 
 
 def _checkpoint(told: Mapping[str, Any]) -> Text:
     """The newest periodic checkpoint, and what is wrong with the next."""
     if told["elapsed"] is None:
-        text = "There is no checkpoint of its memory yet"
+        text = "No periodic checkpoint of its memory exists yet"
     else:
         text = (
-            f"The last checkpoint of its memory was made {formats.duration(told['elapsed'])} ago "
-            f"({formats.size(told['size'])}, away for {told['pause']:.1f} s)"
+            f"The last periodic checkpoint is {formats.duration(told['elapsed'])} old "
+            f"({formats.size(told['size'])}; the process was paused for {told['pause']:.1f} s)"
         )
     return Text(f"{text}: {told['trouble']}" if told["trouble"] else f"{text}.")
 
 
-def _sentence(decision: Mapping[str, Any]) -> Text:
-    said = _SAID.get(decision["kind"], formats.words(decision["kind"]))
-    where = f" {decision['chosen']}" if decision.get("chosen") else ""
-    ago = f", {formats.duration(decision['elapsed'])} ago" if decision.get("elapsed") else ""
-    return Text(f"It {said}{where}{ago} (scoring policy {decision['policy']}; the lowest wins).")
+def _sentence(name: str, decision: Mapping[str, Any]) -> Text:
+    ago = f" {formats.duration(decision['elapsed'])} ago" if decision.get("elapsed") else ""
+    said = _DECIDED.get(decision["kind"], "{process}: " + formats.words(decision["kind"]))
+    what = said.format(process=name, host=decision.get("chosen"), ago=ago)
+    return Text(f"{what}. Scoring policy: {decision['policy'] or 'none'}; the lowest score wins.")
 
 
 def _needs(need: Mapping[str, float]) -> Text:
     amounts = [
         f"{name} {formats.amount(value, _UNITS.get(name, ''))}" for name, value in need.items()
     ]
-    return Text(f"Counted for it: {', '.join(amounts) or 'nothing'}.")
+    return Text(f"Needs that were counted: {', '.join(amounts) or 'none'}.")
 
 
 def _hosts(hosts: list[Mapping[str, Any]]) -> RenderableType:

@@ -20,33 +20,38 @@ if TYPE_CHECKING:
 #: Seconds between two looks.
 PERIOD: Final = 0.5
 
-Follow = Annotated[bool, typer.Option("--follow", "-f", help="Go on until Ctrl-C.")]
+Follow = Annotated[
+    bool, typer.Option("--follow", "-f", help="Keep printing what is new until Ctrl-C.")
+]
 
 
 def events(  # noqa: PLR0917 - an argument for each option
     ctx: typer.Context,
     follow: Follow = False,
     process: Annotated[
-        str, typer.Option("--process", metavar="NAME", help="Only those of one process.")
+        str, typer.Option("--process", metavar="NAME", help="Show only events of this process.")
     ] = "",
     host: Annotated[
-        str, typer.Option("--host", metavar="HOST", help="Only those of one host.")
+        str, typer.Option("--host", metavar="HOST", help="Show only events of this host.")
     ] = "",
     newest: Annotated[
-        int, typer.Option("--newest", "-n", metavar="N", min=1, help="The newest N of them.")
+        int, typer.Option("--newest", "-n", metavar="N", min=1, help="Show the newest N events.")
     ] = 100,
     as_json: AsJson = False,
     domain: Domain = None,
 ) -> None:
-    """Show what happened, oldest first.
+    """Show events of the cluster, oldest first.
 
-    With -f it goes on; with -f and --json each event is an object on a line of its own.
+    With -f the command keeps printing; with --json too, each event is an object on its own line.
     """
     from rosrm.cli import json_forms, tables
 
     with connection.master(ctx, domain) as client:
         snapshot = client.list(events=True, process=process, host=host, newest=newest)
         connection.say_trouble(snapshot)
+        if not snapshot.events:
+            _check_names(client, process, host)
+        console = tables.console()
         if as_json and not follow:
             json_forms.show(json_forms.forms(snapshot.events))
             return
@@ -54,12 +59,27 @@ def events(  # noqa: PLR0917 - an argument for each option
             for row in snapshot.events:
                 if as_json:
                     json_forms.show_line(json_forms.form(row))
+                elif console.is_terminal:
+                    console.print(tables.event(row))
                 else:
                     typer.echo(tables.event_line(row))
             if not follow:
+                _say_left_out(len(snapshot.events), newest)
                 return
             time.sleep(PERIOD)
             snapshot = _later(client, snapshot, process, host)
+
+
+def _check_names(client: MasterClient, process: str, host: str) -> None:
+    """Refuse the name of a process or host that the master does not know."""
+    known = client.list(hosts=True, processes=True)
+    connection.check_name("process", process, [row.name for row in known.processes])
+    connection.check_name("host", host, [row.description.name for row in known.hosts])
+
+
+def _say_left_out(shown: int, newest: int) -> None:
+    if shown >= newest:
+        typer.echo(f"rosrm: at most the newest {newest} are shown; -n N shows more", err=True)
 
 
 def _later(client: MasterClient, before: Snapshot, process: str, host: str) -> Snapshot:

@@ -4,29 +4,10 @@ from __future__ import annotations
 
 import math
 import time
-from typing import Final
 
-_SIZES: Final = ("B", "kB", "MB", "GB", "TB", "PB")
-_BINARY_SIZES: Final = ("B", "KiB", "MiB", "GiB", "TiB", "PiB")
+from rosrm.spelling import amount, size
 
-
-def size(amount: float, *, binary: bool = False) -> str:
-    """Bytes: "512 B", "64.1 MB"; in powers of 1024 "61.1 MiB"."""
-    units, factor = (_BINARY_SIZES, 1024.0) if binary else (_SIZES, 1000.0)
-    exponent = 0
-    while abs(amount) >= factor - 0.5 and exponent < len(units) - 1:
-        amount, exponent = amount / factor, exponent + 1
-    digits = 0 if exponent == 0 or abs(amount) >= 99.5 else 1
-    return f"{amount:.{digits}f} {units[exponent]}"
-
-
-def amount(value: float, unit: str) -> str:
-    """An amount of a resource in its base unit."""
-    if not math.isfinite(value):
-        return "?"
-    if unit in ("B", "B/s"):
-        return size(value) + unit[1:]
-    return f"{value:.3g}" + {"core": " cores", "1": "", "": ""}.get(unit, f" {unit}")
+__all__ = ["amount", "clock", "duration", "percent", "size", "words"]
 
 
 def duration(seconds: float) -> str:

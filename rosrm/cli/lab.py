@@ -36,11 +36,13 @@ class Way(str, Enum):
 
 Named = Annotated[
     str,
-    typer.Option("--lab", metavar="NAME", envvar="ROSRM_LAB", help="Which lab, if not `lab`."),
+    typer.Option(
+        "--lab", metavar="NAME", envvar="ROSRM_LAB", help="Name of the lab; default: lab."
+    ),
 ]
 Host = Annotated[str, typer.Argument(metavar="HOST", help="Name of a host of the lab.")]
 Direction = Annotated[
-    Way, typer.Option("--direction", help="What the host hears, what is heard of it, or both.")
+    Way, typer.Option("--direction", help="Packets to the host (in), from the host (out), or both.")
 ]
 
 
@@ -52,27 +54,31 @@ def _group() -> None:
 @lab.command()
 def up(  # noqa: PLR0917 - typer calls it, by name
     number: Annotated[
-        int, typer.Option("-n", "--hosts", metavar="N", help="How many: host1, host2, ...")
+        int, typer.Option("-n", "--hosts", metavar="N", help="Number of hosts: host1, host2, ...")
     ] = 3,
     memory: Annotated[
-        str, typer.Option("--memory", metavar="SIZE", help="Of each host; `none`: no limit.")
+        str, typer.Option("--memory", metavar="SIZE", help="Memory of each host; `none`: no limit.")
     ] = "none",
     cpu: Annotated[
-        str, typer.Option("--cpu", metavar="CORES", help="Of each host; `none`: no limit.")
+        str, typer.Option("--cpu", metavar="CORES", help="Cores of each host; `none`: no limit.")
     ] = "none",
-    disk: Annotated[str, typer.Option("--disk", metavar="SIZE", help="Of each host.")] = "1GiB",
+    disk: Annotated[
+        str, typer.Option("--disk", metavar="SIZE", help="Disk of each host.")
+    ] = "1GiB",
     host: Annotated[
         list[str] | None,
         typer.Option(
             "--host",
             metavar="NAME[:LIMITS]",
-            help="One more host, or other limits for one: `desk:memory=none,cpu=2,disk=4GiB`. "
-            "What is not said is as for the others. May be repeated.",
+            help="Add a host, or change the limits of one: `desk:memory=none,cpu=2,disk=4GiB`. "
+            "Limits that are left out are those of the others. May be repeated.",
         ),
     ] = None,
     subnet: Annotated[
         str,
-        typer.Option("--subnet", metavar="RANGE", help="Of the addresses; default: a free one."),
+        typer.Option(
+            "--subnet", metavar="RANGE", help="Addresses of the hosts; default: a free range."
+        ),
     ] = "",
     name: Named = "lab",
 ) -> None:
@@ -152,7 +158,7 @@ def cut(host: Host, direction: Direction = Way.BOTH, name: Named = "lab") -> Non
 
 @lab.command()
 def heal(host: Host, name: Named = "lab") -> None:
-    """End what cut, loss and delay did to a host."""
+    """End the cut, the loss and the delay of a host."""
     opened(name).heal(host)
     _say_link(name, host)
 
@@ -160,11 +166,13 @@ def heal(host: Host, name: Named = "lab") -> None:
 @lab.command()
 def loss(
     host: Host,
-    share: Annotated[str, typer.Argument(metavar="SHARE", help="Of the packets: 1% or 0.01.")],
+    share: Annotated[
+        str, typer.Argument(metavar="SHARE", help="Share of packets to drop: 1% or 0.01.")
+    ],
     direction: Direction = Way.BOTH,
     name: Named = "lab",
 ) -> None:
-    """Lose a share of the packets to and from a host; 0 ends it."""
+    """Drop a share of the packets to and from a host; 0 ends it."""
     opened(name).loss(host, fraction(share), direction.value)
     _say_link(name, host)
 
@@ -172,11 +180,13 @@ def loss(
 @lab.command()
 def delay(
     host: Host,
-    time: Annotated[str, typer.Argument(metavar="TIME", help="Of each packet: 50ms.")],
+    time: Annotated[
+        str, typer.Argument(metavar="TIME", help="Delay of each packet, such as 50ms.")
+    ],
     direction: Direction = Way.BOTH,
     name: Named = "lab",
 ) -> None:
-    """Let packets to and from a host be late; 0 ends it. Needs a kernel with netem."""
+    """Delay packets to and from a host; 0 ends it. Needs a kernel with netem."""
     opened(name).delay(host, _quantity("duration", time, "TIME"), direction.value)
     _say_link(name, host)
 
@@ -204,7 +214,7 @@ def boot(host: Host, name: Named = "lab") -> None:
 def status(
     as_json: AsJson = False,
     name: Annotated[
-        str, typer.Option("--lab", metavar="NAME", help="Only this lab, if not all of them.")
+        str, typer.Option("--lab", metavar="NAME", help="Show only this lab; default: all labs.")
     ] = "",
 ) -> None:
     """List the labs and their hosts."""
@@ -232,7 +242,9 @@ def status(
 @lab.command()
 def down(
     name: Named = "lab",
-    everything: Annotated[bool, typer.Option("--all", help="Every lab on this machine.")] = False,
+    everything: Annotated[
+        bool, typer.Option("--all", help="Remove every lab on this machine.")
+    ] = False,
 ) -> None:
     """Remove a lab: its processes end at once, and its disks are deleted."""
     from rosrm.lab import Lab, all_labs

@@ -31,10 +31,10 @@ def status(ctx: typer.Context, as_json: AsJson = False, domain: Domain = None) -
 def ps(
     ctx: typer.Context,
     everything: Annotated[
-        bool, typer.Option("--all", "-a", help="Also those that finished or were cancelled.")
+        bool, typer.Option("--all", "-a", help="List finished and cancelled processes too.")
     ] = False,
     host: Annotated[
-        str, typer.Option("--host", metavar="HOST", help="Only those on one host.")
+        str, typer.Option("--host", metavar="HOST", help="List only processes on this host.")
     ] = "",
     as_json: AsJson = False,
     domain: Domain = None,
@@ -43,8 +43,9 @@ def ps(
     from rosrm.cli import json_forms, tables
 
     with connection.master(ctx, domain) as client:
-        snapshot = client.list(processes=True)
+        snapshot = client.list(processes=True, hosts=bool(host))
     connection.say_trouble(snapshot)
+    connection.check_name("host", host, [row.description.name for row in snapshot.hosts])
     shown = [row for row in snapshot.processes if not host or row.host == host]
     if as_json:
         json_forms.show(json_forms.forms(shown))
@@ -81,14 +82,14 @@ def plugins(
     ctx: typer.Context,
     local: Annotated[
         bool,
-        typer.Option("--local", help="What is installed here, without asking a master."),
+        typer.Option("--local", help="List what is installed here, without a master."),
     ] = False,
     as_json: AsJson = False,
     domain: Domain = None,
 ) -> None:
-    """List the plugins and how they fare.
+    """List the plugins and their states.
 
-    One is selected, available, absent on a host, broken, or failing, with the reason.
+    A plugin is selected, available, absent on a host, broken, or failing, and the reason is shown.
     """
     from rosrm.cli import json_forms, tables
     from rosrm.registry import Registry
@@ -107,9 +108,9 @@ def plugins(
 
 
 def explain(ctx: typer.Context, name: Name, as_json: AsJson = False, domain: Domain = None) -> None:
-    """Say why a process is where it is.
+    """Explain why a process is where it is, or why it waits.
 
-    Or why it waits: each host with its score, its veto or what it lacks, and what happened.
+    Each host is listed with its score, its veto or what it lacks; the events follow.
     """
     from rosrm.cli import explaining, json_forms, tables
 

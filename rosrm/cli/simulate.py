@@ -25,27 +25,32 @@ def simulate(  # noqa: PLR0913, PLR0917 - an argument for each option
     variant: Annotated[
         list[str] | None,
         typer.Option(
-            "--variant", metavar="YAML", help="One more, such as 'scoring: {policy: threshold}'."
+            "--variant",
+            metavar="YAML",
+            help="Add a variant, such as 'scoring: {policy: threshold}'.",
         ),
     ] = None,
     policy: Annotated[
         list[str] | None,
-        typer.Option("--policy", metavar="NAME", help="One more: another scoring policy."),
+        typer.Option("--policy", metavar="NAME", help="Add a variant with this scoring policy."),
     ] = None,
     hosts: Annotated[
         list[int] | None,
-        typer.Option("--hosts", metavar="N", help="One more: another number of hosts."),
+        typer.Option("--hosts", metavar="N", help="Add a variant with so many hosts."),
     ] = None,
     until: Annotated[
-        str, typer.Option("--until", metavar="TIME", help="End each run here, such as 10min.")
+        str,
+        typer.Option(
+            "--until", metavar="TIME", help="End each run after this time, such as 10min."
+        ),
     ] = "",
     seed: Annotated[
         int | None,
-        typer.Option("--seed", metavar="N", min=0, help="For what a workload draws by chance."),
+        typer.Option(
+            "--seed", metavar="N", min=0, help="Seed of the random values; default: the workload's."
+        ),
     ] = None,
-    cut: Annotated[
-        bool, typer.Option("--cut", help="Take what is there of a record that is cut short.")
-    ] = False,
+    cut: Annotated[bool, typer.Option("--cut", help="Accept a record that is cut short.")] = False,
     plot: Annotated[
         Path | None,
         typer.Option("--plot", metavar="FILE", help="Draw the runs: .png, .svg or .pdf."),
@@ -54,8 +59,8 @@ def simulate(  # noqa: PLR0913, PLR0917 - an argument for each option
 ) -> None:
     """Run a workload on virtual time, and compare policies, weights and numbers of hosts.
 
-    The first row is the workload as it is given; each variant is one row more. Of a record the
-    first row is the real run.
+    The first row is the workload as given; each variant adds a row. The first row of a record is
+    the real run.
     """
     from rosrm.cli import simulation_picture, simulation_tables
     from rosrm.cli.simulation_runs import Request, carry_out

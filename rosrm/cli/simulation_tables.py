@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
 import typer
@@ -13,6 +13,7 @@ from rosrm.cli.simulation_runs import Report, Run
 from rosrm.config.plain import to_plain
 from rosrm.simulation.agreement import Agreement
 from rosrm.simulation.replay import Replay
+from rosrm.spelling import counted
 
 #: Processes that were never placed, of which the reason is told.
 _TOLD: Final = 3
@@ -41,11 +42,12 @@ def show(report: Report) -> None:
             more = f"; and {len(never) - _TOLD} more" if len(never) > _TOLD else ""
             typer.echo(f"{run.name}: {len(never)} never placed: {some}{more}")
     if report.agreement is not None:
-        typer.echo(agreement_line(report.agreement))
+        for line in agreement_lines(report.agreement):
+            typer.echo(line)
     simulated = [run for run in report.runs if run.seconds > 0.0]
     events = sum(run.outcome.events for run in simulated)
     seconds = sum(run.seconds for run in simulated)
-    typer.echo(f"{events} events in {seconds:.1f} s, {events / seconds:.0f} a second")
+    typer.echo(f"{counted(events, 'event')} in {seconds:.1f} s, {events / seconds:.0f} a second")
 
 
 def _cells(run: Run) -> dict[str, str]:
@@ -75,34 +77,36 @@ def _say_of_record(report: Report, replayed: Replay) -> None:
     assert recording is not None
     typer.echo(
         f"record of master {recording.header.master}, epoch {recording.header.epoch}: "
-        f"{recording.length:.1f} s, {len(recording.events)} events, {recording.end}"
+        f"{recording.length:.1f} s, {counted(len(recording.events), 'event')}, {recording.end}"
     )
     if not replayed.different:
         typer.echo(f"replayed: all {replayed.decisions} decisions are the same")
         return
     typer.echo(
-        f"replayed: after {replayed.different} events something else is decided; another version "
-        f"of rosrm or of a plugin?"
+        f"replayed: {counted(replayed.different, 'event')} led to other decisions; was the record "
+        f"made by another version of rosrm or of a plugin?"
     )
     for difference in replayed.differences:
         typer.echo(f"  {difference}")
 
 
-def agreement_line(agreement: Agreement) -> str:
-    """How closely a simulation agrees with its run, in a few sentences."""
-    makespan = "" if agreement.makespan is None else f", makespan {agreement.makespan:.2f} of it"
-    return (
-        f"the simulation and the recorded run: first hosts equal for {agreement.same_host:.0%} of "
-        f"{agreement.processes} processes, numbers of processes by host for "
-        f"{agreement.same_counts:.0%}; {agreement.migrations[0]} moves recorded, "
-        f"{agreement.migrations[1]} simulated{makespan}. Apart on average, in points of memory and "
-        f"cpu: usage of the same host {_points(agreement.usage)}, of the k-th fullest "
-        f"{_points(agreement.ranked)}, gap between hosts {_points(agreement.balance)}"
-    )
+def agreement_lines(agreement: Agreement) -> Iterator[str]:
+    """Say how closely a simulation agrees with its run."""
+    same = round(agreement.same_host * agreement.processes)
+    processes = counted(agreement.processes, "process", "processes")
+    yield "The simulation compared with the recorded run:"
+    yield f"  {same} of {processes} started on the same host"
+    yield f"  {agreement.same_counts:.0%} match in how many started on each host"
+    yield f"  moves: {agreement.migrations[0]} recorded, {agreement.migrations[1]} simulated"
+    if agreement.makespan is not None:
+        yield f"  makespan: {agreement.makespan:.2f} times the recorded one"
+    yield f"  mean difference of the usage of a host: {_points(agreement.usage)}"
+    yield f"  the same with hosts ordered from full to empty: {_points(agreement.ranked)}"
+    yield f"  mean difference of the gap between full and empty: {_points(agreement.balance)}"
 
 
 def _points(of: Mapping[str, float]) -> str:
-    return f"{of['memory'] * 100:.1f} and {of['cpu'] * 100:.1f}"
+    return f"memory {of['memory'] * 100:.1f}, CPU {of['cpu'] * 100:.1f} percentage points"
 
 
 # --- JSON -------------------------------------------------------------------------------------

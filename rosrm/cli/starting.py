@@ -33,15 +33,13 @@ def master(
     ] = None,
     recover: Annotated[
         bool,
-        typer.Option(
-            "--recover", help="Go on with what can still be read of a damaged journal, once."
-        ),
+        typer.Option("--recover", help="Recover what can still be read of a damaged journal."),
     ] = False,
     domain: Domain = None,
 ) -> None:
     """Start the master of a cluster.
 
-    It runs until Ctrl-C, which touches no process; started again it goes on where it was.
+    The master runs until Ctrl-C, which stops no process; started again it continues from there.
     """
     from rosrm.config.cluster import default_cluster, load_cluster
     from rosrm.registry import Registry
@@ -73,8 +71,8 @@ def slave(
 ) -> None:
     """Start the slave of this host.
 
-    It runs until Ctrl-C, SIGTERM or SIGHUP (a closed terminal), which stop its processes too,
-    unless the file says `on_stop: keep`.
+    The slave runs until Ctrl-C, SIGTERM or SIGHUP (a closed terminal), which stop its processes
+    too, unless the file has `on_stop: keep`.
     """
     from rosrm.config import HostConfig, load_host
     from rosrm.registry import Registry

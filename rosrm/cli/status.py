@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 
 from rich.console import Group, RenderableType
+from rich.styled import Styled
 from rich.text import Text
 
 from rosrm.cli import formats, tables
@@ -32,7 +33,7 @@ def _lines(snapshot: Snapshot) -> Iterator[RenderableType]:
     yield from _failing(snapshot.plugins)
     if snapshot.events:
         yield Text()
-        yield from (Text(tables.event_line(event), "dim") for event in snapshot.events)
+        yield from (Styled(tables.event(event), "dim") for event in snapshot.events)
 
 
 def _counted(states: Iterable[str]) -> str:
@@ -59,8 +60,7 @@ def _troubles(processes: Iterable[ProcessRow]) -> Iterator[RenderableType]:
     if rows:
         yield Text()
     for row in rows[:_MOST_NAMED]:
-        text = Text(f"{row.name} is ")
-        text.append_text(tables.state(row.state))
+        text = tables.sentence(row.name, row.state)
         yield text.append(f": {row.reason}" if row.reason else "")
     if len(rows) > _MOST_NAMED:
         yield Text(f"and {len(rows) - _MOST_NAMED} more; see rosrm ps")

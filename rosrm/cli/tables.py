@@ -12,6 +12,7 @@ from rich.text import Text
 
 from rosrm.cli import formats
 from rosrm.core.views import EventRow, HostRow, PluginRow, ProcessRow, ResourceRow
+from rosrm.spelling import counted, standing
 
 #: Width of tables that go into a file or pipe, where nobody minds a long line.
 _PIPE_WIDTH: Final = 160
@@ -72,6 +73,12 @@ def state(word: str) -> Text:
     return Text(formats.words(word), style=STYLES.get(word, ""))
 
 
+def sentence(name: str, word: str) -> Text:
+    """A process and its state as the beginning of a sentence, the state in its colour."""
+    verb, _, rest = standing(word).partition(" ")
+    return Text(f"{name} {verb} ").append(rest, STYLES.get(word, ""))
+
+
 def processes(rows: Iterable[ProcessRow]) -> Table:
     """For `rosrm ps`."""
     numbers = ("SINCE", "CPU", "MEMORY")
@@ -102,8 +109,8 @@ def why(row: ProcessRow) -> str:
         parts.append(row.reason)
     elif row.state == "failed" and row.exit_code is not None:
         parts.append(f"exit code {row.exit_code}")
-    if row.restarts:
-        parts.append(f"{row.restarts} restarts")
+    if row.restarts and "restart" not in row.reason:
+        parts.append(counted(row.restarts, "restart"))
     if row.migrations:
         parts.append(f"moved {row.migrations}x")
     return "; ".join(parts)
@@ -152,3 +159,15 @@ def plugins(rows: Iterable[PluginRow]) -> Table:
 def event_line(row: EventRow) -> str:
     """One line of the event record."""
     return f"{formats.clock(row.wall_time)}  {formats.words(row.kind):<18} {row.message}"
+
+
+def event(row: EventRow) -> Table:
+    """One event for a terminal: a long message is wrapped below itself."""
+    return entry(formats.clock(row.wall_time), row.kind, row.message)
+
+
+def entry(when: str, kind: str, message: str) -> Table:
+    """Time, kind and message of an event; a long message is wrapped below itself."""
+    made = Table.grid(padding=(0, 1, 0, 0), pad_edge=False)
+    made.add_row(Text(f"{when} "), Text(f"{formats.words(kind):<18}"), Text(message))
+    return made

@@ -14,6 +14,7 @@ import typer
 from rosrm.config.units import Quantity
 from rosrm.core.views import ProcessRow
 from rosrm.errors import ConfigError
+from rosrm.spelling import standing
 
 if TYPE_CHECKING:
     from rosrm.ros.client import MasterClient
@@ -186,7 +187,7 @@ def _say_news(rows: Iterable[ProcessRow], said: dict[str, str]) -> None:
             said[row.name] = row.state
             if row.state in _NOTEWORTHY:
                 why = f": {row.reason}" if row.reason else ""
-                typer.echo(f"{row.name} is {row.state.replace('_', ' ')}{why}", err=True)
+                typer.echo(f"{row.name} {standing(row.state)}{why}", err=True)
 
 
 def _say_end(

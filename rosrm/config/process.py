@@ -24,6 +24,7 @@ from rosrm.core.model import (
     StandbyPolicy,
     StopPolicy,
 )
+from rosrm.spelling import listed
 
 _RESTART: Final = RestartPolicy()
 _READINESS: Final = Readiness()
@@ -284,9 +285,8 @@ def _about_program(process: ProcessInFile) -> Iterator[Complaint]:
     }
     given = [name for name, value in programs.items() if value]
     if len(given) != 1:
-        said = " and ".join(given) if given else "nothing"
-        rule = "exactly one of package + executable, module and command is wanted"
-        yield Complaint((), f"{rule}, and {said} is given")
+        said = f"{listed(given)} are given" if given else "no program is given"
+        yield Complaint((), f"{said}; give one of package + executable, module or command")
     elif process.package and not process.executable:
         text = f"package {process.package!r} is given without an executable"
         yield Complaint(("package",), text)

@@ -162,4 +162,4 @@ def fault(state: MasterState, strategy: str, source: Host, destination: Host) ->
             "migration", strategy, "host_fault", lambda: required(asked.host_fault(*facts), str)
         )
     except PluginError as error:
-        return f"{strategy} cannot say whether it can go there: {error}"
+        return f"the check of the hosts by {strategy} failed: {error}"

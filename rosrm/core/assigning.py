@@ -15,10 +15,10 @@ from rosrm.core.lost_tail import why_no_work
 from rosrm.core.model import EMPTY
 from rosrm.core.placement import Demand, Ranking
 from rosrm.core.state import MasterState, Process, ProcessPhase, larger
-from rosrm.core.verdicts import Decision, decide, refused_everywhere, why_never
+from rosrm.core.verdicts import Decision, decide, refused_everywhere, why_all_away, why_never
 
 _AWAY: Final = (HostCondition.EXPECTED, HostCondition.LOST)
-_STATE_MAY_COME: Final = "a host that may keep its state has not come back yet"
+_STATE_MAY_COME: Final = "a host that may have a snapshot of its state has not come back yet"
 _NOBODY: Final[frozenset[str]] = frozenset()
 
 
@@ -43,7 +43,8 @@ def demand_to_move(
 ) -> Demand:
     """What decides where a running process may go on."""
     excluded = {
-        **process.excluded, **unable(state, process, source), source: "it is there already",
+        **process.excluded, **unable(state, process, source),
+        source: "it is the source of the move",
     }  # fmt: skip
     return Demand(
         process.spec, *_amounts(state, process, seen), excluded, headroom,
@@ -231,7 +232,7 @@ def _tell_waiting(state: MasterState, process: Process, now: float) -> None:
     if not len(state.hosts):
         _tell_waits(state, process, "no host has registered yet", now)
         return
-    reason = "no host has room for it now"
+    reason = why_all_away(state.hosts) or "no host has room for it now"
     if process.reason != reason:
         state.note_decision(process, decide_now(state, process), "waits", now)
         _tell_waits(state, process, reason, now, {"decision": process.decision})

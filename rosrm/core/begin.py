@@ -16,6 +16,7 @@ from rosrm.core.plugin_calls import required
 from rosrm.core.state import MasterState, Process, ProcessPhase, Run
 from rosrm.core.steps import title
 from rosrm.errors import PluginError, describe_fault
+from rosrm.spelling import standing
 
 #: The method of a strategy that plans for an aim.
 _HOOKS: Final = {Aim.MOVE: "propose", Aim.CHECKPOINT: "checkpoint", Aim.RESTORE: "restore"}
@@ -98,7 +99,9 @@ def why_immovable(state: MasterState, process: Process) -> str:
     if process.phase is ProcessPhase.CHECKPOINTED:
         return f"{process.name} is checkpointed: {reason_of(state, process)}; restore it first"
     if process.phase is not ProcessPhase.RUNNING:
-        return f"{process.name} is {process.phase.value}; only a running process can be moved"
+        return (
+            f"{process.name} {standing(process.phase.value)}; only a running process can be moved"
+        )
     standby = state.standbys.get(process.name)
     others = process.instances - {process.owner, standby.destination.number if standby else 0}
     if others:

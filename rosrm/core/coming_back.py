@@ -47,7 +47,7 @@ def _take_back(
     process.owner, process.left_behind = left.number, None
     state.set_phase(process, ProcessPhase.STARTING, now)
     state.record(
-        now, "taken_back", f"{instance.id} goes on: {host.name} is heard again",
+        now, "readopted", f"{host.name} reports again: {instance.id} is re-adopted",
         process=process.name, host=host.name, facts={"number": left.number},
     )  # fmt: skip
     state.save(process)

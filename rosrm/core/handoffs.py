@@ -22,6 +22,29 @@ DONE: Final = ""
 #: What a destination says when it follows the source, or is further still.
 _READY: Final = frozenset({ReportPhase.READY, ReportPhase.SWITCHING, ReportPhase.ACTIVE})
 
+#: What the master asks for in each phase, as the subject of a sentence.
+TITLES: Final[Mapping[HandoffPhase, str]] = {
+    HandoffPhase.SHADOW: "copying the state to the destination",
+    HandoffPhase.SWITCH: "switching from the source to the destination",
+    HandoffPhase.TAKE_OVER: "letting the destination take over",
+    HandoffPhase.ABORT: "calling the handoff off at the destination",
+    HandoffPhase.RESUME: "letting the source publish again",
+    HandoffPhase.DONE: "ending the handoff",
+}
+#: What a node reports, as a sentence with the node as its subject.
+_REPORTS: Final[Mapping[ReportPhase, str]] = {
+    ReportPhase.ATTACHED: "takes part in the handoff",
+    ReportPhase.SILENT: "has stopped publishing",
+    ReportPhase.RELEASED: "has nothing more to do",
+    ReportPhase.RESUMED: "publishes again",
+    ReportPhase.SHADOWING: "receives the state of the source",
+    ReportPhase.READY: "has the state of the source and can take over",
+    ReportPhase.SWITCHING: "is taking over",
+    ReportPhase.ACTIVE: "is active",
+    ReportPhase.ABORTED: "has called the handoff off",
+    ReportPhase.FAILED: "cannot continue the handoff",
+}
+
 
 # --- what is said -----------------------------------------------------------------------------
 
@@ -94,8 +117,9 @@ def _note(state: MasterState, run: Run, event: happened.HandoffReported, now: fl
     heard = run.heard.setdefault(event.instance, Heard())
     if event.phase not in heard.phases:
         said = f": {event.message}" if event.message else ""
+        message = f"{run.process}#{event.instance} {_REPORTS[event.phase]}{said}"
         state.record(
-            now, "handoff_reported", f"{run.process}#{event.instance} is {event.phase.name}{said}",
+            now, "handoff_reported", message,
             process=run.process,
             facts={"phase": event.phase.name, "sequence": event.sequence},
         )  # fmt: skip
@@ -155,9 +179,9 @@ def _fault(state: MasterState, run: Run) -> str:
     for instance in (run.destination, run.source):
         said = run.phases_of(instance)
         if ReportPhase.FAILED in said:
-            return f"{instance} cannot go on with the handoff: {said[ReportPhase.FAILED]}"
+            return f"{instance} {_REPORTS[ReportPhase.FAILED]}: {said[ReportPhase.FAILED]}"
     if ReportPhase.ABORTED in run.phases_of(run.destination):
-        return f"{run.destination} gave the handoff up"
+        return f"{run.destination} {_REPORTS[ReportPhase.ABORTED]}"
     return ""
 
 
@@ -207,7 +231,7 @@ def timed_out(state: MasterState, run: Run, step: Configure, now: float) -> str 
         if not instance.stopping:
             _stop_unheard(state, run, now)
             return None
-    return f"state_config {step.phase.name} took longer than {step.timeout:g} s: {_waited(run)}"
+    return f"{TITLES[step.phase]} took longer than {step.timeout:g} s: {_waited(run)}"
 
 
 def _stop_unheard(state: MasterState, run: Run, now: float) -> None:
@@ -216,7 +240,8 @@ def _stop_unheard(state: MasterState, run: Run, now: float) -> None:
     lifecycle.stop_instance(state, state.instances[run.destination.number], now)
     run.deadline = now + stop.timeout
     state.record(
-        now, "destination_unheard", f"{run.destination} does not answer to ABORT: stopped",
+        now, "destination_unheard",
+        f"{run.destination} does not confirm that the handoff is called off: the master stops it",
         process=run.process, host=run.destination_host.name,
     )  # fmt: skip
     state.save_run(run)
@@ -227,13 +252,13 @@ def _waited(run: Run) -> str:
     source, destination = run.heard.get(run.source.number), run.heard.get(run.destination.number)
     if source is None and destination is None:
         return (
-            "nothing was heard of either node. Do they use rosrm.node? One that keeps only the "
+            "neither node has reported. Do they use rosrm.node? One that keeps only the "
             "paper's constraints needs `protocol: paper` in the options of its migration"
         )
     said = [
-        f"{instance} said nothing"
+        f"{instance} has not reported"
         if heard is None
-        else f"{instance} is {list(heard.phases)[-1].name}"
+        else f"{instance} {_REPORTS[list(heard.phases)[-1]]}"
         + (f": {heard.message}" if heard.message else "")
         for instance, heard in ((run.destination, destination), (run.source, source))
     ]

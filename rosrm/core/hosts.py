@@ -24,6 +24,7 @@ from rosrm.core.columns import (
     IntArray,
 )
 from rosrm.core.model import EMPTY, RESOURCE_SLOTS, HostDescription
+from rosrm.spelling import counted
 
 #: A usage above this is no measurement but a mistake (a CPU reading of 1.2 can be real).
 ABSURD_USAGE: Final = 64.0
@@ -55,6 +56,7 @@ class Host:
         drained: it is draining, and no process is left on it that can leave.
         pruned: it is in no listing, until it registers.
         told: kind of a record that is not repeated at once, to when it was made.
+        blocked: why nothing could leave it, by what was to be relieved: as last recorded.
         lost_since: time at which it was lost, while it is.
         failing: resource to the reason why its probe gives no readings, as the slave reports.
     """
@@ -69,6 +71,7 @@ class Host:
     over_since: dict[str, float] = field(default_factory=dict)
     over_at: dict[str, float] = field(default_factory=dict)
     told: dict[str, float] = field(default_factory=dict)
+    blocked: dict[str, str] = field(default_factory=dict)
     lost_since: float = 0.0
     failing: Mapping[str, str] = field(default_factory=lambda: EMPTY)
 
@@ -267,16 +270,21 @@ class HostTable(HostColumns):
         if away:
             return away
         if self.condition[column] == HostCondition.SUSPECT:
-            return "it has been silent for a moment"
+            return "it is suspect: its reports are late"
         if self.processes[column] >= self.bound[column]:
-            return f"it holds its most processes, {self.bound[column]}"
+            most = counted(int(self.bound[column]), "process", "processes")
+            return f"it accepts no more than {most} now"
         if self.stale[column]:
             return f"its reading of {', '.join(self.stale_resources(host))} is stale"
         if not self.accepting[column]:
             over = self.over_limit(column)
-            return f"it is over its limit of {', '.join(over)}" if over else "it takes no work now"
+            return (
+                f"it is over its limit of {', '.join(over)}"
+                if over
+                else "its slave accepts no work now"
+            )
         if self.untold[column]:
-            return "it was lost, and has not said yet what it holds"
+            return "it was lost, and has not reported its processes yet"
         if not self.asking[column]:
             return "it has not asked for work yet"
         return ""

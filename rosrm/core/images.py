@@ -31,7 +31,7 @@ _ASK_AGAIN: Final = 60.0
 _KEY: Final = "unwanted_images"
 
 _AWAY: Final = {
-    HostCondition.SUSPECT: "is not heard just now",
+    HostCondition.SUSPECT: "is suspect: its reports are late",
     HostCondition.LOST: "is lost",
     HostCondition.LEFT: "has left",
     HostCondition.EXPECTED: "has not come back since the master started",

@@ -22,6 +22,7 @@ from rosrm.core.state import MasterState
 from rosrm.core.steps import nobody_there, title
 from rosrm.core.verdicts import verdict_of
 from rosrm.ports import Imaging
+from rosrm.spelling import standing
 
 #: Kinds of the records by which each begins.
 _BEGUN: Final = {Aim.CHECKPOINT: "checkpoint_begun", Aim.RESTORE: "restore_begun"}
@@ -58,10 +59,11 @@ def _why_no_checkpoint(state: MasterState, process: Process) -> str:
     if process.phase is ProcessPhase.CHECKPOINTED:
         return f"{process.name} is checkpointed already: {images.reason_of(state, process)}"
     if process.phase is not ProcessPhase.RUNNING:
-        return f"{process.name} is {process.phase.value}; only a running process is checkpointed"
+        stands = standing(process.phase.value)
+        return f"{process.name} {stands}; only a running process is checkpointed"
     if process.spec.standby.wanted:
         return (
-            f"{process.name} has a standby, which would go on in its place: submit it without "
+            f"{process.name} has a standby, which would take over: submit the process without "
             f"`standby` to checkpoint it"
         )
     if process.spec.keeps_state:
@@ -110,7 +112,8 @@ def _why_no_restore(state: MasterState, process: Process) -> str:
         return why_busy(state.runs[process.name])
     image = process.image
     if image is None or process.phase is not ProcessPhase.CHECKPOINTED:
-        return f"{process.name} is {process.phase.value}; only a checkpointed process is restored"
+        stands = standing(process.phase.value)
+        return f"{process.name} {stands}; only a checkpointed process is restored"
     if process.instances:
         return f"an earlier instance of {process.name} is still being stopped"
     away = images.why_away(state, image)
@@ -245,10 +248,13 @@ def ending_of(run: Run) -> tuple[str, str]:
     if run.aim is Aim.CHECKPOINT:
         if done:
             return "checkpointed", f"{name} is checkpointed: its image is on {here}"
-        return "checkpoint_failed", f"{name} runs on on {here}: {run.failure}"
+        return (
+            "checkpoint_failed",
+            f"{name} was not checkpointed and still runs on {here}: {run.failure}",
+        )
     if run.aim is Aim.RESTORE:
         if done:
-            return "restored", f"{name} goes on from its image on {here}"
+            return "restored", f"{name} was restored from its image on {here}"
         return "restore_failed", f"{name} stays checkpointed on {here}: {run.failure}"
     if done:
         return "migrated", f"{name} moved from {here} to {there}"

@@ -17,6 +17,7 @@ from rosrm.core.model import EMPTY
 from rosrm.core.readings import take_readings
 from rosrm.core.state import MasterState, Wanted
 from rosrm.ports import Intent
+from rosrm.spelling import counted
 
 #: Seconds between two records about the same nonsense from the same host.
 _TOLD_EVERY = 10.0
@@ -42,8 +43,9 @@ def host_registered(state: MasterState, event: happened.HostRegistered, now: flo
     host.failing = EMPTY  # the slave reports what fails in this run
     if is_new:
         save_host(state, host)
+    held = counted(len(event.instances), "process", "processes")
     state.record(
-        now, "host_registered", f"{host.name} registered with {len(event.instances)} processes",
+        now, "host_registered", f"{host.name} registered with {held}",
         host=host.name,
         facts={
             "host_id": host.host_id, "labels": dict(description.labels),
@@ -139,7 +141,7 @@ def host_left(state: MasterState, event: happened.HostLeft, now: float) -> None:
         state.emit(Reply(event.request, False, "unknown", "this host is not registered"))
         return
     state.hosts.set_condition(host, HostCondition.LEFT)
-    state.record(now, "host_left", f"{host.name} leaves", host=host.name)
+    state.record(now, "host_left", f"{host.name} leaves: its slave stops", host=host.name)
     for number in sorted(host.instances):
         process = state.owned_by(state.instances[number])
         if process is not None and process.wanted is Wanted.RUN:
@@ -190,7 +192,13 @@ def usages_received(state: MasterState, event: happened.UsagesReceived, now: flo
         if instance is None or instance.host is not host:
             continue
         if not (np.isfinite(cpu) and np.isfinite(memory) and cpu >= 0.0 and memory >= 0.0):
-            _tell(state, host, "reading_refused", now, f"a usage of {instance.id} was refused")
+            _tell(
+                state,
+                host,
+                "reading_refused",
+                now,
+                f"a usage of {instance.id} was refused (NaN or negative)",
+            )
             continue
         instance.seen = {"cpu": float(cpu), "memory": float(memory)}
         for resource, amount in instance.seen.items():

@@ -24,6 +24,7 @@ from rosrm.core.model import (
 from rosrm.core.plugin_calls import note_probes
 from rosrm.core.runs import End, Run
 from rosrm.core.state import WAITING, Instance, MasterState, Process, ProcessPhase, Wanted
+from rosrm.spelling import standing
 
 #: What the state of the owning instance means for the process.
 _PHASE: Final = {
@@ -78,7 +79,7 @@ def reconcile(
             continue
         if instance.state is None and (not registering or _yet_to_start(state, instance)):
             continue
-        gone(state, instance, now, f"{host.name} does not hold it any more")
+        gone(state, instance, now, f"{host.name} does not run it any more")
 
 
 def _yet_to_start(state: MasterState, instance: Instance) -> bool:
@@ -134,7 +135,7 @@ def _follow(
         kind = "ready" if phase is ProcessPhase.RUNNING else phase.value
         kind = "reachable" if repeated else kind
         state.record(
-            now, kind, f"{process.name} is {kind} on {instance.host.name}"
+            now, kind, f"{process.name} {standing(kind)} on {instance.host.name}"
             + (f": {status.message}" if status.message else ""),
             process=process.name, host=instance.host.name,
             facts={"number": instance.id.number, "pid": status.pid, "restarts": status.restarts},
@@ -166,10 +167,10 @@ def _take_stranger(state: MasterState, host: Host, status: InstanceStatus, now: 
             state.emit(Order(state.order_id(), host.host_id, "stop", status.instance))
         return
     followed = coming_back.has_successor(state, status)
-    how = "its successor owns the name: fenced" if followed else "stopped"
+    how = "has it killed: another instance owns its name" if followed else "stops it"
     state.record(
-        now, "fenced" if followed else "stranger_stopped",
-        f"{status.instance} is not meant to run on {host.name}: {how}",
+        now, "fenced" if followed else "unassigned_stopped",
+        f"{status.instance} is not assigned to {host.name}: the master {how}",
         process=status.instance.process, host=host.name,
     )  # fmt: skip
     stranger = adopt_to_stop(state, status.instance, host, now)
@@ -260,7 +261,7 @@ def conclude(state: MasterState, process: Process, end: End, host: Host, now: fl
     elif end.gone:
         _requeue(state, process, host, now, status.message)
     elif end.ordered:
-        _requeue(state, process, host, now, f"it was ended on {host.name}")
+        _requeue(state, process, host, now, f"its instance on {host.name} was stopped")
     elif status.state is InstanceState.FENCED and process.spec.host_loss.then != "stop":
         _requeue(state, process, host, now, status.message)
     elif status.state is InstanceState.REFUSED:
@@ -331,7 +332,7 @@ def _wait_for_ends(state: MasterState, process: Process, now: float) -> None:
 def note_awaited_ends(state: MasterState, process: Process, now: float) -> None:
     """Set the phase of a process without an owner, of which instances are still to end."""
     left = ", ".join(f"{one.id} on {one.host.name}" for one in state.instances_of(process))
-    state.set_phase(process, ProcessPhase.STOPPING, now, f"waits for the end of {left}")
+    state.set_phase(process, ProcessPhase.STOPPING, now, f"waits until {left} has ended")
 
 
 def requeue_if_clear(state: MasterState, process: Process, now: float) -> bool:
@@ -375,7 +376,7 @@ def assignment_withdrawn(
     """The slave never saw it: the process goes back to its place."""
     instance = state.instances.get(event.instance.number)
     if instance is not None:
-        gone(state, instance, now, f"{instance.host.name} did not take it up in time")
+        gone(state, instance, now, f"{instance.host.name} did not accept the assignment in time")
 
 
 def note_phase(state: MasterState, process: Process, owner: Instance, now: float) -> None:
@@ -399,4 +400,5 @@ def _what_follows(process: Process) -> str:
     if policy.then == "wait":
         return ""
     when = f" in {policy.delay:g} s" if policy.delay else ""
-    return f"; it goes elsewhere{when}" if policy.then == "elsewhere" else f"; it fails{when}"
+    what = "is started on another host" if policy.then == "elsewhere" else "fails"
+    return f"; the process {what}{when}"

@@ -55,7 +55,8 @@ def _note_company(state: MasterState, heard: bool, now: float) -> None:
 def _suspect(state: MasterState, host: Host, age: float, now: float) -> None:
     state.hosts.set_condition(host, HostCondition.SUSPECT)
     state.record(
-        now, "host_suspect", f"{host.name} has been silent for {age:.1f} s: no new work",
+        now, "host_suspect",
+        f"{host.name} is suspect: it has not reported for {age:.1f} s and gets no new work",
         host=host.name,
     )  # fmt: skip
 
@@ -64,7 +65,7 @@ def _lose(state: MasterState, host: Host, age: float, lease: float, now: float) 
     state.hosts.set_condition(host, HostCondition.LOST)
     state.record(
         now, "host_lost",
-        f"{host.name} is lost: silent for {age:.1f} s, its lease is {lease:g} s",
+        f"{host.name} is lost: it has not reported for {age:.1f} s, its lease is {lease:g} s",
         host=host.name,
     )  # fmt: skip
     host_loss.lose_sight(state, host, now)
@@ -74,7 +75,7 @@ def welcome_back(state: MasterState, host: Host, now: float) -> None:
     """A host that was suspect or lost is heard again."""
     was_lost = state.hosts.condition_of(host) is HostCondition.LOST
     state.hosts.set_condition(host, HostCondition.UP)
-    state.record(now, "host_back", f"{host.name} is heard again", host=host.name)
+    state.record(now, "host_back", f"{host.name} reports again", host=host.name)
     if was_lost:
         host_loss.regain_sight(state, host, now)
         state.hosts.set_untold(host, untold=True)

@@ -79,12 +79,16 @@ def note_seen(state: MasterState, host: str, seen: int, now: float) -> None:
     if left > 0 and not tail.short:
         tail.short = True
         state.emit(intent(state))
-    wait = f"; no work is given for {left:.1f} s, until all hosts were heard" if left > 0 else ""
+    wait = (
+        f"; the master assigns no work for {left:.1f} s, until all hosts have reported"
+        if left > 0
+        else ""
+    )
     state.record(
         now, "journal_behind",
-        f"the journal has lost what was newest in it: {host} has seen record {seen}, and it ended "
-        f"at {tail.newest} when this master started: {lost} are gone. What was submitted or "
-        f"cancelled in them must be so again; what was started in them is stopped{wait}",
+        f"the journal has lost its newest records: {host} has seen record {seen}, and the journal "
+        f"ended at {tail.newest} when this master started: {lost} are missing. Repeat what was "
+        f"submitted or cancelled in them; processes that they started are stopped{wait}",
         host=host, facts={"seen": seen, "newest": tail.newest, "lost": lost},
     )  # fmt: skip
 
@@ -93,7 +97,7 @@ def why_no_work(state: MasterState, now: float) -> str:
     """Why nobody is given work just now; "" if they may be."""
     review(state, now)
     if state.tail.short:
-        return "the journal has lost its newest part: all hosts must be heard first"
+        return "the journal has lost its newest records: the master waits for all hosts to report"
     if state.tail.fell:
-        return "the machine of the master fell: all hosts must be heard first"
+        return "the master's machine was rebooted: the master waits for all hosts to report"
     return ""

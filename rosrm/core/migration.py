@@ -246,7 +246,7 @@ def _commit_fault(plan: Plan, move: Move, aim: Aim) -> str:
     if not begun:
         return "it commits to a destination that it never starts or awaits"
     if aim is Aim.RESTORE and not any(isinstance(one, Start) and one.restored for one in begun):
-        return "a restore starts the destination anew, not from its image"
+        return "a restore starts the destination without its image"
     return ""
 
 
@@ -283,7 +283,7 @@ def _shadow_fault(step: Start, move: Move) -> str:
     if step.instance != move.destination:
         return "starts a shadow that is not the destination"
     if step.node_name in ("", move.spec.name, move.source_node):
-        return "starts a shadow without an alias of its own"
+        return "starts a shadow without an alias"
     return ""
 
 

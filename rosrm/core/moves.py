@@ -22,7 +22,7 @@ are stopped. When neither source nor destination is left, the process returns to
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, Final
 
 from rosrm.core import abilities, handoffs, images, imaging, keeping, lifecycle, periodic
 from rosrm.core import events as happened
@@ -41,6 +41,13 @@ from rosrm.core.steps import (
     timed_out,
     title,
 )
+
+#: What a commit means.
+_COMMITTED: Final = {
+    Aim.MOVE: "the destination owns the name; the move is not undone any more",
+    Aim.CHECKPOINT: "the image owns the name; the checkpoint is not undone any more",
+    Aim.RESTORE: "the restored instance owns the name; the restore is not undone any more",
+}
 
 # --- go on ------------------------------------------------------------------------------------
 
@@ -135,8 +142,9 @@ def _outcome(state: MasterState, run: Run, step: Step, now: float) -> str | None
 
 
 def _next(state: MasterState, run: Run, step: Step, now: float) -> None:
+    what = _COMMITTED[run.aim] if isinstance(step, Commit) else f"{title(step)} is done"
     state.record(
-        now, "migration_step", f"{run.process}: {title(step)} done", process=run.process,
+        now, "migration_step", f"{run.process}: {what}", process=run.process,
         facts={"step": title(step), "back": run.undo is not None},
     )  # fmt: skip
     process = state.processes[run.process]
@@ -212,20 +220,23 @@ def _failed(state: MasterState, run: Run, step: Step, reason: str, now: float) -
     run.retry_at = now + state.settings.order_retry
     if not run.stuck:
         run.stuck = True
-        way = "forward" if run.undo is None else "back"
+        end = "finished" if run.undo is None else "undone"
         process = state.processes[run.process]
-        state.set_phase(process, ProcessPhase.STUCK, now, f"no way {way}: {reason}; tried again")
-        state.record(
-            now, "migration_stuck", f"{run.process} is STUCK on its way {way}: {reason}",
-            process=run.process,
-        )  # fmt: skip
+        why = f"its {run.aim.value} cannot be {end} yet: {reason}; the master tries again"
+        state.set_phase(process, ProcessPhase.STUCK, now, why)
+        state.record(now, "migration_stuck", f"{run.process} is stuck: {why}", process=run.process)
 
 
 def _turn_back(state: MasterState, run: Run, reason: str, now: float) -> None:
     """Before the commit: undo every step so far, the one in hand included, newest first."""
     run.failure = reason
     run.turn_back()
-    state.record(now, "migration_undone", f"{run.process} stays: {reason}", process=run.process)
+    state.record(
+        now,
+        "migration_undone",
+        f"the {run.aim.value} of {run.process} is undone: {reason}",
+        process=run.process,
+    )
     state.save_run(run)
 
 
@@ -235,9 +246,9 @@ def _go_forward(state: MasterState, run: Run, now: float) -> None:
     run.retry_at = now
     if run.stuck:
         _not_stuck(state, run, now)
-    what = "moves" if run.aim is Aim.MOVE else "goes on"
     state.record(
-        now, "migration_redone", f"{run.process} {what} after all: {run.destination} is active",
+        now, "migration_redone",
+        f"the {run.aim.value} of {run.process} is finished after all: {run.destination} is active",
         process=run.process,
     )  # fmt: skip
     state.save_run(run)
@@ -253,7 +264,7 @@ def _why_turn_back(state: MasterState, run: Run) -> str:
     excused = (
         _told_to_stop(run, run.source) or handoffs.is_switching(run) or _has_left_in_image(run)
     )
-    return f"{run.source} ended by itself" if end.completed or not excused else ""
+    return f"{run.source} ended during the {run.aim.value}" if end.completed or not excused else ""
 
 
 def _has_left_in_image(run: Run) -> bool:

@@ -28,6 +28,7 @@ from rosrm.core.plugin_calls import required
 from rosrm.core.processes import Instance, Process, ProcessPhase
 from rosrm.errors import PluginError
 from rosrm.ports import MemoryPacing, MemoryView, PeriodicImaging
+from rosrm.spelling import size
 
 if TYPE_CHECKING:
     from rosrm.core.state import MasterState
@@ -240,8 +241,8 @@ def _note(state: MasterState, dumped: Dumped, event: happened.OrderAnswered, now
     if not told:
         state.record(
             now, "periodic_checkpoint",
-            f"{dumped.process} starts from its memory of now if it crashes: {dumped.size} bytes, "
-            f"dumped in {dumped.pause:.2f} s, and again from time to time",
+            f"the first periodic checkpoint of {dumped.process} is made ({size(dumped.size)}, "
+            f"paused for {dumped.pause:.2f} s): a crash starts the process from the newest",
             process=dumped.process, host=dumped.host,
             facts={"size": dumped.size, "seconds": parts or {}},
         )  # fmt: skip
@@ -257,7 +258,7 @@ def _say_trouble(state: MasterState, dumped: Dumped, trouble: str, now: float) -
         return
     dumped.trouble = trouble
     state.record(
-        now, "periodic_failed", f"the memory of {dumped.process} is not dumped: {trouble}",
+        now, "periodic_failed", f"no periodic checkpoint of {dumped.process} was made: {trouble}",
         process=dumped.process, host=dumped.host,
     )  # fmt: skip
 

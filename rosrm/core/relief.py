@@ -17,7 +17,7 @@ from rosrm.core.placement import Demand, eligible
 from rosrm.core.state import Instance, MasterState, Process, Wanted
 from rosrm.core.verdicts import decide, verdict_of
 
-#: Seconds between two records that nothing can be moved off a host.
+#: Least seconds between two records that nothing can be moved off a host, for different reasons.
 _TOLD_EVERY = 10.0
 #: Reasons against hosts that one answer names.
 _MOST_SAID: Final = 3
@@ -68,6 +68,7 @@ def _note_under_limit(state: MasterState, host: Host, now: float) -> None:
         if name not in host.over_since and now - at >= state.settings.hysteresis:
             del host.over_at[name]
     if not host.over_at:
+        host.blocked.clear()
         state.record(now, "under_limit", f"{host.name} is under its limits", host=host.name)
 
 
@@ -116,7 +117,7 @@ def _why_not_now(
         return f"{process.name} uses no {resource}"
     since_move, cooldown = now - process.moved_at, state.settings.cooldown
     if since_move < cooldown:
-        return f"{process.name} moved {since_move:.0f} s ago, its cool-down is {cooldown:g} s"
+        return f"{process.name} is in its cool-down of {cooldown:g} s after a move"
     if instance.state is not InstanceState.READY:
         return f"{process.name} is not ready"
     return ""
@@ -141,6 +142,8 @@ def try_move(
     if column < 0:
         return f"no host has room for {process.name}{_and_why(state, process, source.host)}"
     destination = state.hosts.hosts[column]
+    if destination is source.host:
+        return f"{process.name} runs on {destination.name} already"
     if not ranking.fits(column):
         why = verdict_of(ranking, column).reason
         return f"{process.name} does not fit on {destination.name}: {why or 'no room'}"
@@ -258,11 +261,12 @@ def _images_on(state: MasterState, host: Host) -> list[str]:
 def _tell_nothing_moves(
     state: MasterState, host: Host, what: str, reasons: list[str], now: float
 ) -> None:
+    why = "; ".join(reasons[:8]) or "it holds no process of this cluster"
     key = f"nothing_moves {what}"
-    if now - host.told.get(key, float("-inf")) < _TOLD_EVERY:
+    soon = now - host.told.get(key, float("-inf")) < _TOLD_EVERY
+    if soon or host.blocked.get(what) == why:
         return
-    host.told[key] = now
-    why = "; ".join(reasons[:8]) or "it holds no process of ours"
+    host.told[key], host.blocked[what] = now, why
     state.record(
         now, "nothing_moves", f"nothing can leave {host.name}: {why}", host=host.name,
         facts={"cause": what},

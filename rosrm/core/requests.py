@@ -10,6 +10,7 @@ from rosrm.core import images, imaging, keeping, lifecycle
 from rosrm.core.assigning import reconsider_set_aside
 from rosrm.core.begin import why_busy
 from rosrm.core.commands import Order, Reply
+from rosrm.core.graph_names import shared_nodes
 from rosrm.core.hosts import Host
 from rosrm.core.intake import save_host
 from rosrm.core.model import ProcessSpec
@@ -18,6 +19,7 @@ from rosrm.core.relief import departures, try_move
 from rosrm.core.state import WAITING, MasterState, Process, ProcessPhase, Wanted
 from rosrm.errors import PluginError
 from rosrm.ports import SpecChecking
+from rosrm.spelling import counted
 
 
 def refuse(state: MasterState, request: int, message: str, code: str = "invalid") -> None:
@@ -38,6 +40,8 @@ def submission_received(state: MasterState, event: happened.SubmissionReceived, 
     if fault:
         refuse(state, event.request, fault)
         return
+    live = (one.spec for one in state.processes.values() if not one.phase.over)
+    shared = shared_nodes(event.specs, live)
     for spec in event.specs:
         process = Process(
             spec,
@@ -52,7 +56,8 @@ def submission_received(state: MasterState, event: happened.SubmissionReceived, 
         state.enqueue(process, now)
         state.record(now, "submitted", f"{spec.name} was submitted", process=spec.name, by=event.by)
         state.save(process)
-    state.emit(Reply(event.request, message=f"{count(len(event.specs))} queued"))
+    warnings = "".join(f". Warning: {one}" for one in shared)
+    state.emit(Reply(event.request, message=f"{count(len(event.specs))} queued{warnings}"))
 
 
 def _taken(state: MasterState, event: happened.SubmissionReceived) -> str:
@@ -123,7 +128,7 @@ def _strategy_fault(state: MasterState, spec: ProcessSpec) -> str:
             "migration", name, "spec_fault", lambda: required(checking.spec_fault(spec), str)
         )
     except PluginError as error:
-        return f"it cannot say whether it moves this process: {error}"
+        return f"its check of this process failed: {error}"
 
 
 def _names(names: Iterable[str]) -> str:
@@ -133,7 +138,7 @@ def _names(names: Iterable[str]) -> str:
 
 def count(number: int) -> str:
     """Return a number of processes: "1 process", "3 processes"."""
-    return "1 process" if number == 1 else f"{number} processes"
+    return counted(number, "process", "processes")
 
 
 # --- cancel, restart --------------------------------------------------------------------------
@@ -223,6 +228,8 @@ def restart_requested(state: MasterState, event: happened.RestartRequested, now:
 
 
 def _restart_fault(state: MasterState, process: Process) -> str:
+    if process.phase is ProcessPhase.SET_ASIDE:
+        return f"{process.name} is set aside: {process.reason}"
     if process.phase in WAITING:
         return f"{process.name} waits in the queue already"
     if process.name in state.runs:
@@ -238,7 +245,11 @@ def _restart_fault(state: MasterState, process: Process) -> str:
 
 def _restart(state: MasterState, process: Process, now: float, by: str) -> None:
     state.record(
-        now, "restart_requested", f"{process.name} is restarted", process=process.name, by=by
+        now,
+        "restart_requested",
+        f"a restart of {process.name} was requested",
+        process=process.name,
+        by=by,
     )
     if process.phase.over or process.image is not None:
         images.drop(state, process)
@@ -342,6 +353,7 @@ def host_state_requested(
         host, cordoned=event.action != "uncordon", draining=event.action == "drain"
     )
     host.told.clear()
+    host.blocked.clear()
     save_host(state, host)
     state.record(now, f"host_{done}", f"{host.name} is {done}", host=host.name, by=event.by)
     reconsider_set_aside(state, now)

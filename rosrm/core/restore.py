@@ -114,7 +114,7 @@ def _expect_to_run(state: MasterState, process: Process, now: float) -> None:
     elif process.wanted is Wanted.CANCEL:
         state.set_phase(process, ProcessPhase.CANCELLED, now)
     else:
-        state.enqueue(process, now, "nothing of it was left when the master started")
+        state.enqueue(process, now, "no instance of it was left when the master started")
 
 
 def _restore_standby(
@@ -159,9 +159,9 @@ def _restore_move(
         state.instances[number].stopping = True
     state.set_phase(process, ProcessPhase.MIGRATING, now, run.course)
     goes_on = (
-        f"goes on moving to {run.destination_host.name}"
+        f"continues its move to {run.destination_host.name}"
         if run.aim is Aim.MOVE
-        else (f"goes on: {run.course}")
+        else f"continues: {run.course}"
     )
     state.record(
         now, "migration_taken_up", f"{process.name} {goes_on}",
@@ -205,7 +205,7 @@ def _forget_move(
     for instance in state.instances_of(process):
         instance.stopping = instance.id.number != process.owner
     state.record(
-        now, "migration_forgotten", f"the move of {process.name} cannot go on: {fault}",
+        now, "migration_forgotten", f"the move of {process.name} cannot be continued: {fault}",
         process=process.name,
     )  # fmt: skip
     state.emit(Intent("migration", process.name, None))

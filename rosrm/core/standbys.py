@@ -67,7 +67,7 @@ def _begin(state: MasterState, process: Process, now: float) -> bool:
     run = plan_move(state, process, host, "standby", now)
     why = run if isinstance(run, str) else why_no_executor(state, run)
     if isinstance(run, str) or why or not _can_wait(run):
-        why = why or "its migration has no shadow that waits"
+        why = why or "its migration strategy keeps no standby ready"
         _wait(state, process, f"it can have no standby: {why}", now)
         return False
     state.standbys[process.name] = run
@@ -96,15 +96,19 @@ def _can_wait(run: Run) -> bool:
 def _demand(state: MasterState, process: Process, primary: Host) -> Demand:
     """As of the process itself, on a host that is apart from that of the primary."""
     own = demand_of(state, process)
-    excluded = {**process.excluded, primary.name: "the primary is there"}
+    excluded = {**process.excluded, primary.name: "the primary runs there"}
     labels = primary.description.labels
     for host in state.hosts.hosts:
         for label in process.spec.standby.apart_by:
             value = host.description.labels.get(label)
             if value is None:
-                excluded.setdefault(host.name, f"it has no label {label!r}, by which it is apart")
+                excluded.setdefault(
+                    host.name, f"it has no label {label!r}, in which the standby must differ"
+                )
             elif value == labels.get(label):
-                excluded.setdefault(host.name, f"{label}={value}, as where the primary is")
+                excluded.setdefault(
+                    host.name, f"it has {label}={value} as the host of the primary has"
+                )
     return Demand(process.spec, own.amounts, own.estimated, excluded, reads=state.declared.reads)
 
 
@@ -157,7 +161,7 @@ def _see_it_follow(state: MasterState, process: Process, run: Run, now: float) -
     said = run.phases_of(run.destination)
     gave_up = said.get(ReportPhase.FAILED) or said.get(ReportPhase.ABORTED)
     if gave_up is not None:
-        _lost(state, process, run, gave_up or "it gave up", now)
+        _lost(state, process, run, gave_up or f"{run.destination} has called the handoff off", now)
     elif ReportPhase.READY not in said:
         _say_shadow(state, run, now)
     else:
@@ -189,7 +193,8 @@ def _lost(state: MasterState, process: Process, run: Run, why: str, now: float) 
     process.standby_tries = min(process.standby_tries + 1, 16)
     process.standby_at = now + wait
     state.record(
-        now, "standby_lost", f"{process.name} has no standby: {why}; another one in {wait:g} s",
+        now, "standby_lost",
+        f"{process.name} has no standby: {why}; the master starts another one in {wait:g} s",
         process=process.name, host=run.destination_host.name,
     )  # fmt: skip
     end_standby(state, process, now)

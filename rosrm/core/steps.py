@@ -37,9 +37,15 @@ __all__ = [
     "title",
 ]
 
-_WORDS: Final = {
-    Start: "start", AwaitReady: "await ready", AwaitReleased: "await released", Stop: "stop",
-}  # fmt: skip
+_TITLES: Final[Mapping[type[Step], str]] = {
+    Commit: "the commit",
+    Start: "starting {0.instance} on {0.host}",
+    AwaitReady: "waiting until {0.instance} is ready on {0.host}",
+    AwaitReleased: "waiting until {0.instance} has nothing more to do on {0.host}",
+    Stop: "stopping {0.instance} on {0.host}",
+    Execute: "the step {0.executor!r} of the migration strategy on {0.host}",
+    SetRestart: "setting the restart policy of {0.instance} on {0.host} to {0.restart.when!r}",
+}
 #: Of a host that answers nothing, and may never do so again.
 _AWAY: Final = {HostCondition.LOST: "is lost", HostCondition.LEFT: "has left"}
 
@@ -198,7 +204,9 @@ def _(step: SetRestart, state: MasterState, run: Run, now: float) -> str | None:
         return None
     accepted, message = run.answer
     return (
-        DONE if accepted else f"{step.host} kept the restart policy of {step.instance}: {message}"
+        DONE
+        if accepted
+        else f"{step.host} did not change the restart policy of {step.instance}: {message}"
     )
 
 
@@ -231,14 +239,7 @@ def nobody_there(state: MasterState, run: Run, step: Execute) -> bool:
 
 
 def title(step: Step) -> str:
-    """A step in a few words."""
-    if isinstance(step, Commit):
-        return "commit"
-    if isinstance(step, Execute):
-        return f"execute {step.executor} on {step.host}"
+    """Return a step as the subject of a sentence."""
     if isinstance(step, Configure):
-        return f"state_config {step.phase.name}"
-    if isinstance(step, SetRestart):
-        return f"restart policy {step.restart.when!r} of {step.instance} on {step.host}"
-    word = _WORDS[type(step)]
-    return f"{word} {step.instance} on {step.host}"
+        return handoffs.TITLES[step.phase]
+    return _TITLES[type(step)].format(step)

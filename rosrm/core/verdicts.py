@@ -14,13 +14,14 @@ import numpy as np
 
 from rosrm.core.columns import BUSY, CAPACITY, LIMIT, LOAD, USAGE, BoolArray, FloatArray, IntArray
 from rosrm.core.declared import declared_spec
-from rosrm.core.hosts import HostTable
+from rosrm.core.hosts import HostCondition, HostTable
 from rosrm.core.lazy import Lazy
 from rosrm.core.model import EMPTY
 from rosrm.core.placement import CLOSE, TIE, Demand, Labels, NamedPolicy, Names, Ranking, eligible
 from rosrm.core.plugin_calls import PluginCalls, required
 from rosrm.errors import PluginError
 from rosrm.ports import HostView, ProcessView, Scores
+from rosrm.spelling import amount, get_close_matches
 
 #: An explanation names every host up to this many, else the best of those that fit.
 _NAMED_HOSTS: Final = 16
@@ -161,8 +162,8 @@ def decide(ranking: Ranking, *, chosen: int | None = None) -> Decision:
     named, fitting = len(moment.columns), int(np.count_nonzero(ranking.value < np.inf))
     named_fitting = sum(value < np.inf for value in moment.value.tolist())
     omitted = {
-        "fits with a higher score": fitting - named_fitting,
-        "does not fit now": hosts - fitting - (named - named_fitting),
+        "would take it at a higher score": fitting - named_fitting,
+        "cannot take it now": hosts - fitting - (named - named_fitting),
     }
     return Decision(column, ranking.policy_name, moment, omitted)
 
@@ -275,10 +276,35 @@ def why_never(table: HostTable, demand: Demand) -> str:
             possible[host.column] = False
     if (possible & ~_too_large(table, demand)).any():
         return ""
+    unmeasured = _unmeasured(table, demand)
+    if unmeasured:
+        return unmeasured
     return "; ".join(
         f"{host.name}: {_never_reason(table, demand, host.column)}"
         for host in table.listed()[:_NAMED_HOSTS]
     )
+
+
+def why_all_away(table: HostTable) -> str:
+    """Return why each host is away; "" if one of them is there."""
+    away = table.away() | (table.condition == HostCondition.EXPECTED)
+    if not away.all():
+        return ""
+    named = "; ".join(
+        f"{host.name}: {table.why_away(host.column)}" for host in table.hosts[:_NAMED_HOSTS]
+    )
+    more = len(table) - _NAMED_HOSTS
+    return f"every host is away: {named}" + (f"; and {more} more" if more > 0 else "")
+
+
+def _unmeasured(table: HostTable, demand: Demand) -> str:
+    """Return which resource no host reports, with the nearest one that is; "" if there is none."""
+    for resource in sorted(demand.declared - set(table.resources)):
+        near = get_close_matches(resource, table.resources, n=1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        there = ", ".join(sorted(table.resources)) or "none"
+        return f"no host reports the resource {resource!r}{hint} (reported: {there})"
+    return ""
 
 
 def refused_everywhere(table: HostTable, demand: Demand) -> bool:
@@ -307,7 +333,8 @@ def _never_reason(table: HostTable, demand: Demand, column: int) -> str:
         return reason
     need = table.fractions_of(table.hosts[column], demand.amounts, demand.estimated)
     row = int(np.argmax(need - table.limit[:, column]))
-    return (
-        f"it needs {need[row]:.0%} of its {table.resources[row]}, over the limit of "
-        f"{table.limit[row, column]:.0%}"
-    )
+    name, limit = table.resources[row], float(table.limit[row, column])
+    unit = next(one.unit for one in table.hosts[column].description.resources if one.name == name)
+    capacity = float(table.capacity[row, column])
+    needed, has, most = (amount(part * capacity, unit) for part in (float(need[row]), 1.0, limit))
+    return f"it has {has} of {name}, of which {most} ({limit:.0%}) may be used; needed: {needed}"

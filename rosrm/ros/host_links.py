@@ -237,7 +237,7 @@ class HostLinks:
         link = self._links.get(command.host_id)
         if link is None:  # expected from the journal, not heard yet
             self._tell(
-                happened.OrderAnswered(command.order, False, "timeout", "the host is not heard")
+                happened.OrderAnswered(command.order, False, "timeout", "the host does not report")
             )
             return
         request = _order_request(command)

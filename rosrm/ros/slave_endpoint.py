@@ -146,7 +146,8 @@ class SlaveEndpoint:
             self.link = Link.SEARCHING
         if self.link is Link.REGISTERED and self._missed(_MISSED_BEATS, now):
             silence = now - self._beat_at
-            self._lose_master(f"the master has been silent for {silence:.1f} s; processes go on")
+            reason = f"the master has been silent for {silence:.1f} s; processes keep running"
+            self._lose_master(reason)
 
     def _greet(self, now: float) -> None:
         self.link = Link.GREETING

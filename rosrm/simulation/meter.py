@@ -14,9 +14,10 @@ from rosrm.core.columns import FloatArray
 from rosrm.core.commands import Command
 from rosrm.core.hosts import HostCondition
 from rosrm.core.model import Kind
-from rosrm.core.processes import ProcessPhase
+from rosrm.core.processes import Process, ProcessPhase
 from rosrm.core.state import MasterState
 from rosrm.ports import Record
+from rosrm.spelling import standing
 
 #: Resources of which the balance is measured and drawn.
 MEASURED: Final = ("memory", "cpu")
@@ -230,9 +231,9 @@ class Meter:
         finished = sum(phase is ProcessPhase.FINISHED for phase in phases)
         waiting = (ProcessPhase.QUEUED, ProcessPhase.SET_ASIDE)
         never = {
-            name: state.processes[name].reason or f"it waits behind {state.queue.head()}"
-            for name in state.processes
-            if name not in self._placed and not state.processes[name].phase.over
+            name: _why_not_placed(state, process)
+            for name, process in state.processes.items()
+            if name not in self._placed
         }
         seconds = totals.seconds or 1.0
         return Outcome(
@@ -271,3 +272,10 @@ class Meter:
             limit[name] = np.ones(len(hosts))
             limit[name][: len(self._limit[name])] = self._limit[name]
         return Curves(times, hosts, usage, limit)
+
+
+def _why_not_placed(state: MasterState, process: Process) -> str:
+    """Return why a process got no host; one that was cancelled before may have no reason."""
+    if process.phase.over:
+        return process.reason or f"it {standing(process.phase.value)}"
+    return process.reason or f"it waits behind {state.queue.head()}"

@@ -157,9 +157,11 @@ class SlaveRuntime:
     def _adopt(self) -> None:
         """Take over what a former run of this slave left with the supervisor."""
         held = self._supervisor.take_over()
-        if held:
-            self.say(f"{held} processes were found with the supervisor")
         self._work(time.monotonic())
+        if held:
+            live = self._state.live()
+            ended = f"; {held - live} had ended" if held > live else ""
+            self.say(f"{counted(live, 'process', 'processes')} re-adopted{ended}")
 
     # --- the loop ------------------------------------------------------------------------
 
@@ -378,10 +380,13 @@ class SlaveRuntime:
             self._say_kept(0 if self._left else live)
             return 1 if failure else 0
         if live and failure and not self._endpoint.superseded:
-            _log.error("its %d processes go on; start the slave again when that is mended", live)
+            count = counted(live, "process keeps", "processes keep")
+            _log.error("%s running; start the slave again when that is mended", count)
             return 1
         if live:
-            self.say(f"stopping {live} processes ({self._stopping or 'refused'})")
+            self.say(
+                f"stopping {counted(live, 'process', 'processes')} ({self._stopping or 'refused'})"
+            )
         self._starter.close()
         self._endpoint.leave(self._supervisor.shut_down)
         deadline = time.monotonic() + self._longest_stop()
@@ -402,7 +407,7 @@ class SlaveRuntime:
 
     def _ended(self, failure: str, stopped: int) -> int:
         if not self._left:
-            _log.error("the supervisor did not end in time; it goes on stopping the processes")
+            _log.error("the supervisor did not end in time; it still stops the processes")
             return 1
         self._work(time.monotonic())
         self._endpoint.wait_until_heard()

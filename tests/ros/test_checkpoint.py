@@ -191,7 +191,7 @@ def test_the_commands_wait_until_it_is_done(criu, cluster, ear):
     restore(cluster, "counter")
     for action, said in (
         ("checkpoint", "counter is checkpointed: its image is on robot"),
-        ("restore", "counter goes on from its image on robot"),
+        ("restore", "counter was restored from its image on robot"),
     ):
         done = rosrm(cluster, action, "counter", "--wait")
         assert (done.returncode, said in done.stdout) == (0, True), done.stdout + done.stderr
@@ -266,7 +266,7 @@ def test_what_cannot_be_dumped_runs_on_and_says_why(criu, cluster, tmp_path):
         pid = cluster.process("tied").pid
         ask(cluster, "checkpoint", "tied")
         event = cluster.wait_for_event("checkpoint_failed", process="tied")
-        assert "tied runs on on robot" in event.message
+        assert "tied was not checkpointed and still runs on robot" in event.message
         assert "is a Unix socket that is connected to" in event.message
         assert cluster.wait("tied", "running").pid == pid
         held.close()

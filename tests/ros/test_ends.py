@@ -124,6 +124,7 @@ def test_keep_leaves_the_processes_running(make_cluster) -> None:
     assert after.pid == before.pid
     row = cluster.ended("short")
     assert (row.state, row.exit_code) == ("failed", 3)
+    assert "1 process re-adopted; 1 had ended" in cluster.log_of("h0")
 
 
 @pytest.mark.parametrize("role", ["master", "slave"])

@@ -180,7 +180,7 @@ def test_what_cannot_move_is_refused(cluster) -> None:
     here = cluster.wait("mobile", "running").host
     with pytest.raises(Refused, match="no migration strategy"):
         cluster.client.migrate("rooted")
-    with pytest.raises(Refused, match="there already"):
+    with pytest.raises(Refused, match="already"):
         cluster.client.migrate("mobile", here)
     with pytest.raises(Refused, match="nowhere"):
         cluster.client.migrate("mobile", "nowhere")

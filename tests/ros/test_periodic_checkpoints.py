@@ -117,7 +117,7 @@ def test_a_crashed_node_goes_on_from_its_last_checkpoint(cluster, ear, running):
     assert len(ear.checksums) == 1
     told = cluster.events("periodic_checkpoint", process=NAME)
     assert len(told) == 1
-    assert "starts from its memory of now if it crashes" in told[0].message
+    assert "the first periodic checkpoint of" in told[0].message
 
 
 def test_nobody_but_its_supervisor_is_needed(cluster, ear, running):
@@ -222,7 +222,7 @@ def test_what_cannot_be_dumped_is_said_and_goes_on(cluster, ear, running):
     """Once, with the reason; it is tried again, and each time it counts on."""
     running(command=(sys.executable, TROUBLED), arguments=("pipe",))
     event = cluster.wait_for_event("periodic_failed", process=NAME, timeout=60.0)
-    assert "the memory of portable_counter is not dumped" in event.message
+    assert "no periodic checkpoint of portable_counter was made" in event.message
     assert "is a pipe that it shares with" in event.message
     ear.hear(150)
     assert min(ear.steps()) == 1

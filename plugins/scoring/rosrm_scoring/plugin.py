@@ -18,12 +18,12 @@ def register_scoring_policies() -> Sequence[ScoringOffer]:
             name="weighted",
             create=Weighted,
             options=WeightedOptions,
-            summary="Eq. 1: weight x usage, summed over the resources",
+            summary="weight x usage, summed over the resources",
         ),
         ScoringOffer(
             name="threshold",
             create=Threshold,
             options=ThresholdOptions,
-            summary="Eq. 1, a steep cost near a limit and a veto at it",
+            summary="as weighted, with a steep cost near a limit and a veto at it",
         ),
     ]

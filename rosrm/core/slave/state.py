@@ -113,7 +113,7 @@ class SlaveState:
         if not self.has_slot():
             return "waits for a free slot there"
         if self.max_starting and self.starting() >= self.max_starting:
-            return f"waits until others there have started: {self.max_starting} at a time"
+            return f"waits until others there have started (max_starting: {self.max_starting})"
         return ""
 
     def starting(self) -> int:

@@ -48,6 +48,7 @@ from rosrm.core.supervision.words import (
     TimePassed,
     Unspawn,
 )
+from rosrm.spelling import counted
 
 _KILL: Final = len(STEPS) - 1
 #: Part of a wait by which a restart may come sooner, so that what crashed together does not start
@@ -332,7 +333,8 @@ def _by_policy(instance: Instance, ending: str, *, succeeded: bool, now: float) 
         return
     done = _recent_restarts(instance, now)
     if done >= rule.attempts:
-        limit = f"{done} restarts within {rule.window:g} s are the most allowed"
+        most = counted(rule.attempts, "restart")
+        limit = f"its restart policy allows {most} within {rule.window:g} s"
         end(instance, FAILED, f"{ending}; {limit}")
         return
     wait = backoff(rule, done) * (1.0 - _JITTER * _chance(instance))

@@ -67,7 +67,7 @@ PROCESSES = [
     process("done", "finished", kind="job"),
 ]
 PLUGINS = [
-    PluginRow("scoring", "weighted", "rosrm-scoring 0.1.0", "selected", "Eq. 1 of the paper"),
+    PluginRow("scoring", "weighted", "rosrm-scoring 0.1.0", "selected", "weight x usage, summed"),
     PluginRow("probe", "gpu", "rosrm-resources 0.1.0", "absent", "no NVIDIA driver", "alpha"),
 ]
 EVENTS = [event(1, "submitted", host=""), event(2)]
@@ -87,7 +87,7 @@ STORY = {
             {"name": "beta", "verdict": "full", "score": None, "reason": "memory 0.79 of 0.8"},
             {"name": "gamma", "verdict": "vetoed", "score": None, "reason": "too near its limit"},
         ],
-        "omitted": {"does not fit now": 5, "fits with a higher score": 0},
+        "omitted": {"cannot take it now": 5, "would take it at a higher score": 0},
     },
     "history": [{"elapsed": 62.0, "kind": "submitted", "message": "talker was submitted"}],
 }

@@ -49,8 +49,13 @@ def test_a_command_asks_the_master_and_prints_its_answer(rosrm, client, words, a
     ("action", "kind", "message", "code"),
     [
         ("checkpoint", "checkpointed", "a is checkpointed: its image is on alpha", 0),
-        ("checkpoint", "checkpoint_failed", "a runs on on alpha: it holds a pipe", 1),
-        ("restore", "restored", "a goes on from its image on alpha", 0),
+        (
+            "checkpoint",
+            "checkpoint_failed",
+            "a was not checkpointed and still runs on alpha: it holds a pipe",
+            1,
+        ),
+        ("restore", "restored", "a was restored from its image on alpha", 0),
         ("restore", "restore_failed", "a stays checkpointed on alpha: a port is in use", 1),
         ("restore", "cancelled", "a cancelled; its image is removed", 1),
         ("migrate", "migrated", "a moved from alpha to beta", 0),
@@ -112,7 +117,7 @@ def test_submit_wait_fails_with_the_reason_when_a_process_failed(rosrm, client, 
     ]
     result = rosrm("submit", work, "--wait")
     assert result.code == 1
-    assert "a is failed: exit code 3" in result.err
+    assert "a has failed: exit code 3" in result.err
 
 
 def test_submit_wait_gives_up_after_its_time(rosrm, client, work, monkeypatch):

@@ -35,8 +35,8 @@ def file(tmp_path):
             "ok, a cluster: scoring weighted, migration relaunch, checkpoint none\n",
         ),
         ("host: h1\nros: {domain: 1}", "ok, a host: h1, probes cpu\n"),
-        ("processes: [{name: a, command: x, kind: job}]", "ok, work: 1 jobs and 0 services\n"),
-        ("defaults: {kind: job}\nprocesses: [{name: a, command: x}]", "ok, work: 1 jobs and 0"),
+        ("processes: [{name: a, command: x, kind: job}]", "ok, work: 1 job and 0 services\n"),
+        ("defaults: {kind: job}\nprocesses: [{name: a, command: x}]", "ok, work: 1 job and 0"),
     ],
 )
 def test_the_kind_of_a_right_file_is_known_by_its_keys(rosrm, file, text, said):
@@ -143,3 +143,33 @@ def test_plugins_that_cannot_be_made_are_found(rosrm, file, monkeypatch):
     assert "which has no `propose`; is its `proposes` misspelt?" in result.err
     assert "made None; an object with `choose` is wanted" in result.err
     assert "test_checking.py:" in result.err
+
+
+@pytest.mark.parametrize(
+    ("text", "warning"),
+    [
+        (
+            "processes: [{name: a, command: x, needs: {cpus: 1}}]",
+            "a: needs: no probe is named 'cpus'; did you mean 'cpu'?",
+        ),
+        (
+            """
+            defaults: {package: p, executable: e}
+            processes: [{name: a}, {name: b, arguments: [--ros-args, -r, '__node:=a']}]
+            """,
+            "a and b put the node /a into the ROS graph; give each node a name of its own",
+        ),
+    ],
+)
+def test_what_may_be_a_mistake_is_a_warning(rosrm, tmp_path, text, warning):
+    file = tmp_path / "w.yaml"
+    file.write_text(text, encoding="utf-8")
+    result = rosrm("config", "check", file)
+    assert result.code == 0
+    assert result.err == f"{file}: warning: {warning}\n"
+
+
+def test_a_resource_that_no_probe_here_measures_is_no_mistake(rosrm, tmp_path):
+    file = tmp_path / "w.yaml"
+    file.write_text("processes: [{name: a, command: x, needs: {gpu_memory: 1}}]", encoding="utf-8")
+    assert rosrm("config", "check", file).err == ""

@@ -8,6 +8,11 @@ import subprocess
 import sys
 import time
 
+import pytest
+import typer
+
+from rosrm.cli import groups
+from rosrm.cli.commands import app
 from rosrm.version import PROTOCOL_VERSION, __version__
 
 
@@ -26,6 +31,50 @@ def test_a_mistyped_command_is_refused(rosrm):
     result = rosrm("statsu")
     assert result.code == 2
     assert "No such command 'statsu'" in result.err
+
+
+@pytest.mark.parametrize(
+    ("verb", "hint"),
+    [
+        ("stop", "Did you mean 'cancel' or 'restart'?"),
+        ("kill", "Did you mean 'cancel'?"),
+        ("ls", "Did you mean 'ps'?"),
+        ("nodes", "Did you mean 'hosts'?"),
+        ("Run", "Did you mean 'submit'?"),
+        ("check", "Did you mean 'config check'?"),
+    ],
+)
+def test_a_verb_of_another_tool_names_the_command_that_does_as_much(rosrm, verb, hint):
+    result = rosrm(verb, "talker")
+    assert (result.code, result.err.splitlines()[-1]) == (
+        2, f"Error: No such command '{verb}'. {hint}",
+    )  # fmt: skip
+
+
+def commands():
+    """Every command, with the words that call it."""
+    group = typer.main.get_command(app)
+    for name, one in group.commands.items():
+        yield (name,), one
+        for below, command in getattr(one, "commands", {}).items():
+            yield (name, below), command
+
+
+def test_every_hint_names_a_command_that_exists():
+    known = {" ".join(words) for words, _ in commands()}
+    assert {verb for verbs in groups._ELSEWHERE.values() for verb in verbs} <= known
+
+
+@pytest.mark.parametrize("words", [words for words, _ in commands()], ids=" ".join)
+def test_a_usage_line_shows_required_arguments_without_braces(rosrm, words):
+    assert not set("{}") & set(rosrm(*words, "--help").out.splitlines()[0])
+
+
+@pytest.mark.parametrize("group", [(), ("lab",), ("criu",), ("config",)], ids=str)
+def test_the_help_of_a_group_cuts_no_summary_off(rosrm, group):
+    listed = rosrm(*group, "--help").out.partition("Commands:")[2]
+    assert listed
+    assert "..." not in listed
 
 
 def test_help_imports_neither_ros_nor_pydantic_nor_numpy():

@@ -7,6 +7,7 @@ import time
 
 import pytest
 
+from rosrm.cli import explaining, tables
 from rosrm.core.views import PluginRow
 from rosrm.errors import NoMaster
 
@@ -20,7 +21,7 @@ def test_status_shows_the_cluster_on_half_a_page(rosrm, client):
     assert lines[0] == "master     lab, up 2 min"
     assert lines[1] == "hosts      2 up, 1 suspect (1 cordoned, 1 draining)"
     assert lines[2] == "processes  1 running, 1 queued, 1 failed, 1 finished"
-    assert "crashed is failed" in result.out
+    assert "crashed has failed" in result.out
     assert "talker goes to alpha" in result.out
 
 
@@ -213,13 +214,99 @@ def test_explain_shows_every_host_with_its_score_or_veto(rosrm, client):
     out = rosrm("explain", "talker").out
     lines = out.splitlines()
     assert lines[0] == "talker is running on alpha"
-    assert lines[2].startswith("It was given to alpha, 61 s ago (scoring policy weighted;")
-    assert "Counted for it: memory 64.0 MB, cpu 0.5 cores." in out
+    assert lines[2].startswith(
+        "The master assigned talker to alpha 61 s ago. Scoring policy: weighted;"
+    )
+    assert "Needs that were counted: memory 64.0 MB, cpu 0.5 cores." in out
     for expected in ("0.4123", "memory 0.79 of 0.8", "too near its limit", "vetoed"):
         assert expected in out
-    assert "and 5 more: does not fit now" in out
-    assert "fits with a higher score" not in out
+    assert "and 5 more hosts cannot take it now" in out
+    assert "at a higher score" not in out
     assert "62 s ago  submitted          talker was submitted" in out
+
+
+def drawn(made, width=60):
+    from io import StringIO
+
+    from rich.console import Console
+
+    output = StringIO()
+    Console(file=output, width=width, highlight=False).print(made)
+    return [line.rstrip() for line in output.getvalue().splitlines()]
+
+
+def test_the_history_of_explain_wraps_below_the_message():
+    entry = {"elapsed": 9.0, "kind": "waits", "message": "a host " * 9}
+    lines = drawn(explaining.render({**STORY, "history": [entry]}))
+    first = next(i for i, line in enumerate(lines) if "waits" in line)
+    indent = lines[first].index("a host")
+    assert [len(line) - len(line.lstrip()) for line in lines[first + 1 :]] == [indent, indent]
+
+
+def test_an_event_on_a_terminal_wraps_below_its_message():
+    lines = drawn(tables.event(event(1, message="a host " * 9)))
+    indent = lines[0].index("a host")
+    assert [len(line) - len(line.lstrip()) for line in lines[1:]] == [indent, indent]
+
+
+def test_explain_says_that_older_events_are_left_out_and_where_they_are(rosrm, client, monkeypatch):
+    assert "left out" not in rosrm("explain", "talker").out
+    newer = [{"elapsed": 2.0, "kind": "ready", "message": "talker is ready on alpha"}]
+    monkeypatch.setattr(client, "explain", lambda name: {**STORY, "history": newer})
+    out = rosrm("explain", "talker").out
+    assert "Older events are left out: `rosrm events --process talker`" in out
+
+
+@pytest.mark.parametrize(
+    ("state", "sentence"),
+    [
+        ("backoff", "talker is in back-off on alpha"),
+        ("failed", "talker has failed on alpha"),
+        ("finished", "talker has finished on alpha"),
+        ("cancelled", "talker was cancelled on alpha"),
+        ("set_aside", "talker is set aside on alpha"),
+    ],
+)
+def test_a_state_is_said_in_a_sentence(rosrm, client, monkeypatch, state, sentence):
+    monkeypatch.setattr(client, "explain", lambda name: {**STORY, "state": state})
+    assert rosrm("explain", "talker").out.splitlines()[0] == sentence
+
+
+def test_one_restart_is_singular(rosrm, client):
+    client.processes = [process("talker", restarts=1)]
+    assert "1 restart" in rosrm("ps").out
+    assert "1 restarts" not in rosrm("ps").out
+
+
+def test_restarts_that_the_reason_counts_are_not_said_twice(rosrm, client):
+    reason = "exit code 3; its restart policy allows 3 restarts within 300 s"
+    client.processes = [process("crashed", "failed", restarts=3, reason=reason)]
+    assert rosrm("ps").out.count("3 restarts") == 1
+
+
+@pytest.mark.parametrize("command", ["events", "ps"])
+def test_a_host_that_is_not_there_is_refused(rosrm, client, command):
+    result = rosrm(command, "--host", "alpa")
+    assert (result.code, result.out) == (1, "")
+    assert result.err == "rosrm: no such host: 'alpa'; did you mean 'alpha'?\n"
+
+
+def test_events_of_a_process_that_is_not_there_are_refused(rosrm, client):
+    result = rosrm("events", "--process", "talkr")
+    assert (result.code, result.out) == (1, "")
+    assert result.err == "rosrm: no such process: 'talkr'; did you mean 'talker'?\n"
+    assert "see `rosrm ps --all`" in rosrm("events", "--process", "zzz").err
+
+
+def test_events_of_a_process_without_any_are_none(rosrm, client):
+    assert rosrm("events", "--process", "crashed").code == 0
+
+
+def test_events_say_that_older_ones_are_left_out(rosrm, client):
+    assert (
+        rosrm("events", "-n", 1).err == "rosrm: at most the newest 1 are shown; -n N shows more\n"
+    )
+    assert rosrm("events", "-n", 3).err == ""
 
 
 def test_explain_json_is_the_masters_own(rosrm, client):
@@ -230,16 +317,16 @@ def test_explain_says_where_a_state_is_kept(rosrm, client, monkeypatch):
     kept = [{"host": "beta", "number": 7, "sequence": 120, "size": 5_000_000, "elapsed": 0.4}]
     monkeypatch.setattr(client, "explain", lambda name: {**STORY, "kept": kept})
     lines = rosrm("explain", "talker").out.splitlines()
-    assert lines[1] == "Its state is kept on beta (cycle 120, 5.0 MB, 0.4 s ago)."
+    assert lines[1] == "Snapshots of its state are on beta (cycle 120, 5.0 MB, 0.4 s ago)."
 
 
 @pytest.mark.parametrize(
     ("told", "line"),
     [
         ({"elapsed": 12.0, "size": 34_000_000, "pause": 0.84, "trouble": ""},
-         "The last checkpoint of its memory was made 12 s ago (34.0 MB, away for 0.8 s)."),
+         "The last periodic checkpoint is 12 s old (34.0 MB; the process was paused for 0.8 s)."),
         ({"elapsed": None, "size": 0, "pause": 0.0, "trouble": "no room"},
-         "There is no checkpoint of its memory yet: no room"),
+         "No periodic checkpoint of its memory exists yet: no room"),
     ],
 )  # fmt: skip
 def test_explain_says_when_memory_was_dumped(rosrm, client, monkeypatch, told, line):
@@ -250,7 +337,10 @@ def test_explain_says_when_memory_was_dumped(rosrm, client, monkeypatch, told, l
 def test_explain_of_a_process_without_a_decision(rosrm, client, monkeypatch):
     story = {**STORY, "decision": None, "history": [], "host": "", "state": "queued"}
     monkeypatch.setattr(client, "explain", lambda name: {**story, "reason": "2 before it"})
-    assert rosrm("explain", "talker").out == "talker is queued: 2 before it\n"
+    assert rosrm("explain", "talker").out.splitlines() == [
+        "talker is queued: 2 before it", "",
+        "Older events are left out: `rosrm events --process talker`",
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize("command", ["status", "ps", "hosts", "plugins"])

@@ -185,8 +185,11 @@ def test_duplicate_names_are_refused_naming_both_places(refusal):
 @pytest.mark.parametrize(
     ("entry", "said"),
     [
-        ("name: a", "f.yaml:1:13: exactly one of package + executable, module and command"),
-        ("name: a, command: x, module: y", "and module and command is given"),
+        (
+            "name: a",
+            "f.yaml:1:13: no program is given; give one of package + executable, module or command",
+        ),
+        ("name: a, command: x, module: y", "module and command are given; give one of"),
         ("name: a, package: p", "f.yaml:1:32: package 'p' is given without an executable"),
         ("name: a, executable: e", "executable 'e' is given without a package; a program that"),
         ("command: x", "f.yaml:1:13: name: is missing"),

@@ -73,7 +73,7 @@ def test_a_restore_goes_on_from_the_image() -> None:
     assert shelf.machine.programs[instance].restart == policy
     assert cluster["p"].image is None
     assert cluster["p"].migrations == 0
-    assert cluster.told("restored") == ["p goes on from its image on a"]
+    assert cluster.told("restored") == ["p was restored from its image on a"]
     assert cluster.checkpoint("p").accepted
     assert shelf.images == {instance.number}
 
@@ -102,7 +102,7 @@ def test_a_restored_process_that_ends_before_its_plan_does_follows_its_policy() 
     shelf.machine.executors["await"] = end_after
     cluster.restore("p")
     cluster.wait(1.0)
-    assert "p goes on from its image" in cluster.told("restored")[0]
+    assert "p was restored from its image" in cluster.told("restored")[0]
     assert (cluster.where("p"), cluster["p"].image, shelf.images) == ([], None, set())
     assert cluster.phase("p") == "failed"
 
@@ -119,7 +119,10 @@ def test_what_cannot_be_dumped_runs_on_and_the_reason_is_said() -> None:
     assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
     assert shelf.machine.programs[shelf.machine.find("p")].restart == policy
     (said,) = cluster.told("checkpoint_failed")
-    assert said == "p runs on on a: freeze failed on a: file descriptor 7 is a pipe"
+    assert said == (
+        "p was not checkpointed and still runs on a: freeze failed on a: file descriptor 7 is a "
+        "pipe"
+    )
     assert (shelf.frozen, shelf.images) == (set(), set())
 
 
@@ -161,7 +164,7 @@ def test_a_process_that_was_restored_is_not_put_back() -> None:
     cluster.wait(1.0)
     assert (cluster.phase("p"), cluster.where("p"), shelf.images) == ("running", ["a"], set())
     assert cluster.told("migration_redone") == [
-        f"p goes on after all: p#{cluster['p'].owner} is active"
+        f"the restore of p is finished after all: p#{cluster['p'].owner} is active"
     ]
 
 
@@ -202,7 +205,7 @@ def test_what_cannot_be_checkpointed_is_refused_with_its_reason() -> None:
     cases = [
         ("x", "no such process: x"),
         ("waits", "only a running process is checkpointed"),
-        ("watched", "watched has a standby, which would go on in its place"),
+        ("watched", "watched has a standby, which would take over"),
         ("stateful", "takes part under the number of its instance"),
     ]
     for name, said in cases:
@@ -622,7 +625,7 @@ MOVE = Move(process("p"), ONE, "a", TWO, "a", InstanceId("p", 3), 0, "p")
             (Start(TWO, "a", 1.0), Commit(image="x"), Stop(ONE, "a", 1.0)),
             "starts an instance",
         ),
-        (Aim.RESTORE, (Start(TWO, "a", 1.0), Commit()), "not from its image"),
+        (Aim.RESTORE, (Start(TWO, "a", 1.0), Commit()), "without its image"),
         (Aim.RESTORE, (Commit(),), "never starts or awaits"),
         (Aim.MOVE, (Start(TWO, "a", 1.0), Commit(image="x")), "commits to an image"),
     ],

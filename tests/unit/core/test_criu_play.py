@@ -42,7 +42,7 @@ class GivenUp:
     def __contains__(self, number: int) -> bool:
         kinds = [
             record.kind for record in self._records
-            if record.kind in ("given_up", "taken_back") and record.facts["number"] == number
+            if record.kind in ("given_up", "readopted") and record.facts["number"] == number
         ]  # fmt: skip
         return kinds[-1:] == ["given_up"]
 

@@ -182,8 +182,8 @@ def test_a_destination_that_is_never_ready_is_stopped_and_said_what_it_waits_for
     has_stayed(cluster)
     (told,) = cluster.told("stayed")
     assert told == (
-        "p stayed on a: state_config SHADOW took longer than 10 s: p#2 is SHADOWING: waits for "
-        "input /scan; p#1 is ATTACHED"
+        "p stayed on a: copying the state to the destination took longer than 10 s: p#2 receives "
+        "the state of the source: waits for input /scan; p#1 takes part in the handoff"
     )
 
 
@@ -196,15 +196,15 @@ def test_a_node_that_follows_no_protocol_stays_and_it_is_said_what_to_check() ->
     cluster.wait(10.3)
     has_stayed(cluster)
     (told,) = cluster.told("stayed")
-    assert "nothing was heard of either node. Do they use rosrm.node?" in told
+    assert "neither node has reported. Do they use rosrm.node?" in told
     assert "`protocol: paper`" in told
 
 
 @pytest.mark.parametrize(
     ("host", "told"),
     [
-        ("b", "p#2 cannot go on with the handoff: restore: KeyError: 'map'"),
-        ("a", "p#1 cannot go on with the handoff: the state is too large"),
+        ("b", "p#2 cannot continue the handoff: restore: KeyError: 'map'"),
+        ("a", "p#1 cannot continue the handoff: the state is too large"),
     ],
 )
 def test_a_report_of_failure_ends_the_handoff(host: str, told: str) -> None:
@@ -333,7 +333,10 @@ def test_a_silent_source_that_does_not_say_that_it_goes_on_is_stuck() -> None:
     cluster.machines["b"].finish("p", cluster.now, code=3)
     cluster.wait(11.0)
     assert cluster.phase("p") == "stuck"
-    assert "state_config RESUME took longer than 10 s" in cluster.told("migration_stuck")[0]
+    assert (
+        "letting the source publish again took longer than 10 s"
+        in cluster.told("migration_stuck")[0]
+    )
     cluster.machines["a"].quirks["p"].clear()
     cluster.wait(3.0)
     has_stayed(cluster)
@@ -578,7 +581,10 @@ def test_a_move_in_the_journal_that_nobody_understands_is_over() -> None:
     cluster.wait(5.0)
     assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
     assert not cluster.intents["migration"]
-    assert "cannot go on: no step of a plan: 'teleport'" in cluster.told("migration_forgotten")[0]
+    assert (
+        "cannot be continued: no step of a plan: 'teleport'"
+        in cluster.told("migration_forgotten")[0]
+    )
 
 
 def test_reports_of_another_handoff_are_not_heard() -> None:

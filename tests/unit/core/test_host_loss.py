@@ -75,7 +75,7 @@ def test_elsewhere_waits_for_its_delay() -> None:
     """And says so meanwhile."""
     cluster = on_a(process("p", host_loss=HostLossPolicy("elsewhere", 20.0)), "b")
     lose(cluster, "a", seconds=25.0)
-    assert cluster["p"].reason == "a is lost; it goes elsewhere in 20 s"
+    assert cluster["p"].reason == "a is lost; the process is started on another host in 20 s"
     assert cluster.where("p") == ["a"]
     cluster.wait(6.0)
     assert cluster.where("p") == ["a", "b"]
@@ -102,7 +102,9 @@ def test_the_old_instance_is_fenced_when_its_host_is_heard() -> None:
     back(cluster, "a", seconds=0.2)
     assert cluster.where("p") == ["b"]
     assert [order.instance.number for order in cluster.orders("fence") if order.instance] == [1]
-    assert cluster.told("fenced")[0].startswith("p#1 is not meant to run on a")
+    assert cluster.told("fenced")[0].startswith(
+        "p#1 is not assigned to a: the master has it killed"
+    )
 
 
 def test_the_old_instance_is_fenced_by_a_master_that_was_restarted() -> None:
@@ -378,7 +380,7 @@ def test_a_new_process_of_the_name_waits_until_the_old_one_has_ended() -> None:
     cluster.register(cluster.machines["a"])
     cluster.wait(1.0)
     assert (cluster.phase("p"), cluster.queue()) == ("stopping", [])
-    assert cluster["p"].reason == "waits for the end of p#1 on a"
+    assert cluster["p"].reason == "waits until p#1 on a has ended"
     cluster.machines["a"].let_go("p", cluster.now)
     cluster.wait(0.5)
     assert (cluster.phase("p"), cluster["p"].owner) == ("running", 2)

@@ -124,7 +124,7 @@ def test_a_usage_that_makes_no_sense_is_refused() -> None:
         cluster.machines["a"].shown["p"] = {"memory": wrong}
         cluster.tell(cluster.machines["a"].usages())
     assert cluster.state.instances[1].seen == {}
-    assert cluster.told("reading_refused") == ["a usage of p#1 was refused"]
+    assert cluster.told("reading_refused") == ["a usage of p#1 was refused (NaN or negative)"]
 
 
 # --- registration -----------------------------------------------------------------------------
@@ -234,7 +234,7 @@ def test_a_silent_host_is_suspect_and_gets_no_work() -> None:
     assert (cluster.phase("p"), cluster.phase("q")) == ("running", "queued")
     cluster.machines["a"].connected = True
     cluster.wait(0.3)
-    assert cluster.told("host_back") == ["a is heard again"]
+    assert cluster.told("host_back") == ["a reports again"]
     assert cluster.where("q") == ["a"]
 
 
@@ -247,11 +247,13 @@ def test_a_host_that_reports_slowly_by_its_own_word_is_not_silent() -> None:
     assert [told.split()[0] for told in cluster.told("host_suspect")] == ["quick"]
     assert [told.split()[0] for told in cluster.told("host_lost")] == ["quick"]
     cluster.wait(0.3)
-    assert cluster.told("host_suspect")[-1].startswith("slow has been silent for 12.")
+    assert cluster.told("host_suspect")[-1].startswith(
+        "slow is suspect: it has not reported for 12."
+    )
     cluster.wait(8.6)
     assert len(cluster.told("host_lost")) == 1
     cluster.wait(0.4)
-    assert cluster.told("host_lost")[-1].startswith("slow is lost: silent for 21.")
+    assert cluster.told("host_lost")[-1].startswith("slow is lost: it has not reported for 21.")
 
 
 def test_a_host_that_is_silent_past_its_lease_is_lost() -> None:
@@ -263,7 +265,7 @@ def test_a_host_that_is_silent_past_its_lease_is_lost() -> None:
     cluster.machines["a"].connected = False
     cluster.wait(11.0)
     (said,) = cluster.told("host_lost")
-    assert said.startswith("a is lost: silent for 10.")
+    assert said.startswith("a is lost: it has not reported for 10.")
     assert (cluster.phase("p"), cluster["p"].reason) == ("unreachable", "a is lost")
     assert cluster.where("p") == ["a"]
 
@@ -362,7 +364,7 @@ def test_what_a_host_ends_as_it_leaves_returns_to_the_queue() -> None:
     assert cluster.counts() == {"a": 2, "b": 0}
     cluster.leave(cluster.machines["a"])
     assert cluster.counts() == {"a": 0, "b": 2}
-    assert cluster.told("host_left") == ["a leaves"]
+    assert cluster.told("host_left") == ["a leaves: its slave stops"]
 
 
 def test_a_job_that_completes_as_its_host_leaves_has_finished() -> None:

@@ -74,7 +74,7 @@ def lost_with_p_on_b(cluster: Cluster) -> Loss:
 def waits(cluster: Cluster) -> None:
     """`p` is given to nobody, and runs where it was started in what is lost."""
     assert cluster.where("p") == ["b"]
-    assert "all hosts must be heard first" in cluster["p"].reason
+    assert "the master waits for all hosts to report" in cluster["p"].reason
 
 
 def test_it_is_said_once_with_how_much(cluster) -> None:

@@ -88,7 +88,7 @@ def test_a_move_is_refused_with_its_reason() -> None:
     cases = [
         (("x",), "no such process: x"),
         (("p", "z"), "no such host: 'z'; there are: a, b"),
-        (("p", "a"), "it is there already"),
+        (("p", "a"), "p runs on a already"),
         (("fixed",), "has no migration strategy"),
         (("waits",), "only a running process can be moved"),
     ]
@@ -113,7 +113,7 @@ def test_a_destination_that_never_becomes_ready_is_stopped_and_the_source_goes_o
     cluster.wait(11.0)
     assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
     (said,) = cluster.told("stayed")
-    assert said == "p stayed on a: await ready p#2 on b took longer than 10 s"
+    assert said == "p stayed on a: waiting until p#2 is ready on b took longer than 10 s"
     assert cluster.state.hosts.processes.tolist() == [1, 0]
 
 
@@ -174,7 +174,7 @@ def test_a_source_that_ends_by_itself_ends_the_move() -> None:
     cluster.machines["a"].finish("p", cluster.now)
     cluster.settle()
     assert (cluster.phase("p"), cluster.where("p")) == ("finished", [])
-    assert cluster.told("stayed") == ["p stayed on a: p#1 ended by itself"]
+    assert cluster.told("stayed") == ["p stayed on a: p#1 ended during the move"]
 
 
 def test_a_job_that_completes_while_it_is_told_to_stop_has_finished() -> None:
@@ -228,7 +228,7 @@ def test_after_the_commit_a_source_that_does_not_stop_leaves_the_move_stuck() ->
     cluster.wait(11.0)
     assert cluster.phase("p") == "stuck"
     (said,) = cluster.told("migration_stuck")
-    assert said.startswith("p is STUCK on its way forward: stop p#1 on a took longer")
+    assert said.startswith("p is stuck: its move cannot be finished yet: stopping p#1 on a took")
     cluster.wait(60.0)
     assert len(cluster.told("migration_stuck")) == 1
     assert len(cluster.told("migration_step_failed")) == 1

@@ -118,7 +118,7 @@ def test_the_first_one_is_told_and_explained():
     cluster = running(Pacing(), host)
     cluster.wait(60.0)
     (said,) = cluster.told("periodic_checkpoint")
-    assert "5000 bytes, dumped in 0.60 s" in said
+    assert "5.0 kB, paused for 0.60 s" in said
     told = cluster.explain("p")["checkpoint"]
     assert (told["size"], told["trouble"]) == (5000, "")
     assert 0.0 <= told["elapsed"] <= 11.0
@@ -131,7 +131,7 @@ def test_what_fails_is_said_once_and_tried_again():
     cluster = running(Pacing(), host)
     cluster.wait(45.0)
     assert len(host.dumps) >= 3
-    assert cluster.told("periodic_failed") == ["the memory of p is not dumped: no room"]
+    assert cluster.told("periodic_failed") == ["no periodic checkpoint of p was made: no room"]
     assert cluster.explain("p")["checkpoint"]["trouble"] == "no room"
     host.answer = {"size": 1, "seconds": {}}
     cluster.wait(12.0)

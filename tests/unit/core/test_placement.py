@@ -99,7 +99,7 @@ def test_a_declared_need_of_a_resource_that_a_host_has_not_excludes_it() -> None
     cluster = Cluster("a")
     cluster.submit(process("p", needs={"gpu": 0.5}))
     assert cluster.phase("p") == "set_aside"
-    assert "it has no gpu" in cluster["p"].reason
+    assert "no host reports the resource 'gpu'" in cluster["p"].reason
     cluster.add(gpu)
     assert cluster.where("p") == ["g"]
 
@@ -276,7 +276,7 @@ def test_of_many_hosts_the_best_are_named_and_the_rest_counted() -> None:
     cluster.submit(process("p"))
     decision = cluster.explain("p")["decision"]
     assert [host["name"] for host in decision["hosts"]] == ["h0", "h1", "h2", "h3"]
-    assert decision["omitted"] == {"fits with a higher score": 35, "does not fit now": 1}
+    assert decision["omitted"] == {"would take it at a higher score": 35, "cannot take it now": 1}
 
 
 def test_a_waiting_process_tells_who_is_before_it() -> None:

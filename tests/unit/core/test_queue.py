@@ -81,7 +81,39 @@ def test_who_is_too_large_for_every_host_is_set_aside() -> None:
     cluster = Cluster(Machine("a", memory=1000 * MIB))
     cluster.submit(process("p", memory=900))
     assert cluster.phase("p") == "set_aside"
-    assert "it needs 90% of its memory, over the limit of 80%" in cluster["p"].reason
+    assert cluster["p"].reason == (
+        "no host may take it: a: it has 1.0 GB of memory, of which 839 MB (80%) may be used; "
+        "needed: 944 MB"
+    )
+    assert cluster.restart("p").message.startswith("p is set aside: no host may take it: a: ")
+
+
+def test_a_misspelt_resource_is_named_with_the_nearest_that_is_reported() -> None:
+    """Set aside, as a host that reports it may still come."""
+    cluster = Cluster("a", "b")
+    cluster.submit(process("p", needs={"memroy": 1e6}))
+    assert cluster["p"].reason == (
+        "no host may take it: no host reports the resource 'memroy'; did you mean 'memory'? "
+        "(reported: cpu, memory)"
+    )
+
+
+def test_restart_of_a_process_that_waits_for_room_is_refused() -> None:
+    """The process starts as soon as there is room anyway."""
+    cluster = Cluster(full())
+    cluster.submit(process("p"))
+    assert cluster.restart("p").message == "p waits in the queue already. Nothing was restarted"
+
+
+def test_a_queue_without_hosts_that_are_there_says_that_they_are_away() -> None:
+    """Not that they are full."""
+    cluster = Cluster("a", "b")
+    cluster.leave(cluster.machines["a"])
+    cluster.machines["b"].connected = False
+    cluster.wait(11.0)
+    cluster.submit(process("p"))
+    assert cluster["p"].reason == "every host is away: a: it has left; b: it is lost"
+    assert cluster.told("waits") == [f"p waits: {cluster['p'].reason}"]
 
 
 def test_who_was_set_aside_returns_to_its_place_when_a_fitting_host_comes() -> None:

@@ -68,6 +68,24 @@ class Choosy:
         return "" if spec.migration.options else "it wants options"
 
 
+def test_processes_that_put_one_node_into_the_graph_are_mentioned() -> None:
+    """Taken nonetheless: ROS 2 lets both live."""
+    cluster = Cluster("a")
+    alias = ("--ros-args", "-r", "__node:=p", "-r", "__ns:=/robot")
+    cluster.submit(node("p", namespace="/robot"))
+    assert cluster.submit(node("other"), node("p2")).message == "2 processes queued"
+    reply = cluster.submit(node("q", arguments=alias))
+    assert reply.message == (
+        "1 process queued. Warning: q and p put the node /robot/p into the ROS graph; give each "
+        "node a name of its own"
+    )
+    cluster.cancel("p", "q")
+    cluster.settle()
+    run = {"command": ("ros2", "run", "demo_nodes_cpp", "talker")}
+    reply = cluster.submit(process("one", **run), process("two", **run))
+    assert "one and two put the default node of demo_nodes_cpp talker into" in reply.message
+
+
 def test_a_strategy_may_refuse_a_spec_before_it_is_queued() -> None:
     """With its reason; one that raises is named."""
     cluster = Cluster("a", strategies={"choosy": Choosy()})
@@ -78,7 +96,7 @@ def test_a_strategy_may_refuse_a_spec_before_it_is_queued() -> None:
 
     assert message("p", fast=1) == "1 process queued"
     assert message("q") == "q: migration by 'choosy': it wants options. Nothing was queued"
-    assert "cannot say whether it moves this process: RuntimeError: no idea" in message("raises")
+    assert "its check of this process failed: RuntimeError: no idea" in message("raises")
 
 
 def test_an_unknown_migration_strategy_refuses_all() -> None:
@@ -301,13 +319,13 @@ def test_restart_is_refused_where_it_makes_no_sense() -> None:
     """Waiting, being stopped, moving, out of reach: with the reason, and nothing is restarted."""
     cluster = Cluster("a", Machine("b", busy={"memory": 0.5}))
     cluster.machines["a"].stubborn.add("stops")
-    cluster.submit(process("stops"), movable("moves", ros=True), process("waits", memory=1e6))
+    cluster.submit(process("stops"), movable("moves", ros=True), process("huge", memory=1e6))
     cluster.machines["a"].seen_in_graph("moves", cluster.now)
     cluster.settle()
     cluster.migrate("moves")
     cluster.cancel("stops")
-    for name, said in (("waits", "waits in the queue"), ("stops", "is being stopped"),
-                       ("moves", "is moving")):  # fmt: skip
+    for name, said in (("huge", "huge is set aside: no host may take it"),
+                       ("stops", "is being stopped"), ("moves", "is moving")):  # fmt: skip
         reply = cluster.restart(name)
         assert not reply.accepted
         assert said in reply.message
@@ -405,7 +423,7 @@ def test_an_assignment_that_is_not_taken_up_is_withdrawn() -> None:
             cluster.set_host("a", "cordon")
     cluster.settle()
     assert cluster.where("p") == ["b"]
-    assert "a did not take it up in time" in cluster.told("queued")[0]
+    assert "a did not accept the assignment in time" in cluster.told("queued")[0]
 
 
 def test_one_that_was_fetched_and_never_heard_of_is_stopped_before_it_goes_elsewhere() -> None:

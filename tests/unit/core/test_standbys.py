@@ -121,7 +121,7 @@ def test_one_that_gave_up_is_replaced_after_a_while() -> None:
     cluster.wait(1.0)
     assert cluster.where("p") == cluster.active()
     assert cluster.told("standby_lost") == [
-        "p has no standby: another run of the source; another one in 2 s"
+        "p has no standby: another run of the source; the master starts another one in 2 s"
     ]
     cluster.wait(5.0)
     assert len(cluster.where("p")) == 2

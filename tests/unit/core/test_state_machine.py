@@ -778,7 +778,7 @@ class Play(RuleBasedStateMachine):
         for record in self.cluster.records[self.records_seen :]:
             if record.kind == "given_up":
                 self.left.add(record.facts["number"])
-            elif record.kind == "taken_back":
+            elif record.kind == "readopted":
                 self.left.discard(record.facts["number"])
         self.records_seen = len(self.cluster.records)
 

@@ -160,6 +160,15 @@ def test_what_runs_when_the_record_begins_is_where_it_is():
     assert after.arrivals == {"p0": 0.0, "p1": 0.0, "large": 0.0}
 
 
+def test_a_process_of_a_record_that_ended_without_a_host_is_named_with_its_reason():
+    """Among those that were never placed, as one that still waits is."""
+    plans = [plan("p0", 100.0), plan("large", 900.0)]
+    requests = [(3.0, happened.CancelRequested(0, ("large",)))]
+    made = simulation([host("a")], plans, until=5.0, requests=requests)
+    outcome = replay(read(recorded(made)), CoreSettings(), EQ1, STRATEGIES).outcome
+    assert outcome.never_placed == {"large": "it was cancelled"}
+
+
 def test_a_workload_made_of_a_record_gives_nearly_the_same_run(record):
     """Simulated, recorded, extracted and simulated again."""
     extraction = Extraction(record)

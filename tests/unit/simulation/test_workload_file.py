@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from rosrm.cli.simulation_runs import run
 from rosrm.config import workload as in_file
 from rosrm.config.variants import variant_in_text
 from rosrm.config.workload import load_workload
@@ -148,12 +149,20 @@ def test_every_example_loads(path, registry):
     assert load_workload(path, registry).workload.processes
 
 
-def test_the_workload_in_the_how_to_loads_and_runs(load):
+def test_the_workload_in_the_how_to_shows_differences(load, registry):
+    """Each row of its table differs from the others in what it compares."""
     text = (ROOT / "docs" / "how-to" / "simulate.md").read_text(encoding="utf-8")
     (block,) = re.findall(r"<!-- workload -->\n```yaml[^\n]*\n(.*?)```", text, re.DOTALL)
     made = load(block)
-    assert [one.name for one in made.variants] == ["as given", "by memory alone", "hosts 4"]
-    assert len(made.workload.processes) == 21
+    assert [one.name for one in made.variants] == [
+        "as given", "by CPU alone", "without moves", "hosts 4",
+    ]  # fmt: skip
+    outcomes = [run(made.workload, one, registry).outcome for one in made.variants]
+    rows = [(one.migrations, one.over_limit, one.imbalance["memory"]) for one in outcomes]
+    assert len(set(rows)) == len(rows)
+    given, _, without_moves, _ = outcomes
+    assert given.migrations > without_moves.migrations == 0
+    assert given.over_limit < without_moves.over_limit
 
 
 @pytest.mark.parametrize(

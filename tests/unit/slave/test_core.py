@@ -421,7 +421,7 @@ def test_so_many_are_started_at_a_time(one) -> None:
     commands = one.step(nodes(4))
     assert launched(commands) == ["n0", "n1"]
     assert states(commands) == [STATE.HELD, STATE.HELD]
-    assert "2 at a time" in one.of("n2").status.message
+    assert "max_starting: 2" in one.of("n2").status.message
     assert launched(one.step(told(STATE.RUNNING, "n0", pid=5))) == []
     assert launched(one.step(slave.SeenInGraph(InstanceId("n0", 1)))) == ["n2"]
 

@@ -141,7 +141,7 @@ def test_backoff_grows_to_its_bound_and_restarts_run_out():
         assert kinds(core.handle(sv.TimePassed(), now)) == ["Tell", "Spawn"]
         core.handle(sv.Spawned(TALKER, 100), now)
     assert [0.8 * most <= wait <= most for wait, most in zip(waits, (1, 2, 4, 5, 5), strict=True)]
-    assert instance.message == "exit code 1; 5 restarts within 300 s are the most allowed"
+    assert instance.message == "exit code 1; its restart policy allows 5 restarts within 300 s"
     assert instance.restarts == 5
 
 

@@ -1,0 +1,56 @@
+"""Names of nodes in the ROS graph, as far as specs tell them: which processes share one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Final
+
+from rosrm.core.model import ProcessSpec
+from rosrm.spelling import listed
+
+_RUN: Final = ("ros2", "run")
+#: Most processes that one sentence names.
+_MOST_NAMED: Final = 8
+
+
+def shared_nodes(specs: Sequence[ProcessSpec], others: Iterable[ProcessSpec] = ()) -> list[str]:
+    """Return a sentence for each node name that several processes put into the ROS graph.
+
+    Args:
+        specs: processes to be submitted; each sentence is about at least one of them.
+        others: live processes.
+    """
+    users: dict[str, list[str]] = {}
+    for spec in (*specs, *others):
+        node = _node_of(spec)
+        if node:
+            users.setdefault(node, []).append(spec.name)
+    new = {spec.name for spec in specs}
+    return [
+        f"{listed(_named(names))} put {node} into the ROS graph; give each node a name of its own"
+        for node, names in users.items()
+        if len(names) > 1 and not new.isdisjoint(names)
+    ]
+
+
+def _named(names: list[str]) -> list[str]:
+    more = len(names) - _MOST_NAMED
+    return names if more <= 0 else [*names[:_MOST_NAMED], f"{more} more"]
+
+
+def _node_of(spec: ProcessSpec) -> str:
+    """Return which node a process puts into the graph; "" if its spec does not tell.
+
+    rosrm adds its name rule behind the arguments of the user, and the first rule counts.
+    """
+    words = (*spec.command, *spec.arguments)
+    rules = dict(
+        word.split(":=", 1) for word in reversed(words) if word.startswith(("__node:=", "__ns:="))
+    )
+    name = rules.get("__node") or (spec.name if spec.ros else "")
+    if name:
+        namespace = rules.get("__ns", spec.namespace).strip("/")
+        return f"the node /{namespace}/{name}" if namespace else f"the node /{name}"
+    if spec.command[:2] == _RUN and len(spec.command) >= 4:
+        return f"the default node of {' '.join(spec.command[2:4])}"
+    return ""
