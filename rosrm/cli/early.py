@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 #: Commands that ask the master.
 ASKING: Final = frozenset({
-    "submit", "cancel", "restart", "migrate", "checkpoint", "restore",
+    "submit", "cancel", "restart", "migrate", "checkpoint", "restore", "prune",
     "cordon", "uncordon", "drain", "status", "ps", "hosts", "plugins", "explain",
     "events", "logs", "top",
 })  # fmt: skip

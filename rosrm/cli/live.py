@@ -36,6 +36,7 @@ _FIRST: Final = ("memory", "cpu", "gpu", "disk")
 _ORDER: Final = (
     "stuck",
     "unreachable",
+    "unknown",
     "migrating",
     "stopping",
     "backoff",
@@ -213,8 +214,8 @@ def _processes(
         "STATE": [tables.state(row.state) for row in shown],
         "HOST": [Text(row.host) for row in shown],
         "SINCE": [Text(formats.duration(row.since)) for row in shown],
-        "CPU": [Text(f"{row.cpu:.2f}" if row.pid else "") for row in shown],
-        "MEMORY": [Text(formats.size(row.memory) if row.pid else "") for row in shown],
+        "CPU": [tables.age(row, f"{row.cpu:.2f}" if row.pid else "") for row in shown],
+        "MEMORY": [tables.age(row, formats.size(row.memory) if row.pid else "") for row in shown],
     }
     reasons = [Text(" ".join(tables.why(row).split()), "dim") for row in shown]
     wanted = min(_LEAST_REASON, max(reason.cell_len for reason in reasons))

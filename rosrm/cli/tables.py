@@ -90,16 +90,16 @@ def processes(rows: Iterable[ProcessRow]) -> Table:
             state(row.state),
             Text(row.host),
             formats.duration(row.since),
-            _age(row, f"{row.cpu:.2f}") if runs else "",
-            _age(row, formats.size(row.memory)) if runs else "",
+            age(row, f"{row.cpu:.2f}") if runs else "",
+            age(row, formats.size(row.memory)) if runs else "",
             Text(why(row)),
         )
     return made
 
 
-def _age(row: ProcessRow, reading: str) -> Text:
-    """A reading of a process; `?` stands before an old one."""
-    return Text(f"?{reading}", "dim") if row.stale else Text(reading)
+def age(row: ProcessRow, reading: str) -> Text:
+    """Return a reading of a process; `?` stands before an old one."""
+    return Text(f"?{reading}", "dim") if row.stale and reading else Text(reading)
 
 
 def why(row: ProcessRow) -> str:

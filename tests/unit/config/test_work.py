@@ -222,7 +222,7 @@ def test_a_wrong_entry_is_refused_with_its_place(refusal, entry, said):
 @pytest.mark.parametrize(
     ("entry", "said"),
     [
-        ("command: x, module: y, prioritty: 1", "and module and command is given"),
+        ("command: x, module: y, prioritty: 1", "module and command are given; give one of"),
         ("command: x, health: {topic: /scan}, prioritty: 1", "health.topic and health.rate"),
         ("command: x, isolation: {after: 1s}, priority: high", "isolation.after goes with"),
         ("command: x, migration: relunch, prioritty: 1", "unknown migration strategy 'relunch'"),

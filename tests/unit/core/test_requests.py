@@ -494,7 +494,7 @@ def test_a_process_without_an_owner_is_cancelled_when_its_last_instance_has_ende
     cluster.cancel("p")
     assert (cluster.phase("p"), cluster["p"].reason) == (
         "stopping",
-        "waits for the end of p#1 on a",
+        "waits until p#1 on a has ended",
     )
     cluster.machines["a"].let_go("p", cluster.now)
     cluster.register(cluster.machines["a"])

@@ -63,7 +63,7 @@ def test_what_a_slave_ended_while_the_master_was_away_is_queued_again(spec) -> N
     cluster.register(machine)
     cluster.wait(1.0)
     assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
-    assert cluster.told("queued") == ["p returns to the queue: it was ended on a"]
+    assert cluster.told("queued") == ["p returns to the queue: its instance on a was stopped"]
 
 
 def test_a_process_that_was_cancelled_before_its_slave_ended_it_stays_cancelled() -> None:
