@@ -84,7 +84,7 @@ class ReadingsReceived:
 
 @dataclass(frozen=True, slots=True)
 class StatusesReceived:
-    """What became of instances on a host; `complete`: these are all that it holds.
+    """Changes of instances on a host; `complete`: these are all that the host holds.
 
     `failing` is complete in each: resource to the reason why its probe gives no readings.
     """

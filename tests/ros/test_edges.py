@@ -471,7 +471,7 @@ def test_a_slave_that_is_not_there_is_said(cluster) -> None:
 
 
 def test_callbacks_that_raise_end_nothing() -> None:
-    """Of a topic, of a request and of an answer: without the guard rclpy ends this process."""
+    """Without the guard rclpy ends this process: callbacks of a topic, a request and an answer."""
     domain, claim = claim_domain()
     settings = settings_on_this_machine(domain)
     ends: list[object] = []

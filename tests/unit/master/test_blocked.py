@@ -26,7 +26,7 @@ class Clock:
 
 @pytest.mark.parametrize(("takes", "passed"), [(14.0, 0.05), (0.1, 0.15)])
 def test_the_time_of_a_long_decision_does_not_count_for_the_core(monkeypatch, takes, passed):
-    """Answers were not taken in meanwhile; what is decided quickly counts as ever."""
+    """No answer is taken in during a long decision; the time of a quick one counts."""
     clock, events = Clock(takes), [[happened.TimePassed()], []]
     monkeypatch.setattr(runtime, "step", clock.step)
     master = MasterRuntime.__new__(MasterRuntime)

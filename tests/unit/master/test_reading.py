@@ -1,4 +1,4 @@
-"""What a master shows of plugins: those that fail now, with the last error."""
+"""The rows of plugins that a master shows: failing ones with their last error."""
 
 from __future__ import annotations
 
