@@ -70,7 +70,7 @@ def _why_kept(state: MasterState, process: Process) -> str:
     if process.instances:
         instance = state.instances[min(process.instances)]
         return f"{instance.id} is still being stopped on {instance.host.name}"
-    return ""
+    return "" if state.is_gone(process) else f"the standby of {process.name} is being ended"
 
 
 def _why_held(state: MasterState, host: Host) -> str:

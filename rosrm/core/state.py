@@ -271,9 +271,13 @@ class MasterState:
         excess = len(self.over) - self.settings.keep_ended
         if excess <= 0:
             return
-        gone = [name for name in self.over if not self.processes[name].instances]
+        gone = [name for name in self.over if self.is_gone(self.processes[name])]
         for name in gone[:excess]:
             self.remove_process(name)
+
+    def is_gone(self, process: Process) -> bool:
+        """Return True if no instance of an ended process may run and no standby is known."""
+        return not process.instances and process.name not in self.standbys
 
     def remove_process(self, name: str) -> None:
         """Remove an ended process of which no instance may run from memory and journal."""

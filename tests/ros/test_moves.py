@@ -202,12 +202,12 @@ def test_drain_empties_a_host(cluster) -> None:
     for name in ("d0", "d1", "d2"):
         assert moved(cluster, name).host == "right"
     assert cluster.process("fixed").host == "left"
-    cluster.wait_for_event("nothing_moves", "fixed", host="left")
+    cluster.wait_for_event("host_drained", "fixed has no migration strategy", host="left")
     row = cluster.host("left")
-    assert (row.draining, row.cordoned) == (True, True)
+    assert (row.draining, row.drained, row.cordoned) == (True, True, True)
     cluster.client.set_host_state("left", "uncordon")
     row = cluster.host("left")
-    assert (row.draining, row.cordoned) == (False, False)
+    assert (row.draining, row.drained, row.cordoned) == (False, False, False)
     cluster.cancel("d0", "d1", "d2", "fixed")
 
 

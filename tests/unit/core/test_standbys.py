@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from rosrm.core import events as happened
 from rosrm.core.migration import ReportPhase
 from rosrm.core.model import HostLossPolicy, InstanceState, RestartPolicy, StandbyPolicy
 from tests.unit.core.cluster import Cluster, Machine
@@ -228,3 +229,17 @@ def test_a_primary_that_is_heard_while_its_standby_takes_over_is_fenced() -> Non
     cluster.machines["a"].connected = True
     cluster.wait(0.3)
     assert [order.instance.number for order in cluster.orders("fence")] == [1]
+
+
+def test_an_ended_process_is_not_pruned_before_its_standby_is_given_up() -> None:
+    """Otherwise the review of standbys would look for a process that is gone."""
+    cluster = with_standby()
+    cluster.machines["b"].finish("p", cluster.now)
+    cluster.settle()
+    cluster.cancel("p")
+    assert cluster.phase("p") == "cancelled"
+    refused = cluster.ask(happened.PruneRequested, ("p",))
+    assert refused.message == "the standby of p is being ended. Nothing was removed"
+    cluster.wait(1.0)
+    assert cluster.ask(happened.PruneRequested, ("p",)).accepted
+    cluster.wait(1.0)
