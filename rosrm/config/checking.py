@@ -174,7 +174,7 @@ def _cause(error: ValueError, path: tuple[str | int, ...]) -> str:
 
 def _not_one_of(given: Any, expected: str) -> str:
     words = [word.strip().strip("'") for word in expected.replace(" or ", ", ").split(",")]
-    allowed = [word for word in words if word]
+    allowed = [word or '""' for word in words]
     return f"{described(given)} is unknown{near(str(given), allowed)}"
 
 

@@ -31,6 +31,9 @@ class Policy:
         if process.spec.name.startswith("fine"): return Scores(np.zeros(len(hosts.names)))
         return Scores(self.act(len(hosts.names)))
 
+def named(name, act):
+    return ScoringOffer(name, lambda options: Policy(act), reads=("name",))
+
 def raises(count): raise RuntimeError("the policy is out of order")
 def hangs(count):
     while True: pass
@@ -38,11 +41,9 @@ def hangs(count):
 @hookimpl
 def register_scoring_policies():
     return [
-        ScoringOffer("raises", lambda options: Policy(raises)),
-        ScoringOffer("nan", lambda options: Policy(lambda count: np.full(count, np.nan))),
-        ScoringOffer("wrong_size", lambda options: Policy(lambda count: np.zeros(count + 1))),
-        ScoringOffer("hangs", lambda options: Policy(hangs)),
-        ScoringOffer("exits", lambda options: Policy(lambda count: sys.exit(3))),
+        named("raises", raises), named("nan", lambda count: np.full(count, np.nan)),
+        named("wrong_size", lambda count: np.zeros(count + 1)), named("hangs", hangs),
+        named("exits", lambda count: sys.exit(3)),
         ScoringOffer("answers_none", lambda options: Silent()),
     ]
 

@@ -268,3 +268,8 @@ def test_a_resource_that_no_probe_reads_is_refused(refusal, text, said):
         register_migration_strategies=register_migration_strategies,
     )
     assert said in refusal(load_cluster, text, Registry.of(ours=ours))
+
+
+def test_no_text_is_among_the_allowed_words_where_it_is_one(refusal):
+    said = refusal(load_cluster, "ros: {discovery: {range: lokalhost}}")
+    assert "did you mean 'localhost'? Allowed: \"\", " in said
