@@ -354,6 +354,29 @@ def test_both_killed_at_once(make_cluster) -> None:
     assert (after.pid, after.number) == (before.pid, before.number)
 
 
+def test_a_host_that_loses_its_power_starts_its_services_again(make_cluster) -> None:
+    """Slave, supervisor and process end at one moment; the policy starts the service there."""
+    cluster = make_cluster(host("h0"), host("h1"))
+    cluster.submit(service("p", restart=RestartPolicy("on-failure", delay=0.1)))
+    before = cluster.wait("p", "running")
+    slave = cluster.slaves[before.host]
+    supervisor = pids_of(cluster.directory / "hosts" / before.host)
+    for pid in {slave.process.pid, *supervisor, before.pid}:
+        os.kill(pid, signal.SIGSTOP)  # none of them notices the end of another
+    for pid in {slave.process.pid, *supervisor, before.pid}:
+        os.kill(pid, signal.SIGKILL)
+    slave.process.wait(PATIENCE)
+    wait_gone(before.pid)
+    cluster.start_slave(host(before.host))
+    cluster.wait_until(
+        "p runs again", lambda v: any(
+            row.state == "running" and row.pid != before.pid for row in v.processes
+        ),
+    )  # fmt: skip
+    after = cluster.process("p")
+    assert (after.host, after.number) == (before.host, before.number)
+
+
 #: Who comes up without what hosts have seen of its journal gives no work for a lease.
 SHORTLY = LivenessSettings(lease=3.0)
 
