@@ -1,4 +1,4 @@
-"""Signals and errors that end a benchmark in good order: what it has started ends with it."""
+"""Signals and errors that end a benchmark, together with all processes that it started."""
 
 from __future__ import annotations
 

@@ -35,7 +35,10 @@ def end(part, number) -> int:
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_slave_that_is_stopped_stops_its_processes(make_cluster, number) -> None:
-    """Exit code 0, no traceback, no process left; what it ran is queued for another host."""
+    """Exit code 0, no traceback, no process left; what it ran is queued for another host.
+
+    The master acknowledges the last statuses at once: the slave waits less than its 2 s for that.
+    """
     cluster = make_cluster(host("h0"))
     restart = RestartPolicy("always", delay=0.1)
     cluster.submit(*(service(f"p{n}", restart=restart) for n in range(4)))
@@ -46,6 +49,7 @@ def test_a_slave_that_is_stopped_stops_its_processes(make_cluster, number) -> No
     assert not [pid for pid in pids if alive(pid)]
     assert wait_until_none(cluster.directory / "hosts") == {}
     assert "Traceback" not in cluster.log_of("h0")
+    assert "did not acknowledge" not in cluster.log_of("h0")
     view = cluster.wait_until(
         "all queued", lambda v: all(row.state == "queued" for row in v.processes)
     )

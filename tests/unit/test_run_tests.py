@@ -1,4 +1,4 @@
-"""What `make test` makes of failed and flaky tests: its runner on small folders of tests."""
+"""The runner of `make test` on small folders of tests: failed, flaky and last failed ones."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def failures(number: int) -> str:
 
 
 def test_a_test_that_passes_alone_is_listed_as_flaky(run_tests, tmp_path):
-    """It does not fail the run; a parameter's brackets and spaces and a class do not hide it."""
+    """The run passes; the name keeps the class and a parameter's brackets and spaces."""
     status, lines = run_tests({"ros/test_a.py": FLAKY, "ros/test_b.py": PASSES})
     assert (status, lines[-1]) == (0, "3 passed, 0 failed, 0 skipped")
     names = [line.split(" (")[0] for line in lines if line.startswith("flaky: ")]

@@ -1,4 +1,4 @@
-"""How benchmarks begin and end: what is missing is said first, a signal ends them in good order."""
+"""Begin and end of the benchmarks: missing programs, errors and signals."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from benchmarks.stopping import run
 
 def main():
     with contextlib.ExitStack() as opened:
-        opened.callback(print, "ended in good order", flush=True)
+        opened.callback(print, "cleaned up", flush=True)
         try:
             os.kill(os.getpid(), int(sys.argv[1]))
         except Exception:
@@ -39,13 +39,13 @@ sys.exit(run("it", main))
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_ends_a_benchmark_in_good_order(number):
-    """What it has started ends with it, and no `except Exception` on the way hides the signal."""
+def test_a_signal_ends_a_benchmark_after_its_clean_ups(number):
+    """Clean-ups run, and no `except Exception` on the way hides the signal."""
     ended = subprocess.run(
         [sys.executable, "-c", SIGNALLED, str(int(number))],
         cwd=ROOT, capture_output=True, text=True, timeout=60, check=False,
     )  # fmt: skip
-    assert ended.stdout == "ended in good order\n"
+    assert ended.stdout == "cleaned up\n"
     assert ended.stderr == f"benchmarks.it: stopped by {signal.Signals(number).name}\n"
     assert ended.returncode == 128 + number
 
@@ -90,7 +90,7 @@ def test_chaos_names_a_missing_program_before_it_begins(monkeypatch, tmp_path, p
 
 
 def test_a_clock_is_given_to_a_part_and_not_to_what_enters_its_host(monkeypatch, tmp_path):
-    """Where libfaketime is not here, the command is as it was."""
+    """Without libfaketime the command stays as it is."""
     monkeypatch.setattr(clocks, "library", lambda: Path("/lib/faketime.so"))
     command = clocks.with_clock(tmp_path, "master", ["rosrm", "master"])
     assert (command[0], command[-2:]) == ("env", ["rosrm", "master"])

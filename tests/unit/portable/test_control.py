@@ -120,7 +120,7 @@ def test_times_and_missing_peers_arrive(directory, node) -> None:
 
 
 def test_the_directory_of_a_process_is_found_in_the_middle_of_its_execve(directory) -> None:
-    """On one processor the parent goes on while the child's execve has set no environment yet."""
+    """On one processor the parent runs again before the child's execve has set the environment."""
     allowed = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {min(allowed)})
     try:

@@ -1,4 +1,4 @@
-"""What /proc says of a process, also in the middle of an execve; real processes."""
+"""Environments of real processes in /proc, also in the middle of an execve."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ STARTS = 20
 
 @pytest.fixture
 def one_processor():
-    """On one processor the parent of a process that was started goes on within its execve."""
+    """On one processor the parent runs again before the child's execve has ended."""
     allowed = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {min(allowed)})
     yield
@@ -34,7 +34,7 @@ def test_the_marks_of_a_process_are_read_in_the_middle_of_its_execve(one_process
 
 
 def test_a_process_without_an_environment_is_not_waited_for(one_processor):
-    """One that never gets any is told from one in the middle of its execve."""
+    """An empty environment differs from one that an execve has not yet set."""
     process = subprocess.Popen(["/bin/sleep", "60"], env={})
     try:
         assert read_environment(process.pid) == [b""]
