@@ -185,6 +185,16 @@ class Cluster(LocalCluster):
         self.wait_for_hosts()
         return part
 
+    def start_slave_again(self, name: str) -> Part:
+        """Start the slave of a host again after a SIGKILL, and wait for its registration.
+
+        Until then the master may take the former run for alive, and the host for accepting.
+        """
+        before = self.client.list().last_sequence
+        part = self.start_slave(next(one for one in self.hosts if one.host == name))
+        self.wait_for_event("host_registered", host=name, after=before)
+        return part
+
     def parts(self) -> list[Part]:
         return [part for part in (self.master, *self.slaves.values()) if part is not None]
 
