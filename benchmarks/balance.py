@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import sys
 import tempfile
 from collections import Counter
 from pathlib import Path
 
 from benchmarks.hosts import three_hosts
 from benchmarks.machine import print_report
+from benchmarks.stopping import run
 from rosrm.core.model import ProcessSpec
 from rosrm.local_cluster import LocalCluster
 
@@ -48,4 +50,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run("balance", main))

@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from benchmarks.machine import percentile, print_report, say
-from benchmarks.stopping import Stopped, raise_signals
+from benchmarks.stopping import run
 from rosrm.criu.probe import ability
 from rosrm.errors import LabError
 from rosrm.lab import DATA, GIB, HostPlan, Lab, uniform
@@ -253,14 +253,7 @@ def main() -> int:
     if not able.works:
         say(f"no CRIU that works here: {able.reason}")
         return 2
-    raise_signals()
-    try:
-        hops = measure(max(1, chosen.hops), chosen.heaps)
-    except LabError as error:
-        say(str(error))
-        return 2
-    except Stopped as stopped:
-        return 128 + stopped.number
+    hops = measure(max(1, chosen.hops), chosen.heaps)
     moved = [hop for hop in hops if hop["strategy"] == "criu"]
     outcomes = {
         f"{mb:g}": Outcome([hop for hop in moved if hop["mb"] == mb]) for mb in chosen.heaps
@@ -296,4 +289,4 @@ def _heap(text: str) -> float:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run("criu", main))

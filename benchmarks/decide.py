@@ -17,12 +17,14 @@ from __future__ import annotations
 
 import argparse
 import gc
+import sys
 import time
 from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from benchmarks.machine import median, print_report, say
+from benchmarks.stopping import run
 from rosrm.core import events as happened
 from rosrm.core.commands import Assign
 from rosrm.core.master import step
@@ -157,4 +159,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run("decide", main))

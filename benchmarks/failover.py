@@ -37,6 +37,7 @@ from std_msgs.msg import Int64MultiArray
 from benchmarks.handoff import Observer, Output
 from benchmarks.handoff_nodes import QOS
 from benchmarks.machine import percentile, print_report, say
+from benchmarks.stopping import run
 from rosrm import kept
 from rosrm.config.settings import ClusterConfig, ControlSettings, HostConfig, LivenessSettings
 from rosrm.core.model import HostLossPolicy, MigrationPolicy, ProcessSpec, StandbyPolicy, StopPolicy
@@ -359,4 +360,4 @@ def _quantiles(name: str, seconds: Sequence[float]) -> dict[str, float | None]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run("failover", main))

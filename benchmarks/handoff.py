@@ -34,6 +34,7 @@ from std_msgs.msg import Int64MultiArray
 from benchmarks.handoff_nodes import OUTPUT, QOS
 from benchmarks.hosts import three_hosts
 from benchmarks.machine import percentile, print_report, say
+from benchmarks.stopping import run
 from rosrm.config.settings import ClusterConfig, MigrationSettings
 from rosrm.core.model import MigrationPolicy, ProcessSpec
 from rosrm.local_cluster import LocalCluster
@@ -260,4 +261,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run("handoff", main))

@@ -24,6 +24,7 @@ import rclpy
 from std_msgs.msg import UInt8MultiArray
 
 from benchmarks.machine import print_report, say
+from benchmarks.stopping import run
 from rosrm.loopback import enter_private_network
 from rosrm.node import Node
 
@@ -126,4 +127,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run("keep_cost", main))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import subprocess
+import sys
 import tempfile
 import time
 from contextlib import suppress
@@ -17,6 +18,7 @@ import numpy as np
 
 from benchmarks.hosts import three_hosts
 from benchmarks.machine import print_report
+from benchmarks.stopping import run
 from rosrm.core.model import Kind, ProcessSpec
 from rosrm.errors import Refused
 from rosrm.local_cluster import LocalCluster
@@ -97,4 +99,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run("latency", main))

@@ -34,7 +34,7 @@ from typing import Any
 
 from benchmarks.machine import percentile, print_report, say
 from benchmarks.simulated_slaves import STEP
-from benchmarks.stopping import Stopped, raise_signals
+from benchmarks.stopping import run
 from rosrm.core.model import Kind, ProcessSpec
 from rosrm.errors import RosrmError
 from rosrm.local_cluster import LocalCluster
@@ -296,17 +296,9 @@ def main() -> int:
     arguments = parser.parse_args()
     if arguments.processes > arguments.slaves:
         parser.error(f"{arguments.slaves} slaves cannot share {arguments.processes} processes")
-    raise_signals()
     alone = enter_private_network()
-    try:
-        with tempfile.TemporaryDirectory(prefix="rosrm-scale-") as folder:
-            figures = measure(arguments, Path(folder))
-    except Stopped as stopped:
-        say(f"benchmarks.scale: stopped by {stopped}")
-        return 128 + stopped.number
-    except (RosrmError, OSError) as error:
-        say(f"benchmarks.scale: {error}")
-        return 2
+    with tempfile.TemporaryDirectory(prefix="rosrm-scale-") as folder:
+        figures = measure(arguments, Path(folder))
     print_report(
         "scale",
         {
@@ -329,4 +321,4 @@ def _positive(kind: type) -> Any:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run("scale", main))

@@ -10,6 +10,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 import tempfile
 import time
 from pathlib import Path
@@ -17,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.machine import median, print_report, say
+from benchmarks.stopping import run
 from rosrm.core.events import ReadingsReceived
 from rosrm.core.model import RESOURCE_SLOTS, Kind, ProcessSpec, ResourceDescription
 from rosrm.core.settings import CoreSettings
@@ -114,4 +116,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run("simulation", main))

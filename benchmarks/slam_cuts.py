@@ -15,6 +15,7 @@ import numpy as np
 from rclpy.serialization import deserialize_message, serialize_message
 
 from benchmarks.machine import percentile, print_report, say
+from benchmarks.stopping import run
 from rosrm_examples.drives import Drive, load_drive
 from rosrm_examples.errors import ExampleError
 from rosrm_examples.live_slam import LiveSlam
@@ -119,4 +120,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run("slam_cuts", main))

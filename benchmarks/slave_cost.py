@@ -18,6 +18,7 @@ from pathlib import Path
 import psutil
 
 from benchmarks.machine import print_report
+from benchmarks.stopping import run
 from rosrm.config.settings import HostConfig
 from rosrm.local_cluster import LocalCluster
 
@@ -103,4 +104,4 @@ def _measure(
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run("slave_cost", main))

@@ -1,14 +1,18 @@
-"""Signals that end a benchmark in good order: what it has started ends with it."""
+"""Signals and errors that end a benchmark, together with all processes that it started."""
 
 from __future__ import annotations
 
 import os
 import signal
+from collections.abc import Callable
 from types import FrameType
 
+from benchmarks.machine import say
+from rosrm.errors import RosrmError
 
-class Stopped(Exception):
-    """A signal came.
+
+class Stopped(BaseException):
+    """A signal came; no `except Exception` on the way may swallow it.
 
     Attributes:
         number: of the signal.
@@ -34,3 +38,19 @@ def raise_signals() -> None:
 
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, stop)
+
+
+def run(name: str, main: Callable[[], int | None]) -> int:
+    """Run a benchmark; return its exit status.
+
+    It is 2 where something is missing or failed, 128 + signal number where a signal stopped it.
+    """
+    raise_signals()
+    try:
+        return main() or 0
+    except Stopped as stopped:
+        say(f"benchmarks.{name}: stopped by {stopped}")
+        return 128 + stopped.number
+    except (RosrmError, OSError) as error:
+        say(f"benchmarks.{name}: {error}")
+        return 2

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import statistics
+import sys
 import tempfile
 import time
 from collections.abc import Sequence
@@ -16,6 +17,7 @@ from pathlib import Path
 
 from benchmarks.hosts import three_hosts
 from benchmarks.machine import print_report
+from benchmarks.stopping import run
 from rosrm.config.settings import HostConfig
 from rosrm.core.model import Kind, ProcessSpec
 from rosrm.local_cluster import LocalCluster
@@ -88,4 +90,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run("throughput", main))

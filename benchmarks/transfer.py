@@ -13,11 +13,13 @@ from __future__ import annotations
 import argparse
 import random
 import resource
+import sys
 import tempfile
 import time
 from pathlib import Path
 
 from benchmarks.machine import median, print_report, say
+from benchmarks.stopping import run
 from rosrm.transfer import Fetcher, Sender
 
 SIZES_MB = (10, 100, 500)
@@ -93,4 +95,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run("transfer", main))

@@ -23,31 +23,26 @@ from benchmarks.chaos.faults import Round, draw
 from benchmarks.chaos.story import Story
 from benchmarks.chaos.trial import Stuck, Tally, Trial
 from benchmarks.machine import percentile, print_report, say
-from benchmarks.stopping import Stopped, raise_signals
-from rosrm.errors import RosrmError
+from benchmarks.stopping import run
 from rosrm.lab import needs
 
 #: Labs that may get stuck before a run is given up.
 _MOST_STUCK: Final = 5
-_FAILED: Final = 2
+_NO_CLOCKS: Final = "the package libfaketime is not installed (pip install libfaketime)"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Do faults until there were enough of them; returns the exit status."""
     options = _parse(arguments)
-    raise_signals()
+    needs.check_rights()
+    needs.check_commands()
+    if clocks.library() is None:
+        say(f"no clock is set back: {_NO_CLOCKS}")
     tally, began = Tally(), time.monotonic()
     try:
-        needs.check_rights()
         out = options.out or Path(tempfile.mkdtemp(prefix="rosrm-chaos-"))
         out.mkdir(parents=True, exist_ok=True)
         _run(options, out, tally, began)
-    except Stopped as stopped:
-        say(f"stopped by {stopped}")
-        return 128 + stopped.number
-    except (RosrmError, OSError) as error:
-        say(f"benchmarks.chaos: {error}")
-        return _FAILED
     finally:
         if tally.rounds:
             _report(options, tally, time.monotonic() - began)
@@ -101,7 +96,7 @@ def _while(rounds: Iterator[Round], faults: int, deadline: float, tally: Tally) 
 
 def _report(options: argparse.Namespace, tally: Tally, seconds: float) -> None:
     violations = tally.violations
-    left_out = {} if clocks.library() else {"clock": "the package libfaketime is not installed"}
+    left_out = {} if clocks.library() else {"clock": _NO_CLOCKS}
     print_report(
         "chaos",
         {
@@ -134,4 +129,4 @@ def _spread(seconds: Mapping[str, Sequence[float]]) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run("chaos", main))

@@ -7,7 +7,7 @@ has a file with what its clock is ahead (+) or behind (-), which is read again e
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -23,12 +23,16 @@ def library() -> Path | None:
     return path if path.is_file() else None
 
 
-def environment(folder: Path, part: str) -> dict[str, str]:
-    """The variables that give a part, and all that it starts, a clock of its own."""
+def with_clock(folder: Path, part: str, command: Sequence[str]) -> list[str]:
+    """Return the command of a part such that the part, and all it starts, has a clock of its own.
+
+    Only the part itself gets the variables, not the program that enters its host. libfaketime makes
+    files in /dev/shm, which a killed process leaves: those of a host are removed with the host.
+    """
     path = library()
     if path is None:
-        return {}
-    return {
+        return list(command)
+    variables = {
         "LD_PRELOAD": str(path),
         "FAKETIME_TIMESTAMP_FILE": str(_file(folder, part)),
         "FAKETIME_CACHE_DURATION": "1",
@@ -36,6 +40,7 @@ def environment(folder: Path, part: str) -> dict[str, str]:
         "FAKETIME_FORCE_MONOTONIC_FIX": "0",  # else who waits by the monotonic clock spins
         "NO_FAKE_STAT": "1",
     }
+    return ["env", *(f"{name}={value}" for name, value in variables.items()), *command]
 
 
 def set_back(folder: Path, part: str, seconds: float) -> None:

@@ -117,8 +117,8 @@ class Cluster:
         part.held, part.ended = False, 0.0
         with part.log.open("ab") as sink:
             part.process = self.lab.popen(
-                part.host, part.command, cwd=str(ROOT), stdin=subprocess.DEVNULL, stdout=sink,
-                stderr=sink, env=clocks.environment(self.folder, name),
+                part.host, clocks.with_clock(self.folder, name, part.command), cwd=str(ROOT),
+                stdin=subprocess.DEVNULL, stdout=sink, stderr=sink,
             )  # fmt: skip
 
     def kill(self, name: str) -> bool:

@@ -46,6 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options.out.mkdir(parents=True, exist_ok=True)
         if set(names) - set(_WITHOUT_LAB):
             needs.check_rights()
+            needs.check_commands(needs.FROM_THE_START)
         statuses = {name: _measured(name, options) for name in names}
         if options.page is not None:
             measured = [name for name, status in statuses.items() if status != _FAILED]

@@ -34,7 +34,7 @@ COMMANDS: Final = {
     "unshare": "util-linux",
 }
 #: `nft` is asked for when a network is changed.
-_FROM_THE_START: Final = ("mkfs.ext4", "mount", "nsenter", "setpriv", "unshare")
+FROM_THE_START: Final = ("mkfs.ext4", "mount", "nsenter", "setpriv", "unshare")
 #: Makes loop devices, which disks are mounted with.
 _DEVICE: Final = Path("/dev/loop-control")
 #: Where they are although an ordinary user's PATH, or sudo's, may not say so.
@@ -59,6 +59,12 @@ def find_command(name: str) -> str:
             f"apt-get install {COMMANDS.get(name, name)}"
         )
     return found
+
+
+def check_commands(names: Iterable[str] = tuple(COMMANDS)) -> None:
+    """Raise `LabError` where a program is missing, by default one of all that a lab may need."""
+    for name in names:
+        find_command(name)
 
 
 def check_rights(hosts: Sequence[HostPlan] = (), status: str | None = None) -> None:
@@ -91,8 +97,7 @@ def check_machine(
         images: the directory that will hold their disks.
         hierarchies: where their groups will be: a container may have a limit of its own there.
     """
-    for name in _FROM_THE_START:
-        find_command(name)
+    check_commands(FROM_THE_START)
     if not _DEVICE.exists():
         raise LabError(
             f"there are no loop devices ({_DEVICE}): the hosts' disks cannot be mounted. "

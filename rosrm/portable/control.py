@@ -25,6 +25,7 @@ from rosrm.portable.form import (
     remove_status,
     write_request,
 )
+from rosrm.supervisor.members import read_environment
 
 #: Seconds between two looks at a status: the standard library cannot await the change of a file.
 _LOOK: Final = 0.005
@@ -54,7 +55,7 @@ def directory_of(pid: int) -> Path | None:
         OSError: it has ended, or is not ours to look at.
     """
     mark = f"{VARIABLE}=".encode()
-    variables = Path(f"/proc/{pid}/environ").read_bytes().split(b"\0")
+    variables = read_environment(pid)
     named = next((word[len(mark) :] for word in variables if word.startswith(mark)), b"")
     return Path(os.fsdecode(named)) if named else None
 

@@ -394,8 +394,12 @@ class SlaveEndpoint:
 
     def wait_until_heard(self) -> None:
         """Give the last words time to arrive: what is not acknowledged is lost when we leave."""
-        if self.link is Link.REGISTERED:
-            self._statuses.wait_for_all_acked(Duration(seconds=_LAST_WORDS))
+        if self.link is not Link.REGISTERED:
+            return
+        if not self._statuses.wait_for_all_acked(Duration(seconds=_LAST_WORDS)):
+            self._host.say(
+                f"the master did not acknowledge the last statuses within {_LAST_WORDS:g} s"
+            )
 
     def leave(self, done: Callable[[], None]) -> None:
         """Say that this host stops in good order; `done` when the master knows, or is silent."""

@@ -7,6 +7,7 @@ puts into each environment. Only a daemon that also cleans its environment escap
 
 from __future__ import annotations
 
+import errno
 import os
 import time
 from collections.abc import Iterator
@@ -17,6 +18,10 @@ _TICKS_PER_SECOND: Final = os.sysconf("SC_CLK_TCK")
 #: Marks in a process's environment: its instance, and the state directory of its supervisor.
 INSTANCE_MARK = "ROSRM_INSTANCE"
 SUPERVISOR_MARK = "ROSRM_SUPERVISOR"
+
+#: Seconds within which an execve ends, and between two looks at it.
+_EXECVE: Final = 1.0
+_LOOK: Final = 0.001
 
 
 class Stat(NamedTuple):
@@ -62,11 +67,42 @@ def was_born(stat: Stat, birth: int) -> bool:
     return birth - 1 <= stat.start <= birth + _TICKS_PER_SECOND
 
 
+def read_environment(pid: int) -> list[bytes]:
+    """Return the variables that a process got from its last execve.
+
+    During an execve /proc shows none, because the kernel has dropped the old ones and not yet
+    copied the new ones. So the end of the execve is awaited.
+
+    Raises:
+        OSError: the process has ended, is not ours to look at, or its execve did not end.
+    """
+    deadline = time.monotonic() + _EXECVE
+    while True:
+        with open(f"/proc/{pid}/environ", "rb") as file:
+            variables = file.read()
+        if variables or _has_no_environment(pid):
+            return variables.split(b"\0")
+        if time.monotonic() > deadline:
+            raise TimeoutError(errno.ETIMEDOUT, f"its execve did not end within {_EXECVE:g} s")
+        time.sleep(_LOOK)
+
+
+def _has_no_environment(pid: int) -> bool:
+    """Return True if the process was started without variables, or has no memory (kernel thread).
+
+    During an execve the end of the environment (env_end) is 0.
+    """
+    with open(f"/proc/{pid}/stat", "rb") as file:
+        text = file.read()
+    fields = text[text.rindex(b")") + 2 :].split()
+    memory, start, end = (int(fields[index]) for index in (20, 47, 48))
+    return memory == 0 or (end > 0 and start == end)
+
+
 def read_marks(pid: int) -> tuple[str, str]:
     """The instance and supervisor that a process's environment names; "" where it names none."""
     try:
-        with open(f"/proc/{pid}/environ", "rb") as file:
-            variables = file.read().split(b"\0")
+        variables = read_environment(pid)
     except OSError:
         return "", ""
     marks = {}

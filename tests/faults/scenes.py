@@ -132,10 +132,7 @@ class Scene:
         elif victim.endswith("slave"):
             name = self._host_of(victim)
             self.cluster.slaves[name].process.wait(PATIENCE)
-            before = self.cluster.client.list().last_sequence
-            self.cluster.start_slave(next(one for one in self.cluster.hosts if one.host == name))
-            # Until then the master may take the former run for alive, and a move would go astray.
-            self.cluster.wait_for_event("host_registered", host=name, after=before)
+            self.cluster.start_slave_again(name)
 
     # --- blows -----------------------------------------------------------------------------
 

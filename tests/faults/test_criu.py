@@ -128,9 +128,7 @@ class Scene:
 
     def switch_on(self, name: str) -> None:
         """It comes back with nothing; only what lay on its disk is there."""
-        before = self.cluster.client.list().last_sequence
-        self.cluster.start_slave(next(one for one in self.cluster.hosts if one.host == name))
-        self.cluster.wait_for_event("host_registered", host=name, after=before)
+        self.cluster.start_slave_again(name)
 
     def _ends(self) -> list[str]:
         events = self.cluster.events(process=NAME, after=self._before)

@@ -59,8 +59,6 @@ def test_a_slave_starts_again_on_a_full_disk(cluster, disk) -> None:
     slave = cluster.slaves["h0"].process
     slave.send_signal(signal.SIGKILL)
     slave.wait(PATIENCE)
-    before = cluster.client.list().last_sequence
-    cluster.start_slave(cluster.hosts[0])
-    cluster.wait_for_event("host_registered", after=before)
+    cluster.start_slave_again(cluster.hosts[0].host)
     assert cluster.wait("runs", "running").pid == pid
     disk.make_room()

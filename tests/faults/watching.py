@@ -6,7 +6,6 @@ import contextlib
 import itertools
 import threading
 from collections.abc import Callable
-from pathlib import Path
 from typing import NamedTuple
 
 import rclpy
@@ -17,6 +16,7 @@ from std_msgs.msg import Int64, Int64MultiArray
 from benchmarks.handoff_nodes import INPUT, OUTPUT, QOS
 from rosrm.node.channel import CHANNEL, STATE_CONFIG
 from rosrm.ros import qos
+from rosrm.supervisor.members import read_environment
 from rosrm_msgs.msg import HandoffReport, ProcessStatus, ProcessStatusBatch, StateConfig
 from tests.ros.clusters import Cluster, pids_of, zombie
 
@@ -160,11 +160,11 @@ def is_gapless(outputs: list[Output]) -> bool:
 
 def instances(cluster: Cluster, process: str) -> dict[int, int]:
     """The pids of the instances of a process that run in a cluster, by number."""
-    mark, found = f"ROSRM_INSTANCE={process}#", {}
+    mark, found = f"ROSRM_INSTANCE={process}#".encode(), {}
     for pid in pids_of(cluster.directory):
         with contextlib.suppress(OSError):
-            variables = Path(f"/proc/{pid}/environ").read_text().split("\0")
-            number = next((v.removeprefix(mark) for v in variables if v.startswith(mark)), "")
+            variables = read_environment(pid)
+            number = next((v.removeprefix(mark) for v in variables if v.startswith(mark)), b"")
             if number and not zombie(pid):
                 found[int(number)] = pid
     return found

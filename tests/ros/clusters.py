@@ -17,6 +17,7 @@ from rosrm.core.model import Kind, ProcessSpec, Readiness, StopPolicy
 from rosrm.core.views import ProcessRow, Snapshot
 from rosrm.errors import Refused
 from rosrm.local_cluster import LocalCluster, Part
+from rosrm.supervisor.members import read_environment
 
 MIB = 2**20
 QUICK = StopPolicy(interrupt_grace=0.5, terminate_grace=0.5)
@@ -184,6 +185,16 @@ class Cluster(LocalCluster):
         self.wait_for_hosts()
         return part
 
+    def start_slave_again(self, name: str) -> Part:
+        """Start the slave of a host again after a SIGKILL, and wait for its registration.
+
+        Until then the master may take the former run for alive, and the host for accepting.
+        """
+        before = self.client.list().last_sequence
+        part = self.start_slave(next(one for one in self.hosts if one.host == name))
+        self.wait_for_event("host_registered", host=name, after=before)
+        return part
+
     def parts(self) -> list[Part]:
         return [part for part in (self.master, *self.slaves.values()) if part is not None]
 
@@ -199,9 +210,9 @@ def pids_of(directory: Path) -> dict[int, str]:
         if not entry.name.isdigit() or int(entry.name) == os.getpid():
             continue
         with contextlib.suppress(OSError):
+            environment = read_environment(int(entry.name))
             command = (entry / "cmdline").read_bytes()
-            environment = (entry / "environ").read_bytes()
-            ours = [v for v in environment.split(b"\0") if v.startswith(b"ROSRM_SUPERVISOR=")]
+            ours = [v for v in environment if v.startswith(b"ROSRM_SUPERVISOR=")]
             if command and (mark in command or any(mark in value for value in ours)):
                 found[int(entry.name)] = command.replace(b"\0", b" ").decode(errors="replace")
     return found

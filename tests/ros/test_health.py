@@ -159,8 +159,7 @@ def test_the_next_run_of_the_slave_watches_on(cluster) -> None:
     slave = cluster.slaves["h0"].process
     slave.kill()
     slave.wait(PATIENCE)
-    cluster.start_slave(host("h0"))
-    cluster.wait_for_hosts()
+    cluster.start_slave_again("h0")
     os.kill(pid, signal.SIGSTOP)
     assert failed(cluster, "orphan").startswith("unhealthy: stopped by a signal")
 

@@ -67,7 +67,7 @@ def replace_slave(cluster) -> None:
     part = cluster.slaves["h0"]
     part.process.kill()
     part.process.wait()
-    cluster.start_slave(host("h0"))
+    cluster.start_slave_again("h0")
     cluster.wait_for_hosts()
 
 

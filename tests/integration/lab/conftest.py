@@ -28,7 +28,7 @@ def why_not() -> str:
         needs.check_rights()
         hierarchies = groups.find_hierarchies()
         needs.check_machine([], store.IMAGES, hierarchies)
-        needs.find_command("nft")
+        needs.check_commands()
     except LabError as error:
         return str(error).splitlines()[0]
     sealed = [str(one.mount) for one in hierarchies if not os.access(one.mount, os.W_OK)]

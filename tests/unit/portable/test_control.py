@@ -14,6 +14,7 @@ import pytest
 from rosrm.errors import PortableError
 from rosrm.portable import (
     SIGNAL,
+    VARIABLE,
     Request,
     State,
     Status,
@@ -23,6 +24,7 @@ from rosrm.portable import (
     await_joined,
     await_left,
     control_directory,
+    directory_of,
     make_directory,
     remove_directory,
     status_of,
@@ -115,6 +117,23 @@ def test_times_and_missing_peers_arrive(directory, node) -> None:
     status = Status(State.RUNNING, "m1", "", {"leave": 0.25}, ("readers of /count: 0 of 1",))
     node.say(status)
     assert status_of(directory) == status
+
+
+def test_the_directory_of_a_process_is_found_in_the_middle_of_its_execve(directory) -> None:
+    """On one processor the parent runs again before the child's execve has set the environment."""
+    allowed = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(allowed)})
+    try:
+        for _ in range(20):
+            with subprocess.Popen(
+                ["sleep", "60"], env={**os.environ, VARIABLE: str(directory)}
+            ) as process:
+                try:
+                    assert directory_of(process.pid) == directory
+                finally:
+                    process.kill()
+    finally:
+        os.sched_setaffinity(0, allowed)
 
 
 # --- what comes twice, late, or in another order ---
