@@ -15,6 +15,7 @@ import numpy as np
 
 from benchmarks.hosts import three_hosts
 from benchmarks.machine import print_report
+from benchmarks.stopping import run
 from rosrm.local_cluster import LocalCluster
 
 _COMMANDS = (("ps",), ("hosts",), ("status",), ("events",))
@@ -63,4 +64,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run("command", main))
