@@ -232,7 +232,7 @@ def _tell_waiting(state: MasterState, process: Process, now: float) -> None:
     if not len(state.hosts):
         _tell_waits(state, process, "no host has registered yet", now)
         return
-    reason = why_all_away(state.hosts) or "no host has room for it now"
+    reason = why_all_away(state.hosts) or "no host can take it now"
     if process.reason != reason:
         state.note_decision(process, decide_now(state, process), "waits", now)
         _tell_waits(state, process, reason, now, {"decision": process.decision})

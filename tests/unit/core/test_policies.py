@@ -178,6 +178,17 @@ def test_a_vetoed_host_takes_nothing() -> None:
     assert (found["b"]["verdict"], found["b"]["reason"]) == ("vetoed", "b is for the boss")
 
 
+def test_a_process_that_is_vetoed_everywhere_does_not_wait_for_room() -> None:
+    """The reason why it waits is true of a veto as well as of a full host."""
+
+    def nowhere(hosts: HostView, process: ProcessView) -> Scores:
+        return Scores(hosts.column("memory"), np.ones(len(hosts.names), np.bool_))
+
+    cluster = three(policy=Policy(nowhere))
+    cluster.submit(process("p"))
+    assert cluster.told("waits") == ["p waits: no host can take it now"]
+
+
 def test_a_score_of_a_host_that_does_not_fit_may_be_anything() -> None:
     """NaN where a host has no such resource harms nobody who is not asked."""
 

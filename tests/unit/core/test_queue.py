@@ -42,7 +42,7 @@ def test_the_head_blocks_those_behind_it() -> None:
     cluster.submit(process("filler", memory=400))
     cluster.submit(process("large", memory=600), process("small", memory=10))
     assert cluster.queue() == ["large", "small"]
-    assert cluster.told("waits") == ["large waits: no host has room for it now"]
+    assert cluster.told("waits") == ["large waits: no host can take it now"]
 
 
 def test_with_backfill_those_behind_may_pass() -> None:

@@ -86,7 +86,7 @@ def test_equal_processes_are_spread_evenly_and_none_goes_over_the_limit():
     assert (outcome.running, outcome.waiting) == (24, 6)
     assert np.nanmax(outcome.curves.usage["memory"]) <= 0.8
     assert len(outcome.never_placed) == 6
-    assert "no host has room" in outcome.never_placed["p24"]
+    assert "no host can take it now" in outcome.never_placed["p24"]
     assert "waits behind p24" in outcome.never_placed["p29"]
 
 
