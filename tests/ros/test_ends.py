@@ -309,9 +309,6 @@ def test_a_slave_that_is_killed(make_cluster) -> None:
 
     end(cluster.slaves["h0"], signal.SIGKILL)
     assert alive(before.pid)
-    log = cluster.log_of("h0")
-    assert "slave of h0 ended (SIGINT); 2 processes keep running (supervisor pid " in log
-    assert "`rosrm slave --stop-all`" in log
     go.touch()
     cluster.start_slave(host("h0"))
     row = cluster.ended("ends")
