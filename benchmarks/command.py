@@ -40,7 +40,7 @@ def _cpu() -> float:
 def main() -> None:
     """Measure and print one JSON object."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--runs", type=int, default=10, help="Of each command.")
+    parser.add_argument("--runs", type=int, default=10, help="Runs of each command; default: 10.")
     arguments = parser.parse_args()
     with (
         tempfile.TemporaryDirectory(prefix="rosrm-command-") as folder,

@@ -19,11 +19,11 @@ if TYPE_CHECKING:
     from rosrm.ros.client import MasterClient
 
 Wait = Annotated[
-    bool, typer.Option("--wait", help="Wait until it is done; exit 1 if it failed, and say why.")
+    bool, typer.Option("--wait", help="Wait for the result; exit 1 with the reason if it failed.")
 ]
 Timeout = Annotated[
     str,
-    typer.Option("--timeout", metavar="TIME", help="With --wait: the longest to wait, as 5min."),
+    typer.Option("--timeout", metavar="TIME", help="With --wait: longest wait, e.g. 5min."),
 ]
 #: A process has a name without a slash, and a name that ends like this is rather a file's.
 _FILE_ENDINGS: Final = (".yaml", ".yml")
@@ -49,7 +49,7 @@ def submit(
 ) -> None:
     """Queue the processes of work files.
 
-    All of them are taken, or none.
+    If one process cannot be queued, none is.
     """
     from rosrm.cli.waiting import interruptible, longest, wait_for
     from rosrm.config import load_work
@@ -83,7 +83,7 @@ def cancel(
 ) -> None:
     """Cancel processes: take them out of the queue, or stop them for good.
 
-    Of a work file, those of its processes that have not ended.
+    A work file stands for those of its processes that have not ended.
     """
     from rosrm.cli.waiting import interruptible, longest, over, wait_for
 
@@ -179,7 +179,7 @@ def _with_ending(
     ctx: typer.Context, name: str, ask: Callable[[MasterClient], str], domain: int | None,
     wait: bool, timeout: str,
 ) -> None:  # fmt: skip
-    """Ask for something that an event ends."""
+    """Send a request whose end is an event; wait for the event if asked to."""
     from rosrm.cli.waiting import interruptible, longest, wait_for_ending
 
     limit = longest(timeout)
@@ -247,7 +247,7 @@ def prune(
 ) -> None:
     """Remove ended processes and departed hosts from all listings.
 
-    Without names, all processes that ended and all hosts that left. A lost host is removed by its
+    Without names, remove all ended processes and all hosts that left. A lost host is removed by its
     name alone; what was cancelled there then counts as cancelled.
     """
     with connection.master(ctx, domain) as client:

@@ -54,7 +54,7 @@ def check(
 ) -> None:
     """Check files before they are used.
 
-    They are checked against all rules and against the plugins that are installed here.
+    The files are checked against all rules and against the plugins installed on this machine.
     """
     from rosrm.errors import ConfigError
     from rosrm.registry import Registry

@@ -58,9 +58,9 @@ def install(
         ),
     ] = None,
 ) -> None:
-    """Bring a CRIU that works into a folder of its own. The system is not touched.
+    """Install a working CRIU into a folder of its own; the system stays unchanged.
 
-    Needs no root. Nothing is done where one works already.
+    Needs no root. Does nothing if a working CRIU is found.
     """
     from rosrm.criu import installing
     from rosrm.criu.probe import probe
@@ -87,7 +87,7 @@ def install(
 
 @criu.command()
 def check(prefix: Prefix = None, as_json: AsJson = False) -> None:
-    """Dump and restore a process here, and say what works and what does not.
+    """Dump and restore a process on this machine, and report what works.
 
     The exit code is 0 only if it works, and images can be sent.
     """

@@ -28,7 +28,7 @@ _made: list[Participant] = []
 
 
 def join(arguments: Sequence[str], environment: Mapping[str, str]) -> None:
-    """Join ROS if a command is sure to want it, in the way that the environment says.
+    """Join ROS, as the environment says, if the command is sure to ask the master.
 
     Args:
         arguments: of the command line.

@@ -71,7 +71,7 @@ def up(  # noqa: PLR0917 - typer calls it, by name
             "--host",
             metavar="NAME[:LIMITS]",
             help="Add a host, or change the limits of one: `desk:memory=none,cpu=2,disk=4GiB`. "
-            "Limits that are left out are those of the others. May be repeated.",
+            "Limits that are left out are as for the other hosts. May be repeated.",
         ),
     ] = None,
     subnet: Annotated[
@@ -202,11 +202,11 @@ def kill(host: Host, name: Named = "lab") -> None:
 def boot(host: Host, name: Named = "lab") -> None:
     """Switch a host on again after `kill`.
 
-    Its disk is as it was, and so is its network, cut or not; nothing runs yet.
+    Its disk and its network faults (cut, loss, delay) are kept. No process runs on it yet.
     """
     opened(name).boot(host)
     network = _network(name, host)
-    still = f"; its network is as before: {network}" if network else ""
+    still = f"; its network is still: {network}" if network else ""
     typer.echo(f"{host} is up{still}")
 
 
@@ -369,7 +369,7 @@ def _check_rights() -> None:
 
 
 def _say_link(name: str, host: str) -> None:
-    typer.echo(f"{host}: {_network(name, host) or 'the network is as it should be'}")
+    typer.echo(f"{host}: {_network(name, host) or 'its network has no fault'}")
 
 
 def _network(name: str, host: str) -> str:

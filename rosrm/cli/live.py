@@ -21,7 +21,7 @@ from rosrm.core.views import HostRow, ProcessRow, ResourceRow, Snapshot
 
 _BAR: Final = 14
 _LEAST_BAR: Final = 4
-#: Of what stands beside a bar: " 100%".
+#: Width of the percentage beside a bar: " 100%".
 _NUMBER: Final = 5
 _MOST_RESOURCES: Final = 3
 #: Near its limit: from this part of it on.

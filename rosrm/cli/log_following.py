@@ -16,6 +16,7 @@ from rosrm.cli import formats
 from rosrm.cli.log_writing import Stream
 from rosrm.config.units import Quantity
 from rosrm.errors import ConfigError, Refused, RosrmError
+from rosrm.spelling import standing
 
 if TYPE_CHECKING:
     from rosrm.core.views import HostRow, ProcessRow, Snapshot
@@ -52,7 +53,7 @@ def since_of(text: str) -> float:
     try:
         ago = Quantity("duration", above=True).parse(text) if text else 0.0
     except ValueError as error:
-        raise ConfigError(f"--since: {error}. It is a time until now, such as 10min") from None
+        raise ConfigError(f"--since: {error}. Give a time span up to now, e.g. 10min") from None
     return time.time() - ago if ago else 0.0
 
 
@@ -193,7 +194,7 @@ class _Copy:
         if owner in self._away:
             self._refuse(row, owner)
         for away in self._away.values():
-            typer.echo(f"rosrm: {name}: what it wrote there is out of reach: {away}", err=True)
+            typer.echo(f"rosrm: {name}: part of its log cannot be read: {away}", err=True)
         return sorted(found, key=lambda one: one[1])
 
     def _ask(self) -> tuple[str, ProcessRow | None, dict[str, HostRow], list[str]]:
@@ -210,9 +211,9 @@ class _Copy:
         name = self.stream.name
         known = ""
         if row is not None:
-            reason = f": {row.reason}" if row.reason else ""
+            reason = f", {row.reason}" if row.reason else ""
             since = formats.duration(row.since)
-            known = f". {name} has been {formats.words(row.state)} for {since}{reason}"
+            known = f". State of {name} for {since}: {formats.words(row.state)}{reason}"
         raise Refused(
             f"the log of {name} is on {host}, and {self._away[host]}{known}. `rosrm events "
             f"--process {name}` shows what happened; `--host HOST` reads an older part elsewhere"
@@ -228,10 +229,10 @@ class _Copy:
             since = " since then" if self.wanted.since else ""
             typer.echo(f"rosrm: {name} has written nothing{where}{since}", err=True)
             return
-        state = "not known to the master any more" if row is None else formats.words(row.state)
+        state = "is no longer known to the master" if row is None else standing(row.state)
         reason = f": {row.reason}" if row is not None and row.reason else ""
         gone = "it was not started, or its log has been removed"
-        raise Refused(f"{name} has no log{where}: {gone}. It is {state}{reason}")
+        raise Refused(f"{name} has no log{where}: {gone}. {name} {state}{reason}")
 
     def _find_next(self) -> bool:
         """Copy the beginning of the next instance; return False if there is none, or none yet."""

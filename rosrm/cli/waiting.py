@@ -196,18 +196,18 @@ def _say_end(
 ) -> None:  # fmt: skip
     counts = Counter(row.state.replace("_", " ") for row in rows)
     summary = ", ".join(f"{count} {state}" for state, count in sorted(counts.items()))
-    typer.echo(summary or "all gone")
+    typer.echo(summary or "all processes were removed")
     ended = [row for row in failed if row.state == "finished"]
     if ended:
         typer.echo(
-            f"rosrm: not running, as a service does: {_named(ended)}; a program that is to end "
-            f"is a `kind: job`",
+            f"rosrm: services that finished: {_named(ended)}; declare a program that is meant to "
+            f"end as `kind: job`",
             err=True,
         )
     if awaited and stays:
         typer.echo(
             f"rosrm: no longer waiting for {_named(awaited)}: set aside until a host registers or "
-            f"changes (`rosrm explain NAME` says what it has to have)",
+            f"changes (`rosrm explain NAME` shows the requirements)",
             err=True,
         )
     elif awaited:
@@ -215,7 +215,7 @@ def _say_end(
 
 
 def _say_time_is_up(awaited: Sequence[ProcessRow]) -> None:
-    typer.echo(f"rosrm: the time is up; still waiting for {_named(awaited)}", err=True)
+    typer.echo(f"rosrm: --timeout has passed; still waiting for {_named(awaited)}", err=True)
 
 
 def _named(rows: Sequence[ProcessRow]) -> str:

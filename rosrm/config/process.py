@@ -37,7 +37,7 @@ ListOfWords = Annotated[tuple[Text, ...], Words()]
 
 @dataclass(frozen=True, slots=True)
 class RestartInFile:
-    """When a process that ended is started again on its host; `when` defaults by its kind."""
+    """Policy for restarts of an ended process on its host; `when` defaults by its kind."""
 
     when: Literal["never", "on-failure", "always"] | None = None
     delay: Seconds = _RESTART.delay
@@ -151,7 +151,7 @@ class ProcessInFile:
 
     @property
     def restart_policy(self) -> RestartPolicy:
-        """The default brings a service back after a power cut; a job may not be repeatable."""
+        """Return the policy; a service restarts after a power cut, a job may not be repeatable."""
         when = self.restart.when or ("never" if self.kind == "job" else "on-failure")
         policy: RestartPolicy = _same(RestartPolicy, self.restart)
         return replace(policy, when=when)

@@ -1,4 +1,4 @@
-"""What can happen to the master, in the past tense. Readings arrive as one batch.
+"""Events of the master, in the past tense. Readings arrive as one batch.
 
 `by` of a request is the name of the client that sent it; "": unknown.
 """

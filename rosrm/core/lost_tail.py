@@ -24,6 +24,7 @@ from typing import Any, Final
 from rosrm.core.hosts import HostCondition
 from rosrm.core.state import MasterState
 from rosrm.ports import Intent
+from rosrm.spelling import counted
 
 _KEY: Final = "unheard"
 
@@ -84,11 +85,12 @@ def note_seen(state: MasterState, host: str, seen: int, now: float) -> None:
         if left > 0
         else ""
     )
+    records = counted(lost, "record is", "records are")
     state.record(
         now, "journal_behind",
         f"the journal has lost its newest records: {host} has seen record {seen}, and the journal "
-        f"ended at {tail.newest} when this master started: {lost} are missing. Repeat what was "
-        f"submitted or cancelled in them; processes that they started are stopped{wait}",
+        f"ended at {tail.newest} when this master started: {records} missing. Repeat the "
+        f"requests that they held; processes that these started are stopped{wait}",
         host=host, facts={"seen": seen, "newest": tail.newest, "lost": lost},
     )  # fmt: skip
 

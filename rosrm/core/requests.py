@@ -71,7 +71,8 @@ def _taken(state: MasterState, event: happened.SubmissionReceived) -> str:
     ]  # fmt: skip
     for name in taken:
         if state.processes[name].wanted is Wanted.CANCEL:
-            return f"{name} is in use still: {state.processes[name].reason}. Nothing was queued"
+            reason = state.processes[name].reason
+            return f"the name {name} is still in use: {reason}. Nothing was queued"
     if taken:
         return (
             f"in use already by a live process: {_names(taken)}. Cancel it first or choose another "

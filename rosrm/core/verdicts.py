@@ -238,7 +238,7 @@ def _said(moment: Moment, scores: Scores | None, at: int, *, veto: bool) -> str:
     try:
         return moment.plugins.ask("scoring", moment.policy[0], hook, lambda: str(reason(at)))
     except PluginError as error:
-        return f"(its reason: {error})"
+        return f"(no reason, because the policy failed: {error})"
 
 
 def _full_reason(moment: Moment, at: int) -> str:

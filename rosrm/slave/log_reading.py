@@ -56,7 +56,7 @@ def read_log(state_directory: Path, query: LogQuery, *, ended: bool) -> LogSlice
             continue  # rotated between two looks
         if log_index.base(str(path)) == before:
             return part
-    raise Refused(f"there is no log of {instance} here (any more): {path}", "unknown")
+    raise Refused(f"this host has no log of {instance} (any more): {path}", "unknown")
 
 
 def newest_instance(state_directory: Path, process: str) -> InstanceId:

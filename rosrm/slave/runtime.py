@@ -225,7 +225,7 @@ class SlaveRuntime:
         self.take(core.TimePassed())
 
     def _note_probes(self, reports: Sequence[ProbeReport]) -> None:
-        """Log which readings went stale or came back, and have the master know."""
+        """Log which readings became stale or fresh again, and report that to the master."""
         failing = self._endpoint.failing
         for report in reports:
             self.say(str(report))
@@ -371,7 +371,7 @@ class SlaveRuntime:
     # --- the end -------------------------------------------------------------------------
 
     def _end(self) -> int:
-        """Leave in good order: the master knows, the processes are stopped, or kept."""
+        """End the slave: inform the master, then stop the processes or leave them running."""
         failure = self._endpoint.failure
         if failure:
             _log.error("%s", failure)
@@ -381,7 +381,7 @@ class SlaveRuntime:
             return 1 if failure else 0
         if live and failure and not self._endpoint.superseded:
             count = counted(live, "process keeps", "processes keep")
-            _log.error("%s running; start the slave again when that is mended", count)
+            _log.error("%s running; correct the error and start the slave again", count)
             return 1
         if live:
             self.say(

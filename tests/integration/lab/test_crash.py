@@ -310,7 +310,7 @@ def test_the_command_line_from_up_to_down(name):
     assert rosrm("exec", "--env", "X=1", "host1", "--", "printenv", "X")[:2] == (0, "1\n")
     assert rosrm("cut", "host1", "--direction", "in")[1] == "host1: in: cut\n"
     assert rosrm("loss", "host1", "1%")[1] == "host1: in: cut, loss 1 %; out: loss 1 %\n"
-    assert rosrm("heal", "host1")[1] == "host1: the network is as it should be\n"
+    assert rosrm("heal", "host1")[1] == "host1: its network has no fault\n"
     assert rosrm("kill", "host2")[0] == 0
     rows = json.loads(rosrm("status", "--lab", name, "--json")[1])
     assert [(row["name"], row["state"]) for row in rows] == [

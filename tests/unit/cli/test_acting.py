@@ -126,7 +126,7 @@ def test_submit_wait_gives_up_after_its_time(rosrm, client, work, monkeypatch):
     client.processes = [process("a", "starting", kind="job"), process("b", "finished")]
     result = rosrm("submit", work, "--wait", "--timeout", "50ms")
     assert result.code == 1
-    assert "the time is up; still waiting for a\n" in result.err
+    assert "--timeout has passed; still waiting for a\n" in result.err
 
 
 def test_submit_wait_ends_when_a_service_has_ended(rosrm, client, work):
@@ -134,7 +134,7 @@ def test_submit_wait_ends_when_a_service_has_ended(rosrm, client, work):
     client.processes = [process("a", "finished", kind="job"), process("b", "finished")]
     result = rosrm("submit", work, "--wait")
     assert (result.code, result.out.splitlines()[-1]) == (1, "2 finished")
-    assert "not running, as a service does: b;" in result.err
+    assert "services that finished: b;" in result.err
     assert "waiting" not in result.err
 
 

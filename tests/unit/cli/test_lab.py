@@ -157,4 +157,4 @@ def test_all_processes_of_a_host_are_not_called_the_runs_of_rosrm(rosrm, one_hos
 
 
 def test_boot_says_that_the_network_is_still_cut(rosrm, one_host):
-    assert rosrm("lab", "boot", "host1").out == "host1 is up; its network is as before: cut\n"
+    assert rosrm("lab", "boot", "host1").out == "host1 is up; its network is still: cut\n"

@@ -83,7 +83,7 @@ def test_an_order_waits_until_dds_has_told_of_the_slaves_service(links, control)
 
 
 def test_an_order_to_a_slave_that_registers_again_waits_for_a_new_beat(links):
-    """It was cut off: what it said before is old by now, and an order with that would be stale."""
+    """A host that was cut off has only old readings, and an order with those would be stale."""
     client = links._client
     links.renew(HOST, DESCRIPTION)
     heard(links, beat=100, sequence=1)
