@@ -98,7 +98,10 @@ def _scalar(hint: type[Any], plain: Any, where: str) -> Any:
             raise _unfit(where, "a mapping", plain)
         return from_plain(hint, plain)
     if issubclass(hint, Path) or issubclass(hint, Enum):
-        return hint(plain)
+        try:
+            return hint(plain)
+        except TypeError:
+            raise _unfit(where, "text", plain) from None
     if hint is float and isinstance(plain, int) and not isinstance(plain, bool):
         return float(plain)
     if hint is type(None) and plain is not None:

@@ -47,20 +47,23 @@ def demand_to_move(
         source: "it is the source of the move",
     }  # fmt: skip
     return Demand(
-        process.spec, *_amounts(state, process, seen), excluded, headroom,
+        process.spec, *amounts_of(state, process, seen), excluded, headroom,
         reads=state.declared.reads,
     )  # fmt: skip
 
 
 def demand_to_restore(state: MasterState, process: Process, seen: Mapping[str, float]) -> Demand:
     """What its host must have for a process that goes on from an image that lies there."""
-    return Demand(process.spec, *_amounts(state, process, seen), reads=state.declared.reads)
+    return Demand(process.spec, *amounts_of(state, process, seen), reads=state.declared.reads)
 
 
-def _amounts(
+def amounts_of(
     state: MasterState, process: Process, seen: Mapping[str, float]
 ) -> tuple[Mapping[str, float], frozenset[str]]:
-    """What it needs of each resource, and which of that is a guess: what was seen is none."""
+    """Return what a process needs of each resource, and which of that is a guess.
+
+    What was seen of its use is no guess.
+    """
     estimate = state.learned.estimate(process.spec, state.settings.default_needs)
     amounts = larger(estimate.amounts, seen)
     guessed = {name for name in estimate.estimated if amounts[name] > seen.get(name, 0.0)}

@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Final
 
-from rosrm.core.assigning import demand_to_move, ranking_of, unable
+from rosrm.core.assigning import amounts_of, demand_to_move, ranking_of, unable
 from rosrm.core.begin import begin_move, moves_under_way, why_immovable, why_never_movable
 from rosrm.core.hosts import Host
 from rosrm.core.model import InstanceState
-from rosrm.core.placement import Demand, eligible
+from rosrm.core.placement import Demand
 from rosrm.core.state import Instance, MasterState, Process, Wanted
-from rosrm.core.verdicts import decide, verdict_of
+from rosrm.core.verdicts import decide, may_ever_take, verdict_of
 
 #: Least seconds between two records that nothing can be moved off a host, for different reasons.
 _TOLD_EVERY = 10.0
@@ -34,8 +34,9 @@ def relieve_hosts(state: MasterState, now: float) -> None:
     for host in state.hosts.hosts:
         if moves_under_way(state) >= state.settings.max_migrations:
             return
-        if host.draining and not host.drained:
-            _drain(state, host, now)
+        if host.draining:
+            if not host.drained:
+                _drain(state, host, now)
         elif state.settings.automatic and host.over_since:
             _relieve(state, host, now)
 
@@ -202,14 +203,11 @@ def _why_it_stays(state: MasterState, instance: Instance) -> str:
     reason = why_never_movable(state, process)
     if reason:
         return reason
-    demand = demand_to_move(state, process, _measured(instance), source.name, 0.0)
     # What a strategy or a lost host lacks may change later; labels and resources do not.
     lasting = {**process.excluded, source.name: "it is there"}
-    possible = eligible(
-        state.hosts, Demand(process.spec, demand.amounts, demand.estimated, lasting)
-    )
-    others = [host for host in state.hosts.listed() if host is not source]
-    if any(possible[host.column] or not state.hosts.incarnation[host.column] for host in others):
+    amounts, estimated = amounts_of(state, process, _measured(instance))
+    possible = may_ever_take(state.hosts, Demand(process.spec, amounts, estimated, lasting))
+    if any(possible[host.column] for host in state.hosts.listed() if host is not source):
         return ""
     return f"no other host may take {process.name} (`rosrm explain {process.name}` says why)"
 
@@ -223,7 +221,8 @@ def _note_drained(state: MasterState, host: Host, now: float) -> None:
     """Say once that nothing which can leave a host is left on it."""
     if state.hosts.why_unreachable(host):
         return
-    was, host.drained = host.drained, not _leaving(state, host)
+    held = (state.instances[number] for number in host.instances)
+    was, host.drained = host.drained, all(_why_it_stays(state, one) for one in held)
     if host.drained and not was:
         state.record(
             now, "host_drained", f"{host.name} is drained: {departures(state, host)}",

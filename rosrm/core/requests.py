@@ -117,17 +117,18 @@ def _strategy_fault(state: MasterState, spec: ProcessSpec) -> str:
     strategy: object = state.strategies.get(name)
     if strategy is None:
         return ""
+
+    def fault_of() -> str:
+        try:
+            state.declared.options_of(name, spec)
+        except ValueError as fault:
+            return str(fault)
+        if not isinstance(strategy, SpecChecking):
+            return ""
+        return required(strategy.spec_fault(spec), str)
+
     try:
-        state.declared.options_of(name, spec)
-    except ValueError as fault:
-        return str(fault)
-    if not isinstance(strategy, SpecChecking):
-        return ""
-    checking = strategy
-    try:
-        return state.plugins.ask(
-            "migration", name, "spec_fault", lambda: required(checking.spec_fault(spec), str)
-        )
+        return state.plugins.ask("migration", name, "spec_fault", fault_of)
     except PluginError as error:
         return f"its check of this process failed: {error}"
 

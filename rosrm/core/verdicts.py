@@ -266,7 +266,7 @@ def why_never(table: HostTable, demand: Demand) -> str:
     """
     if not len(table):
         return ""
-    possible = eligible(table, demand) | _untold(table)
+    possible = may_ever_take(table, demand)
     away = table.away()
     if not away.all():
         possible &= ~away
@@ -274,7 +274,7 @@ def why_never(table: HostTable, demand: Demand) -> str:
         host = table.by_name.get(name)
         if host is not None:
             possible[host.column] = False
-    if (possible & ~_too_large(table, demand)).any():
+    if possible.any():
         return ""
     unmeasured = _unmeasured(table, demand)
     if unmeasured:
@@ -312,19 +312,16 @@ def refused_everywhere(table: HostTable, demand: Demand) -> bool:
     if not demand.excluded:
         return False
     allowed = Demand(demand.spec, demand.amounts, demand.estimated)
-    might = (eligible(table, allowed) & ~_too_large(table, demand)) | _untold(table)
+    might = may_ever_take(table, allowed)
     return all(table.hosts[column].name in demand.excluded for column in np.flatnonzero(might))
 
 
-def _untold(table: HostTable) -> BoolArray:
-    """(H,) True: a host that has not said yet what it has."""
-    return np.asarray(table.incarnation == 0)
-
-
-def _too_large(table: HostTable, demand: Demand) -> BoolArray:
-    """(H,) True: it would not fit on the host even if nothing else ran there."""
+def may_ever_take(table: HostTable, demand: Demand) -> BoolArray:
+    """Return which hosts, (H,), fit a demand if nothing else runs there; unknown ones count."""
     need = table.fractions(demand.amounts, demand.estimated)
-    return np.asarray(((need > table.limit + CLOSE) & (table.capacity > 0.0)).any(axis=0))
+    too_large = ((need > table.limit + CLOSE) & (table.capacity > 0.0)).any(axis=0)
+    unknown = table.incarnation == 0
+    return np.asarray((eligible(table, demand) & ~too_large) | unknown)
 
 
 def _never_reason(table: HostTable, demand: Demand, column: int) -> str:

@@ -29,6 +29,9 @@ class Deadlines:
     Args:
         seconds: for one call.
         pause: seconds for which a plugin is not asked after a late call.
+
+    Attributes:
+        spent: seconds that all calls took so far.
     """
 
     def __init__(self, seconds: float = 1.0, pause: float = 30.0) -> None:
@@ -36,6 +39,7 @@ class Deadlines:
         self._pause = pause
         self._asked: Plugin | None = None
         self._late: dict[Plugin, tuple[float, str]] = {}
+        self.spent = 0.0
         if threading.current_thread() is not threading.main_thread():
             raise RuntimeError("the deadlines work by a signal and need the main thread")
         signal.signal(signal.SIGALRM, self._expired)
@@ -43,7 +47,8 @@ class Deadlines:
     def __call__(self, plugin: Plugin, call: Callable[[], T]) -> T:
         """Return the answer of a call; raises `PluginError` or what the plugin raised."""
         late_at, told = self._late.get(plugin, (float("-inf"), ""))
-        if time.monotonic() - late_at < self._pause:
+        began = time.monotonic()
+        if began - late_at < self._pause:
             raise PluginError(told)
         self._asked = plugin
         signal.setitimer(signal.ITIMER_REAL, self._seconds, _AGAIN)
@@ -59,6 +64,7 @@ class Deadlines:
         finally:
             self._asked = None
             signal.setitimer(signal.ITIMER_REAL, 0.0)
+            self.spent += time.monotonic() - began
 
     def _expired(self, _signal: int, _frame: FrameType | None) -> None:
         if self._asked is None:  # the call ended in the very last moment

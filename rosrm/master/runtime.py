@@ -115,6 +115,7 @@ class MasterRuntime:
         self._stopping = ""
         self._recorder: Recorder | None = None
         self._held: Standstill | None = None
+        self._deadlines = Deadlines()
         self._behind = 0.0  # seconds by which the core's clock is behind, as it was blocked
         self._closing = contextlib.ExitStack()
         with contextlib.ExitStack() as opened:
@@ -154,7 +155,7 @@ class MasterRuntime:
             self._config.core(), self._config.scoring.policy or "", policy, strategies, epoch,
             self._fallback, declared=self._declared,
         )  # fmt: skip
-        state.plugins.limit = Deadlines()
+        state.plugins.limit = self._deadlines
         state.wall = time.time()
         state.keeping.policy = self._checkpoint
         state.keeping.policy_name = self._config.checkpoint.policy or ""
@@ -292,7 +293,7 @@ class MasterRuntime:
             self._held.take(self._state, self._endpoint.take_events(), self._endpoint.reply)
             return
         self._state.wall = time.time()
-        core_now = self._core_now(now)
+        core_now, spent = self._core_now(now), self._deadlines.spent
         while self._held is None and (events := self._endpoint.take_events()):
             commands: list[Command] = []
             for event in events:
@@ -303,14 +304,13 @@ class MasterRuntime:
             if commands:
                 self._carry_out(commands, now)
         if self._held is None:
-            self._leave_out_blocked(now)
+            self._leave_out_blocked(self._deadlines.spent - spent)
 
-    def _leave_out_blocked(self, began: float) -> None:
-        """Hold the core's clock back by a time in which a plugin kept the master from its work.
+    def _leave_out_blocked(self, blocked: float) -> None:
+        """Hold the core's clock back by the seconds for which plugins kept the master from work.
 
         The master took no answer in during that time, so no time-out of a step must pass with it.
         """
-        blocked = self._now() - began
         if blocked > _BLOCKED:
             self._behind += blocked
 

@@ -62,6 +62,7 @@ def test_plain_values_come_back_as_they_were():
     [
         ({"txt": "a"}, "unknown txt; allowed: text, ratio"),
         ({"text": 5}, "text: str is wanted, not 5"),
+        ({"path": 5}, "path: text is wanted, not 5"),
         ({"ratio": True}, "ratio: float is wanted, not True"),
         ({"inner": 5}, "inner: a mapping is wanted, not 5"),
         ({"names": "abc"}, "names: a list is wanted, not 'abc'"),

@@ -456,6 +456,21 @@ def test_a_move_brings_the_options_of_its_process() -> None:
     assert moves == ["strange of p"]
 
 
+def test_options_that_raise_cost_one_submission() -> None:
+    """An options class is code of a third party: what it raises is a failure of the plugin."""
+
+    def options_of(strategy: str, spec: ProcessSpec) -> None:
+        raise KeyError("speed")
+
+    cluster = Cluster(
+        "a", strategies={"strange": Strange(StartFirstOrStopFirst().propose)},
+        declared=Declared(options_of=options_of),
+    )  # fmt: skip
+    said = cluster.submit(process("p", migration=MigrationPolicy("strange"))).message
+    assert said.startswith("p: migration by 'strange': its check of this process failed: KeyError")
+    assert len(cluster.told("plugin_failed")) == 1
+
+
 def test_a_plan_without_undo_leaves_no_instance_behind() -> None:
     """What it started and does not own the name is stopped; nothing else is started meanwhile."""
 

@@ -226,6 +226,16 @@ def test_a_process_that_no_other_host_may_take_stays_on_a_draining_host() -> Non
     assert cluster.where("p") == ["c"]
 
 
+def test_a_process_too_large_for_every_other_host_stays_on_a_draining_host() -> None:
+    """Waiting for room would never end."""
+    cluster = cluster_of(machine("a"), Machine("small", memory=100 * MIB))
+    cluster.submit(movable("p", needs={"memory": 400 * MIB}))
+    assert cluster.where("p") == ["a"]
+    assert "cannot leave: no other host may take p" in cluster.set_host("a", "drain").message
+    cluster.wait(3.0)
+    assert len(cluster.told("host_drained")) == 1
+
+
 def test_with_automatic_off_nothing_moves_by_itself() -> None:
     """Drain and `migrate` still do."""
     cluster = cluster_of(machine("a"), automatic=False)
