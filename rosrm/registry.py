@@ -11,6 +11,7 @@ import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache, partial
 from typing import Any, Final, TypeVar, cast
 
 from rosrm.config.own_options import merged_options
@@ -226,11 +227,15 @@ class Registry:
         """Return what the offers of a scoring policy and of migration strategies declare."""
         offers = {name: cast(MigrationOffer, self.offer("migration", name)) for name in chosen}
 
-        def options(strategy: str, spec: ProcessSpec) -> Any:
+        def merged(strategy: str, own: Mapping[str, Any]) -> Any:
             offer = offers[strategy]
+            return merged_options(offer.own_options or offer.options, chosen[strategy], own)
+
+        common = cache(partial(merged, own=EMPTY))  # most processes set no option of their own
+
+        def options(strategy: str, spec: ProcessSpec) -> Any:
             own = spec.migration.options if spec.migration.strategy == strategy else EMPTY
-            wanted = offer.own_options or offer.options
-            return merged_options(wanted, chosen[strategy], own)
+            return merged(strategy, own) if own else common(strategy)
 
         return Declared(
             reads=tuple(cast(ScoringOffer, self.offer("scoring", scoring)).reads),

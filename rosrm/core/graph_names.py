@@ -21,15 +21,16 @@ def shared_nodes(specs: Sequence[ProcessSpec], others: Iterable[ProcessSpec] = (
         others: live processes.
     """
     users: dict[str, list[str]] = {}
-    for spec in (*specs, *others):
-        node = _node_of(spec)
-        if node:
+    for spec in specs:
+        if node := _node_of(spec):
             users.setdefault(node, []).append(spec.name)
-    new = {spec.name for spec in specs}
+    for spec in others if users else ():
+        if (node := _node_of(spec)) in users:
+            users[node].append(spec.name)
     return [
         f"{listed(_named(names))} put {node} into the ROS graph; give each node a name of its own"
         for node, names in users.items()
-        if len(names) > 1 and not new.isdisjoint(names)
+        if len(names) > 1
     ]
 
 
