@@ -201,6 +201,29 @@ def test_the_images_of_an_instance_go_with_it():
     assert host.sweeps == before + 1
 
 
+def late(plugin: tuple[str, str], call: Any) -> Any:
+    """Stand for the deadline of a plugin call that has passed, for strategies."""
+    if plugin[0] == "migration":
+        raise TimeoutError("late")
+    return call()
+
+
+def test_a_strategy_that_fails_to_name_its_removal_is_asked_again():
+    """Otherwise the images of the instance stay on the host."""
+    host = Host()
+    cluster = Cluster(host.machine, strategies={"criu": Criu(CriuOptions())})
+    cluster.state.keeping.policy, cluster.state.keeping.policy_name = Pacing(), "pacing"
+    cluster.submit(portable())
+    limit, cluster.state.plugins.limit = cluster.state.plugins.limit, late
+    cluster.wait(2.0)
+    cluster.cancel("p")
+    cluster.wait(5.0)
+    assert (cluster.phase("p"), host.sweeps) == ("cancelled", 0)
+    cluster.state.plugins.limit = limit
+    cluster.wait(5.0)
+    assert host.sweeps == 1
+
+
 def test_a_restarted_master_goes_on():
     """It knows of none any more, and asks for the next one."""
     host = Host()
