@@ -24,6 +24,7 @@ from rosrm.core import events as happened
 from rosrm.core.commands import Order
 from rosrm.core.hosts import Host, HostCondition
 from rosrm.core.migration import Execute
+from rosrm.core.plans import checked_step
 from rosrm.core.plugin_calls import required
 from rosrm.core.processes import Instance, Process, ProcessPhase
 from rosrm.errors import PluginError
@@ -211,11 +212,13 @@ def _order(
     dumped: Dumped, now: float,
 ) -> None:  # fmt: skip
     spec, host = process.spec, owner.host.name
+
+    def ask() -> Execute:
+        step = required(strategy.periodic(spec, owner.id, host, int(state.wall)), Execute)
+        return required(checked_step(step), Execute)
+
     try:
-        step = state.plugins.ask(
-            "migration", spec.migration.strategy or "", "periodic",
-            lambda: required(strategy.periodic(spec, owner.id, host, int(state.wall)), Execute),
-        )  # fmt: skip
+        step = state.plugins.ask("migration", spec.migration.strategy or "", "periodic", ask)
     except PluginError as error:
         _say_trouble(state, dumped, str(error), now)
         return
