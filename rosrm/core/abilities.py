@@ -6,6 +6,7 @@ of a host                      what is done
 it is up, and was not asked    `execute` of the strategy's executor
 it has answered                its answer holds until it registers anew
 it did not answer              it is asked again after a while
+the plugin's `ability` fails   the plugin is asked again after a while
 =============================  ==============================================================
 
 Nothing of it is durable, and until a host has answered nothing is moved to or from it.
@@ -92,8 +93,10 @@ def _ask(state: MasterState, name: str, strategy: HostChecking, host: Host, now:
             "migration", name, "ability", lambda: required(strategy.ability, str)
         )
     except PluginError as error:
-        reason = f"its ability is not known: {error}"
-        state.abilities.answers[name, host.name] = Answer(incarnation, 0, reason=reason)
+        answer = Answer(
+            incarnation, 0, reason=f"its ability is not known: {error}", ask_at=now + _ASK_AGAIN
+        )
+        state.abilities.answers[name, host.name] = answer
         return
     if ability not in host.description.executors:
         reason = f"the plugin of {name!r} is not installed there"

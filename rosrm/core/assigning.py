@@ -232,7 +232,7 @@ def reconsider_set_aside(state: MasterState, now: float) -> None:
 
 def _tell_waiting(state: MasterState, process: Process, now: float) -> None:
     """Say once that the head of the queue waits, and why."""
-    if not len(state.hosts):
+    if not state.hosts.listed():
         _tell_waits(state, process, "no host has registered yet", now)
         return
     reason = why_all_away(state.hosts) or "no host can take it now"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Final
@@ -11,7 +10,7 @@ from rosrm.core.hosts import Host
 from rosrm.core.images import reason_of
 from rosrm.core.migration import Aim, Commit, Move, Plan, Start, executors_of, plan_fault
 from rosrm.core.placement import Ranking
-from rosrm.core.plans import plan_to_dict
+from rosrm.core.plans import checked_plan
 from rosrm.core.plugin_calls import required
 from rosrm.core.state import MasterState, Process, ProcessPhase, Run
 from rosrm.core.steps import title
@@ -165,8 +164,7 @@ def proposed(
         fault = plan_fault(plan, move, aim) or _strange_executor(state, name, plan)
         if fault:
             raise PluginError(f"an unsound plan: {fault}")
-        json.dumps(plan_to_dict(plan))  # it goes into the journal
-        return plan
+        return checked_plan(plan)  # it goes into the journal
 
     try:
         return state.plugins.ask("migration", name, _HOOKS[aim], ask)

@@ -8,6 +8,7 @@ own monotonic clock; clocks may differ, if only they run equally fast.
 
 from __future__ import annotations
 
+from math import inf
 from typing import Final
 
 from rosrm.core.model import Fence, ProcessSpec
@@ -38,3 +39,14 @@ def fence_of(spec: ProcessSpec, settings: CoreSettings) -> Fence | None:
     after = spec.isolation.after or until_successor - grace
     grace = min(graces, max(0.0, until_successor - after))
     return Fence(after, grace, alive=not stops)
+
+
+def ended_after_loss(spec: ProcessSpec, settings: CoreSettings) -> float:
+    """Return the seconds after a host is lost by which its fence has ended every instance.
+
+    inf: the fence may not end the instance at all, because a slave that is at work keeps it.
+    """
+    fence = fence_of(spec, settings)
+    if fence is None or fence.alive:
+        return inf
+    return settings.suspect + _MARGIN + fence.after + fence.grace - settings.lease

@@ -115,6 +115,8 @@ class Keeping:
         next_order: their numbers are apart from those of all else: a record that is replayed
             without the policy must not number its orders otherwise.
         dropped_at: when a host was last told to drop what it keeps of a process.
+        removed: stateful processes that were removed, each with a number above those of all its
+            instances.
         waiting: processes that are still to be looked at in this round.
         looked: time of the last look.
     """
@@ -126,6 +128,7 @@ class Keeping:
     orders: dict[int, str] = field(default_factory=dict)
     next_order: int = 1 << 40
     dropped_at: dict[tuple[str, str], float] = field(default_factory=dict)
+    removed: dict[str, int] = field(default_factory=dict)
     waiting: list[str] = field(default_factory=list)
     looked: float = -inf
 

@@ -7,8 +7,8 @@ the owner of the name      given up at once, where a standby can take over
                            by `host_loss`: `wait`; after `delay` go `elsewhere`, or `stop`
 one that may be the owner  as the owner: the destination of a move that may be active, or the last
                            that is left of a process
-one that is cancelled      kept until its host reports it ended, or is pruned; with `elsewhere`
-                           given up after `delay`: its fence has ended it by then
+one that is cancelled      kept until its host reports it ended, or is pruned; with `elsewhere` and
+                           `isolation: stop` given up after `delay`, when its fence has ended it
 is being restored          never: its memory is there alone
 any other                  given up at once: a former source, a shadow
 =========================  ======================================================================
@@ -24,6 +24,7 @@ from __future__ import annotations
 import numpy as np
 
 from rosrm.core import coming_back, failover, handoffs, lifecycle
+from rosrm.core.fencing import ended_after_loss
 from rosrm.core.hosts import Host, HostCondition
 from rosrm.core.migration import Aim
 from rosrm.core.processes import LeftBehind
@@ -79,9 +80,12 @@ def _is_given_up(state: MasterState, instance: Instance, now: float) -> bool:
     if process.owner == instance.id.number and failover.is_ready(state, process):
         return True
     policy = process.spec.host_loss
-    # Nothing ends a cancelled process on a lost host, unless it has the fence of `elsewhere`.
-    ends = ("elsewhere",) if process.wanted is Wanted.CANCEL else ("elsewhere", "stop")
-    return policy.then in ends and now - instance.host.lost_since >= policy.delay
+    lost_for = now - instance.host.lost_since
+    if process.wanted is Wanted.CANCEL:
+        # Its name becomes free now, so it must have ended: only an expired fence ensures that.
+        ends_at = max(policy.delay, ended_after_loss(process.spec, state.settings))
+        return policy.then == "elsewhere" and lost_for >= ends_at
+    return policy.then in ("elsewhere", "stop") and lost_for >= policy.delay
 
 
 def _may_be_active(state: MasterState, instance: Instance) -> bool:

@@ -101,6 +101,7 @@ class HostTable(HostColumns):
         self.version = 0
         self.touched: list[int] = []
         self._labelled: dict[tuple[str, str], BoolArray] = {}
+        self._listed: list[Host] | None = None
 
     # --- registration --------------------------------------------------------------------
 
@@ -111,6 +112,7 @@ class HostTable(HostColumns):
         host = Host(self.add_column(), HostDescription(name, 0))
         self.hosts.append(host)
         self.by_name[name] = host
+        self._listed = None
         self.heard[host.column] = now
         self.condition[host.column] = HostCondition.EXPECTED
         self.set_closed(host, cordoned=cordoned, draining=draining)
@@ -121,6 +123,7 @@ class HostTable(HostColumns):
         host = self.by_name.get(description.name) or self.expect(description.name)
         column = host.column
         host.description, host.pruned = description, False
+        self._listed = None
         host.over_since.clear()
         host.over_at.clear()
         for resource in description.resources:
@@ -145,10 +148,14 @@ class HostTable(HostColumns):
         return host
 
     def prune(self, host: Host) -> None:
-        """Leave a host out of every listing until its slave registers, which it has to."""
+        """Leave a host out of every listing until its slave registers, then as a new host."""
         host.pruned, host.description = True, HostDescription(host.name, 0)
+        host.failing, self._listed = EMPTY, None
+        for known in (host.over_since, host.over_at, host.told, host.blocked):
+            known.clear()
         self.incarnation[host.column] = 0
         self._labelled.clear()
+        self.set_closed(host, cordoned=False, draining=False)
         self.set_condition(host, HostCondition.LEFT)
 
     def find(self, host_id: int, incarnation: int) -> Host | None:
@@ -158,9 +165,11 @@ class HostTable(HostColumns):
             return None
         return self.hosts[column]
 
-    def listed(self) -> list[Host]:
-        """Every host that was not pruned."""
-        return [host for host in self.hosts if not host.pruned]
+    def listed(self) -> Sequence[Host]:
+        """Return every host that was not pruned; kept, because each decision asks for them."""
+        if self._listed is None:
+            self._listed = [host for host in self.hosts if not host.pruned]
+        return self._listed
 
     def labelled(self, key: str, value: str) -> BoolArray:
         """(H,) True: the host has this label; kept until a host registers."""

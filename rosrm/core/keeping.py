@@ -14,11 +14,13 @@ it runs, and the policy gives no answer     as it chose last; where it has not c
                                             master started, `keep` on the hosts that keep a state
 it is cancelled, or has finished            `drop_kept` wherever something is kept of it
 it was submitted anew                       `drop_kept` of what is kept of its former life
+it was removed by this master               `drop_kept` wherever something is kept of it
 a host that is not chosen keeps a state     `drop_kept`, once a newer one lies where it should;
                                             never before the policy has chosen
 ==========================================  =====================================================
 
-What is kept of a name that this master does not know is left alone: its journal may be lost.
+What is kept of any other name that this master does not know is left alone: its journal may be
+lost.
 """
 
 from __future__ import annotations
@@ -39,7 +41,7 @@ from rosrm.ports import CheckpointChoice, CheckpointView
 
 #: Seconds between two looks at the same process.
 _LOOK_EVERY: Final = 1.0
-#: Orders to drop that are remembered, so as not to give them again at once.
+#: Most drop orders remembered, so as not to repeat them at once; also most removed processes.
 _REMEMBERED: Final = 10_000
 #: What is kept of a process that ended so is of no use any more.
 _DONE: Final = frozenset({ProcessPhase.FINISHED, ProcessPhase.CANCELLED})
@@ -121,6 +123,8 @@ def review(state: MasterState, now: float) -> None:
     names = keeping.holdings.processes()
     if len(keeping.dropped_at) > _REMEMBERED:
         keeping.dropped_at.clear()
+    if len(keeping.removed) > _REMEMBERED:
+        keeping.removed.clear()
     share = min(1.0, (now - keeping.looked) / _LOOK_EVERY)
     keeping.looked = now
     if not keeping.waiting:
@@ -132,8 +136,17 @@ def review(state: MasterState, now: float) -> None:
         process = state.processes.get(name)
         if process is None:
             keeping.told.pop(name, None)
+            _drop_removed(state, name, now)
         else:
             _review(state, process, now)
+
+
+def _drop_removed(state: MasterState, name: str, now: float) -> None:
+    """Drop every replica of a process that this master has removed."""
+    end = state.keeping.removed.get(name, 0)
+    for host, holding in state.keeping.holdings.of(name).items():
+        if holding.number < end:
+            _drop(state, name, host, holding, now)
 
 
 def _review(state: MasterState, process: Process, now: float) -> None:
@@ -143,7 +156,7 @@ def _review(state: MasterState, process: Process, now: float) -> None:
         _choose(state, process, owner.host, holdings, now)
     for name, holding in holdings.items():
         if _is_stale(state, process, name, holding, holdings):
-            _drop(state, process, name, holding, now)
+            _drop(state, process.name, name, holding, now)
 
 
 def _choose(
@@ -270,13 +283,13 @@ def _is_stale(
     return any(name in holdings and holdings[name].age > holding.age for name in better)
 
 
-def _drop(state: MasterState, process: Process, name: str, holding: Holding, now: float) -> None:
+def _drop(state: MasterState, process: str, name: str, holding: Holding, now: float) -> None:
     host = state.hosts.by_name.get(name)
     if host is None or state.hosts.condition_of(host) is not HostCondition.UP:
         return  # it says again what it keeps when it comes back
-    at = state.keeping.dropped_at.get((process.name, name), -math.inf)
+    at = state.keeping.dropped_at.get((process, name), -math.inf)
     if now - at < state.settings.order_retry:
         return
-    state.keeping.dropped_at[process.name, name] = now
-    instance = InstanceId(process.name, holding.number)
+    state.keeping.dropped_at[process, name] = now
+    instance = InstanceId(process, holding.number)
     state.emit(Order(state.keeping.order_id(), host.host_id, "drop_kept", instance))

@@ -24,6 +24,7 @@ from rosrm.core import events as happened
 from rosrm.core.commands import Order
 from rosrm.core.hosts import Host, HostCondition
 from rosrm.core.migration import Execute
+from rosrm.core.plans import checked_step
 from rosrm.core.plugin_calls import required
 from rosrm.core.processes import Instance, Process, ProcessPhase
 from rosrm.errors import PluginError
@@ -48,7 +49,8 @@ class Dumped:
 
     Attributes:
         process, host: names.
-        discard: the executor that removes its images.
+        strategy: name of the strategy that makes them.
+        discard: the executor that removes its images; None: the strategy failed to name it.
         since: time of the last one, or since when the first is due.
         made: there is one.
         size: its bytes.
@@ -60,7 +62,8 @@ class Dumped:
 
     process: str
     host: str
-    discard: str
+    strategy: str
+    discard: str | None
     since: float
     made: bool = False
     size: int = 0
@@ -91,7 +94,8 @@ def review(state: MasterState, now: float) -> None:
         return
     known.looked = now
     for number in [number for number in known.of if number not in state.instances]:
-        _remove(state, known.of.pop(number))
+        if _remove(state, known.of[number]):
+            del known.of[number]
     if any(isinstance(one, PeriodicImaging) for one in state.strategies.values()):
         for process in state.processes.values():
             if process.spec.checkpointed:
@@ -130,8 +134,9 @@ def _review(state: MasterState, process: Process, now: float) -> None:
     number, host = process.owner, owner.host
     dumped = state.periodic.of.get(number)
     if dumped is None:
-        discard = _discard_of(state, process, strategy)
-        dumped = state.periodic.of[number] = Dumped(process.name, host.name, discard, now)
+        name = process.spec.migration.strategy or ""
+        discard = _discard_of(state, name)
+        dumped = state.periodic.of[number] = Dumped(process.name, host.name, name, discard, now)
     if dumped.order and dumped.asked != host.description.incarnation:
         dumped.order, dumped.since = 0, now  # it ended with the slave that was at it
     if dumped.order or not _may_be_dumped(state, process, owner):
@@ -147,15 +152,16 @@ def _review(state: MasterState, process: Process, now: float) -> None:
         _order(state, process, strategy, owner, dumped, now)
 
 
-def _discard_of(state: MasterState, process: Process, strategy: PeriodicImaging) -> str:
-    """The executor that removes the images of the process; "": the strategy names none."""
-    name = process.spec.migration.strategy or ""
-    try:
-        return state.plugins.ask(
-            "migration", name, "discard", lambda: required(strategy.discard, str)
-        )
-    except PluginError:
+def _discard_of(state: MasterState, name: str) -> str | None:
+    """Return the executor with which a strategy removes images; "": none; None: the call failed."""
+    strategy: object = state.strategies.get(name)
+    if not isinstance(strategy, PeriodicImaging):
         return ""
+    asked = strategy
+    try:
+        return state.plugins.ask("migration", name, "discard", lambda: required(asked.discard, str))
+    except PluginError:
+        return None
 
 
 def _may_be_dumped(state: MasterState, process: Process, owner: Instance) -> bool:
@@ -206,11 +212,13 @@ def _order(
     dumped: Dumped, now: float,
 ) -> None:  # fmt: skip
     spec, host = process.spec, owner.host.name
+
+    def ask() -> Execute:
+        step = required(strategy.periodic(spec, owner.id, host, int(state.wall)), Execute)
+        return required(checked_step(step), Execute)
+
     try:
-        step = state.plugins.ask(
-            "migration", spec.migration.strategy or "", "periodic",
-            lambda: required(strategy.periodic(spec, owner.id, host, int(state.wall)), Execute),
-        )  # fmt: skip
+        step = state.plugins.ask("migration", spec.migration.strategy or "", "periodic", ask)
     except PluginError as error:
         _say_trouble(state, dumped, str(error), now)
         return
@@ -263,11 +271,18 @@ def _say_trouble(state: MasterState, dumped: Dumped, trouble: str, now: float) -
     )  # fmt: skip
 
 
-def _remove(state: MasterState, dumped: Dumped) -> None:
-    """A host that is not heard removes them when it registers."""
+def _remove(state: MasterState, dumped: Dumped) -> bool:
+    """Order the removal of images; return False if the strategy must be asked again first.
+
+    A host that is not up removes them when it registers.
+    """
     host = state.hosts.by_name.get(dumped.host)
-    if not dumped.discard or host is None or state.hosts.condition_of(host) is not HostCondition.UP:
-        return
+    if host is None or state.hosts.condition_of(host) is not HostCondition.UP:
+        return True
+    if dumped.discard is None:
+        dumped.discard = _discard_of(state, dumped.strategy)
+    if not dumped.discard:
+        return dumped.discard is not None
     state.periodic.last_order += 1
     state.emit(
         Order(
@@ -275,3 +290,4 @@ def _remove(state: MasterState, dumped: Dumped) -> None:
             timeout=_PATIENCE,
         )
     )  # fmt: skip
+    return True

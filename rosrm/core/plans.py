@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, asdict, fields
 from typing import Any, Final
@@ -20,6 +21,7 @@ from rosrm.core.migration import (
     Stop,
 )
 from rosrm.core.model import InstanceId, RestartPolicy
+from rosrm.errors import PluginError
 
 _KINDS: Final[Mapping[str, type[Any]]] = {
     "start": Start,
@@ -55,6 +57,26 @@ def plan_from_dict(plain: Mapping[str, Any]) -> Plan:
         return Plan(steps, _number(known["overlap"]), _mapping(known["options"]))
     except (KeyError, TypeError) as fault:
         raise ValueError(f"no plan: {fault}") from fault
+
+
+def checked_plan(plan: Plan) -> Plan:
+    """Return a plan as the journal gives it back.
+
+    Raises:
+        PluginError: a field has the wrong type, or is no JSON.
+    """
+    try:
+        return plan_from_dict(json.loads(json.dumps(plan_to_dict(plan))))
+    except (ValueError, TypeError) as fault:
+        raise PluginError(f"an unsound plan: {fault}") from fault
+
+
+def checked_step(step: Step) -> Step:
+    """Return a step as the journal gives it back; raise `PluginError` as `checked_plan`."""
+    try:
+        return step_from_dict(json.loads(json.dumps(step_to_dict(step))))
+    except (ValueError, TypeError) as fault:
+        raise PluginError(f"an unsound step: {fault}") from fault
 
 
 def step_to_dict(step: Step) -> dict[str, Any]:
@@ -103,7 +125,8 @@ def _instance(plain: Any) -> InstanceId:
 
 
 def _restart(plain: Any) -> RestartPolicy:
-    return RestartPolicy(**_known("RestartPolicy", RestartPolicy, plain))
+    known = _known("RestartPolicy", RestartPolicy, plain)
+    return RestartPolicy(**{name: _READ[name](value) for name, value in known.items()})
 
 
 def _undo(plain: Any) -> Step | None:
@@ -118,6 +141,10 @@ def _mapping(plain: Any) -> Mapping[str, Any]:
     if not isinstance(plain, Mapping):
         raise TypeError(f"{plain!r} is no mapping")
     return dict(plain)
+
+
+def _texts(plain: Any) -> Mapping[str, str]:
+    return {_text(key): _text(value) for key, value in _mapping(plain).items()}
 
 
 def _text(plain: Any) -> str:
@@ -144,7 +171,7 @@ def _truth(plain: Any) -> bool:
     return plain
 
 
-#: How each field of a step is read.
+#: How each field of a step and of a restart policy is read.
 _READ: Final[Mapping[str, Callable[[Any], Any]]] = {
     "instance": _instance,
     "host": _text,
@@ -158,7 +185,13 @@ _READ: Final[Mapping[str, Callable[[Any], Any]]] = {
     "restart": _restart,
     "executor": _text,
     "arguments": _mapping,
-    "remappings": _mapping,
+    "remappings": _texts,
     "undo": _undo,
     "image": _text,
+    "when": _text,
+    "delay": _number,
+    "max_delay": _number,
+    "factor": _number,
+    "attempts": _whole,
+    "window": _number,
 }

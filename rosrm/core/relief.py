@@ -28,10 +28,10 @@ _MOST_NAMED: Final = 8
 def relieve_hosts(state: MasterState, now: float) -> None:
     """Move processes off hosts that were over a limit for long enough, and off drained ones."""
     _note_limits(state, now)
-    for host in state.hosts.hosts:
+    for host in state.hosts.listed():
         if host.draining:
             _note_drained(state, host, now)
-    for host in state.hosts.hosts:
+    for host in state.hosts.listed():
         if moves_under_way(state) >= state.settings.max_migrations:
             return
         if host.draining:
@@ -44,7 +44,7 @@ def relieve_hosts(state: MasterState, now: float) -> None:
 def _note_limits(state: MasterState, now: float) -> None:
     """Note since when each host is over which of its limits."""
     over = {int(column) for column in state.hosts.hosts_over_limit()}
-    for host in state.hosts.hosts:
+    for host in state.hosts.listed():
         names = state.hosts.over_limit(host.column) if host.column in over else ()
         for name in names:
             host.over_since.setdefault(name, now)

@@ -282,7 +282,8 @@ class MasterState:
     def remove_process(self, name: str) -> None:
         """Remove an ended process of which no instance may run from memory and journal."""
         del self.over[name]
-        del self.processes[name]
+        if self.processes.pop(name).spec.keeps_state:
+            self.keeping.removed[name] = self.next_instance
         self._unsaved.pop(name, None)
         self.emit(Intent("process", name, None))
 

@@ -151,19 +151,18 @@ def decide(ranking: Ranking, *, chosen: int | None = None) -> Decision:
         chosen: column decided elsewhere, -1: none; None: the best.
     """
     column = ranking.best() if chosen is None else chosen
-    hosts = len(ranking.value)
-    if hosts <= _NAMED_HOSTS:
-        listed = [host.column for host in ranking.table.listed()]
+    listed = [host.column for host in ranking.table.listed()]
+    if len(listed) <= _NAMED_HOSTS:
         moment = _moment(ranking, _first(column, listed))
         return Decision(column, ranking.policy_name, moment, EMPTY)
     # Of many hosts only those that were nearly chosen are of interest, and time is short.
-    nearly = ranking.lowest() if column >= 0 else range(_NAMED_HOSTS)
+    nearly = ranking.lowest() if column >= 0 else listed[:_NAMED_HOSTS]
     moment = _moment(ranking, _first(column, nearly))
     named, fitting = len(moment.columns), int(np.count_nonzero(ranking.value < np.inf))
     named_fitting = sum(value < np.inf for value in moment.value.tolist())
     omitted = {
         "would take it at a higher score": fitting - named_fitting,
-        "cannot take it now": hosts - fitting - (named - named_fitting),
+        "cannot take it now": len(listed) - fitting - (named - named_fitting),
     }
     return Decision(column, ranking.policy_name, moment, omitted)
 
@@ -290,10 +289,11 @@ def why_all_away(table: HostTable) -> str:
     away = table.away() | (table.condition == HostCondition.EXPECTED)
     if not away.all():
         return ""
+    listed = table.listed()
     named = "; ".join(
-        f"{host.name}: {table.why_away(host.column)}" for host in table.hosts[:_NAMED_HOSTS]
+        f"{host.name}: {table.why_away(host.column)}" for host in listed[:_NAMED_HOSTS]
     )
-    more = len(table) - _NAMED_HOSTS
+    more = len(listed) - _NAMED_HOSTS
     return f"every host is away: {named}" + (f"; and {more} more" if more > 0 else "")
 
 

@@ -38,6 +38,11 @@ class Freezing:
         )
 
 
+def late(_plugin: object, _call: object) -> Any:
+    """Stand for the deadline of a plugin call that has passed."""
+    raise TimeoutError("late")
+
+
 class Host:
     """A machine with the executors of `Freezing`, which remembers what they were asked."""
 
@@ -139,6 +144,18 @@ def test_a_host_without_the_plugin_is_no_destination():
     """It is not even asked."""
     cluster = frozen(Host("a"), Machine("b", busy={"memory": 0.5}))
     assert "is not installed there" in cluster.migrate("p", "b").message
+
+
+def test_a_strategy_that_fails_to_name_its_ability_is_asked_again():
+    """One late call of its plugin must not keep it off every host until their slaves restart."""
+    host, cluster = Host("a"), Cluster(strategies={"freezing": Freezing()})
+    limit, cluster.state.plugins.limit = cluster.state.plugins.limit, late
+    cluster.add(host.machine)
+    cluster.wait(5.0)
+    assert host.asked == []
+    cluster.state.plugins.limit = limit
+    cluster.wait(10.0)
+    assert host.asked == [("can_freeze", {})]
 
 
 def test_what_an_executor_answered_outlives_the_master():

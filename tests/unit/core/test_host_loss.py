@@ -245,11 +245,39 @@ def test_a_process_that_is_being_cancelled_when_its_host_is_lost_says_so() -> No
 
 def test_a_fenced_process_is_cancelled_when_its_fence_has_ended_it() -> None:
     """With `elsewhere` it has ended by the time at which a successor could have started."""
-    cluster = on_a(process("p", host_loss=HostLossPolicy("elsewhere", 20.0)), "b")
+    spec = process(
+        "p", host_loss=HostLossPolicy("elsewhere", 20.0), isolation=IsolationPolicy("stop")
+    )
+    cluster = on_a(spec, "b")
     lose(cluster, "a")
     cluster.cancel("p")
     assert cluster.phase("p") == "stopping"
     cluster.wait(20.0)
+    assert cluster.phase("p") == "cancelled"
+
+
+def test_a_cancelled_process_that_its_host_keeps_is_not_said_to_have_ended() -> None:
+    """A fence of `isolation: keep` ends nothing while the slave is at work."""
+    cluster = on_a(process("p", host_loss=HostLossPolicy("elsewhere", 20.0)), "b")
+    lose(cluster, "a")
+    cluster.cancel("p")
+    cluster.wait(100.0)
+    assert (cluster.phase("p"), cluster["p"].reason) == ("stopping", BEING_CANCELLED)
+    back(cluster, "a")
+    assert (cluster.phase("p"), cluster.where("p")) == ("cancelled", [])
+
+
+def test_a_cancelled_process_waits_for_a_fence_that_is_later_than_its_delay() -> None:
+    """Its own `isolation.after` counts from when its host last knew that it was heard."""
+    spec = process(
+        "p", host_loss=HostLossPolicy("elsewhere", 20.0), isolation=IsolationPolicy("stop", 60.0)
+    )
+    cluster = on_a(spec, "b")
+    lose(cluster, "a")
+    cluster.cancel("p")
+    cluster.wait(48.0)  # the lease of 10 s is over since 2 s
+    assert cluster.phase("p") == "stopping"
+    cluster.wait(6.0)
     assert cluster.phase("p") == "cancelled"
 
 

@@ -289,6 +289,34 @@ def test_what_is_cancelled_is_dropped_everywhere_and_begins_from_nothing():
     assert cluster.orders("drop_kept")[-1].instance == InstanceId("p", number)
 
 
+def test_the_replicas_of_a_pruned_process_are_dropped():
+    """Also on a host that returns after the prune; those of an unknown later instance stay."""
+    cluster = running(Asked())
+    host, (other, third) = where(cluster), others(cluster)
+    number = cluster["p"].owner
+    keep(cluster, other, ("p", number, 4))
+    cluster.machines[other].connected = False
+    cluster.machines[host].finish("p", cluster.now, code=1)
+    cluster.wait(2.0)
+    assert cluster.phase("p") == "failed"
+    assert not cluster.orders("drop_kept")
+    assert cluster.ask(happened.PruneRequested, ("p",), ()).accepted
+    keep(cluster, third, ("p", number + 70, 1))
+    cluster.wait(2.0)
+    assert {order.host_id for order in cluster.orders("drop_kept")} == {
+        cluster.machines[host].host_id
+    }
+    keep(cluster, host)
+    cluster.machines[other].connected = True
+    cluster.wait(3.0)
+    last = cluster.orders("drop_kept")[-1]
+    assert (last.host_id, last.instance) == (
+        cluster.machines[other].host_id, InstanceId("p", number)
+    )  # fmt: skip
+    dropped_on = {order.host_id for order in cluster.orders("drop_kept")}
+    assert cluster.machines[third].host_id not in dropped_on
+
+
 def test_where_it_was_submitted_is_not_forgotten_with_the_master():
     """The state of a former life stays unused after a restart of the master too."""
     cluster = running(Asked())

@@ -12,8 +12,14 @@ from rosrm.core import events as happened
 from rosrm.core import slave
 from rosrm.core.commands import Order
 from rosrm.core.declared import Declared
-from rosrm.core.migration import AwaitReady, Commit, Execute, Move, Plan, Start, Stop
-from rosrm.core.model import InstanceId, InstanceState, MigrationPolicy, ProcessSpec
+from rosrm.core.migration import AwaitReady, Commit, Execute, Move, Plan, SetRestart, Start, Stop
+from rosrm.core.model import (
+    InstanceId,
+    InstanceState,
+    MigrationPolicy,
+    ProcessSpec,
+    RestartPolicy,
+)
 from tests.unit.core.cluster import Cluster, Machine, StartFirstOrStopFirst, job, movable, process
 
 
@@ -336,6 +342,21 @@ def never_starts(move: Move) -> Plan:
     return Plan((Stop(move.source, move.source_host, 1.0), Commit()))
 
 
+DELAY: Any = {"delay": "1s"}
+
+
+def with_step(kind: Any, **fields: Any) -> Any:
+    """Propose a sound plan with one more step before the commit."""
+
+    def propose(move: Move) -> Plan:
+        start = Start(move.destination, move.destination_host, 1.0)
+        instance = {} if kind is Execute else {"instance": move.destination}
+        step = kind(host=move.destination_host, timeout=1.0, **instance, **fields)
+        return Plan((start, step, Commit()))
+
+    return propose
+
+
 def none_at_all(move: Move) -> Any:
     return None
 
@@ -352,6 +373,11 @@ def none_at_all(move: Move) -> Any:
         (never_starts, "never starts"),
         (none_at_all, "gave no plan: answered None; Plan is required"),
         (exits, "gave no plan: SystemExit: 3"),
+        (with_step(AwaitReady, settle="1s"), "'1s' is no number"),
+        (with_step(Start, node_name=7), "7 is no text"),
+        (with_step(Start, remappings={"/a": 7}), "7 is no text"),
+        (with_step(SetRestart, restart=RestartPolicy(**DELAY)), "'1s' is no number"),
+        (with_step(Execute, executor="x", arguments={"of": {1}}), "set is not JSON serializable"),
     ],
 )
 def test_a_strategy_that_raises_or_proposes_nonsense_moves_nothing(make: Any, said: str) -> None:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import pytest
 
+from rosrm.core.migration import Execute
 from rosrm.core.model import MigrationPolicy, ProcessSpec, Readiness, RestartPolicy
 from rosrm.ports import CheckpointChoice, CheckpointView, MemoryView
 from rosrm_migration.criu import Criu, CriuOptions
@@ -199,6 +201,58 @@ def test_the_images_of_an_instance_go_with_it():
     cluster.wait(5.0)
     assert cluster.phase("p") == "cancelled"
     assert host.sweeps == before + 1
+
+
+class Unsound(Criu):
+    """Proposes a step that a test has changed."""
+
+    fields: Mapping[str, Any] = {}
+
+    def periodic(self, *given: Any) -> Execute:
+        return replace(super().periodic(*given), **self.fields)
+
+
+@pytest.mark.parametrize(
+    ("fields", "reason"),
+    [
+        ({"timeout": "10s"}, "'10s' is no number"),
+        ({"arguments": {"of": {1}}}, "set is not JSON serializable"),
+    ],
+)
+def test_a_step_with_a_field_of_a_wrong_type_is_not_ordered(fields, reason):
+    """The strategy is named; an order with that field would end the master."""
+    host, strategy = Host(), Unsound(CriuOptions())
+    strategy.fields = fields
+    cluster = Cluster(host.machine, strategies={"criu": strategy})
+    cluster.state.keeping.policy, cluster.state.keeping.policy_name = Pacing(), "pacing"
+    cluster.submit(portable())
+    cluster.wait(15.0)
+    assert host.dumps == []
+    (said,) = cluster.told("periodic_failed")
+    assert reason in said
+
+
+def late(plugin: tuple[str, str], call: Any) -> Any:
+    """Stand for the deadline of a plugin call that has passed, for strategies."""
+    if plugin[0] == "migration":
+        raise TimeoutError("late")
+    return call()
+
+
+def test_a_strategy_that_fails_to_name_its_removal_is_asked_again():
+    """Otherwise the images of the instance stay on the host."""
+    host = Host()
+    cluster = Cluster(host.machine, strategies={"criu": Criu(CriuOptions())})
+    cluster.state.keeping.policy, cluster.state.keeping.policy_name = Pacing(), "pacing"
+    cluster.submit(portable())
+    limit, cluster.state.plugins.limit = cluster.state.plugins.limit, late
+    cluster.wait(2.0)
+    cluster.cancel("p")
+    cluster.wait(5.0)
+    assert (cluster.phase("p"), host.sweeps) == ("cancelled", 0)
+    cluster.state.plugins.limit = limit
+    cluster.wait(5.0)
+    assert host.sweeps == 1
 
 
 def test_a_restarted_master_goes_on():

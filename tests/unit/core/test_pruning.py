@@ -62,6 +62,60 @@ def test_a_pruned_host_that_registers_is_listed_and_given_work() -> None:
     assert seen(cluster)[1] == ["a", "b"]
 
 
+def test_a_pruned_host_registers_as_a_new_host() -> None:
+    """Open for work, though it was cordoned and draining; nothing is recorded about it before."""
+    cluster = of_two_hosts()
+    cluster.set_host("b", "cordon")
+    cluster.set_host("b", "drain")
+    cluster.wait(1.0)
+    drained = cluster.told("host_drained")
+    host = cluster.state.hosts.by_name["b"]
+    host.over_at["memory"] = host.over_since["memory"] = cluster.now
+    prune(cluster, hosts=("b",))
+    cluster.wait(20.0)
+    assert (cluster.told("host_drained"), cluster.told("under_limit")) == (drained, [])
+    machine = cluster.machines["b"]
+    machine.connected = True
+    cluster.register(machine)
+    (_, row) = listing.host_rows(cluster.state, cluster.now)
+    assert (row.state, host.cordoned, host.draining) == ("up", False, False)
+    cluster.set_host("a", "cordon")
+    cluster.submit(process("more"))
+    assert cluster.where("more") == ["b"]
+
+
+def test_no_reason_names_a_pruned_host() -> None:
+    """Whether another host is listed or none is."""
+    cluster = of_two_hosts()
+    prune(cluster, hosts=("b",))
+    cluster.set_host("a", "cordon")
+    cluster.submit(process("p"))
+    assert cluster["p"].reason == "every host is away: a: it is cordoned"
+    cluster.cancel("p", "live")
+    cluster.leave(cluster.machines["a"])
+    cluster.machines["a"].connected = False
+    cluster.wait(1.0)
+    prune(cluster)
+    cluster.submit(process("q"))
+    cluster.wait(1.0)
+    assert cluster["q"].reason == "no host has registered yet"
+
+
+def test_a_pruned_host_is_not_among_the_hosts_of_a_decision_about_many() -> None:
+    """Neither by name nor in the number of those that are left out."""
+    cluster = Cluster(*(f"h{number}" for number in range(20)))
+    for number in range(18):
+        cluster.set_host(f"h{number}", "cordon")
+    for name in ("h0", "h18", "h19"):
+        cluster.leave(cluster.machines[name])
+        cluster.machines[name].connected = False
+    prune(cluster)
+    cluster.submit(process("p"))
+    decision = cluster.explain("p")["decision"]
+    assert "h0" not in [row["name"] for row in decision["hosts"]]
+    assert sum(decision["omitted"].values()) + len(decision["hosts"]) == 17
+
+
 def test_what_has_not_ended_or_left_is_refused_and_nothing_is_removed() -> None:
     """By name, of processes and hosts."""
     cluster = of_two_hosts()
