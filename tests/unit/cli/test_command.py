@@ -148,7 +148,7 @@ def test_output_that_cannot_be_written_gives_no_traceback(command, output, ros):
     with os.fdopen(write, "wb") as pipe, Path("/dev/full").open("wb") as full:
         done = subprocess.run(
             words, stdout=full if output == "full disk" else pipe, stderr=subprocess.PIPE,
-            text=True, check=False,
+            text=True, check=False, env={**os.environ, "PYTHONUNBUFFERED": ""},
         )  # fmt: skip
     lines = done.stderr.splitlines()
     assert done.returncode == (0 if output == "closed" else 1), lines
