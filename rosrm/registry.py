@@ -216,12 +216,16 @@ class Registry:
         """Refuse a strategy whose `ability` or `discard` is no executor of its own offer."""
         own = cast(MigrationOffer, self.offer("migration", name)).executors
         for kind, named in ((HostChecking, "ability"), (PeriodicImaging, "discard")):
-            if isinstance(strategy, kind) and (executor := getattr(strategy, named)) not in own:
-                raise self._fault(
-                    "migration", name,
-                    f"its `{named}` is {executor!r}, no executor of its offer; "
-                    f"there are: {', '.join(sorted(own)) or 'none'}",
-                )  # fmt: skip
+            fault = ""
+            try:
+                if isinstance(strategy, kind) and (executor := getattr(strategy, named)) not in own:
+                    there = ", ".join(sorted(own)) or "none"
+                    fault = f"its `{named}` is {executor!r}, no executor of its offer; "
+                    fault += f"there are: {there}"
+            except FAULTS as raised:
+                fault = f"its `{named}` raised {describe_plugin_fault(raised)}"
+            if fault:
+                raise self._fault("migration", name, fault)
 
     def declared(self, scoring: str, chosen: NameToOptions) -> Declared:
         """Return what the offers of a scoring policy and of migration strategies declare."""

@@ -104,7 +104,7 @@ def cancel(
         typer.echo(client.cancel(names))
         if wait:
             with interruptible("the processes are still being cancelled (`rosrm ps`)"):
-                _exit_unless(wait_for(client, names, limit, over))
+                _exit_unless(wait_for(client, names, limit, over, missing="done"))
 
 
 def _is_file(word: str) -> bool:

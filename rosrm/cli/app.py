@@ -7,9 +7,12 @@ all (`rosrm.cli.early`).
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 import time
+from contextlib import suppress
+from typing import TextIO
 
 #: When this process began, by the monotonic clock: what is promised to be quick counts from here.
 BEGUN = time.monotonic()
@@ -38,13 +41,48 @@ def _run() -> None:
         early.drop()
         _leave(ended.code)
         raise
+    except OSError as error:
+        if error.errno != errno.ENOSPC:
+            raise
+        early.drop()
+        _say(f"rosrm: {error}")
+        _leave(1)
     finally:
         early.drop()
 
 
 def _leave(code: object) -> None:
-    """End the process at once where ROS was used: Fast DDS sleeps 0.1 s at a normal exit."""
-    if "rclpy" in sys.modules and (code is None or isinstance(code, int)):
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(code or 0)
+    """Exit with a code, or with 1 if the rest of the output cannot be written.
+
+    End the process at once where ROS was used: Fast DDS sleeps 0.1 s at a normal exit.
+    """
+    if not (code is None or isinstance(code, int)):
+        return
+    status = code or 0
+    for stream in (sys.stdout, sys.stderr):
+        status = status if _flush(stream, status) else status or 1
+    if "rclpy" in sys.modules:
+        os._exit(status)
+    sys.exit(status)
+
+
+def _flush(stream: TextIO | None, status: int) -> bool:
+    """Flush a standard stream, None if it is closed; return False if it cannot be written."""
+    if stream is None:
+        return True
+    try:
+        stream.flush()
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())  # else Python tries once more
+        if error.errno != errno.EPIPE and status == 0:
+            _say(f"rosrm: the output cannot be written: {error.strerror}")
+        return False
+    return True
+
+
+def _say(text: str) -> None:
+    """Print a line to standard error, if that can be written."""
+    if sys.stderr is not None:
+        with suppress(OSError):
+            sys.stderr.write(f"{text}\n")
+            sys.stderr.flush()

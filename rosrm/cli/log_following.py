@@ -60,10 +60,14 @@ def since_of(text: str) -> float:
 def copy_logs(client: MasterClient, streams: Sequence[Stream], wanted: Wanted) -> None:
     """Copy the logs of processes to standard output, one after the other, and follow all of them.
 
+    A log that comes out of reach is reported at once, and the others are followed further.
+
     Raises:
         RosrmError: there is no log of one, or its newest part is out of reach.
     """
-    copies, troubles = [], []
+    copies: list[_Copy] = []
+    troubles: list[RosrmError] = []
+    exit_code = 0
     for stream in streams:
         copy = _Copy(client, stream, wanted)
         try:
@@ -74,7 +78,14 @@ def copy_logs(client: MasterClient, streams: Sequence[Stream], wanted: Wanted) -
         if not wanted.follow:
             stream.close()
     while wanted.follow and copies:
-        news = [copy.look() for copy in copies]
+        news = []
+        for copy in copies:
+            try:
+                news.append(copy.look())
+            except RosrmError as error:
+                copy.over, exit_code = True, error.exit_code
+                copy.stream.close()
+                typer.echo(f"rosrm: {copy.stream.name}: {error}", err=True)
         copies = [copy for copy in copies if not copy.over]
         if copies and not any(news):
             time.sleep(PERIOD)
@@ -84,6 +95,8 @@ def copy_logs(client: MasterClient, streams: Sequence[Stream], wanted: Wanted) -
         typer.echo(f"rosrm: {trouble}", err=True)
     if troubles:
         raise troubles[-1]
+    if exit_code:
+        raise typer.Exit(exit_code)
 
 
 @dataclass

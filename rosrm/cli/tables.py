@@ -66,6 +66,7 @@ def show(renderable: RenderableType) -> None:
     with output.capture() as captured:
         output.print(renderable)
     output.file.write("".join(f"{line.rstrip()}\n" for line in captured.get().splitlines()))
+    output.file.flush()  # here click turns a broken pipe into exit code 1
 
 
 def state(word: str) -> Text:

@@ -36,7 +36,7 @@ _UNTIL_ASKED: Final = frozenset({"failed", "cancelled", "stuck", "checkpointed"}
 #: Kinds of events by which a checkpoint, a restore or a migration ends; whether it was done.
 _ENDINGS: Final = {
     "checkpointed": True, "restored": True, "migrated": True, "checkpoint_failed": False,
-    "restore_failed": False, "stayed": False, "cancelled": False,
+    "restore_failed": False, "stayed": False, "cancelled": False, "migration_forgotten": False,
 }  # fmt: skip
 _NOTEWORTHY: Final = _UNTIL_ASKED | {"set_aside", "unreachable", "unknown"}
 _MOST_NAMED: Final = 5
@@ -97,8 +97,9 @@ def identity(row: ProcessRow) -> Identity:
 
 
 def wait_for(
-    client: MasterClient, names: Sequence[str], longest: float, judge: Judge = settled
-) -> bool:
+    client: MasterClient, names: Sequence[str], longest: float, judge: Judge = settled,
+    *, missing: str = "failed",
+) -> bool:  # fmt: skip
     """Watch processes until none of them is awaited, or none can change without a user.
 
     Args:
@@ -106,23 +107,36 @@ def wait_for(
         names: of the processes.
         longest: seconds.
         judge: what is awaited of each.
+        missing: verdict on a process that left the list before a look found it done.
 
     Returns:
         Whether all were done in time.
     """
     deadline = time.monotonic() + longest
     said: dict[str, str] = {}
+    verdicts: dict[str, str] = {}
     while True:
         rows = {row.name: row for row in client.list(processes=True).processes}
         ours = [rows[name] for name in names if name in rows]
         _say_news(ours, said)
-        verdicts = {row.name: judge(row) for row in ours}
+        verdicts.update((row.name, judge(row)) for row in ours)
+        unseen = [
+            name
+            for name in names
+            if name not in rows and "done" not in (verdicts.get(name), missing)
+        ]
         awaited = [row for row in ours if verdicts[row.name] == "awaited"]
         stays = all(row.state == "set_aside" and row.since >= SETTLED for row in awaited)
         if stays or time.monotonic() >= deadline:
             failed = [row for row in ours if verdicts[row.name] == "failed"]
             _say_end(ours, awaited, failed, stays=stays)
-            return not awaited and not failed
+            if unseen:
+                typer.echo(
+                    f"rosrm: no longer listed, and not seen to be done: {_named(unseen)} "
+                    f"(`rosrm events --process NAME` shows what happened)",
+                    err=True,
+                )
+            return not awaited and not failed and not unseen
         time.sleep(PERIOD)
 
 
@@ -148,6 +162,10 @@ def wait_for_ending(client: MasterClient, name: str, since: int, longest: float)
                 return _ENDINGS[event.kind]
         ours = [row for row in view.processes if row.name == name]
         _say_news(ours, said)
+        if not ours or ours[0].state in _OVER:
+            state = standing(ours[0].state) if ours else "is no longer listed"
+            typer.echo(f"rosrm: no longer waiting: {name} {state}", err=True)
+            return False
         if time.monotonic() >= deadline:
             _say_time_is_up(ours)
             return False
@@ -197,16 +215,17 @@ def _say_end(
     counts = Counter(row.state.replace("_", " ") for row in rows)
     summary = ", ".join(f"{count} {state}" for state, count in sorted(counts.items()))
     typer.echo(summary or "all processes were removed")
-    ended = [row for row in failed if row.state == "finished"]
+    ended = [row.name for row in failed if row.state == "finished"]
     if ended:
         typer.echo(
             f"rosrm: services that finished: {_named(ended)}; declare a program that is meant to "
             f"end as `kind: job`",
             err=True,
         )
+    waited = [row.name for row in awaited]
     if awaited and stays:
         typer.echo(
-            f"rosrm: no longer waiting for {_named(awaited)}: set aside until a host registers or "
+            f"rosrm: no longer waiting for {_named(waited)}: set aside until a host registers or "
             f"changes (`rosrm explain NAME` shows the requirements)",
             err=True,
         )
@@ -215,9 +234,10 @@ def _say_end(
 
 
 def _say_time_is_up(awaited: Sequence[ProcessRow]) -> None:
-    typer.echo(f"rosrm: --timeout has passed; still waiting for {_named(awaited)}", err=True)
+    names = _named([row.name for row in awaited])
+    typer.echo(f"rosrm: --timeout has passed; still waiting for {names}", err=True)
 
 
-def _named(rows: Sequence[ProcessRow]) -> str:
-    some = ", ".join(row.name for row in rows[:_MOST_NAMED])
-    return f"{some} and {len(rows) - _MOST_NAMED} more" if len(rows) > _MOST_NAMED else some
+def _named(names: Sequence[str]) -> str:
+    some = ", ".join(names[:_MOST_NAMED])
+    return f"{some} and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else some

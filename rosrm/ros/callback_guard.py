@@ -24,12 +24,13 @@ class CallbackGuard:
 
     Attributes:
         failures: callbacks that raised.
-        interrupted: Ctrl-C came in a callback; the loop has to raise it.
+        interrupted: Ctrl-C, or an exception of a signal handler, that came in a callback; the
+            loop has to raise it.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self.failures = 0
-        self.interrupted: KeyboardInterrupt | None = None
+        self.interrupted: BaseException | None = None
         self._clock = clock
         self._places: dict[str, tuple[float, int]] = {}
 
@@ -37,17 +38,17 @@ class CallbackGuard:
         """Call a callback; returns "" or what was raised, with file and line."""
         try:
             callback(*arguments)
-        except KeyboardInterrupt as interrupt:
-            self.interrupted = interrupt
-        except BaseException as fault:  # noqa: BLE001 - the guard: nothing may reach the executor
+        except (Exception, SystemExit, GeneratorExit) as fault:  # noqa: BLE001 - the guard
             place = place_in_rosrm(fault)
             reason = f"{describe_fault(fault)} ({place})"
             self._note(place, getattr(callback, "__qualname__", str(callback)), reason)
             return reason
+        except BaseException as interrupt:  # noqa: BLE001 - nothing may reach the executor
+            self.interrupted = interrupt  # it came from a signal, which may come only once
         return ""
 
     def raise_interrupt(self) -> None:
-        """Raise the Ctrl-C that came in a callback, if one did."""
+        """Raise the Ctrl-C or signal that came in a callback, if one did."""
         if self.interrupted is not None:
             interrupt, self.interrupted = self.interrupted, None
             raise interrupt

@@ -46,6 +46,14 @@ def add(log: str, mark: Mark) -> None:
         os.close(index)
 
 
+def size(log: str) -> int:
+    """Return the bytes of the index of a log file; 0: it has none."""
+    try:
+        return os.stat(path_of(log)).st_size
+    except OSError:
+        return 0
+
+
 def begin(log: str, mark: Mark, rest: bytes = b"") -> None:
     """Replace the index of a log file, as a whole."""
     new = f"{path_of(log)}.new"

@@ -30,7 +30,7 @@ class LogLimits(NamedTuple):
     """How much log is kept.
 
     Attributes:
-        max_bytes: of one file.
+        max_bytes: of one file, and of its index; beyond either the log is rotated.
         keep: older files beside the current one, for each instance.
         instances: instances of one process whose logs are kept.
         processes: processes whose logs are kept.
@@ -129,7 +129,7 @@ class _Log:
         if size == self.size:
             return False
         self.note(size, 0)
-        if size > limits.max_bytes:
+        if size > limits.max_bytes or log_index.size(self.path) > limits.max_bytes:
             try:
                 rotate(self.path, size, limits)
             except OSError as error:

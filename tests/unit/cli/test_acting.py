@@ -60,6 +60,7 @@ def test_a_command_asks_the_master_and_prints_its_answer(rosrm, client, words, a
         ("restore", "cancelled", "a cancelled; its image is removed", 1),
         ("migrate", "migrated", "a moved from alpha to beta", 0),
         ("migrate", "stayed", "a stayed on alpha: beta did not start it", 1),
+        ("migrate", "migration_forgotten", "the move of a cannot be continued: no plan", 1),
     ],
 )
 def test_wait_says_how_a_checkpoint_a_restore_or_a_move_ended(
@@ -82,6 +83,40 @@ def test_wait_says_how_a_checkpoint_a_restore_or_a_move_ended(
     assert "a is stuck: alpha is lost" in result.err
     assert message in (result.err if code else result.out)
     assert "another time" not in result.out + result.err
+
+
+@pytest.mark.parametrize(
+    ("rows", "said"),
+    [([process("a", "finished", kind="job")], "a has finished"), ([], "a is no longer listed")],
+)
+def test_wait_ends_when_nothing_is_left_to_migrate(rosrm, client, rows, said):
+    """End the waiting with exit code 1 when the process is over or was removed."""
+    client.processes = rows
+    result = rosrm("migrate", "a", "--wait")
+    assert (result.code, result.err) == (1, f"rosrm: no longer waiting: {said}\n")
+
+
+@pytest.mark.parametrize(("last", "code"), [("failed", 1), ("running", 1), ("finished", 0)])
+def test_submit_wait_fails_if_a_job_left_the_list_before_it_was_seen_done(
+    rosrm, client, work, monkeypatch, last, code
+):
+    """Count a job that was pruned between two looks as failed, unless it was seen finished."""
+    looks = iter([[process("a", last, kind="job"), process("b", "starting")], [process("b")]])
+    client.processes = next(looks)
+
+    def later(seconds):
+        client.processes = next(looks)
+
+    monkeypatch.setattr("rosrm.cli.waiting.time.sleep", later)
+    result = rosrm("submit", work, "--wait")
+    assert result.code == code
+    assert ("not seen to be done: a (" in result.err) == bool(code)
+
+
+def test_cancel_wait_takes_a_process_that_left_the_list_for_ended(rosrm, client):
+    """Exit with 0: a process that is no longer listed does not run."""
+    client.processes = []
+    assert rosrm("cancel", "a", "--wait").code == 0
 
 
 def test_submit_sends_every_process_of_the_file(rosrm, client, work):

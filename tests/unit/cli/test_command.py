@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 import typer
@@ -120,3 +121,36 @@ def test_ctrl_c_in_a_running_command_is_clean(tmp_path):
     os.kill(child.pid, signal.SIGINT)
     out, err = child.communicate(timeout=10)
     assert (child.returncode, out, err) == (130, "", "")
+
+
+@pytest.mark.parametrize("ros", [False, True])
+@pytest.mark.parametrize("command", ["show", "write"])
+@pytest.mark.parametrize("output", ["closed pipe", "full disk", "closed"])
+def test_output_that_cannot_be_written_gives_no_traceback(command, output, ros):
+    """Exit with 1, in silence for a closed pipe; `write` leaves its output to the exit."""
+    code = (
+        "import sys, types\n"
+        "from rosrm.cli import commands, tables\n"
+        "@commands.app.command()\n"
+        "def show(): tables.show('some')\n"
+        "@commands.app.command()\n"
+        "def write(): sys.stdout and sys.stdout.write('some')\n"
+        f"if {ros}: sys.modules['rclpy'] = types.ModuleType('rclpy')\n"
+        f"sys.argv = ['rosrm', {command!r}]\n"
+        "from rosrm.cli.app import main\n"
+        "main()\n"
+    )
+    words = [sys.executable, "-c", code]
+    if output == "closed":
+        words = ["sh", "-c", 'exec "$0" "$@" >&-', *words]
+    read, write = os.pipe()
+    os.close(read)
+    with os.fdopen(write, "wb") as pipe, Path("/dev/full").open("wb") as full:
+        done = subprocess.run(
+            words, stdout=full if output == "full disk" else pipe, stderr=subprocess.PIPE,
+            text=True, check=False, env={**os.environ, "PYTHONUNBUFFERED": ""},
+        )  # fmt: skip
+    lines = done.stderr.splitlines()
+    assert done.returncode == (0 if output == "closed" else 1), lines
+    assert len(lines) == (1 if output == "full disk" else 0), lines
+    assert all("No space left on device" in line for line in lines)

@@ -13,7 +13,7 @@ import pytest
 
 from rosrm.cli import log_following
 from rosrm.core.model import InstanceId
-from rosrm.errors import Refused
+from rosrm.errors import NoMaster, Refused
 from rosrm.ros.slave_services import LogQuery
 from rosrm.slave.log_reading import newest_instance, read_log
 from rosrm.supervisor import log_index
@@ -317,3 +317,31 @@ def test_several_are_followed_at_once(rosrm, client, slaves, monkeypatch):
     monkeypatch.setattr(log_following.time, "sleep", later)
     lines = rosrm("logs", "talker", "ear", "-f").out.splitlines()
     assert lines == ["talker | one", "ear    | a", "talker | two", "ear    | b"]
+
+
+def test_a_host_that_is_lost_ends_only_its_own_log(rosrm, client, slaves, monkeypatch):
+    """Report the lost log with its unfinished line, and follow the other log to its end."""
+    client.processes = [process("talker"), process("ear", host="beta", number=2)]
+    slaves.write("alpha", 1, b"half")
+    slaves.write("beta", 2, b"a\n", "ear")
+    slaves.live |= {("alpha", 1), ("beta", 2)}
+    there = client.read_log
+
+    def read(on, *query, **more):
+        if on == "alpha":
+            raise NoMaster("no slave answers on alpha")
+        return there(on, *query, **more)
+
+    def lose(seconds):
+        client.read_log = read
+        slaves.write("beta", 2, b"b\n", "ear")
+        monkeypatch.setattr(log_following.time, "sleep", end)
+
+    def end(seconds):
+        slaves.live.clear()
+        client.processes = [process("ear", "finished")]
+
+    monkeypatch.setattr(log_following.time, "sleep", lose)
+    result = rosrm("logs", "talker", "ear", "-f")
+    assert result.out.splitlines() == ["ear    | a", "talker | half", "ear    | b"]
+    assert (result.code, result.err) == (3, "rosrm: talker: no slave answers on alpha\n")

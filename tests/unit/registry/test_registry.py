@@ -370,6 +370,24 @@ def test_an_ability_that_is_no_executor_of_the_offer_is_refused():
         registry.migrations({"m": {}})
 
 
+def test_an_ability_that_cannot_be_read_is_the_plugins_fault():
+    """Report a property that raises and a value that cannot be hashed as a broken plugin."""
+
+    class Angry:
+        propose = host_fault = max
+
+        @property
+        def ability(self):
+            raise OSError("no")
+
+    listed = SimpleNamespace(propose=None, ability=["m.able"], host_fault=max)
+    for strategy, said in ((Angry(), "OSError: no"), (listed, "TypeError: ")):
+        offer = MigrationOffer("m", lambda options, made=strategy: made)
+        registry = Registry.of(ours=plugin(register_migration_strategies=[offer]))
+        with pytest.raises(PluginError, match=f"its `ability` raised {said}"):
+            registry.migrations({"m": {}})
+
+
 def test_options_that_cannot_be_read_are_the_plugins_fault():
     @dataclass(frozen=True)
     class Unreadable:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import logging
+import signal
 
 import pytest
 
+from benchmarks.stopping import Stopped
 from rosrm.ros import convert
 from rosrm.ros.callback_guard import CallbackGuard
 
@@ -46,16 +48,17 @@ def test_a_callback_that_fails_often_is_logged_once_a_second_and_counted(caplog)
     assert caplog.messages[-1].endswith("; 49 more since the last line")
 
 
-def test_ctrl_c_is_kept_for_the_loop(caplog) -> None:
-    """Ctrl-C is no failure, and is raised once."""
+@pytest.mark.parametrize("interrupt", [KeyboardInterrupt(), Stopped(signal.SIGTERM)])
+def test_an_interrupt_is_kept_for_the_loop(caplog, interrupt) -> None:
+    """Raise Ctrl-C and the exception of a signal handler once, in the loop, as no failure."""
 
     def callback() -> None:
-        raise KeyboardInterrupt
+        raise interrupt
 
     guard = CallbackGuard()
     with caplog.at_level(logging.DEBUG):
         assert guard.call(callback) == ""
     assert (guard.failures, caplog.messages) == (0, [])
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(type(interrupt)):
         guard.raise_interrupt()
     guard.raise_interrupt()

@@ -252,3 +252,15 @@ def test_all_files_are_for_their_owner_alone(tmp_path, keeper) -> None:
     files = list(log_path(tmp_path, P).parent.iterdir())
     assert len(files) == 4
     assert {stat.S_IMODE(file.stat().st_mode) for file in files} == {0o600}
+
+
+def test_an_index_is_bounded_like_its_log(tmp_path, keeper) -> None:
+    """Rotate a log of a few bytes whose index exceeds `max_bytes`, and lose no byte of the log."""
+    start(keeper, 7)
+    for look in range(1, 7):
+        with log_path(tmp_path, P).open("ab") as program:
+            program.write(b".")
+        keeper.look(look * 1e9)
+        files = log_path(tmp_path, P).parent.glob("*.times*")
+        assert all(file.stat().st_size <= 100 + 24 for file in files)
+    assert everything(tmp_path)[0] == b"." * 6
