@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from rosrm.errors import PluginError, describe_plugin_fault
+from rosrm.spelling import counted
 
 if TYPE_CHECKING:
     from rosrm.core.hosts import Host
@@ -56,7 +57,7 @@ class Failing:
     @property
     def reason(self) -> str:
         """Return the last error and the number of failures, for a listing."""
-        return f"{self.error}; {self.count} failure{'s' if self.count > 1 else ''} so far"
+        return f"{self.error}; {counted(self.count, 'failure')} so far"
 
 
 def _without_limit(_plugin: Plugin, call: Callable[[], Any]) -> Any:

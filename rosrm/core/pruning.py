@@ -11,6 +11,7 @@ from rosrm.core.hosts import Host, HostCondition
 from rosrm.core.requests import count, known_host, known_processes, refuse
 from rosrm.core.state import MasterState, Process, Wanted
 from rosrm.ports import Intent
+from rosrm.spelling import counted
 
 _PRESENT: Final = (HostCondition.UP, HostCondition.SUSPECT)
 
@@ -37,8 +38,8 @@ def prune_requested(state: MasterState, event: happened.PruneRequested, now: flo
         _prune_host(state, host, event.by, now)
     if processes:
         state.record(now, "pruned", f"{count(len(processes))} removed", by=event.by)
-    of_hosts = "1 host" if len(hosts) == 1 else f"{len(hosts)} hosts"
-    state.emit(Reply(event.request, message=f"{count(len(processes))} and {of_hosts} removed"))
+    removed = f"{count(len(processes))} and {counted(len(hosts), 'host')} removed"
+    state.emit(Reply(event.request, message=removed))
 
 
 def _named(

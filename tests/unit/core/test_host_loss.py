@@ -268,7 +268,7 @@ def test_a_cancelled_process_that_its_host_keeps_is_not_said_to_have_ended() -> 
 
 
 def test_a_cancelled_process_waits_for_a_fence_that_is_later_than_its_delay() -> None:
-    """Its own `isolation.after` counts from when its host last knew that it was heard."""
+    """Its own `isolation.after` counts from the last contact that its host knows of."""
     spec = process(
         "p", host_loss=HostLossPolicy("elsewhere", 20.0), isolation=IsolationPolicy("stop", 60.0)
     )

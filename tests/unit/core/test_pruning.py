@@ -85,7 +85,7 @@ def test_a_pruned_host_registers_as_a_new_host() -> None:
 
 
 def test_no_reason_names_a_pruned_host() -> None:
-    """Whether another host is listed or none is."""
+    """The reasons are right with another host in the listing, and without any."""
     cluster = of_two_hosts()
     prune(cluster, hosts=("b",))
     cluster.set_host("a", "cordon")
