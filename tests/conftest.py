@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,11 @@ LABS = tuple(f"tests/integration/{one}" for one in ("lab/", "test_chaos.py", "te
 
 # By default DDS multicasts on every interface: what a test starts stays on this machine.
 os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+
+# Under `nohup` a program ignores SIGHUP, its children inherit that, and rosrm respects it.
+# Children do not inherit a handler: the tests still ignore SIGHUP, the programs they start do not.
+if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+    signal.signal(signal.SIGHUP, lambda *_: None)
 
 # Where `make setup` has put CRIU, if it could be had.
 os.environ.setdefault("ROSRM_CRIU_PREFIX", str(HERE.parent / ".venv/criu"))
