@@ -7,7 +7,6 @@ checked; `rosrm.config.options` checks those of a file against the same offers.
 from __future__ import annotations
 
 import logging
-import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from typing import Any, Final, TypeVar, cast
 from rosrm.config.own_options import merged_options
 from rosrm.config.plain import from_plain
 from rosrm.core.declared import Declared
+from rosrm.core.descriptions import resource_fault
 from rosrm.core.model import EMPTY, RESOURCE_SLOTS, ProcessSpec, ResourceDescription
 from rosrm.core.plugin_calls import TITLES
 from rosrm.core.views import PluginRow
@@ -46,7 +46,7 @@ from rosrm.ports import (
     ScoringOffer,
     ScoringPolicy,
 )
-from rosrm.spelling import get_close_matches
+from rosrm.spelling import counted, get_close_matches
 
 #: What the object of each kind must have.
 _METHODS: Final[Mapping[str, tuple[str, ...]]] = {
@@ -63,10 +63,6 @@ _SHIPPED_IN: Final[Mapping[str, str]] = {
     "migration": "rosrm-migration",
     "checkpoint": "rosrm-checkpoint",
 }
-
-_RESOURCE_NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_.-]{0,63}")
-#: Of what stands in the description of a resource.
-_EXAMPLES: Final = {"unit": '"B", "core", "B/s" or "1"', "scope": '"machine"'}
 
 _log = logging.getLogger("rosrm.plugins")
 
@@ -382,7 +378,7 @@ class Registry:
         others = len(might) - len(meant)
         if not others:
             return note
-        many = "1 plugin is" if others == 1 else f"{others} plugins are"
+        many = counted(others, "plugin is", "plugins are")
         return f"{note} {many} broken{' besides' if note else ''}: see `rosrm plugins --local`."
 
 
@@ -407,27 +403,6 @@ def _missing_method(kind: str, thing: object) -> str:
             near = get_close_matches(name, has, 1)
             misspelt = f"; is its `{near[0]}` misspelt?" if near else ""
             return f"a {type(thing).__name__}, which has no `{name}`{misspelt}"
-    return ""
-
-
-def resource_fault(resource: object) -> str:
-    """Return what is wrong with the description of a resource; "": nothing."""
-    if not isinstance(resource, ResourceDescription):
-        return f"describes a resource by {resource!r}, which is not a ResourceDescription"
-    name: object = resource.name
-    if not (isinstance(name, str) and _RESOURCE_NAME.fullmatch(name)):
-        return (
-            f"names a resource {name!r}. Allowed: at most 64 letters, digits, '_', '-' and '.', "
-            "the first of them a letter"
-        )
-    for field in ("unit", "scope"):
-        word: object = getattr(resource, field)
-        if not isinstance(word, str):
-            return f"gives {name!r} the {field} {word!r}; text is wanted, as {_EXAMPLES[field]}"
-    capacity: object = resource.capacity
-    numeric = isinstance(capacity, (int, float)) and not isinstance(capacity, bool)
-    if not (numeric and math.isfinite(resource.capacity) and resource.capacity > 0.0):
-        return f"gives {name!r} a capacity of {capacity!r}; a number above 0 is wanted"
     return ""
 
 

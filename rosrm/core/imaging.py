@@ -183,7 +183,7 @@ def _begin(
 def commit_to_image(state: MasterState, process: Process, run: Run, step: Commit) -> None:
     """The source stands still for good: its image owns the name."""
     source: Instance | None = state.instances.get(run.source.number)
-    needs = {} if source is None else _probed(source)
+    needs = {} if source is None else source.measured
     image = Image(
         run.source.number, run.source_host.name, run.strategy, step.image, state.wall,
         "" if run.source_node == process.name else run.source_node, needs,
@@ -217,12 +217,6 @@ def _remove_unmade(state: MasterState, run: Run) -> None:
     if isinstance(commit, Commit):
         number = run.source.number
         images.remove(state, run.process, run.source_host.name, commit.image, number)
-
-
-def _probed(source: Instance) -> dict[str, float]:
-    """What it was seen to use of what its host has a probe for."""
-    names = {resource.name for resource in source.host.description.resources}
-    return {name: amount for name, amount in source.seen.items() if name in names}
 
 
 def settle(state: MasterState, process: Process, run: Run, now: float) -> None:
