@@ -18,7 +18,7 @@ from rosrm.config.plain import from_plain
 from rosrm.core.declared import Declared
 from rosrm.core.descriptions import resource_fault
 from rosrm.core.model import EMPTY, RESOURCE_SLOTS, ProcessSpec, ResourceDescription
-from rosrm.core.plugin_calls import TITLES
+from rosrm.core.plugin_calls import TITLES, implements
 from rosrm.core.views import PluginRow
 from rosrm.errors import ConfigError, PluginError, SkipPlugin, describe_fault, describe_plugin_fault
 from rosrm.handover import PluginAddress
@@ -214,7 +214,7 @@ class Registry:
         for kind, named in ((HostChecking, "ability"), (PeriodicImaging, "discard")):
             fault = ""
             try:
-                if isinstance(strategy, kind) and (executor := getattr(strategy, named)) not in own:
+                if implements(strategy, kind) and (executor := getattr(strategy, named)) not in own:
                     there = ", ".join(sorted(own)) or "none"
                     fault = f"its `{named}` is {executor!r}, no executor of its offer; "
                     fault += f"there are: {there}"

@@ -14,7 +14,7 @@ from rosrm.core.graph_names import shared_nodes
 from rosrm.core.hosts import Host
 from rosrm.core.intake import save_host
 from rosrm.core.model import ProcessSpec
-from rosrm.core.plugin_calls import required
+from rosrm.core.plugin_calls import implements, required
 from rosrm.core.relief import departures, try_move
 from rosrm.core.state import WAITING, MasterState, Process, ProcessPhase, Wanted
 from rosrm.errors import PluginError
@@ -123,7 +123,7 @@ def _strategy_fault(state: MasterState, spec: ProcessSpec) -> str:
             state.declared.options_of(name, spec)
         except ValueError as fault:
             return str(fault)
-        if not isinstance(strategy, SpecChecking):
+        if not implements(strategy, SpecChecking):
             return ""
         return required(strategy.spec_fault(spec), str)
 
