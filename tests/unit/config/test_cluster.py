@@ -19,6 +19,27 @@ from rosrm.registry import Registry
 
 
 @dataclass(frozen=True)
+class Steady:
+    """One form of an option."""
+
+    value: float = 1.0
+
+
+@dataclass(frozen=True)
+class Rising:
+    """The other form."""
+
+    slope: float = 1.0
+
+
+@dataclass(frozen=True)
+class Curves:
+    """Options of another scoring policy."""
+
+    curve: Steady | Rising = Steady()
+
+
+@dataclass(frozen=True)
 class Weights:
     """Options of a scoring policy."""
 
@@ -37,7 +58,7 @@ class Made:
 
 @hookimpl
 def register_scoring_policies():
-    return [ScoringOffer("weighted", Made, Weights)]
+    return [ScoringOffer("weighted", Made, Weights), ScoringOffer("curved", Made, Curves)]
 
 
 @hookimpl
@@ -188,7 +209,7 @@ def test_a_wrong_type_and_an_unknown_plugin_are_said_together(refusal, registry)
     assert "f.yaml:1:7: name: text is wanted, not 5" in said
     assert (
         "f.yaml:2:11: unknown scoring policy 'wieghted'; did you mean 'weighted'? "
-        "Installed: weighted." in said
+        "Installed: curved, weighted." in said
     )
 
 
@@ -210,6 +231,23 @@ def test_a_wrong_option_names_plugin_option_allowed_ones_and_place(refusal, regi
     assert f"f.yaml:1:36: {title}: cpu: 0.6 is not at most 0.5" in said
     assert f"f.yaml:1:41: unknown key 'memory' in {title}; did you mean 'mem'?" in said
     assert "Allowed: mem, cpu, window, order" in said
+
+
+@pytest.mark.parametrize(
+    ("curve", "fault"),
+    [
+        ("{slop: 1}", "unknown key 'slop' in {}; did you mean 'slope'? Allowed: value, slope"),
+        ("{slope: steep}", '{}.slope: a number is wanted, not "steep"'),
+        ("5", "{}: a mapping is wanted, not 5"),
+    ],
+)
+def test_a_fault_in_an_option_of_several_types_is_reported_once(refusal, registry, curve, fault):
+    """With its path in the file, and the keys of all types."""
+    said = refusal(
+        load_cluster, f"scoring: {{policy: curved, options: {{curve: {curve}}}}}", registry
+    )
+    assert said.endswith(fault.format("options of scoring policy 'curved': curve"))
+    assert said.count("options of") == 1
 
 
 def test_options_for_a_plugin_without_any_are_refused(refusal, registry):
