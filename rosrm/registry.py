@@ -47,6 +47,7 @@ from rosrm.ports import (
     ScoringPolicy,
 )
 from rosrm.spelling import counted, get_close_matches
+from rosrm.time_limit import limited
 
 #: What the object of each kind must have.
 _METHODS: Final[Mapping[str, tuple[str, ...]]] = {
@@ -63,6 +64,9 @@ _SHIPPED_IN: Final[Mapping[str, str]] = {
     "migration": "rosrm-migration",
     "checkpoint": "rosrm-checkpoint",
 }
+
+#: Seconds for a `create`, which may load a large library.
+CREATE_LIMIT: Final = 30.0
 
 _log = logging.getLogger("rosrm.plugins")
 
@@ -319,8 +323,15 @@ class Registry:
             reason = f"its options cannot be read: {describe_fault(fault)}"
             raise self._fault(kind, name, reason) from fault
         create = cast(Callable[..., Any], offer.create)
+
+        def late() -> str:
+            return (
+                f"it did not return within {CREATE_LIMIT:g} s; repair what it waits for, or leave "
+                f"{name!r} out of the configuration"
+            )
+
         try:
-            thing = create(settings, *more)
+            thing = limited(CREATE_LIMIT, partial(create, settings, *more), late)
         except (SkipPlugin, ConfigError):  # its own word on this host, or on its options
             raise
         except FAULTS as fault:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import threading
 from dataclasses import dataclass
 from types import SimpleNamespace
 
@@ -386,6 +388,27 @@ def test_an_ability_that_cannot_be_read_is_the_plugins_fault():
         registry = Registry.of(ours=plugin(register_migration_strategies=[offer]))
         with pytest.raises(PluginError, match=f"its `ability` raised {said}"):
             registry.migrations({"m": {}})
+
+
+def test_a_create_that_hangs_is_ended_and_named(monkeypatch, context):
+    """A probe is left out, and what the master cannot do without is an error; nothing hangs."""
+    monkeypatch.setattr("rosrm.registry.CREATE_LIMIT", 0.05)
+
+    def hangs(*_):
+        threading.Event().wait()
+
+    registry = Registry.of(
+        ours=plugin(
+            register_probes=[ProbeOffer("slow", hangs)],
+            register_scoring_policies=[ScoringOffer("s", hangs)],
+        )
+    )
+    said = r"`create` \(.*\) raised TimeoutError: it did not return within 0.05 s; repair what it "
+    said += r"waits for, or leave '{}' out of the configuration"
+    with pytest.raises(PluginError, match=said.format("s")):
+        registry.scoring("s")
+    absent = registry.probes({"slow": {}}, context).absent["slow"]
+    assert re.search(said.format("slow"), absent)
 
 
 def test_options_that_cannot_be_read_are_the_plugins_fault():
