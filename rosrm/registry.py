@@ -407,7 +407,7 @@ def _missing_method(kind: str, thing: object) -> str:
     """Return what is wrong with an object that an offer made; "": it has all its methods."""
     if thing is None:
         wanted = " and ".join(f"`{name}`" for name in _METHODS[kind])
-        return f"None; an object with {wanted} is wanted (does it lack a `return`?)"
+        return f"None; an object with {wanted} is required (does it lack a `return`?)"
     for name in _METHODS[kind]:
         if not hasattr(type(thing), name) and not hasattr(thing, name):
             has = [one for one in dir(thing) if not one.startswith("_")]

@@ -169,7 +169,7 @@ def _said(error: Mapping[str, Any]) -> str:
         bound = next(iter(error["ctx"].values()))
         return f"{described(given)} is not {_BOUNDS[kind]} {bound}"
     if kind in _WANTED:
-        return f"{_WANTED[kind]} is wanted, not {described(given)}"
+        return f"{_WANTED[kind]} is required, not {described(given)}"
     return f"{error['msg'][:1].lower()}{error['msg'][1:]}, and {described(given)} is given"
 
 

@@ -42,9 +42,9 @@ def resource_fault(resource: object) -> str:
     for field in ("unit", "scope"):
         word: object = getattr(resource, field)
         if not isinstance(word, str):
-            return f"gives {name!r} the {field} {word!r}; text is wanted, as {_EXAMPLES[field]}"
+            return f"gives {name!r} the {field} {word!r}; text is required, as {_EXAMPLES[field]}"
     capacity: object = resource.capacity
     numeric = isinstance(capacity, (int, float)) and not isinstance(capacity, bool)
     if not (numeric and math.isfinite(resource.capacity) and resource.capacity > 0.0):
-        return f"gives {name!r} a capacity of {capacity!r}; a number above 0 is wanted"
+        return f"gives {name!r} a capacity of {capacity!r}; a number above 0 is required"
     return ""

@@ -285,7 +285,7 @@ def sound(scores: Scores, hosts: HostView, fits: BoolArray) -> tuple[FloatArray,
         if veto.shape != (size,):
             raise ValueError(f"vetoes of shape {veto.shape} for {size} hosts")
         if veto.dtype != np.bool_:
-            raise ValueError(f"vetoes of type {veto.dtype}; booleans are wanted, True: vetoed")
+            raise ValueError(f"vetoes of type {veto.dtype}; booleans are required, True: vetoed")
         asked = fits & ~veto
     if np.count_nonzero(np.isfinite(value)) < size:
         wrong = np.flatnonzero(asked & ~np.isfinite(value))

@@ -239,7 +239,7 @@ class MigrationContract:
                     continue
                 given = "None" if answer is None else repr(answer)
                 assert isinstance(answer, Mapping), (
-                    f"the executor {step.executor!r} answered {given}; a mapping is wanted, as {{}}"
+                    f"the executor {step.executor!r} answered {given}; a mapping is required"
                 )
                 assert all(isinstance(key, str) for key in answer), answer
                 results[step.executor] = json.loads(json.dumps(dict(answer), allow_nan=False))

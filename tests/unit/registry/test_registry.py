@@ -120,7 +120,7 @@ def test_of_broken_plugins_only_the_one_that_is_meant_is_told():
 @pytest.mark.parametrize(
     ("made", "said"),
     [
-        (None, "made None; an object with `score` is wanted (does it lack a `return`?)"),
+        (None, "made None; an object with `score` is required (does it lack a `return`?)"),
         (SimpleNamespace(scores=1), "which has no `score`; is its `scores` misspelt?"),
         (SimpleNamespace(), "made a SimpleNamespace, which has no `score`"),
     ],
@@ -139,7 +139,7 @@ def test_what_lacks_its_method_is_refused_when_it_is_made(made, said):
     ("reads", "said"),
     [
         (("nmae",), "`reads` has no field 'nmae'; did you mean 'name'? Allowed: name, namespace"),
-        ("name", "`reads` is 'name'; a tuple of field names is wanted"),
+        ("name", "`reads` is 'name'; a tuple of field names is required"),
         (None, "`reads` is None; a tuple"),
     ],
 )
@@ -154,8 +154,8 @@ def test_fields_that_a_spec_lacks_cannot_be_declared(reads, said):
 @pytest.mark.parametrize(
     ("described", "said"),
     [
-        (ResourceDescription("a", None, 1.0), "gives 'a' the unit None; text is wanted"),
-        (ResourceDescription("a", "B", 1.0, None), "gives 'a' the scope None; text is wanted"),
+        (ResourceDescription("a", None, 1.0), "gives 'a' the unit None; text is required"),
+        (ResourceDescription("a", "B", 1.0, None), "gives 'a' the scope None; text is required"),
         (ResourceDescription("Open Files", "1", 1.0), "names a resource 'Open Files'. Allowed"),
         (ResourceDescription("a", "B", "10"), "gives 'a' a capacity of '10'; a number above 0"),
         ("a", "describes a resource by 'a', which is not a ResourceDescription"),
@@ -184,7 +184,7 @@ def test_a_wrong_option_is_refused_with_what_is_allowed():
     )
     with pytest.raises(ConfigError, match=r"options of scoring policy 's': unknown a; allowed: ra"):
         registry.scoring("s", {"a": 1})
-    with pytest.raises(ConfigError, match=r"ratio: float is wanted, not 'x'"):
+    with pytest.raises(ConfigError, match=r"ratio: float is required, not 'x'"):
         registry.scoring("s", {"ratio": "x"})
 
 
@@ -323,8 +323,8 @@ def described(**fields):
         (Probe("b", capacity=float("nan")), "gives 'b' a capacity of nan"),
         (Probe(*(f"r{i}" for i in range(16))), "more than 16"),
         (SimpleNamespace(), "made a SimpleNamespace, which has no `resources`"),
-        (described(unit=None), "gives 'b' the unit None; text is wanted"),
-        (described(scope=None), "gives 'b' the scope None; text is wanted"),
+        (described(unit=None), "gives 'b' the unit None; text is required"),
+        (described(scope=None), "gives 'b' the scope None; text is required"),
         (described(name=3), "names a resource 3"),
         (described(capacity="10"), "gives 'b' a capacity of '10'; a number above 0"),
         (SimpleNamespace(resources=["b"], read=None, close=None), "describes a resource by 'b'"),
