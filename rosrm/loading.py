@@ -226,7 +226,7 @@ def _fault_of_reads(offer: ScoringOffer) -> str:
     """Return why the fields that a scoring policy declares to read cannot be; "": they can."""
     reads: object = offer.reads
     if isinstance(reads, str) or not isinstance(reads, Sequence):
-        return f'`reads` is {reads!r}; a tuple of field names is wanted, as ("name",)'
+        return f'`reads` is {reads!r}; a tuple of field names is required, as ("name",)'
     for field in reads:
         if field not in SPEC_FIELDS:
             near = get_close_matches(str(field), SPEC_FIELDS, 1)

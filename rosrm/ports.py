@@ -217,7 +217,6 @@ class MigrationStrategy(Protocol):
         """The steps of this move. Raises `ValueError` with the reason where it cannot move it."""
 
 
-@runtime_checkable
 class SpecChecking(Protocol):
     """A migration strategy that says of a spec, before it is queued, whether it can move it."""
 
@@ -225,7 +224,6 @@ class SpecChecking(Protocol):
         """What is wrong with it, its own `migration.options` included; "": nothing. Pure."""
 
 
-@runtime_checkable
 class HostChecking(Protocol):
     """A migration strategy that does not work on every host, or not between all of them."""
 
@@ -241,7 +239,6 @@ class HostChecking(Protocol):
         """Why nothing can be moved so between two hosts of these answers; "": it can. Pure."""
 
 
-@runtime_checkable
 class Imaging(Protocol):
     """A migration strategy that dumps a process into an image, and restores it on the same host."""
 
@@ -261,7 +258,6 @@ class Imaging(Protocol):
         """
 
 
-@runtime_checkable
 class PeriodicImaging(Protocol):
     """A migration strategy that dumps a process which then goes on, for its start after a crash."""
 
@@ -367,7 +363,6 @@ class MemoryView:
     pause: float
 
 
-@runtime_checkable
 class MemoryPacing(Protocol):
     """A checkpoint policy that has the memory of processes dumped, too."""
 

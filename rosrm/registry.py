@@ -7,7 +7,6 @@ checked; `rosrm.config.options` checks those of a file against the same offers.
 from __future__ import annotations
 
 import logging
-import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,8 +16,9 @@ from typing import Any, Final, TypeVar, cast
 from rosrm.config.own_options import merged_options
 from rosrm.config.plain import from_plain
 from rosrm.core.declared import Declared
+from rosrm.core.descriptions import resource_fault
 from rosrm.core.model import EMPTY, RESOURCE_SLOTS, ProcessSpec, ResourceDescription
-from rosrm.core.plugin_calls import TITLES
+from rosrm.core.plugin_calls import TITLES, implements
 from rosrm.core.views import PluginRow
 from rosrm.errors import ConfigError, PluginError, SkipPlugin, describe_fault, describe_plugin_fault
 from rosrm.handover import PluginAddress
@@ -46,7 +46,8 @@ from rosrm.ports import (
     ScoringOffer,
     ScoringPolicy,
 )
-from rosrm.spelling import get_close_matches
+from rosrm.spelling import counted, get_close_matches
+from rosrm.time_limit import limited
 
 #: What the object of each kind must have.
 _METHODS: Final[Mapping[str, tuple[str, ...]]] = {
@@ -64,9 +65,8 @@ _SHIPPED_IN: Final[Mapping[str, str]] = {
     "checkpoint": "rosrm-checkpoint",
 }
 
-_RESOURCE_NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_.-]{0,63}")
-#: Of what stands in the description of a resource.
-_EXAMPLES: Final = {"unit": '"B", "core", "B/s" or "1"', "scope": '"machine"'}
+#: Seconds for a `create`, which may load a large library.
+CREATE_LIMIT: Final = 30.0
 
 _log = logging.getLogger("rosrm.plugins")
 
@@ -218,7 +218,7 @@ class Registry:
         for kind, named in ((HostChecking, "ability"), (PeriodicImaging, "discard")):
             fault = ""
             try:
-                if isinstance(strategy, kind) and (executor := getattr(strategy, named)) not in own:
+                if implements(strategy, kind) and (executor := getattr(strategy, named)) not in own:
                     there = ", ".join(sorted(own)) or "none"
                     fault = f"its `{named}` is {executor!r}, no executor of its offer; "
                     fault += f"there are: {there}"
@@ -323,8 +323,15 @@ class Registry:
             reason = f"its options cannot be read: {describe_fault(fault)}"
             raise self._fault(kind, name, reason) from fault
         create = cast(Callable[..., Any], offer.create)
+
+        def late() -> str:
+            return (
+                f"it did not return within {CREATE_LIMIT:g} s; repair what it waits for, or leave "
+                f"{name!r} out of the configuration"
+            )
+
         try:
-            thing = create(settings, *more)
+            thing = limited(CREATE_LIMIT, partial(create, settings, *more), late)
         except (SkipPlugin, ConfigError):  # its own word on this host, or on its options
             raise
         except FAULTS as fault:
@@ -382,7 +389,7 @@ class Registry:
         others = len(might) - len(meant)
         if not others:
             return note
-        many = "1 plugin is" if others == 1 else f"{others} plugins are"
+        many = counted(others, "plugin is", "plugins are")
         return f"{note} {many} broken{' besides' if note else ''}: see `rosrm plugins --local`."
 
 
@@ -400,34 +407,13 @@ def _missing_method(kind: str, thing: object) -> str:
     """Return what is wrong with an object that an offer made; "": it has all its methods."""
     if thing is None:
         wanted = " and ".join(f"`{name}`" for name in _METHODS[kind])
-        return f"None; an object with {wanted} is wanted (does it lack a `return`?)"
+        return f"None; an object with {wanted} is required (does it lack a `return`?)"
     for name in _METHODS[kind]:
         if not hasattr(type(thing), name) and not hasattr(thing, name):
             has = [one for one in dir(thing) if not one.startswith("_")]
             near = get_close_matches(name, has, 1)
             misspelt = f"; is its `{near[0]}` misspelt?" if near else ""
             return f"a {type(thing).__name__}, which has no `{name}`{misspelt}"
-    return ""
-
-
-def resource_fault(resource: object) -> str:
-    """Return what is wrong with the description of a resource; "": nothing."""
-    if not isinstance(resource, ResourceDescription):
-        return f"describes a resource by {resource!r}, which is not a ResourceDescription"
-    name: object = resource.name
-    if not (isinstance(name, str) and _RESOURCE_NAME.fullmatch(name)):
-        return (
-            f"names a resource {name!r}. Allowed: at most 64 letters, digits, '_', '-' and '.', "
-            "the first of them a letter"
-        )
-    for field in ("unit", "scope"):
-        word: object = getattr(resource, field)
-        if not isinstance(word, str):
-            return f"gives {name!r} the {field} {word!r}; text is wanted, as {_EXAMPLES[field]}"
-    capacity: object = resource.capacity
-    numeric = isinstance(capacity, (int, float)) and not isinstance(capacity, bool)
-    if not (numeric and math.isfinite(resource.capacity) and resource.capacity > 0.0):
-        return f"gives {name!r} a capacity of {capacity!r}; a number above 0 is wanted"
     return ""
 
 

@@ -30,9 +30,15 @@ def counted(number: int, singular: str, plural: str = "") -> str:
     return f"{number} {singular if number == 1 else plural or singular + 's'}"
 
 
+def few(names: Iterable[str], most: int = 8) -> list[str]:
+    """Return names; in place of those beyond the first `most`, their number: "3 more"."""
+    first = list(names)
+    return first if len(first) <= most else [*first[:most], f"{len(first) - most} more"]
+
+
 def listed(names: Iterable[str], word: str = "and") -> str:
-    """Return names as a sentence lists them: "a", "a and b", "a, b and c"."""
-    *first, last = names
+    """Return names as a sentence lists them, `few` of them: "none", "a", "a, b and c"."""
+    *first, last = few(names) or ["none"]
     return f"{', '.join(first)} {word} {last}" if first else last
 
 

@@ -13,7 +13,7 @@ from rosrm.cli.simulation_runs import Report, Run
 from rosrm.config.plain import to_plain
 from rosrm.simulation.agreement import Agreement
 from rosrm.simulation.replay import Replay
-from rosrm.spelling import counted
+from rosrm.spelling import counted, few
 
 #: Processes that were never placed, of which the reason is told.
 _TOLD: Final = 3
@@ -36,11 +36,10 @@ def show(report: Report) -> None:
             made.add_row(Text(run.name), *(cells[column] for column in columns))
         tables.show(made)
     for run in report.runs:
-        never = list(run.outcome.never_placed.items())
+        never = [f"{name}: {reason}" for name, reason in run.outcome.never_placed.items()]
         if never:
-            some = "; ".join(f"{name}: {reason}" for name, reason in never[:_TOLD])
-            more = f"; and {len(never) - _TOLD} more" if len(never) > _TOLD else ""
-            typer.echo(f"{run.name}: {len(never)} never placed: {some}{more}")
+            some = "; ".join(few(never, _TOLD))
+            typer.echo(f"{run.name}: {len(never)} never placed: {some}")
     if report.agreement is not None:
         for line in agreement_lines(report.agreement):
             typer.echo(line)

@@ -14,7 +14,7 @@ import typer
 from rosrm.config.units import Quantity
 from rosrm.core.views import ProcessRow
 from rosrm.errors import ConfigError
-from rosrm.spelling import standing
+from rosrm.spelling import listed, standing
 
 if TYPE_CHECKING:
     from rosrm.ros.client import MasterClient
@@ -39,7 +39,6 @@ _ENDINGS: Final = {
     "restore_failed": False, "stayed": False, "cancelled": False, "migration_forgotten": False,
 }  # fmt: skip
 _NOTEWORTHY: Final = _UNTIL_ASKED | {"set_aside", "unreachable", "unknown"}
-_MOST_NAMED: Final = 5
 
 
 def longest(text: str) -> float:
@@ -132,7 +131,7 @@ def wait_for(
             _say_end(ours, awaited, failed, stays=stays)
             if unseen:
                 typer.echo(
-                    f"rosrm: no longer listed, and not seen to be done: {_named(unseen)} "
+                    f"rosrm: no longer listed, and not seen to be done: {listed(unseen)} "
                     f"(`rosrm events --process NAME` shows what happened)",
                     err=True,
                 )
@@ -152,9 +151,9 @@ def wait_for_ending(client: MasterClient, name: str, since: int, longest: float)
     Returns:
         Whether it was done in time.
     """
-    deadline = time.monotonic() + longest
     said: dict[str, str] = {}
-    while True:
+
+    def look() -> bool | Sequence[str]:
         view = client.list(processes=True, events=True, process=name, after=since)
         for event in view.events:
             if event.kind in _ENDINGS:
@@ -166,10 +165,9 @@ def wait_for_ending(client: MasterClient, name: str, since: int, longest: float)
             state = standing(ours[0].state) if ours else "is no longer listed"
             typer.echo(f"rosrm: no longer waiting: {name} {state}", err=True)
             return False
-        if time.monotonic() >= deadline:
-            _say_time_is_up(ours)
-            return False
-        time.sleep(PERIOD)
+        return [name]
+
+    return _look_until(longest, look)
 
 
 def wait_until_drained(client: MasterClient, host: str, since: int, longest: float) -> bool:
@@ -178,8 +176,8 @@ def wait_until_drained(client: MasterClient, host: str, since: int, longest: flo
     Returns:
         Whether it was drained in time and nothing has stayed there.
     """
-    deadline = time.monotonic() + longest
-    while True:
+
+    def look() -> bool | Sequence[str]:
         view = client.list(hosts=True, processes=True, events=True, host=host, after=since)
         row = next((row for row in view.hosts if row.description.name == host), None)
         staying = [row for row in view.processes if row.host == host and row.state not in _OVER]
@@ -190,10 +188,20 @@ def wait_until_drained(client: MasterClient, host: str, since: int, longest: flo
         if row is None or not row.draining:
             typer.echo(f"rosrm: {host} is no longer draining", err=True)
             return False
+        return [row.name for row in staying] or [host]
+
+    return _look_until(longest, look)
+
+
+def _look_until(longest: float, look: Callable[[], bool | Sequence[str]]) -> bool:
+    """Return the outcome that `look` comes to; until then it returns the names still awaited."""
+    deadline = time.monotonic() + longest
+    while not isinstance(seen := look(), bool):
         if time.monotonic() >= deadline:
-            _say_time_is_up(staying)
+            _say_time_is_up(seen)
             return False
         time.sleep(PERIOD)
+    return seen
 
 
 # --- messages ---------------------------------------------------------------------------------
@@ -218,26 +226,20 @@ def _say_end(
     ended = [row.name for row in failed if row.state == "finished"]
     if ended:
         typer.echo(
-            f"rosrm: services that finished: {_named(ended)}; declare a program that is meant to "
+            f"rosrm: services that finished: {listed(ended)}; declare a program that is meant to "
             f"end as `kind: job`",
             err=True,
         )
     waited = [row.name for row in awaited]
-    if awaited and stays:
+    if waited and stays:
         typer.echo(
-            f"rosrm: no longer waiting for {_named(waited)}: set aside until a host registers or "
+            f"rosrm: no longer waiting for {listed(waited)}: set aside until a host registers or "
             f"changes (`rosrm explain NAME` shows the requirements)",
             err=True,
         )
-    elif awaited:
-        _say_time_is_up(awaited)
+    elif waited:
+        _say_time_is_up(waited)
 
 
-def _say_time_is_up(awaited: Sequence[ProcessRow]) -> None:
-    names = _named([row.name for row in awaited])
-    typer.echo(f"rosrm: --timeout has passed; still waiting for {names}", err=True)
-
-
-def _named(names: Sequence[str]) -> str:
-    some = ", ".join(names[:_MOST_NAMED])
-    return f"{some} and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else some
+def _say_time_is_up(awaited: Sequence[str]) -> None:
+    typer.echo(f"rosrm: --timeout has passed; still waiting for {listed(awaited)}", err=True)

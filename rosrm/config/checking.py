@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import types
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from functools import cache
 from typing import (
@@ -46,6 +46,8 @@ _WANTED: Final = {
 }
 
 
+_UNKNOWN_KEY: Final = frozenset({"unexpected_keyword_argument", "extra_forbidden"})
+
 #: What a bound of annotated_types asks for.
 _BOUNDS: Final = {
     "greater_than": "greater than",
@@ -69,8 +71,10 @@ def validated(wanted: type[T], node: Node, problems: Problems, where: str = "") 
             json.dumps({"value": node.plain()})
         )
     except ValidationError as error:
-        for found in error.errors(include_url=False):
-            _note(wanted, node, dict(found), problems, where)
+        found = [dict(one) for one in error.errors(include_url=False)]
+        # Another member of a union may know the key that the one which was tried does not.
+        for one in [one for one in found if not _is_known(wanted, one)] or found:
+            _note(wanted, node, one, problems, where)
         return None
     return cast(T, holder.value)
 
@@ -132,13 +136,14 @@ def _holder(wanted: type[Any]) -> type[BaseModel]:
 def _note(
     wanted: type[Any], node: Node, error: Mapping[str, Any], problems: Problems, where: str
 ) -> None:
-    path = tuple(step for step in error["loc"][1:] if step != "[key]")
+    path = _path(wanted, error["loc"][1:])
     target = node.deepest(path)
-    if error["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
+    if error["type"] in _UNKNOWN_KEY:
         inside = _named(path[:-1], where)
         note = f"unknown key {path[-1]!r}" + (f" in {inside}" if inside else "")
-        allowed = list(_allowed(wanted, path[:-1]))
-        problems.add(target.key_place or target.place, note + near(str(path[-1]), allowed))
+        problems.add(
+            target.key_place or target.place, note + near(str(path[-1]), _keys(wanted, path[:-1]))
+        )
         return
     prefix = _named(path, where)
     problems.add(target.place, (f"{prefix}: " if prefix else "") + _said(error))
@@ -164,7 +169,7 @@ def _said(error: Mapping[str, Any]) -> str:
         bound = next(iter(error["ctx"].values()))
         return f"{described(given)} is not {_BOUNDS[kind]} {bound}"
     if kind in _WANTED:
-        return f"{_WANTED[kind]} is wanted, not {described(given)}"
+        return f"{_WANTED[kind]} is required, not {described(given)}"
     return f"{error['msg'][:1].lower()}{error['msg'][1:]}, and {described(given)} is given"
 
 
@@ -178,14 +183,38 @@ def _not_one_of(given: Any, expected: str) -> str:
     return f"{described(given)} is unknown{near(str(given), allowed)}"
 
 
-def _allowed(wanted: Any, path: tuple[str | int, ...]) -> Iterator[str]:
-    """The keys of the dataclass at a path."""
-    if not path:
-        if is_dataclass(wanted):
-            yield from (f.name for f in fields(wanted) if f.init)
-        return
-    for inner in _inside(wanted, path[0]):
-        yield from _allowed(inner, path[1:])
+def _is_known(wanted: type[Any], error: Mapping[str, Any]) -> bool:
+    """Return True if an error is an unknown key which some type at its place has."""
+    path = _path(wanted, error["loc"][1:])
+    return error["type"] in _UNKNOWN_KEY and path[-1] in _keys(wanted, path[:-1])
+
+
+def _keys(wanted: Any, path: tuple[str | int, ...]) -> list[str]:
+    """Return the keys of the dataclasses at a path."""
+    types = [one for one in _types_at(wanted, path) if is_dataclass(one)]
+    return list(dict.fromkeys(f.name for one in types for f in fields(one) if f.init))
+
+
+def _path(wanted: Any, steps: Iterable[str | int]) -> tuple[str | int, ...]:
+    """Return the path of an error in the document, from that of pydantic.
+
+    That has "[key]" before a key, and below a union the member that was tried.
+    """
+    path: tuple[str | int, ...] = ()
+    is_member = False
+    for step in steps:
+        is_member = not is_member and len(set(_types_at(wanted, path)) - {None, type(None)}) > 1
+        if not is_member and step != "[key]":
+            path = (*path, step)
+    return path
+
+
+def _types_at(wanted: Any, path: tuple[str | int, ...]) -> list[Any]:
+    """Return the types that may stand at a path."""
+    found = [wanted]
+    for step in path:
+        found = [inner for one in found for inner in _inside(one, step)]
+    return found
 
 
 def _inside(wanted: Any, step: str | int) -> Iterator[Any]:

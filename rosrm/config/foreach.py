@@ -48,7 +48,7 @@ def _rows(foreach: Node, problems: Problems) -> list[Row]:
     if foreach.items:
         names = {name: _values(name, node, problems) for name, node in foreach.items.items()}
         return _product(foreach, names, problems)
-    wanted = "a mapping from a name to its values is wanted, such as {i: range(0, 60)}"
+    wanted = "a mapping from a name to its values is required, such as {i: range(0, 60)}"
     problems.add(foreach.place, f"foreach: {wanted}, not {described(foreach.plain())}")
     return []
 
@@ -99,7 +99,7 @@ def _values(name: str, node: Node, problems: Problems) -> list[Scalar]:
         return [value for item in node.value for value in _one(item, problems)]
     problems.add(
         node.place,
-        f"foreach.{name}: a list or range(first, end) is wanted, not {described(node.plain())}",
+        f"foreach.{name}: a list or range(first, end) is required, not {described(node.plain())}",
     )
     return []
 
@@ -109,7 +109,7 @@ def _one(node: Node, problems: Problems) -> Iterator[Scalar]:
         yield node.value
     else:
         problems.add(
-            node.place, f"foreach: text or a number is wanted, not {described(node.plain())}"
+            node.place, f"foreach: text or a number is required, not {described(node.plain())}"
         )
 
 

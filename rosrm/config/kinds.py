@@ -63,8 +63,8 @@ def check_kind(root: Node, wanted: str) -> None:
     if len(there) * 2 > len(given):
         file, keys = root.place.file, ", ".join(key for key in root.items if key in there)
         raise ConfigError(
-            f"{file}: a {wanted} file is wanted, and this is a {best[0]} file, by its keys {keys}; "
-            f"it is for `{_COMMANDS[best[0]]} {file}`"
+            f"{file}: a {wanted} file is required, and this is a {best[0]} file, by its keys "
+            f"{keys}; it is for `{_COMMANDS[best[0]]} {file}`"
         )
 
 

@@ -113,4 +113,4 @@ def _scalar(hint: type[Any], plain: Any, where: str) -> Any:
 
 
 def _unfit(where: str, wanted: str, plain: Any) -> ValueError:
-    return ValueError(f"{where}: {wanted} is wanted, not {plain!r}")
+    return ValueError(f"{where}: {wanted} is required, not {plain!r}")

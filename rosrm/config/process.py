@@ -332,13 +332,13 @@ def _about_surroundings(process: ProcessInFile) -> Iterator[Complaint]:
 
 def _fault_of_parameter(value: Any) -> str:
     if value is None:
-        return "a value is wanted; ROS has no null"
+        return "a value is required; ROS has no null"
     items = value if isinstance(value, list) else [value]
     kinds = {type(item) for item in items}
     if kinds - {bool, int, float, str}:
         return "a list of ROS holds booleans, numbers or text"
     if any(isinstance(item, float) and not math.isfinite(item) for item in items):
-        return "a finite number is wanted"
+        return "a finite number is required"
     return "a list of ROS holds values of one type" if len(kinds) > 1 else ""
 
 

@@ -126,7 +126,7 @@ class Quantity:
         if unit in units:
             return units[unit]
         if not units:
-            raise ValueError(f"a number without a unit is wanted, not one with {unit!r}")
+            raise ValueError(f"a number without a unit is required, not one with {unit!r}")
         by_case = [known for known in units if known.lower() == unit.lower()]
         near = by_case or get_close_matches(unit, units, 1)
         meant = f"; did you mean {near[0]!r}?" if near else "."

@@ -148,5 +148,5 @@ def variants_of(root: Node) -> list[Node]:
     if node is None:
         return []
     if not isinstance(node.value, tuple):
-        raise ConfigError(f"{node.place}: variants: a list is wanted")
+        raise ConfigError(f"{node.place}: variants: a list is required")
     return list(node.value)

@@ -56,7 +56,7 @@ def _entries(root: Node, problems: Problems) -> Sequence[Node]:
     processes = root.get("processes")
     if processes is None or not isinstance(processes.value, tuple) or not processes.value:
         place = (processes or root).place
-        problems.add(place, "processes: a list of at least one process is wanted")
+        problems.add(place, "processes: a list of at least one process is required")
         return ()
     for entry in processes.value:
         if not isinstance(entry.value, Mapping):
@@ -67,7 +67,7 @@ def _entries(root: Node, problems: Problems) -> Sequence[Node]:
 def _defaults(root: Node, problems: Problems) -> Node:
     defaults = root.get("defaults") or Node({}, root.place)
     if not isinstance(defaults.value, Mapping):
-        problems.add(defaults.place, "defaults: a mapping is wanted")
+        problems.add(defaults.place, "defaults: a mapping is required")
     for name in _NOT_IN_DEFAULTS:
         node = defaults.get(name)
         if node is not None:

@@ -203,7 +203,7 @@ def _listed(root: Node, section: str, problems: Problems) -> Iterator[Node]:
     if node is None or not isinstance(node.value, tuple) or not node.value:
         what = "host" if section == "hosts" else "process"
         place = (node or root).place
-        problems.add(place, f"{section}: a list of at least one {what} is wanted")
+        problems.add(place, f"{section}: a list of at least one {what} is required")
         return
     for entry in node.value:
         if not isinstance(entry.value, Mapping):

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Final
 from rosrm.core import events as happened
 from rosrm.core.commands import Order
 from rosrm.core.hosts import Host, HostCondition
-from rosrm.core.plugin_calls import required
+from rosrm.core.plugin_calls import implements, required
 from rosrm.errors import PluginError
 from rosrm.ports import HostChecking
 
@@ -79,7 +79,7 @@ def ask_hosts(state: MasterState, now: float) -> None:
 
 def _checking(state: MasterState) -> Iterator[tuple[str, HostChecking]]:
     for name, strategy in state.strategies.items():
-        if isinstance(strategy, HostChecking):
+        if implements(strategy, HostChecking):
             yield name, strategy
 
 
@@ -149,7 +149,7 @@ def fault(state: MasterState, strategy: str, source: Host, destination: Host) ->
         strategy: its name; one that works everywhere has no fault.
     """
     checking: object = state.strategies.get(strategy)
-    if not isinstance(checking, HostChecking):
+    if not implements(checking, HostChecking):
         return ""
     facts = []
     for host in (source, destination):

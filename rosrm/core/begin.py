@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Final
 
@@ -70,7 +69,7 @@ def plan_move(
         destination.name, state.new_instance_id(process), int(state.wall),
         source.node_name or process.name,
     )  # fmt: skip
-    plan = proposed(state, name, move, state.strategies[name].propose)
+    plan = proposed(state, name, move)
     if isinstance(plan, str):
         return plan
     return Run(
@@ -141,24 +140,20 @@ def why_no_executor(state: MasterState, run: Run) -> str:
     return ""
 
 
-def proposed(
-    state: MasterState, name: str, move: Move, propose: Callable[[Move], Plan],
-    aim: Aim = Aim.MOVE,
-) -> Plan | str:  # fmt: skip
+def proposed(state: MasterState, name: str, move: Move, aim: Aim = Aim.MOVE) -> Plan | str:
     """The plan of a strategy, or why there is none; a strategy that raises is named.
 
     Args:
         state: guards the call, and says what the strategy's offer declares.
         name: of the strategy.
         move: to be planned; it is given its options.
-        propose: the strategy's own function.
         aim: of the plan.
     """
 
     def ask() -> Plan | str:
         try:
             given = replace(move, options=state.declared.options_of(name, move.spec))
-            plan = required(propose(given), Plan)
+            plan = required(getattr(state.strategies[name], _HOOKS[aim])(given), Plan)
         except ValueError as reason:  # by its contract: the strategy cannot move this process
             return f"the migration strategy {name!r} gave no plan: {describe_fault(reason)}"
         fault = plan_fault(plan, move, aim) or _strange_executor(state, name, plan)

@@ -9,8 +9,6 @@ from rosrm.core.model import ProcessSpec
 from rosrm.spelling import listed
 
 _RUN: Final = ("ros2", "run")
-#: Most processes that one sentence names.
-_MOST_NAMED: Final = 8
 
 
 def shared_nodes(specs: Sequence[ProcessSpec], others: Iterable[ProcessSpec] = ()) -> list[str]:
@@ -28,15 +26,10 @@ def shared_nodes(specs: Sequence[ProcessSpec], others: Iterable[ProcessSpec] = (
         if (node := _node_of(spec)) in users:
             users[node].append(spec.name)
     return [
-        f"{listed(_named(names))} put {node} into the ROS graph; give each node a name of its own"
+        f"{listed(names)} put {node} into the ROS graph; give each node a name of its own"
         for node, names in users.items()
         if len(names) > 1
     ]
-
-
-def _named(names: list[str]) -> list[str]:
-    more = len(names) - _MOST_NAMED
-    return names if more <= 0 else [*names[:_MOST_NAMED], f"{more} more"]
 
 
 def _node_of(spec: ProcessSpec) -> str:

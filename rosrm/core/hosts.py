@@ -23,7 +23,7 @@ from rosrm.core.columns import (
     HostColumns,
     IntArray,
 )
-from rosrm.core.model import EMPTY, RESOURCE_SLOTS, HostDescription
+from rosrm.core.model import EMPTY, HostDescription
 from rosrm.spelling import counted
 
 #: A usage above this is no measurement but a mistake (a CPU reading of 1.2 can be real).
@@ -41,6 +41,18 @@ class HostCondition(IntEnum):
     LOST = 2
     LEFT = 3
     EXPECTED = 4  # known from the journal, not heard since this master's start
+
+    def words(self, *only: HostCondition) -> str:
+        """Return how a host that is not up stands, without its name; "": in none of `only`."""
+        return _WORDS.get(self, "") if self in (only or _WORDS) else ""
+
+
+_WORDS: Final[Mapping[HostCondition, str]] = {
+    HostCondition.SUSPECT: "is suspect: its reports are late",
+    HostCondition.LOST: "is lost",
+    HostCondition.LEFT: "has left",
+    HostCondition.EXPECTED: "has not come back since the master started",
+}
 
 
 @dataclass(slots=True, eq=False)
@@ -279,7 +291,7 @@ class HostTable(HostColumns):
         if away:
             return away
         if self.condition[column] == HostCondition.SUSPECT:
-            return "it is suspect: its reports are late"
+            return f"it {HostCondition.SUSPECT.words()}"
         if self.processes[column] >= self.bound[column]:
             most = counted(int(self.bound[column]), "process", "processes")
             return f"it accepts no more than {most} now"
@@ -312,14 +324,14 @@ class HostTable(HostColumns):
 
     def why_unreachable(self, host: Host) -> str:
         """Return why a host cannot be reached, without its name; "" if it can."""
-        return _UNREACHABLE.get(self.condition_of(host), "")
+        return self.condition_of(host).words(HostCondition.LOST, HostCondition.EXPECTED)
 
     def why_away(self, column: int) -> str:
         """Why a host is away, or may be; "" if it is there."""
         host = self.hosts[column]
-        reason = _AWAY.get(self.condition_of(host), "")
-        if reason:
-            return reason
+        condition = self.condition_of(host)
+        if condition is not HostCondition.SUSPECT and (words := condition.words()):
+            return f"it {words}"
         if host.draining or host.cordoned:
             return "it is being drained" if host.draining else "it is cordoned"
         return ""
@@ -373,35 +385,3 @@ class HostTable(HostColumns):
 def _over(usage: FloatArray, limit: FloatArray) -> BoolArray:
     """True: at or over its limit. A limit of 1 is none; NaN, no such resource, is over nothing."""
     return np.asarray((usage >= limit) & (limit < 1.0))
-
-
-def description_fault(description: HostDescription) -> str:
-    """What is wrong with what a slave says of itself; "" for nothing."""
-    resources = description.resources
-    if not description.name:
-        return "a host needs a name"
-    if not description.incarnation:
-        return f"{description.name}: the incarnation of a slave is not 0"
-    if len(resources) > RESOURCE_SLOTS:
-        return f"{description.name} has {len(resources)} resources; {RESOURCE_SLOTS} are the most"
-    names = [resource.name for resource in resources]
-    if len(set(names)) < len(names):
-        return f"{description.name} names a resource twice: {', '.join(names)}"
-    for resource in resources:
-        if not 0.0 < resource.capacity < np.inf:
-            return (
-                f"{description.name}: the capacity of {resource.name} is {resource.capacity:g} "
-                f"{resource.unit}; it must be above 0"
-            )
-    return ""
-
-
-_UNREACHABLE: Final[Mapping[HostCondition, str]] = {
-    HostCondition.LOST: "is lost",
-    HostCondition.EXPECTED: "has not come back since the master started",
-}
-_AWAY: Final[Mapping[HostCondition, str]] = {
-    HostCondition.LOST: "it is lost",
-    HostCondition.LEFT: "it has left",
-    HostCondition.EXPECTED: "it has not come back since the master started",
-}

@@ -30,13 +30,6 @@ _ASK_AGAIN: Final = 60.0
 #: Where what is unwanted is kept, in the table "cluster".
 _KEY: Final = "unwanted_images"
 
-_AWAY: Final = {
-    HostCondition.SUSPECT: "is suspect: its reports are late",
-    HostCondition.LOST: "is lost",
-    HostCondition.LEFT: "has left",
-    HostCondition.EXPECTED: "has not come back since the master started",
-}
-
 
 @dataclass(slots=True)
 class Unwanted:
@@ -94,9 +87,7 @@ def note_checkpointed(state: MasterState, process: Process, now: float, trouble:
 def why_away(state: MasterState, image: Image) -> str:
     """Why nothing can be done with an image now: its host is not there; "": it is."""
     host = state.hosts.by_name.get(image.host)
-    if host is None:
-        return "is not known"
-    return _AWAY.get(state.hosts.condition_of(host), "")
+    return "is not known" if host is None else state.hosts.condition_of(host).words()
 
 
 def reason_of(state: MasterState, process: Process) -> str:

@@ -16,6 +16,7 @@ from rosrm.core.hosts import Host
 from rosrm.core.migration import Aim, Commit, Execute, Move
 from rosrm.core.model import InstanceId
 from rosrm.core.placement import Ranking
+from rosrm.core.plugin_calls import implements
 from rosrm.core.processes import Image, Instance, Process, ProcessPhase, Wanted
 from rosrm.core.runs import Run
 from rosrm.core.state import MasterState
@@ -80,7 +81,7 @@ def _strategy_of(state: MasterState, process: Process) -> str:
     """Its own strategy if that takes images, else the first that does; "": none does."""
     own = process.spec.migration.strategy or ""
     names = [*([own] if own in state.strategies else []), *state.strategies]
-    return next((name for name in names if isinstance(state.strategies[name], Imaging)), "")
+    return next((name for name in names if implements(state.strategies[name], Imaging)), "")
 
 
 # --- restore ----------------------------------------------------------------------------------
@@ -120,7 +121,7 @@ def _why_no_restore(state: MasterState, process: Process) -> str:
     if away:
         return f"{process.name} can be restored on {image.host} alone, which {away}"
     strategy: object = state.strategies.get(image.strategy)
-    if not isinstance(strategy, Imaging):
+    if not implements(strategy, Imaging):
         return (
             f"the image of {process.name} was made by {image.strategy!r}, which is not selected "
             f"here: name it below `migration: strategies:` in the cluster's file"
@@ -148,11 +149,7 @@ def _begin(
     *, cause: str, ranking: Ranking | None = None,
 ) -> str:  # fmt: skip
     """Have the strategy plan it, and begin; `ranking`: by which the destination is charged."""
-    imaging: object = state.strategies[strategy]
-    if not isinstance(imaging, Imaging):
-        raise TypeError(f"{strategy!r} takes no images")
-    make = imaging.checkpoint if aim is Aim.CHECKPOINT else imaging.restore
-    plan = proposed(state, strategy, move, make, aim)
+    plan = proposed(state, strategy, move, aim)
     if isinstance(plan, str):
         return plan
     host = state.hosts.by_name[move.source_host]
@@ -183,7 +180,7 @@ def _begin(
 def commit_to_image(state: MasterState, process: Process, run: Run, step: Commit) -> None:
     """The source stands still for good: its image owns the name."""
     source: Instance | None = state.instances.get(run.source.number)
-    needs = {} if source is None else _probed(source)
+    needs = {} if source is None else source.measured
     image = Image(
         run.source.number, run.source_host.name, run.strategy, step.image, state.wall,
         "" if run.source_node == process.name else run.source_node, needs,
@@ -217,12 +214,6 @@ def _remove_unmade(state: MasterState, run: Run) -> None:
     if isinstance(commit, Commit):
         number = run.source.number
         images.remove(state, run.process, run.source_host.name, commit.image, number)
-
-
-def _probed(source: Instance) -> dict[str, float]:
-    """What it was seen to use of what its host has a probe for."""
-    names = {resource.name for resource in source.host.description.resources}
-    return {name: amount for name, amount in source.seen.items() if name in names}
 
 
 def settle(state: MasterState, process: Process, run: Run, now: float) -> None:

@@ -9,7 +9,8 @@ from rosrm.core import host_loss, keeping, lifecycle
 from rosrm.core.assigning import reconsider_set_aside
 from rosrm.core.charges import settle_charge
 from rosrm.core.commands import Order, Reply
-from rosrm.core.hosts import Host, HostCondition, description_fault
+from rosrm.core.descriptions import description_fault
+from rosrm.core.hosts import Host, HostCondition
 from rosrm.core.liveness import welcome_back
 from rosrm.core.lost_tail import note_seen
 from rosrm.core.migration import Execute

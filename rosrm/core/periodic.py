@@ -25,7 +25,7 @@ from rosrm.core.commands import Order
 from rosrm.core.hosts import Host, HostCondition
 from rosrm.core.migration import Execute
 from rosrm.core.plans import checked_step
-from rosrm.core.plugin_calls import required
+from rosrm.core.plugin_calls import implements, required
 from rosrm.core.processes import Instance, Process, ProcessPhase
 from rosrm.errors import PluginError
 from rosrm.ports import MemoryPacing, MemoryView, PeriodicImaging
@@ -96,7 +96,7 @@ def review(state: MasterState, now: float) -> None:
     for number in [number for number in known.of if number not in state.instances]:
         if _remove(state, known.of[number]):
             del known.of[number]
-    if any(isinstance(one, PeriodicImaging) for one in state.strategies.values()):
+    if any(implements(one, PeriodicImaging) for one in state.strategies.values()):
         for process in state.processes.values():
             if process.spec.checkpointed:
                 _review(state, process, now)
@@ -129,7 +129,7 @@ def of_process(state: MasterState, process: Process, now: float) -> Mapping[str,
 def _review(state: MasterState, process: Process, now: float) -> None:
     strategy: object = state.strategies.get(process.spec.migration.strategy or "")
     owner = state.instances.get(process.owner)
-    if owner is None or not isinstance(strategy, PeriodicImaging):
+    if owner is None or not implements(strategy, PeriodicImaging):
         return
     number, host = process.owner, owner.host
     dumped = state.periodic.of.get(number)
@@ -155,7 +155,7 @@ def _review(state: MasterState, process: Process, now: float) -> None:
 def _discard_of(state: MasterState, name: str) -> str | None:
     """Return the executor with which a strategy removes images; "": none; None: the call failed."""
     strategy: object = state.strategies.get(name)
-    if not isinstance(strategy, PeriodicImaging):
+    if not implements(strategy, PeriodicImaging):
         return ""
     asked = strategy
     try:
@@ -182,7 +182,7 @@ def _pace(
     policy, name = state.keeping.policy, state.keeping.policy_name
     if policy is None:
         return None, "no checkpoint policy is selected: name one in the cluster's file"
-    if not isinstance(policy, MemoryPacing):
+    if not implements(policy, MemoryPacing):
         return None, f"the checkpoint policy {name!r} makes none of memory"
     pacing = policy
     asked_of = process.spec.migration.strategy or ""

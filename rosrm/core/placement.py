@@ -285,19 +285,19 @@ def sound(scores: Scores, hosts: HostView, fits: BoolArray) -> tuple[FloatArray,
         if veto.shape != (size,):
             raise ValueError(f"vetoes of shape {veto.shape} for {size} hosts")
         if veto.dtype != np.bool_:
-            raise ValueError(f"vetoes of type {veto.dtype}; booleans are wanted, True: vetoed")
+            raise ValueError(f"vetoes of type {veto.dtype}; booleans are required, True: vetoed")
         asked = fits & ~veto
     if np.count_nonzero(np.isfinite(value)) < size:
         wrong = np.flatnonzero(asked & ~np.isfinite(value))
         if len(wrong):
-            name = hosts.names[int(wrong[0])]
+            row = int(wrong[0])
             raise ValueError(
-                f"the score of host {name} is {value[wrong[0]]}{_unmeasured(hosts, int(wrong[0]))}"
+                f"the score of host {hosts.names[row]} is {value[row]}{_unread_by(hosts, row)}"
             )
     return value, veto
 
 
-def _unmeasured(hosts: HostView, row: int) -> str:
+def _unread_by(hosts: HostView, row: int) -> str:
     """Return what a host does not measure, as that is where a NaN comes from; "": nothing."""
     names = [
         name for name, usage in zip(hosts.resources, hosts.usage[row], strict=True)

@@ -12,7 +12,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from inspect import getattr_static
+from typing import TYPE_CHECKING, Any, Final, TypeGuard, TypeVar
 
 from rosrm.errors import PluginError, describe_plugin_fault
 from rosrm.spelling import counted
@@ -142,6 +143,17 @@ def note_probes(state: MasterState, host: Host, failing: Mapping[str, str], now:
             host=host.name, facts={"plugin": "probe", "name": resource},
         )  # fmt: skip
     host.failing = failing
+
+
+def implements(plugin: object, contract: Callable[..., T]) -> TypeGuard[T]:
+    """Return True if a plugin has every member of a protocol; no code of the plugin runs.
+
+    `isinstance` evaluates the properties of the plugin, because Python before 3.12 asks `hasattr`.
+    """
+    return all(
+        name.startswith("_") or getattr_static(plugin, name, None) is not None
+        for name in vars(contract)
+    )
 
 
 def required(answer: object, kind: type[T]) -> T:

@@ -101,6 +101,12 @@ class Instance:
         """Its slave says that it runs, ready or not."""
         return self.state in _RUNS
 
+    @property
+    def measured(self) -> dict[str, float]:
+        """Newest usage of the resources that a probe of its host reads, base units."""
+        probed = {resource.name for resource in self.host.description.resources}
+        return {name: amount for name, amount in self.seen.items() if name in probed}
+
 
 _RUNS: Final = frozenset({InstanceState.RUNNING, InstanceState.READY})
 

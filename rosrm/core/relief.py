@@ -6,7 +6,6 @@ those the one with the largest relief goes. When no host has room nothing moves.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Final
 
 from rosrm.core.assigning import amounts_of, demand_to_move, ranking_of, unable
@@ -16,13 +15,12 @@ from rosrm.core.model import InstanceState
 from rosrm.core.placement import Demand
 from rosrm.core.state import Instance, MasterState, Process, Wanted
 from rosrm.core.verdicts import decide, may_ever_take, verdict_of
+from rosrm.spelling import counted, few, listed
 
 #: Least seconds between two records that nothing can be moved off a host, for different reasons.
 _TOLD_EVERY = 10.0
 #: Reasons against hosts that one answer names.
 _MOST_SAID: Final = 3
-#: Processes that one answer about a drain names.
-_MOST_NAMED: Final = 8
 
 
 def relieve_hosts(state: MasterState, now: float) -> None:
@@ -137,7 +135,7 @@ def try_move(
     if refusal:
         return refusal
     source = state.instances[process.owner]
-    demand = demand_to_move(state, process, _measured(source), source.host.name, headroom)
+    demand = demand_to_move(state, process, source.measured, source.host.name, headroom)
     ranking = ranking_of(state, demand)
     column = ranking.best() if host is None else host.column
     if column < 0:
@@ -159,15 +157,7 @@ def _and_why(state: MasterState, process: Process, source: Host) -> str:
     """What its strategy has against hosts, a few of them; "" for nothing."""
     faults = unable(state, process, source.name)
     faults.pop(source.name, None)
-    said = list(dict.fromkeys(faults.values()))
-    more = f" (and {len(said) - _MOST_SAID} more)" if len(said) > _MOST_SAID else ""
-    return "".join(f"; {fault}" for fault in said[:_MOST_SAID]) + more
-
-
-def _measured(source: Instance) -> Mapping[str, float]:
-    """What it was seen to use of what its host has a probe for: of the rest nobody has asked."""
-    probed = {resource.name for resource in source.host.description.resources}
-    return {name: amount for name, amount in source.seen.items() if name in probed}
+    return "".join(f"; {fault}" for fault in few(dict.fromkeys(faults.values()), _MOST_SAID))
 
 
 # --- drain ------------------------------------------------------------------------------------
@@ -176,10 +166,9 @@ def _measured(source: Instance) -> Mapping[str, float]:
 def departures(state: MasterState, host: Host) -> str:
     """Return which processes leave a draining host, and which cannot and why."""
     leaving, staying = _leaving(state, host), _staying(state, host)
-    count = "1 process leaves" if len(leaving) == 1 else f"{len(leaving)} processes leave"
-    named = ", ".join(leaving[:_MOST_NAMED]) + (", ..." if len(leaving) > _MOST_NAMED else "")
-    said = f"{count} ({named})" if leaving else "no process is left that can leave"
-    return f"{said}; cannot leave: {_listed(staying)}" if staying else said
+    count = counted(len(leaving), "process leaves", "processes leave")
+    said = f"{count} ({listed(leaving)})" if leaving else "no process is left that can leave"
+    return f"{said}; cannot leave: {'; '.join(few(staying))}" if staying else said
 
 
 def _leaving(state: MasterState, host: Host) -> list[str]:
@@ -205,16 +194,11 @@ def _why_it_stays(state: MasterState, instance: Instance) -> str:
         return reason
     # What a strategy or a lost host lacks may change later; labels and resources do not.
     lasting = {**process.excluded, source.name: "it is there"}
-    amounts, estimated = amounts_of(state, process, _measured(instance))
+    amounts, estimated = amounts_of(state, process, instance.measured)
     possible = may_ever_take(state.hosts, Demand(process.spec, amounts, estimated, lasting))
     if any(possible[host.column] for host in state.hosts.listed() if host is not source):
         return ""
     return f"no other host may take {process.name} (`rosrm explain {process.name}` says why)"
-
-
-def _listed(reasons: list[str]) -> str:
-    more = f"; and {len(reasons) - _MOST_NAMED} more" if len(reasons) > _MOST_NAMED else ""
-    return "; ".join(reasons[:_MOST_NAMED]) + more
 
 
 def _note_drained(state: MasterState, host: Host, now: float) -> None:

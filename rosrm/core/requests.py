@@ -14,12 +14,12 @@ from rosrm.core.graph_names import shared_nodes
 from rosrm.core.hosts import Host
 from rosrm.core.intake import save_host
 from rosrm.core.model import ProcessSpec
-from rosrm.core.plugin_calls import required
+from rosrm.core.plugin_calls import implements, required
 from rosrm.core.relief import departures, try_move
 from rosrm.core.state import WAITING, MasterState, Process, ProcessPhase, Wanted
 from rosrm.errors import PluginError
 from rosrm.ports import SpecChecking
-from rosrm.spelling import counted
+from rosrm.spelling import counted, listed
 
 
 def refuse(state: MasterState, request: int, message: str, code: str = "invalid") -> None:
@@ -64,7 +64,7 @@ def _taken(state: MasterState, event: happened.SubmissionReceived) -> str:
     """Which names cannot be given; "" for none."""
     twice = [name for name, n in Counter(spec.name for spec in event.specs).items() if n > 1]
     if twice:
-        return f"submitted twice at once: {_names(twice)}; names are unique. Nothing was queued"
+        return f"submitted twice at once: {listed(twice)}; names are unique. Nothing was queued"
     taken = [
         spec.name for spec in event.specs
         if spec.name in state.processes and not state.processes[spec.name].phase.over
@@ -75,7 +75,7 @@ def _taken(state: MasterState, event: happened.SubmissionReceived) -> str:
             return f"the name {name} is still in use: {reason}. Nothing was queued"
     if taken:
         return (
-            f"in use already by a live process: {_names(taken)}. Cancel it first or choose another "
+            f"in use already by a live process: {listed(taken)}. Cancel it first or choose another "
             f"name. Nothing was queued"
         )
     for spec in event.specs:
@@ -103,7 +103,7 @@ def _submission_fault(state: MasterState, event: happened.SubmissionReceived) ->
         if strategy is not None and strategy not in known:
             return (
                 f"{spec.name}: unknown migration strategy {strategy!r}; selected here: "
-                f"{_names(sorted(known)) or 'none'}. Nothing was queued"
+                f"{listed(sorted(known))}. Nothing was queued"
             )
         fault = _strategy_fault(state, spec)
         if fault:
@@ -123,7 +123,7 @@ def _strategy_fault(state: MasterState, spec: ProcessSpec) -> str:
             state.declared.options_of(name, spec)
         except ValueError as fault:
             return str(fault)
-        if not isinstance(strategy, SpecChecking):
+        if not implements(strategy, SpecChecking):
             return ""
         return required(strategy.spec_fault(spec), str)
 
@@ -131,11 +131,6 @@ def _strategy_fault(state: MasterState, spec: ProcessSpec) -> str:
         return state.plugins.ask("migration", name, "spec_fault", fault_of)
     except PluginError as error:
         return f"its check of this process failed: {error}"
-
-
-def _names(names: Iterable[str]) -> str:
-    named = list(names)
-    return ", ".join(named[:8]) + (f" and {len(named) - 8} more" if len(named) > 8 else "")
 
 
 def count(number: int) -> str:
@@ -150,7 +145,7 @@ def known_processes(state: MasterState, request: int, names: Iterable[str]) -> l
     """The processes of these names; a name that nobody has refuses the whole request."""
     unknown = [name for name in names if name not in state.processes]
     if unknown:
-        refuse(state, request, f"no such process: {_names(unknown)}; see `rosrm ps`", "unknown")
+        refuse(state, request, f"no such process: {listed(unknown)}; see `rosrm ps`", "unknown")
         return None
     return [state.processes[name] for name in dict.fromkeys(names)]
 
@@ -181,7 +176,7 @@ def _cancelled(state: MasterState, processes: Iterable[Process], over: list[str]
         and state.hosts.why_unreachable(owner.host)
     ]
     if over:
-        said.append(f"ended before: {_names(over)}")
+        said.append(f"ended before: {listed(over)}")
     return "; ".join(said)
 
 
@@ -331,7 +326,7 @@ def known_host(state: MasterState, request: int, name: str) -> Host | None:
     host = state.hosts.by_name.get(name)
     if host is not None and not host.pruned:
         return host
-    there = _names(sorted(host.name for host in state.hosts.listed())) or "none"
+    there = listed(sorted(host.name for host in state.hosts.listed()))
     refuse(state, request, f"no such host: {name!r}; there are: {there}", "unknown")
     return None
 

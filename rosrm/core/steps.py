@@ -47,7 +47,7 @@ _TITLES: Final[Mapping[type[Step], str]] = {
     SetRestart: "setting the restart policy of {0.instance} on {0.host} to {0.restart.when!r}",
 }
 #: Of a host that answers nothing, and may never do so again.
-_AWAY: Final = {HostCondition.LOST: "is lost", HostCondition.LEFT: "has left"}
+_AWAY: Final = (HostCondition.LOST, HostCondition.LEFT)
 
 
 def give_order(state: MasterState, run: Run, step: Step, now: float) -> None:
@@ -218,7 +218,7 @@ def _(step: Commit, state: MasterState, run: Run, now: float) -> str | None:
 @outcome_of.register
 def _(step: Execute, state: MasterState, run: Run, now: float) -> str | None:
     if run.answer is None:
-        away = _AWAY.get(state.hosts.condition_of(state.hosts.by_name[step.host]), "")
+        away = state.hosts.condition_of(state.hosts.by_name[step.host]).words(*_AWAY)
         # Who stands still meanwhile is not to wait for a time-out that may be long. On a way that
         # has to be gone to its end, the host is waited for as long as somebody is there.
         turns = run.undo is None and not run.committed

@@ -317,11 +317,14 @@ def refused_everywhere(table: HostTable, demand: Demand) -> bool:
 
 
 def may_ever_take(table: HostTable, demand: Demand) -> BoolArray:
-    """Return which hosts, (H,), fit a demand if nothing else runs there; unknown ones count."""
+    """Return which hosts, (H,), fit a demand if nothing else runs there.
+
+    A host that is expected back counts, since its capacity is not known yet; a pruned one does not.
+    """
     need = table.fractions(demand.amounts, demand.estimated)
     too_large = ((need > table.limit + CLOSE) & (table.capacity > 0.0)).any(axis=0)
-    unknown = table.incarnation == 0
-    return np.asarray((eligible(table, demand) & ~too_large) | unknown)
+    is_listed = table.condition != HostCondition.LEFT  # of a host that was not heard
+    return np.where(table.incarnation == 0, is_listed, eligible(table, demand) & ~too_large)
 
 
 def _never_reason(table: HostTable, demand: Demand, column: int) -> str:

@@ -10,6 +10,8 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 
+from rosrm.spelling import listed
+
 #: The facts that are compared, each with its meaning.
 FACTS = {
     "version": "of CRIU",
@@ -43,7 +45,7 @@ def mismatch(source: Mapping[str, str], destination: Mapping[str, str]) -> str:
         )
     lacking = sorted({*source["cpu"].split()} - {*destination["cpu"].split()})
     if lacking:
-        named = ", ".join(lacking[:5]) + (", ..." if len(lacking) > 5 else "")
+        named = listed(lacking)
         return f"its processor lacks what a program of the source may use already: {named}"
     if destination["all_users"] != "yes" and source["uid"] != destination["uid"]:
         return (

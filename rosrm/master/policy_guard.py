@@ -2,29 +2,25 @@
 
 from __future__ import annotations
 
-import signal
 import threading
 import time
 from collections.abc import Callable
-from types import FrameType
-from typing import Final, TypeVar
+from functools import partial
+from typing import TypeVar
 
 from rosrm.core.plugin_calls import Plugin
 from rosrm.errors import PluginError, describe_plugin_fault
-
-#: Seconds between two alarms, for a plugin that takes no notice of the first.
-_AGAIN: Final = 0.05
+from rosrm.time_limit import limited
 
 T = TypeVar("T")
 
 
 class Deadlines:
-    """A deadline for each call of each plugin, by the real-time interval timer.
+    """A deadline for each call of each plugin.
 
     The core treats a late call like any other failure: that decision is made without the plugin. A
     plugin that was late is not asked again for a while: a master that waits for it with every
-    reading would have no time for its slaves. A loop inside C code that never returns to Python
-    cannot be ended so. One of these serves a process, as a process has one such timer.
+    reading would have no time for its slaves.
 
     Args:
         seconds: for one call.
@@ -37,12 +33,10 @@ class Deadlines:
     def __init__(self, seconds: float = 1.0, pause: float = 30.0) -> None:
         self._seconds = seconds
         self._pause = pause
-        self._asked: Plugin | None = None
         self._late: dict[Plugin, tuple[float, str]] = {}
         self.spent = 0.0
         if threading.current_thread() is not threading.main_thread():
             raise RuntimeError("the deadlines work by a signal and need the main thread")
-        signal.signal(signal.SIGALRM, self._expired)
 
     def __call__(self, plugin: Plugin, call: Callable[[], T]) -> T:
         """Return the answer of a call; raises `PluginError` or what the plugin raised."""
@@ -50,10 +44,8 @@ class Deadlines:
         began = time.monotonic()
         if began - late_at < self._pause:
             raise PluginError(told)
-        self._asked = plugin
-        signal.setitimer(signal.ITIMER_REAL, self._seconds, _AGAIN)
         try:
-            return call()
+            return limited(self._seconds, call, partial(self._expired, plugin))
         except TimeoutError as fault:
             if plugin in self._late:  # the pause says where the plugin was when the time was up
                 told = describe_plugin_fault(fault)
@@ -62,16 +54,12 @@ class Deadlines:
         except KeyboardInterrupt as fault:  # of the plugin: Ctrl-C raises nothing in a master
             raise PluginError(describe_plugin_fault(fault)) from fault
         finally:
-            self._asked = None
-            signal.setitimer(signal.ITIMER_REAL, 0.0)
             self.spent += time.monotonic() - began
 
-    def _expired(self, _signal: int, _frame: FrameType | None) -> None:
-        if self._asked is None:  # the call ended in the very last moment
-            return
+    def _expired(self, plugin: Plugin) -> str:
         reason = (
             f"it took longer than {self._seconds:g} s for one decision, and is not asked again "
             f"for {self._pause:g} s"
         )
-        self._late[self._asked] = (time.monotonic(), reason)
-        raise TimeoutError(reason)
+        self._late[plugin] = (time.monotonic(), reason)
+        return reason

@@ -22,7 +22,9 @@ def arrays_message(arrays: Mapping[str, npt.ArrayLike]) -> Arrays:
     plain = {name: np.asarray(value) for name, value in arrays.items()}
     for name, value in plain.items():
         if value.dtype.hasobject:
-            raise ValueError(f"the array {name!r} holds Python objects: numbers or text are wanted")
+            raise ValueError(
+                f"the array {name!r} holds Python objects: numbers or text are required"
+            )
     packed = io.BytesIO()
     # The names go in as a mapping's, so that an array may be called "file" too.
     np.savez(packed, **{f"_{name}": value for name, value in plain.items()})  # type: ignore[arg-type]

@@ -165,5 +165,5 @@ def decode_decisions(content: bytes) -> tuple[str, ...]:
     """The inverse of `encode_decisions`; raises `ValueError`."""
     lines = json.loads(content)
     if not isinstance(lines, list) or not all(isinstance(line, str) for line in lines):
-        raise ValueError("a list of decisions is wanted")
+        raise ValueError("a list of decisions is required")
     return tuple(lines)

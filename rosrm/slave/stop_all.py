@@ -8,7 +8,7 @@ from typing import Final
 
 from rosrm.core.model import InstanceId, InstanceStatus
 from rosrm.errors import RosrmError
-from rosrm.spelling import counted
+from rosrm.spelling import counted, listed
 from rosrm.state_directory import only_one
 from rosrm.supervisor.client import SupervisorClient, SupervisorEnded
 
@@ -52,5 +52,5 @@ def _await_end(client: SupervisorClient, live: set[InstanceId], count: int, dead
         live -= {
             one.instance for one in told if isinstance(one, InstanceStatus) and one.state.ended
         }
-    named = ", ".join(map(str, sorted(live, key=str)[:8])) or "the supervisor"
+    named = listed(sorted(map(str, live)) or ["the supervisor"])
     raise RosrmError(f"not ended in time: {named}; supervisor pid {client.pid} still stops them")

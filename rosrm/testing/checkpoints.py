@@ -9,6 +9,7 @@ from itertools import islice, permutations
 from typing import Any, ClassVar, Final
 
 from rosrm.core.model import EMPTY, MigrationPolicy, ProcessSpec
+from rosrm.core.plugin_calls import implements
 from rosrm.ports import (
     CheckpointOffer,
     CheckpointPolicy,
@@ -90,7 +91,7 @@ class CheckpointContract:
         """Of a policy that does: seconds, more than none, the same for the same view, or none."""
         policy: object = self.make()
         twin: object = self.make()
-        if not (isinstance(policy, MemoryPacing) and isinstance(twin, MemoryPacing)):
+        if not (implements(policy, MemoryPacing) and implements(twin, MemoryPacing)):
             return
         for asked in (0.5, 60.0):
             for size, pause in ((0, 0.0), (1 << 30, 8.0)):

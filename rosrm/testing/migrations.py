@@ -28,6 +28,7 @@ from rosrm.core.migration import (
 from rosrm.core.migration import plan_fault as fault_of
 from rosrm.core.model import EMPTY, InstanceId, ProcessSpec
 from rosrm.core.plans import plan_from_dict, plan_to_dict
+from rosrm.core.plugin_calls import implements
 from rosrm.ports import Imaging, MigrationOffer, MigrationStrategy, PeriodicImaging
 
 #: A unit of each quantity that an option may have.
@@ -95,7 +96,7 @@ class MigrationContract:
     def test_checkpoints_and_restores_are_sound(self) -> None:
         """Of a strategy that takes images: on one host, and owned by the image in between."""
         strategy: object = self.make()
-        if not isinstance(strategy, Imaging):
+        if not implements(strategy, Imaging):
             return
         for move in self.moves():
             here = replace(move, destination_host=move.source_host)
@@ -111,7 +112,7 @@ class MigrationContract:
     def test_periodic_checkpoints_are_sound(self) -> None:
         """Of a strategy that makes them: a step on the instance's host, each time another one."""
         strategy: object = self.make()
-        if not isinstance(strategy, PeriodicImaging):
+        if not implements(strategy, PeriodicImaging):
             return
         assert strategy.checkpoint_every(self.spec) >= 0.0
         assert {strategy.discard} <= self.offer.executors.keys()
@@ -238,7 +239,7 @@ class MigrationContract:
                     continue
                 given = "None" if answer is None else repr(answer)
                 assert isinstance(answer, Mapping), (
-                    f"the executor {step.executor!r} answered {given}; a mapping is wanted, as {{}}"
+                    f"the executor {step.executor!r} answered {given}; a mapping is required"
                 )
                 assert all(isinstance(key, str) for key in answer), answer
                 results[step.executor] = json.loads(json.dumps(dict(answer), allow_nan=False))

@@ -11,10 +11,11 @@ from pathlib import Path
 from typing import Any, ClassVar
 from unittest import SkipTest
 
+from rosrm.core.descriptions import resource_fault
 from rosrm.core.model import EMPTY, Reading, ResourceDescription
 from rosrm.errors import SkipPlugin
 from rosrm.ports import Probe, ProbeContext, ProbeOffer
-from rosrm.registry import MadeProbe, resource_fault
+from rosrm.registry import MadeProbe
 
 
 class FakeClock:

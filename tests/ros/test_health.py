@@ -94,7 +94,7 @@ def test_a_topic_that_falls_silent(cluster) -> None:
     )  # fmt: skip
     reason = failed(cluster, "quiet")
     assert reason.startswith("unhealthy: ~/scan: 0.0 Hz for 2.")
-    assert reason.endswith("at least 5 Hz are wanted")
+    assert reason.endswith("at least 5 Hz are required")
     assert cluster.client.explain("quiet")["reason"] == reason
 
 

@@ -140,11 +140,11 @@ class Judgement:
             silent = f"no answer from {' or '.join(self._watch.services)}"
             found = f"lifecycle state {seen.state}" if seen.state else silent
             lasted = self._lifecycle.seconds
-            yield f"{found} for {lasted:.1f} s, the state {wanted.lifecycle} is wanted"
+            yield f"{found} for {lasted:.1f} s, the state {wanted.lifecycle} is required"
         lasted = self._rate.amiss.seconds
         if lasted > wanted.timeout:
             found = seen.trouble or f"{self._rate.found:.1f} Hz"
-            least = f"at least {wanted.rate:g} Hz are wanted"
+            least = f"at least {wanted.rate:g} Hz are required"
             yield f"{wanted.topic}: {found} for {lasted:.1f} s, {least}"
 
 

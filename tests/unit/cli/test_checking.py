@@ -80,10 +80,10 @@ WORK = "processes: [{name: a, command: x}]"
 @pytest.mark.parametrize(
     ("command", "text", "said"),
     [
-        (["submit"], HOST, "a work file is wanted, and this is a host file, by its keys host, "),
+        (["submit"], HOST, "a work file is required, and this is a host file, by its keys host, "),
         (["submit"], f"seed: 1\n{SIMULATION}", "is a simulation file, by its keys seed, hosts"),
-        (["simulate"], WORK, "a simulation file is wanted, and this is a work file"),
-        (["master", "--config"], HOST, "a cluster file is wanted, and this is a host file"),
+        (["simulate"], WORK, "a simulation file is required, and this is a work file"),
+        (["master", "--config"], HOST, "a cluster file is required, and this is a host file"),
         (["slave", "--config"], "name: x\nscoring: {}", "it is for `rosrm master --config "),
     ],
 )
@@ -141,7 +141,7 @@ def test_plugins_that_cannot_be_made_are_found(rosrm, file, monkeypatch):
     assert "f.yaml: scoring: scoring policy 's' of plugin 'ours': `create` (" in result.err
     assert "raised KeyError: 'weight'" in result.err
     assert "which has no `propose`; is its `proposes` misspelt?" in result.err
-    assert "made None; an object with `choose` is wanted" in result.err
+    assert "made None; an object with `choose` is required" in result.err
     assert "test_checking.py:" in result.err
 
 

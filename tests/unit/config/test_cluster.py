@@ -19,6 +19,27 @@ from rosrm.registry import Registry
 
 
 @dataclass(frozen=True)
+class Steady:
+    """One form of an option."""
+
+    value: float = 1.0
+
+
+@dataclass(frozen=True)
+class Rising:
+    """The other form."""
+
+    slope: float = 1.0
+
+
+@dataclass(frozen=True)
+class Curves:
+    """Options of another scoring policy."""
+
+    curve: Steady | Rising = Steady()
+
+
+@dataclass(frozen=True)
 class Weights:
     """Options of a scoring policy."""
 
@@ -37,7 +58,7 @@ class Made:
 
 @hookimpl
 def register_scoring_policies():
-    return [ScoringOffer("weighted", Made, Weights)]
+    return [ScoringOffer("weighted", Made, Weights), ScoringOffer("curved", Made, Curves)]
 
 
 @hookimpl
@@ -136,11 +157,11 @@ def test_everything_wrong_is_said_at_once_each_with_its_place(refusal):
         "f.yaml:4:15: ros.domain: 300 is not within 0..232",
         """f.yaml:4:39: ros.discovery.range: "local" is unknown; did you mean 'localhost'?""",
         "f.yaml:5:23: migration.headroom: 5 is not within 0..1 (a fraction: 0.8 means 80 %)",
-        'f.yaml:5:37: migration.automatic: true or false is wanted, not "yes"',
+        'f.yaml:5:37: migration.automatic: true or false is required, not "yes"',
         "f.yaml:5:54: migration.strategies: 'a' is named twice",
         "f.yaml:6:21: liveness.suspect (20 s) must be less than liveness.lease (10 s)",
-        "f.yaml:7:9: journal: a mapping is wanted, not nothing (null)",
-        "f.yaml:8:8: queue: a mapping is wanted, not a list",
+        "f.yaml:7:9: journal: a mapping is required, not nothing (null)",
+        "f.yaml:8:8: queue: a mapping is required, not a list",
         "f.yaml:9:25: defaults.needs.cpu: unknown unit 'MB'. Allowed: core, cores",
     ]
     lines = said.splitlines()
@@ -185,10 +206,10 @@ def test_options_of_no_policy_are_refused(refusal):
 
 def test_a_wrong_type_and_an_unknown_plugin_are_said_together(refusal, registry):
     said = refusal(load_cluster, "name: 5\nscoring: {policy: wieghted}\n", registry)
-    assert "f.yaml:1:7: name: text is wanted, not 5" in said
+    assert "f.yaml:1:7: name: text is required, not 5" in said
     assert (
         "f.yaml:2:11: unknown scoring policy 'wieghted'; did you mean 'weighted'? "
-        "Installed: weighted." in said
+        "Installed: curved, weighted." in said
     )
 
 
@@ -212,6 +233,23 @@ def test_a_wrong_option_names_plugin_option_allowed_ones_and_place(refusal, regi
     assert "Allowed: mem, cpu, window, order" in said
 
 
+@pytest.mark.parametrize(
+    ("curve", "fault"),
+    [
+        ("{slop: 1}", "unknown key 'slop' in {}; did you mean 'slope'? Allowed: value, slope"),
+        ("{slope: steep}", '{}.slope: a number is required, not "steep"'),
+        ("5", "{}: a mapping is required, not 5"),
+    ],
+)
+def test_a_fault_in_an_option_of_several_types_is_reported_once(refusal, registry, curve, fault):
+    """With its path in the file, and the keys of all types."""
+    said = refusal(
+        load_cluster, f"scoring: {{policy: curved, options: {{curve: {curve}}}}}", registry
+    )
+    assert said.endswith(fault.format("options of scoring policy 'curved': curve"))
+    assert said.count("options of") == 1
+
+
 def test_options_for_a_plugin_without_any_are_refused(refusal, registry):
     said = refusal(load_cluster, "migration: {strategies: {relaunch: {fast: true}}}", registry)
     assert "unknown key 'fast' in options of migration strategy 'relaunch'" in said
@@ -220,7 +258,7 @@ def test_options_for_a_plugin_without_any_are_refused(refusal, registry):
 
 def test_options_that_are_no_mapping_are_refused(refusal, registry):
     said = refusal(load_cluster, "scoring: {options: [1]}", registry)
-    assert "f.yaml:1:20: scoring.options: a mapping is wanted, not a list" in said
+    assert "f.yaml:1:20: scoring.options: a mapping is required, not a list" in said
 
 
 def test_a_default_plugin_that_is_not_installed_is_said_too(refusal):

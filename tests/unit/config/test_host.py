@@ -128,7 +128,7 @@ def test_other_values_are_refused_with_what_is_allowed(refusal):
         "f.yaml:5:16: max_processes: -1 is not within 0..",
         "f.yaml:6:19: logs.max_bytes: 10 is not at least 4096",
         'f.yaml:7:10: on_stop: "restart" is unknown. Allowed: stop, keep',
-        "f.yaml:8:13: labels.a: text is wanted, not a list",
+        "f.yaml:8:13: labels.a: text is required, not a list",
     ):
         assert expected in said
 

@@ -61,13 +61,13 @@ def test_plain_values_come_back_as_they_were():
     ("plain", "said"),
     [
         ({"txt": "a"}, "unknown txt; allowed: text, ratio"),
-        ({"text": 5}, "text: str is wanted, not 5"),
-        ({"path": 5}, "path: text is wanted, not 5"),
-        ({"ratio": True}, "ratio: float is wanted, not True"),
-        ({"inner": 5}, "inner: a mapping is wanted, not 5"),
-        ({"names": "abc"}, "names: a list is wanted, not 'abc'"),
-        ({"table": {"a": 5}}, "table.a: a mapping is wanted, not 5"),
-        ({"maybe": "x"}, "maybe: int is wanted, not 'x'"),
+        ({"text": 5}, "text: str is required, not 5"),
+        ({"path": 5}, "path: text is required, not 5"),
+        ({"ratio": True}, "ratio: float is required, not True"),
+        ({"inner": 5}, "inner: a mapping is required, not 5"),
+        ({"names": "abc"}, "names: a list is required, not 'abc'"),
+        ({"table": {"a": 5}}, "table.a: a mapping is required, not 5"),
+        ({"maybe": "x"}, "maybe: int is required, not 'x'"),
     ],
 )
 def test_plain_values_of_another_shape_are_refused_by_name(plain, said):

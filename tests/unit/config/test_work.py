@@ -159,10 +159,14 @@ def test_braces_are_plain_without_foreach(file):
         ("{i: range(0)}", "n{i}", "f.yaml:1:37: foreach: stands for no process at all"),
         ("{i: 'range(0,5,0)'}", "n{i}", "f.yaml:1:41: foreach.i: a step of 0"),
         ("{i: range(10001)}", "n{i}", "foreach: stands for more than 10000 processes"),
-        ("{i: 5}", "n{i}", "f.yaml:1:41: foreach.i: a list or range(first, end) is wanted, not 5"),
-        ("{i: [[1]]}", "n{i}", "f.yaml:1:42: foreach: text or a number is wanted, not a list"),
+        (
+            "{i: 5}",
+            "n{i}",
+            "f.yaml:1:41: foreach.i: a list or range(first, end) is required, not 5",
+        ),
+        ("{i: [[1]]}", "n{i}", "f.yaml:1:42: foreach: text or a number is required, not a list"),
         ("[{i: 1}, {j: 1}]", "n{i}", "f.yaml:1:46: foreach: gives j, and the first of the list i"),
-        ("3", "n", "f.yaml:1:34: foreach: a mapping from a name to its values is wanted"),
+        ("3", "n", "f.yaml:1:34: foreach: a mapping from a name to its values is required"),
     ],
 )
 def test_a_wrong_foreach_is_refused_with_its_place(refusal, foreach, name, said):
@@ -199,9 +203,9 @@ def test_duplicate_names_are_refused_naming_both_places(refusal):
         ("name: a, command: x, namespace: /b", "namespace: only a ROS node has one"),
         ("name: a, command: x, readiness: graph", "only a ROS node is seen in the graph"),
         ("name: a, module: x, ros: true, namespace: b", "'b' is not an absolute namespace"),
-        ("name: a, module: x, ros: true, parameters: {b: }", "parameters.b: a value is wanted"),
+        ("name: a, module: x, ros: true, parameters: {b: }", "parameters.b: a value is required"),
         ("name: a, module: x, ros: true, parameters: {b: [1, a]}", "values of one type"),
-        ("name: a, module: x, ros: true, parameters: {b: .nan}", "a finite number is wanted"),
+        ("name: a, module: x, ros: true, parameters: {b: .nan}", "a finite number is required"),
         ("name: a, command: x, working_directory: ''", "f.yaml:1:54: working_directory: "),
         ("name: a, command: x, environment: {A=B: c}", "'A=B' cannot be a variable"),
         ("name: a, command: x, restart: sometimes", 'restart.when: "sometimes" is unknown'),
@@ -212,7 +216,7 @@ def test_duplicate_names_are_refused_naming_both_places(refusal):
         ('name: a, command: "echo \'x"', "cannot be split into words: No closing quotation"),
         ("name: a, comand: x", "unknown key 'comand'; did you mean 'command'?"),
         ("name: a, command: x, labels: {need: {}}", "unknown key 'need' in labels"),
-        ("name: a, module: x, ros: true, remappings: [[a]]", "remappings: a mapping is wanted"),
+        ("name: a, module: x, ros: true, remappings: [[a]]", "remappings: a mapping is required"),
     ],
 )
 def test_a_wrong_entry_is_refused_with_its_place(refusal, entry, said):
@@ -331,12 +335,12 @@ def test_quoted_words_and_lists_are_passed_as_they_are(file, given, words):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("", "f.yaml:1:1: processes: a list of at least one process is wanted"),
+        ("", "f.yaml:1:1: processes: a list of at least one process is required"),
         ("processes: []", "f.yaml:1:12: processes: a list of at least one"),
         ("processes: [a]", "f.yaml:1:13: processes: each of the list is a mapping"),
         ("proceses: []", "f.yaml:1:1: unknown key 'proceses'; did you mean 'processes'?"),
         ("defaults: {name: x}\nprocesses: []", "f.yaml:1:12: defaults: name belongs to one"),
-        ("defaults: 5\nprocesses: []", "f.yaml:1:11: defaults: a mapping is wanted"),
+        ("defaults: 5\nprocesses: []", "f.yaml:1:11: defaults: a mapping is required"),
     ],
 )
 def test_a_wrong_file_is_refused_with_its_place(refusal, text, said):

@@ -176,8 +176,8 @@ def test_a_registration_that_comes_twice_changes_nothing() -> None:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"resources": (ResourceDescription("memory", "B", 0.0),)}, "must be above 0"),
-        ({"resources": (ResourceDescription("memory", "B", float("nan")),)}, "must be above 0"),
+        ({"resources": (ResourceDescription("memory", "B", 0.0),)}, "a number above 0"),
+        ({"resources": (ResourceDescription("memory", "B", float("nan")),)}, "a number above 0"),
         ({"resources": (ResourceDescription("x", "1", 1.0),) * 2}, "twice"),
         (
             {"resources": tuple(ResourceDescription(f"r{i}", "1", 1.0) for i in range(17))},
@@ -353,7 +353,7 @@ def test_a_cordoned_host_gets_no_work_and_keeps_what_it_has() -> None:
 def test_an_unknown_host_or_action_is_refused_with_what_there_is() -> None:
     """The answer names the hosts, or the actions."""
     cluster = Cluster("a", "b")
-    assert cluster.set_host("c", "cordon").message == "no such host: 'c'; there are: a, b"
+    assert cluster.set_host("c", "cordon").message == "no such host: 'c'; there are: a and b"
     assert "cordon, uncordon, drain" in cluster.set_host("a", "explode").message
 
 

@@ -93,7 +93,7 @@ def test_a_move_is_refused_with_its_reason() -> None:
     cluster.submit(process("fixed"), process("waits", memory=1e6))
     cases = [
         (("x",), "no such process: x"),
-        (("p", "z"), "no such host: 'z'; there are: a, b"),
+        (("p", "z"), "no such host: 'z'; there are: a and b"),
         (("p", "a"), "p runs on a already"),
         (("fixed",), "has no migration strategy"),
         (("waits",), "only a running process can be moved"),

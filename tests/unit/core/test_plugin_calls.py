@@ -8,10 +8,11 @@ from typing import Any
 import pytest
 
 from rosrm.core import events as happened
+from rosrm.core.model import MigrationPolicy, Readiness
 from rosrm.core.plugin_calls import WORKS_AFTER, PluginCalls, required
 from rosrm.errors import PluginError
 from rosrm.ports import HostView, ProcessView, Scores
-from tests.unit.core.cluster import Cluster, Eq1, process
+from tests.unit.core.cluster import Cluster, Eq1, StartFirstOrStopFirst, process
 
 
 class Moody:
@@ -122,3 +123,33 @@ def test_a_probe_that_fails_is_recorded_when_that_changes() -> None:
         )
     assert cluster.told("plugin_failed") == ["the probe of lidar on a fails: no such sensor"]
     assert cluster.told("plugin_works") == ["the probe of lidar on a works again"]
+
+
+#: Of a strategy whose processes ask for periodic checkpoints.
+PERIODIC = {
+    "checkpoint_every": lambda *_: 10.0, "periodic": lambda *_: None, "discard": "sweep",
+}  # fmt: skip
+
+
+def leave(_plugin: object) -> Any:
+    raise SystemExit("no driver")
+
+
+@pytest.mark.parametrize(
+    "members",
+    ["propose", "spec_fault", "ability host_fault", "checkpoint restore",
+     "checkpoint_every periodic discard", "pace"],
+)  # fmt: skip
+def test_a_property_of_a_plugin_that_raises_costs_one_decision(members: str) -> None:
+    """A look for what a plugin can do runs no code of the plugin outside the guard."""
+    raising = {name: property(leave) for name in members.split()}
+    strategy = type("Strategy", (StartFirstOrStopFirst,), dict(PERIODIC | raising))()
+    cluster = Cluster("a", "b", strategies={"criu": strategy})
+    cluster.state.keeping.policy = type("Policy", (), dict(raising))()
+    migration = MigrationPolicy("criu", options={"checkpoint_every": 10.0})
+    cluster.submit(process("p", ros=True, readiness=Readiness("running"), migration=migration))
+    cluster.wait(2.0)
+    if "p" in cluster.state.processes:
+        cluster.checkpoint("p")
+        cluster.migrate("p")
+    assert "SystemExit: no driver" in cluster.told("plugin_failed")[0]

@@ -95,7 +95,7 @@ BROKEN = [
     (exits, "SystemExit: 3"),
     (words, "ValueError"),
     (wrong_veto, "vetoes of shape (1,) for 3 hosts"),
-    (veto_in_words, "vetoes of type <U2; booleans are wanted, True: vetoed"),
+    (veto_in_words, "vetoes of type <U2; booleans are required, True: vetoed"),
     (by_name, "'name' of the spec, which its offer does not declare: say ScoringOffer(..., reads="),
     (by_name_with_a_default, "UndeclaredField"),
     (by_no_field, "AttributeError: a spec has no field 'nmae'; it has name, namespace"),

@@ -47,6 +47,16 @@ def test_without_names_all_that_ended_and_all_hosts_that_left_are_removed() -> N
     assert prune(cluster).message == "0 processes and 0 hosts removed"
 
 
+def test_a_process_that_every_listed_host_refused_fails() -> None:
+    """A pruned host is no host that may still take it."""
+    cluster = of_two_hosts()
+    prune(cluster)
+    cluster.machines["a"].refuses["next"] = "no such package"
+    cluster.submit(process("next"))
+    cluster.wait(1.0)
+    assert cluster.phase("next") == "failed"
+
+
 def test_a_pruned_host_that_registers_is_listed_and_given_work() -> None:
     """As a new one; a master that was restarted knows it."""
     cluster = of_two_hosts()

@@ -182,7 +182,7 @@ def test_a_drained_host_is_emptied_of_what_can_move() -> None:
     cluster.add(machine("b"))
     stays = "cannot leave: fixed has no migration strategy; give it `migration:` in its file"
     said = cluster.set_host("a", "drain").message
-    assert said == f"a is draining: 2 processes leave (p, q); {stays}"
+    assert said == f"a is draining: 2 processes leave (p and q); {stays}"
     cluster.wait(3.0)
     assert cluster.counts() == {"a": 1, "b": 2}
     assert cluster.told("host_drained") == [

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import threading
 from dataclasses import dataclass
 from types import SimpleNamespace
 
@@ -118,7 +120,7 @@ def test_of_broken_plugins_only_the_one_that_is_meant_is_told():
 @pytest.mark.parametrize(
     ("made", "said"),
     [
-        (None, "made None; an object with `score` is wanted (does it lack a `return`?)"),
+        (None, "made None; an object with `score` is required (does it lack a `return`?)"),
         (SimpleNamespace(scores=1), "which has no `score`; is its `scores` misspelt?"),
         (SimpleNamespace(), "made a SimpleNamespace, which has no `score`"),
     ],
@@ -137,7 +139,7 @@ def test_what_lacks_its_method_is_refused_when_it_is_made(made, said):
     ("reads", "said"),
     [
         (("nmae",), "`reads` has no field 'nmae'; did you mean 'name'? Allowed: name, namespace"),
-        ("name", "`reads` is 'name'; a tuple of field names is wanted"),
+        ("name", "`reads` is 'name'; a tuple of field names is required"),
         (None, "`reads` is None; a tuple"),
     ],
 )
@@ -152,8 +154,8 @@ def test_fields_that_a_spec_lacks_cannot_be_declared(reads, said):
 @pytest.mark.parametrize(
     ("described", "said"),
     [
-        (ResourceDescription("a", None, 1.0), "gives 'a' the unit None; text is wanted"),
-        (ResourceDescription("a", "B", 1.0, None), "gives 'a' the scope None; text is wanted"),
+        (ResourceDescription("a", None, 1.0), "gives 'a' the unit None; text is required"),
+        (ResourceDescription("a", "B", 1.0, None), "gives 'a' the scope None; text is required"),
         (ResourceDescription("Open Files", "1", 1.0), "names a resource 'Open Files'. Allowed"),
         (ResourceDescription("a", "B", "10"), "gives 'a' a capacity of '10'; a number above 0"),
         ("a", "describes a resource by 'a', which is not a ResourceDescription"),
@@ -182,7 +184,7 @@ def test_a_wrong_option_is_refused_with_what_is_allowed():
     )
     with pytest.raises(ConfigError, match=r"options of scoring policy 's': unknown a; allowed: ra"):
         registry.scoring("s", {"a": 1})
-    with pytest.raises(ConfigError, match=r"ratio: float is wanted, not 'x'"):
+    with pytest.raises(ConfigError, match=r"ratio: float is required, not 'x'"):
         registry.scoring("s", {"ratio": "x"})
 
 
@@ -321,8 +323,8 @@ def described(**fields):
         (Probe("b", capacity=float("nan")), "gives 'b' a capacity of nan"),
         (Probe(*(f"r{i}" for i in range(16))), "more than 16"),
         (SimpleNamespace(), "made a SimpleNamespace, which has no `resources`"),
-        (described(unit=None), "gives 'b' the unit None; text is wanted"),
-        (described(scope=None), "gives 'b' the scope None; text is wanted"),
+        (described(unit=None), "gives 'b' the unit None; text is required"),
+        (described(scope=None), "gives 'b' the scope None; text is required"),
         (described(name=3), "names a resource 3"),
         (described(capacity="10"), "gives 'b' a capacity of '10'; a number above 0"),
         (SimpleNamespace(resources=["b"], read=None, close=None), "describes a resource by 'b'"),
@@ -386,6 +388,27 @@ def test_an_ability_that_cannot_be_read_is_the_plugins_fault():
         registry = Registry.of(ours=plugin(register_migration_strategies=[offer]))
         with pytest.raises(PluginError, match=f"its `ability` raised {said}"):
             registry.migrations({"m": {}})
+
+
+def test_a_create_that_hangs_is_ended_and_named(monkeypatch, context):
+    """A probe is left out, and what the master cannot do without is an error; nothing hangs."""
+    monkeypatch.setattr("rosrm.registry.CREATE_LIMIT", 0.05)
+
+    def hangs(*_):
+        threading.Event().wait()
+
+    registry = Registry.of(
+        ours=plugin(
+            register_probes=[ProbeOffer("slow", hangs)],
+            register_scoring_policies=[ScoringOffer("s", hangs)],
+        )
+    )
+    said = r"`create` \(.*\) raised TimeoutError: it did not return within 0.05 s; repair what it "
+    said += r"waits for, or leave '{}' out of the configuration"
+    with pytest.raises(PluginError, match=said.format("s")):
+        registry.scoring("s")
+    absent = registry.probes({"slow": {}}, context).absent["slow"]
+    assert re.search(said.format("slow"), absent)
 
 
 def test_options_that_cannot_be_read_are_the_plugins_fault():

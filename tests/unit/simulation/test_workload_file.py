@@ -100,9 +100,9 @@ def test_variants_say_their_own_word_over_the_settings(load):
     ("text", "place", "said"),
     [
         (BOTH + "host: 3", "3:1", "unknown key 'host'; did you mean 'hosts'?"),
-        ("seed: 1\n" + PROCESS, "1:1", "hosts: a list of at least one host is wanted"),
-        ("hosts: []\n" + PROCESS, "1:8", "hosts: a list of at least one host is wanted"),
-        (HOST, "1:1", "processes: a list of at least one process is wanted"),
+        ("seed: 1\n" + PROCESS, "1:1", "hosts: a list of at least one host is required"),
+        ("hosts: []\n" + PROCESS, "1:8", "hosts: a list of at least one host is required"),
+        (HOST, "1:1", "processes: a list of at least one process is required"),
         (of_process("arrives: -1s"), "2:32", "arrives: '-1s' is not at least 0"),
         (of_process("duration: [9s, 2s]"), "2:33", "the lowest value is above"),
         (of_process("memory: [1MB]"), "2:31", "not one value or [lowest, high"),

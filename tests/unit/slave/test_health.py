@@ -74,7 +74,7 @@ def test_a_slow_topic_is_not_enough() -> None:
     """Four tenths of a hertz where five are wanted; however steady."""
     node = Node()
     verdict = node.goes_on(20.0, rate=0.4)
-    assert verdict.endswith("at least 5 Hz are wanted")
+    assert verdict.endswith("at least 5 Hz are required")
     assert "0.4 Hz" in verdict or "0.2 Hz" in verdict or "0.5 Hz" in verdict
 
 
@@ -154,7 +154,7 @@ def test_another_lifecycle_state_or_no_answer(state, said) -> None:
     assert node.goes_on(0.3, state="active") == ""
     verdict = node.goes_on(5.0, state=state)
     assert verdict.startswith(f"unhealthy: {said}")
-    assert verdict.endswith("the state active is wanted")
+    assert verdict.endswith("the state active is required")
 
 
 def test_all_that_is_amiss_is_said() -> None:

@@ -1,0 +1,39 @@
+"""A time limit for one call of a plugin, by the real-time interval timer of the process."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Callable
+from types import FrameType
+from typing import Final, TypeVar
+
+T = TypeVar("T")
+
+#: Seconds between two alarms, for a plugin that catches the first.
+_AGAIN: Final = 0.05
+
+
+def limited(seconds: float, call: Callable[[], T], late: Callable[[], str]) -> T:
+    """Return the answer of a call; only the main thread has a limit, because signals go there.
+
+    A loop inside C code that never returns to Python cannot be ended so.
+
+    Raises:
+        TimeoutError: the time was up; the text is that of `late`.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return call()
+    running = True
+
+    def expired(_signal: int, _frame: FrameType | None) -> None:
+        if running:  # else the call ended in the very last moment
+            raise TimeoutError(late())
+
+    signal.signal(signal.SIGALRM, expired)
+    signal.setitimer(signal.ITIMER_REAL, seconds, _AGAIN)
+    try:
+        return call()
+    finally:
+        running = False
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
