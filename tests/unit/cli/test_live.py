@@ -9,6 +9,8 @@ from rich.console import Console
 
 from rosrm.cli import live
 from rosrm.core.views import Snapshot
+from tests.unit.core.cluster import Cluster
+from tests.unit.core.cluster import process as core_process
 
 from .conftest import HOSTS, NAN, PROCESSES, event, host, process, resource
 
@@ -79,6 +81,12 @@ def test_reasons_that_are_cut_show_where_they_differ():
 def test_a_reason_gets_the_room_of_empty_columns():
     rows = [process("arm", "set_aside", "", reason=f"no host may take it: {'x' * 40} label a=b")]
     assert f" …{'x' * 40} label a=b\n" in drawn(Snapshot("lab", 1.0, 1, HOSTS, rows))
+
+
+def test_the_master_begins_reasons_as_the_table_knows():
+    cluster = Cluster("a")
+    cluster.submit(core_process("p", required_labels={"gpu": "new"}))
+    assert cluster["p"].reason.startswith(live._BEGINNINGS[cluster.phase("p")])
 
 
 @pytest.mark.parametrize("width", [50, 60, 80, 120])
