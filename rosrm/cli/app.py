@@ -23,10 +23,20 @@ INTERRUPTED = 130
 
 def main() -> None:
     """Run the command line and exit with its code."""
+    _open_closed_streams()
     try:
         _run()
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
+
+
+def _open_closed_streams() -> None:
+    """Connect closed standard streams to /dev/null; else files and sockets take their numbers."""
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            null = os.open(os.devnull, os.O_RDWR)  # the least free number: that of the stream
+            os.set_inheritable(null, True)
+            setattr(sys, name, os.fdopen(null, mode, encoding="utf-8"))
 
 
 def _run() -> None:
@@ -66,10 +76,8 @@ def _leave(code: object) -> None:
     sys.exit(status)
 
 
-def _flush(stream: TextIO | None, status: int) -> bool:
-    """Flush a standard stream, None if it is closed; return False if it cannot be written."""
-    if stream is None:
-        return True
+def _flush(stream: TextIO, status: int) -> bool:
+    """Flush a standard stream; return False if it cannot be written."""
     try:
         stream.flush()
     except OSError as error:
@@ -82,7 +90,6 @@ def _flush(stream: TextIO | None, status: int) -> bool:
 
 def _say(text: str) -> None:
     """Print a line to standard error, if that can be written."""
-    if sys.stderr is not None:
-        with suppress(OSError):
-            sys.stderr.write(f"{text}\n")
-            sys.stderr.flush()
+    with suppress(OSError):
+        sys.stderr.write(f"{text}\n")
+        sys.stderr.flush()

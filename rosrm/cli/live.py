@@ -1,7 +1,8 @@
 """The live table: hosts with their usage against their limits, processes, queue, newest events.
 
 A pure function of a `Snapshot` and the width: `rosrm top` and `make demo` show it. Where room is
-short, the reasons shrink first, then bars, then columns leave; names stay whole.
+short, the reasons shrink first, then bars, then columns leave; names stay whole. A reason that is
+too long loses the beginning that others share, and then its end.
 """
 
 from __future__ import annotations
@@ -9,7 +10,8 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import takewhile
 from typing import Any, Final
 
 from rich.cells import cell_len
@@ -19,6 +21,8 @@ from rich.text import Text
 from rosrm.cli import formats, tables
 from rosrm.core.views import HostRow, ProcessRow, ResourceRow, Snapshot
 
+#: Most processes in a picture, if the height of the terminal does not say so.
+ROWS: Final = 18
 _BAR: Final = 14
 _LEAST_BAR: Final = 4
 #: Width of the percentage beside a bar: " 100%".
@@ -50,6 +54,8 @@ _ORDER: Final = (
     "cancelled",
     "finished",
 )
+#: How the reason for a state always begins: the state has said so.
+_BEGINNINGS: Final = {"set_aside": "no host may take it: "}
 _OVER: Final = ("failed", "cancelled", "finished")
 #: Columns of the processes that leave where room is short, the first one first.
 _LEAVE: Final = ("MEMORY", "CPU", "SINCE", "HOST")
@@ -86,7 +92,7 @@ class Picture:
 
 
 def render(
-    snapshot: Snapshot, *, rows: int = 18, events: int = 4, note: str = "", sort: str = "state",
+    snapshot: Snapshot, *, rows: int = ROWS, events: int = 4, note: str = "", sort: str = "state",
     foot: str = "",
 ) -> RenderableType:  # fmt: skip
     """Return the picture of a snapshot.
@@ -217,14 +223,48 @@ def _processes(
         "CPU": [tables.age(row, f"{row.cpu:.2f}" if row.pid else "") for row in shown],
         "MEMORY": [tables.age(row, formats.size(row.memory) if row.pid else "") for row in shown],
     }
-    reasons = [Text(" ".join(tables.why(row).split()), "dim") for row in shown]
-    wanted = min(_LEAST_REASON, max(reason.cell_len for reason in reasons))
-    leaving = iter(_LEAVE)
-    while width - _total(cells) - _GAP < wanted and (column := next(leaving, "")):
-        del cells[column]
+    longest = max(cell_len(_why(row)) for row in shown)
+    for column in _LEAVE:
+        wanted = min(_LEAST_REASON, longest) if any(cells[column]) else longest
+        if width - _total(cells) - _GAP < wanted:
+            del cells[column]
+    room = max(0, width - _total(cells) - _GAP)
+    reasons = [Text(why, "dim") for why in _reasons(shown, room)]
     yield from _lines({**cells, "WHY": reasons}, width, _RIGHT)
     if len(processes) > len(shown):
         yield Text(f"and {len(processes) - len(shown)} more", "dim")
+
+
+def _why(row: ProcessRow) -> str:
+    return " ".join(tables.why(row).split())
+
+
+def _reasons(rows: Sequence[ProcessRow], room: int) -> list[str]:
+    """Return why each process is in its state, in what differs where a reason exceeds the room."""
+    known = {row.reason for row in rows if cell_len(_why(row)) > room}
+    return [
+        _why(replace(row, reason=_without_beginning(row, known, room)))
+        if row.reason in known
+        else _why(row)
+        for row in rows
+    ]
+
+
+def _without_beginning(row: ProcessRow, reasons: set[str], room: int) -> str:
+    """Return a reason from a word on that is in sight where it differs from the other reasons."""
+    shared = max((_alike(row.reason, other) for other in reasons - {row.reason}), default=0)
+    said = _BEGINNINGS.get(row.state, "")
+    begin = len(said) if said and row.reason.startswith(said) else 0
+    if shared > max(begin, room // 2):
+        enough = max(0, len(row.reason) - room)  # from there on all of the rest has room
+        begin = max(begin, row.reason.find(" ", min(shared - 1, enough)) + 1)
+    return f"…{row.reason[begin:]}" if begin else row.reason
+
+
+def _alike(one: str, other: str) -> int:
+    """Return the length of the words with which two texts begin."""
+    letters = takewhile(bool, map(str.__eq__, one, other))
+    return one.rfind(" ", 0, len(list(letters))) + 1
 
 
 # --- columns ----------------------------------------------------------------------------------

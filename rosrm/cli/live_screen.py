@@ -62,7 +62,8 @@ def show(look: Callable[[], Snapshot], period: float, count: int, sort: str) -> 
         return
     snapshot, note = look(), ""
     for shown in itertools.count(1):
-        console.print(live.render(snapshot, note=note, sort=sort))
+        rows = live.ROWS if console.is_terminal else len(snapshot.processes)
+        console.print(live.render(snapshot, rows=rows, note=note, sort=sort))
         if shown == count:
             return
         time.sleep(period)

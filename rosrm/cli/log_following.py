@@ -6,16 +6,18 @@ The numbers of instances ascend over all hosts, so that they order what a proces
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from heapq import merge
+from operator import itemgetter
 from typing import TYPE_CHECKING, Final
 
 import typer
 
 from rosrm.cli import formats
-from rosrm.cli.log_writing import Stream
+from rosrm.cli.log_writing import Piece, Stream, show
 from rosrm.config.units import Quantity
-from rosrm.errors import ConfigError, Refused, RosrmError
+from rosrm.errors import ConfigError, NoMaster, Refused, RosrmError
 from rosrm.spelling import standing
 
 if TYPE_CHECKING:
@@ -58,69 +60,93 @@ def since_of(text: str) -> float:
 
 
 def copy_logs(client: MasterClient, streams: Sequence[Stream], wanted: Wanted) -> None:
-    """Copy the logs of processes to standard output, one after the other, and follow all of them.
+    """Copy the logs of processes to standard output by the times of their lines; follow all.
 
-    A log that comes out of reach is reported at once, and the others are followed further.
+    A log that is out of reach is reported at once, and the others are copied.
 
     Raises:
-        RosrmError: there is no log of one, or its newest part is out of reach.
+        typer.Exit: one of them could not be copied.
     """
-    copies: list[_Copy] = []
-    troubles: list[RosrmError] = []
-    exit_code = 0
-    for stream in streams:
-        copy = _Copy(client, stream, wanted)
-        try:
-            copy.begin()
-            copies.append(copy)
-        except RosrmError as error:
-            troubles.append(error)
-        if not wanted.follow:
-            stream.close()
-    while wanted.follow and copies:
-        news = []
+    silent: dict[str, str] = {}
+    copies = [_Copy(client, stream, wanted, silent) for stream in streams]
+    # `merge` takes the least of the next pieces: one without a time follows the one before it.
+    show(merge(*map(_begin, copies), key=itemgetter(0)))
+    if wanted.follow:
+        _follow([copy for copy in copies if not copy.over])
+    if exit_code := max(copy.exit_code for copy in copies):
+        raise typer.Exit(exit_code)
+
+
+def _begin(copy: _Copy) -> Iterator[Piece]:
+    """Read what there is, in pieces."""
+    try:
+        for _ in copy.begin():
+            yield from copy.stream.take()
+    except RosrmError as error:
+        copy.fail(error)
+    if copy.over or not copy.wanted.follow:
+        copy.stream.close()
+    yield from copy.stream.take()
+
+
+def _follow(copies: Sequence[_Copy]) -> None:
+    """Copy what is new until all processes have ended."""
+    while copies:
+        news = False
         for copy in copies:
             try:
-                news.append(copy.look())
+                news = copy.look() or news
             except RosrmError as error:
-                copy.over, exit_code = True, error.exit_code
+                copy.fail(error)
+            if copy.over:
                 copy.stream.close()
-                typer.echo(f"rosrm: {copy.stream.name}: {error}", err=True)
+            show(copy.stream.take())
         copies = [copy for copy in copies if not copy.over]
-        if copies and not any(news):
+        if copies and not news:
             time.sleep(PERIOD)
-    for stream in streams:
-        stream.close()
-    for trouble in troubles[:-1]:
-        typer.echo(f"rosrm: {trouble}", err=True)
-    if troubles:
-        raise troubles[-1]
-    if exit_code:
-        raise typer.Exit(exit_code)
 
 
 @dataclass
 class _Copy:
-    """The copy of the logs of one process."""
+    """The copy of the logs of one process.
+
+    Attributes:
+        client: asks master and slaves.
+        stream: takes the bytes.
+        wanted: options of the command.
+        silent: hosts that did not answer, with the error; shared, so that each is asked once.
+        over: nothing more comes.
+        exit_code: of the error that ended the copy; 0: none.
+    """
 
     client: MasterClient
     stream: Stream
     wanted: Wanted
+    silent: dict[str, str]
     over: bool = False
+    exit_code: int = 0
     _host: str = ""
     _number: int = 0
     _offset: int = 0
     _started: bool = False
     _away: dict[str, str] = field(default_factory=dict)
 
-    def begin(self) -> None:
-        """Copy what there is; raises `RosrmError`."""
+    def fail(self, error: RosrmError) -> None:
+        """Report that the log cannot be read any further."""
+        self.over, self.exit_code = True, error.exit_code
+        typer.echo(f"rosrm: {error}", err=True)
+
+    def begin(self) -> Iterator[None]:
+        """Copy what there is, one part at each step; raises `RosrmError`."""
         found = self._find()
         for host, number, tail in self._chosen(found):
             part = self._read(host, number, 0, tail=tail, since=self.wanted.since)
             self._started = self._started or any(pid for _, _, pid in part.marks)
             self._take(host, part)
-            self._rest()
+            yield
+            while (part := self._read(host, number, self._offset)).content:
+                self._take(host, part)
+                yield
         if not self.stream.wrote:
             self._explain_nothing(found)
 
@@ -156,16 +182,19 @@ class _Copy:
             part = self._read(host, number, part.next_offset)
         return lines + (last != b"\n")
 
-    def _rest(self) -> None:
-        """Copy what follows the newest part, up to the end of its instance."""
-        while (part := self._read(self._host, self._number, self._offset)).content:
-            self._take(self._host, part)
-
     def _read(
-        self, host: str, number: int, offset: int, *, tail: int = 0, since: float = 0.0
-    ) -> LogPart:
-        name = self.stream.name
-        return self.client.read_log(host, name, number, offset, _CHUNK, tail=tail, since=since)
+        self, host: str, number: int, offset: int, most: int = 0, *, tail: int = 0,
+        since: float = 0.0,
+    ) -> LogPart:  # fmt: skip
+        name, most = self.stream.name, most or _CHUNK
+        if host not in self.silent:
+            try:
+                return self.client.read_log(
+                    host, name, number, offset, most, tail=tail, since=since
+                )
+            except NoMaster as error:
+                self.silent[host] = str(error)
+        raise NoMaster(f"{name}: {self.silent[host]}")
 
     def _take(self, host: str, part: LogPart) -> None:
         new = (host, part.number) != (self._host, self._number)
@@ -173,9 +202,7 @@ class _Copy:
         expected = (0 if whole else part.offset) if new else self._offset
         if new:
             self.stream.enter(host)
-        if part.offset > expected:
-            self.stream.say(f"{formats.size(part.offset - expected)} before this were dropped")
-        self.stream.write(part.content, part.offset, part.marks)
+        self.stream.write(part.content, part.offset, part.marks, part.offset - expected)
         self._host, self._number, self._offset = host, part.number, part.next_offset
 
     # --- where -------------------------------------------------------------------------------
@@ -190,25 +217,32 @@ class _Copy:
             names = list(dict.fromkeys([*here, *(host for host in events if host)]))
         if not names and row is None:
             raise Refused(f"there is no process {name!r}; `rosrm ps --all` lists them")
-        found = []
-        for host in names:
-            away = _why_away(hosts.get(host), host)
-            if away:
-                self._away[host] = away
-                continue
-            try:
-                part = self.client.read_log(host, name, 0, 0, 1)
-            except Refused as refusal:
-                if refusal.code != "unknown":
-                    raise
-                continue
-            found += [(host, number) for number in part.numbers or (part.number,)]
         owner = row.host if row is not None and not self.wanted.host else self.wanted.host
+        self._away = {host: away for host in names if (away := _why_away(hosts.get(host), host))}
         if owner in self._away:
             self._refuse(row, owner)
+        found = []
+        for host in names:
+            if host not in self._away:
+                found += [(host, number) for number in self._numbers(host, owner)]
         for away in self._away.values():
             typer.echo(f"rosrm: {name}: part of its log cannot be read: {away}", err=True)
         return sorted(found, key=lambda one: one[1])
+
+    def _numbers(self, host: str, owner: str) -> Sequence[int]:
+        """Return the numbers of the instances whose logs a host holds."""
+        try:
+            part = self._read(host, 0, 0, 1)
+        except Refused as refusal:
+            if refusal.code != "unknown":
+                raise
+            return ()
+        except NoMaster:
+            if host == owner:
+                raise
+            self._away[host] = self.silent[host]
+            return ()
+        return part.numbers or (part.number,)
 
     def _ask(self) -> tuple[str, ProcessRow | None, dict[str, HostRow], list[str]]:
         name = self.stream.name

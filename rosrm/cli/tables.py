@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Sequence
 from typing import Final
 
@@ -14,8 +15,8 @@ from rosrm.cli import formats
 from rosrm.core.views import EventRow, HostRow, PluginRow, ProcessRow, ResourceRow
 from rosrm.spelling import counted, standing
 
-#: Width of tables that go into a file or pipe, where nobody minds a long line.
-_PIPE_WIDTH: Final = 160
+#: Width of tables that go into a file or pipe: no line there is cut or wrapped.
+_PIPE_WIDTH: Final = 100_000
 
 #: How a state looks; others are plain.
 STYLES: Final = {
@@ -41,9 +42,11 @@ STYLES: Final = {
 
 
 def console() -> Console:
-    """Where tables go: as wide as the terminal, else wide enough not to be cut."""
+    """Where tables go: as wide as the terminal or COLUMNS says, else wide enough not to be cut."""
     output = Console(highlight=False)
-    return output if output.is_terminal else Console(highlight=False, width=_PIPE_WIDTH)
+    if output.is_terminal or os.environ.get("COLUMNS", "").strip("0").isdigit():
+        return output
+    return Console(highlight=False, width=_PIPE_WIDTH)
 
 
 def table(*columns: str, right: Sequence[str] = ()) -> Table:

@@ -95,7 +95,8 @@ def _read(
     last = segments[-1].end
     offset = min(_start(segments, query), last)
     found = next((one for one in segments if one.end > offset), segments[-1])
-    offset = max(offset, found.begin)
+    if offset < found.begin:
+        offset = _whole_line(found)
     with found.path.open("rb") as log:
         log.seek(offset - found.begin)
         content = log.read(min(query.max_bytes or _MOST, _MOST))
@@ -111,6 +112,20 @@ def _start(segments: Sequence[_Segment], query: LogQuery) -> int:
     if query.since:
         return _written_since(segments, query.since)
     return query.offset
+
+
+def _whole_line(segment: _Segment) -> int:
+    """Return where the first whole line of a file begins, if what lies before it was dropped.
+
+    A line that is the only one stays, whole or not.
+    """
+    with log_index.Index(str(segment.path)) as index:
+        first = index.marks(0, 2)  # of the file, and of a program that was started there
+    if segment.begin == 0 or any(mark.pid and mark.offset == segment.begin for mark in first):
+        return segment.begin
+    with segment.path.open("rb") as log:
+        end = log.read(_BLOCK).find(b"\n") + 1
+    return segment.begin + (end if segment.begin + end < segment.end else 0)
 
 
 def _before_lines(segments: Sequence[_Segment], lines: int) -> int:
@@ -130,7 +145,7 @@ def _before_lines(segments: Sequence[_Segment], lines: int) -> int:
                     if wanted == 0:
                         return segment.begin + begin + at + 1
                 end = begin
-    return segments[0].begin
+    return _whole_line(segments[0])
 
 
 def _written_since(segments: Sequence[_Segment], since: float) -> int:
@@ -138,8 +153,10 @@ def _written_since(segments: Sequence[_Segment], since: float) -> int:
     for segment in segments:
         with log_index.Index(str(segment.path)) as index:
             late = index.find(lambda mark: mark.time >= since)
+            if 0 < late < index.count:
+                return index.mark(late - 1).offset
             if late < index.count:
-                return index.mark(late - 1).offset if late else segment.begin
+                return _whole_line(segment) if segment is segments[0] else segment.begin
     # The last look at a log that grows may be older than its newest bytes.
     with log_index.Index(str(segments[-1].path)) as index:
         return index.mark(index.count - 1).offset if index.count else segments[-1].begin
@@ -160,7 +177,7 @@ def _marks(
         first = index.find(lambda mark: mark.offset >= begin)
         last = index.find(lambda mark: mark.offset >= end)
         found = index.marks(first, min(last + 1 - first, _MOST_MARKS))
-    if len(found) == _MOST_MARKS and found[-1].offset > begin:
+    if len(found) == _MOST_MARKS:
         return list(found), min(end, found[-1].offset)
     if now and (not found or found[-1].offset < end):
         found.append(log_index.Mark(time.time(), end, 0))

@@ -37,11 +37,16 @@ def path_of(log: str) -> str:
 
 
 def add(log: str, mark: Mark) -> None:
-    """Append a record."""
-    flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC
+    """Append a record; a start replaces the one before it if nothing was written in between."""
+    flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC
     index = os.open(path_of(log), flags, 0o600)
     try:
-        os.write(index, _RECORD.pack(*mark))
+        end = os.fstat(index).st_size // _RECORD.size * _RECORD.size
+        if mark.pid and end:
+            before = Mark(*_RECORD.unpack(os.pread(index, _RECORD.size, end - _RECORD.size)))
+            if before.pid and before.offset == mark.offset:
+                end -= _RECORD.size
+        os.pwrite(index, _RECORD.pack(*mark), end)
     finally:
         os.close(index)
 

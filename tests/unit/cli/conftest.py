@@ -191,7 +191,7 @@ def client(monkeypatch):
 def rosrm():
     """Run one command line; both streams and the exit code come back."""
 
-    def run(*words, columns="80"):
+    def run(*words, columns=None):
         runner = CliRunner(env={"COLUMNS": columns, "NO_COLOR": "1", "TERM": "dumb"})
         result = runner.invoke(app, [str(word) for word in words], prog_name="rosrm")
         return SimpleNamespace(code=result.exit_code, out=result.stdout, err=result.stderr)

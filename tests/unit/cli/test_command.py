@@ -134,7 +134,7 @@ def test_output_that_cannot_be_written_gives_no_traceback(command, output, ros):
         "@commands.app.command()\n"
         "def show(): tables.show('some')\n"
         "@commands.app.command()\n"
-        "def write(): sys.stdout and sys.stdout.write('some')\n"
+        "def write(): sys.stdout.write('some')\n"
         f"if {ros}: sys.modules['rclpy'] = types.ModuleType('rclpy')\n"
         f"sys.argv = ['rosrm', {command!r}]\n"
         "from rosrm.cli.app import main\n"
@@ -154,3 +154,54 @@ def test_output_that_cannot_be_written_gives_no_traceback(command, output, ros):
     assert done.returncode == (0 if output == "closed" else 1), lines
     assert len(lines) == (1 if output == "full disk" else 0), lines
     assert all("No space left on device" in line for line in lines)
+
+
+ASKING = """
+import sys
+from rosrm.cli import connection
+from rosrm.ros.client import LogPart
+from tests.unit.cli.conftest import FakeClient
+client = FakeClient()
+client.read_log = lambda host, name, number, offset, *more, **rest: LogPart(
+    1, (1,), b"" if offset else b"hello", offset, 5, True, ())
+connection.connect = lambda settings: client
+sys.argv = ["rosrm", *sys.argv[1:]]
+from rosrm.cli.app import main
+main()
+"""
+
+
+@pytest.mark.parametrize(
+    ("words", "closed", "code"),
+    [
+        ("ps", ">&-", 0), ("logs talker", ">&-", 0), ("top -n1", ">&-", 0),
+        ("ps --host x", "2>&-", 1), ("logs talker", "<&- >&- 2>&-", 0),
+    ],
+)  # fmt: skip
+def test_a_command_whose_standard_streams_are_closed_ends_without_a_traceback(words, closed, code):
+    """What a closed stream would have had is lost; the exit code is as ever."""
+    command = [sys.executable, "-c", ASKING, *words.split(), "--domain", "0"]
+    done = subprocess.run(
+        ["sh", "-c", f'exec "$0" "$@" {closed}', *command], capture_output=True, text=True,
+        check=False, cwd=Path(__file__).parents[3], timeout=60,
+    )  # fmt: skip
+    assert (done.returncode, done.stdout, done.stderr) == (code, "", "")
+
+
+def test_no_file_takes_the_number_of_a_closed_standard_stream():
+    """What a library writes to standard output goes nowhere, and not into that file."""
+    code = (
+        "import os, sys\n"
+        "from rosrm.cli import commands\n"
+        "@commands.app.command()\n"
+        "def show():\n"
+        "    file = os.open(os.devnull, os.O_RDONLY)\n"
+        "    assert file > 2\n"
+        "    assert all(os.get_inheritable(stream) for stream in range(3))\n"
+        "sys.argv = ['rosrm', 'show']\n"
+        "from rosrm.cli.app import main\n"
+        "main()\n"
+    )
+    words = ["sh", "-c", 'exec "$0" "$@" <&- >&-', sys.executable, "-c", code]
+    done = subprocess.run(words, stderr=subprocess.PIPE, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")

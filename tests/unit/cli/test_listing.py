@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from dataclasses import replace
 
 import pytest
 
@@ -343,32 +344,30 @@ def test_explain_of_a_process_without_a_decision(rosrm, client, monkeypatch):
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize("command", ["status", "ps", "hosts", "plugins"])
-def test_tables_keep_to_80_columns_on_a_terminal(client, command, monkeypatch):
-    from io import StringIO
+PIPED = ("ps", "hosts", "plugins", "status", "top -n 1")
 
-    from rich.console import Console
 
-    from rosrm.cli import tables
+@pytest.mark.parametrize("words", PIPED)
+def test_what_is_piped_is_neither_cut_nor_wrapped(rosrm, client, words):
+    reason = "because " * 90 + "of this."
+    client.processes = [process(f"p{number}", reason=reason) for number in range(30)]
+    client.plugins = [replace(PLUGINS[0], reason=reason)]
+    out = rosrm(*words.split()).out
+    assert "…" not in out
+    wanted = {"ps": 30, "top -n 1": 30, "plugins": 1}.get(words, 0)
+    assert len([line for line in out.splitlines() if line.endswith(reason)]) == wanted
 
+
+@pytest.mark.parametrize("words", PIPED)
+def test_what_is_piped_obeys_columns(rosrm, client, words):
+    """Tables are wrapped as in a terminal of that width, and not cut."""
     client.processes = [process("a_process_with_quite_a_long_name", reason="because " * 12)]
     client.hosts = [
         host("robot-with-a-long-name", resources=[resource(n) for n in ("memory", "cpu", "disk")])
     ]
-    output = StringIO()
-    monkeypatch.setattr(
-        tables, "console", lambda: Console(file=output, width=80, force_terminal=False)
-    )
-    from typer.testing import CliRunner
-
-    from rosrm.cli.commands import app
-
-    CliRunner().invoke(app, [command])
-    lines = output.getvalue().splitlines()
-    assert lines
-    assert all(len(line.rstrip()) <= 80 for line in lines)
-    text = "".join(line.strip() for line in lines)
-    assert "…" not in text
+    out = rosrm(*words.split(), columns="80").out
+    assert 0 < max(map(len, out.splitlines())) <= 80
+    assert ("…" in out) == ("top" in words)
 
 
 def test_top_shows_pictures_and_ends(rosrm, client, monkeypatch):

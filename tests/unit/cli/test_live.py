@@ -9,6 +9,8 @@ from rich.console import Console
 
 from rosrm.cli import live
 from rosrm.core.views import Snapshot
+from tests.unit.core.cluster import Cluster
+from tests.unit.core.cluster import process as core_process
 
 from .conftest import HOSTS, NAN, PROCESSES, event, host, process, resource
 
@@ -57,6 +59,34 @@ def test_a_long_reason_is_cut_and_names_stay_whole(width):
         assert state in line
     (moving,) = [line for line in lines if line.startswith("mapkeeper ")]
     assert "to shelf: no host" in moving
+
+
+def test_reasons_that_are_cut_show_where_they_differ():
+    """The beginning that they share, or that the state says already, makes room for the rest."""
+    lacks = "no host may take it: shelf: it lacks the label"
+    rows = [
+        process("camera_driver_front", reason="restarted 3 times after exit code 1"),
+        process("camera_driver_rear", "set_aside", "", reason=f"{lacks} camera=rear"),
+        process("planner", "set_aside", "", reason=f"{lacks} gpu=true; desk: it lacks it too"),
+        process("arm", "set_aside", "", reason="no host may take it: shelf: it has no gpu; " * 4),
+    ]
+    lines = drawn(Snapshot("lab", 1.0, 1, HOSTS, rows)).splitlines()
+    shown = {line.split()[0]: line for line in lines if line}
+    assert shown["camera_driver_front"].endswith(" restarted 3 times after exi…")
+    assert shown["camera_driver_rear"].endswith(" …lacks the label camera=rear")
+    assert shown["planner"].endswith(" …gpu=true; desk: it lacks i…")
+    assert shown["arm"].endswith(" …has no gpu; no host may ta…")
+
+
+def test_a_reason_gets_the_room_of_empty_columns():
+    rows = [process("arm", "set_aside", "", reason=f"no host may take it: {'x' * 40} label a=b")]
+    assert f" …{'x' * 40} label a=b\n" in drawn(Snapshot("lab", 1.0, 1, HOSTS, rows))
+
+
+def test_the_master_begins_reasons_as_the_table_knows():
+    cluster = Cluster("a")
+    cluster.submit(core_process("p", required_labels={"gpu": "new"}))
+    assert cluster["p"].reason.startswith(live._BEGINNINGS[cluster.phase("p")])
 
 
 @pytest.mark.parametrize("width", [50, 60, 80, 120])

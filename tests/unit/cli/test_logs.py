@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 import time
 from datetime import datetime
+from io import StringIO
 
 import pytest
 
@@ -107,7 +108,7 @@ def test_what_was_dropped_is_said_with_its_size(rosrm, client, slaves):
     slaves.rotate("alpha", 1, keep=1, most=5)
     slaves.write("alpha", 1, b"new\n")
     out = rosrm("logs", "talker").out
-    assert out == "--- talker: 3.0 kB before this were dropped ---\nkept\nnew\n"
+    assert out == "--- 3.0 kB before this were dropped ---\nkept\nnew\n"
 
 
 def test_restarts_and_former_instances_stand_apart(rosrm, client, slaves):
@@ -120,7 +121,7 @@ def test_restarts_and_former_instances_stand_apart(rosrm, client, slaves):
     out = rosrm("logs", "talker").out
     out, marks = re.subn(r" at 2023-11-1.T..:..:..\.. ---", "", out)
     assert marks == 2
-    again = "--- talker: started on alpha\n"
+    again = "--- started on alpha\n"
     assert out == f"on beta\n{again}oh no\n{again}oh no\n"
     assert rosrm("logs", "talker", "--host", "beta").out == "on beta\n"
 
@@ -163,18 +164,51 @@ def test_since_begins_at_a_time(rosrm, client, slaves):
     assert (result.code, "e.g. 10min" in result.err) == (2, True)
 
 
-def test_lines_have_times_and_names(rosrm, client, slaves):
-    """Each line has the time by which it was written; with several names each has its process."""
+def test_lines_have_times(rosrm, client, slaves):
+    """Each line has the time by which it was written."""
     slaves.write("alpha", 1, b"one\ntwo\n")
     slaves.write("alpha", 1, b"three", at=NOON + 5.25)
     lines = rosrm("logs", "talker", "-t").out.splitlines()
     assert [line.split(" ", 1)[1] for line in lines] == ["one", "two", "three"]
     times = [datetime.fromisoformat(line.split()[0]).timestamp() for line in lines]
     assert times == pytest.approx([NOON, NOON, NOON + 5.2])
-    client.processes = [*client.processes, process("ear")]
-    slaves.write("alpha", 2, b"heard\n", "ear")
-    out = rosrm("logs", "talker", "ear").out
-    assert out == "talker | one\ntalker | two\ntalker | three\near    | heard\n"
+
+
+def test_several_logs_are_merged_by_time(rosrm, client, slaves, monkeypatch):
+    """Each line has its process, also the line before each start, the first one included."""
+    monkeypatch.setattr("rosrm.cli.log_following._CHUNK", 5)
+    client.processes = [process("talker"), process("ear", host="beta", number=2)]
+    slaves.write("alpha", 1, b"one\ntwo\n", at=NOON + 1)
+    slaves.write("beta", 2, b"a\n", "ear", at=NOON)
+    slaves.write("beta", 2, b"b\n", "ear", at=NOON + 2)
+    slaves.write("alpha", 1, b"three", at=NOON + 3)
+    slaves.start("alpha", 1, at=NOON + 4)
+    slaves.write("alpha", 1, b"four\n", at=NOON + 5)
+    slaves.write("beta", 2, b"c\n", "ear", at=NOON + 6)
+    out = re.sub(r" at 20.*", "", rosrm("logs", "talker", "ear").out)
+    assert out.splitlines() == [
+        "ear    | --- started on beta", "ear    | a",
+        "talker | --- started on alpha", "talker | one", "talker | two",
+        "ear    | b",
+        "talker | three", "talker | --- started on alpha", "talker | four",
+        "ear    | c",
+    ]  # fmt: skip
+
+
+def test_lines_without_a_time_stay_where_they_are_in_their_log(rosrm, client, slaves):
+    """An earlier instance may be from before there were times."""
+    client.processes = [process("talker"), process("ear")]
+    slaves.write("alpha", 1, b"one\n")
+    slaves.path("alpha", 2).write_bytes(b"two\n")
+    slaves.path("alpha", 2).with_name("talker.2.log.1").write_bytes(b"old\n")
+    slaves.write("alpha", 3, b"three\n", at=NOON + 2)
+    slaves.write("alpha", 4, b"a\nb\n", "ear", at=NOON + 1)
+    lines = rosrm("logs", "talker", "ear").out.splitlines()
+    assert [line for line in lines if "---" not in line] == [
+        "talker | one", "talker | old",
+        "ear    | a", "ear    | b",
+        "talker | two", "talker | three",
+    ]  # fmt: skip
 
 
 # --- nothing ----------------------------------------------------------------------------------
@@ -235,8 +269,55 @@ def test_one_name_that_fails_does_not_keep_the_others(rosrm, client, slaves):
     slaves.write("alpha", 1, b"one\n")
     result = rosrm("logs", "nobody", "talker")
     assert result.code == 1
-    assert result.out == "talker | one\n"
+    assert result.out.endswith("\ntalker | one\n")
     assert "there is no process 'nobody'" in result.err
+
+
+def test_a_host_that_does_not_answer_is_asked_once(rosrm, client, slaves):
+    """Report each log that is there alone, and show those of other hosts at once."""
+    client.processes = [process(name, host="alpha") for name in ("one", "two")]
+    client.processes.append(process("ear", host="beta", number=3))
+    client.events = [event(1, process="ear", host="alpha")]
+    slaves.write("beta", 3, b"heard\n", "ear")
+    there = client.read_log
+
+    def read(on, *query, **more):
+        if on == "alpha":
+            client.asked.append("alpha")
+            raise NoMaster("no slave answers on alpha")
+        return there(on, *query, **more)
+
+    client.read_log = read
+    result = rosrm("logs", "one", "two", "ear")
+    assert client.asked.count("alpha") == 1
+    assert result.out.endswith("\near | heard\n")
+    assert (result.code, result.err.splitlines()) == (3, [
+        "rosrm: one: no slave answers on alpha",
+        "rosrm: two: no slave answers on alpha",
+        "rosrm: ear: part of its log cannot be read: no slave answers on alpha",
+    ])  # fmt: skip
+
+
+def test_a_lost_host_holds_up_no_other_log(rosrm, client, slaves, monkeypatch):
+    """With -f too: the report comes before the other logs are followed."""
+    client.hosts = [host("alpha", "lost"), host("beta")]
+    client.processes = [process("talker", "unreachable"), process("ear", host="beta", number=2)]
+    slaves.write("beta", 2, b"heard\n", "ear")
+    slaves.live.add(("beta", 2))
+    reported = []
+
+    def later(seconds):
+        reported.append(capture.getvalue())
+        slaves.live.clear()
+        client.processes = [process("ear", "finished")]
+
+    capture = StringIO()
+    monkeypatch.setattr(log_following.typer, "echo", lambda text, err: capture.write(text))
+    monkeypatch.setattr(log_following.time, "sleep", later)
+    result = rosrm("logs", "talker", "ear", "-f")
+    assert (result.code, result.out.splitlines()[1:]) == (1, ["ear    | heard"])
+    assert "the log of talker is on alpha, and alpha is lost" in reported[0]
+    assert ("read_log", "alpha") not in client.asked
 
 
 # --- on and on --------------------------------------------------------------------------------
@@ -277,7 +358,7 @@ def test_follow_continues_where_the_process_moves_to(rosrm, client, slaves, monk
     assert result.code == 0
     first, mark, last = result.out.splitlines()
     assert (first, last) == ("on alpha", "on beta")
-    assert mark.startswith("--- talker: started on beta at ")
+    assert mark.startswith("--- started on beta at ")
 
 
 def test_follow_waits_for_a_log_that_its_host_is_about_to_begin(rosrm, client, slaves, monkeypatch):
@@ -316,7 +397,9 @@ def test_several_are_followed_at_once(rosrm, client, slaves, monkeypatch):
 
     monkeypatch.setattr(log_following.time, "sleep", later)
     lines = rosrm("logs", "talker", "ear", "-f").out.splitlines()
-    assert lines == ["talker | one", "ear    | a", "talker | two", "ear    | b"]
+    assert [line for line in lines if "---" not in line] == [
+        "talker | one", "ear    | a", "talker | two", "ear    | b",
+    ]  # fmt: skip
 
 
 def test_a_host_that_is_lost_ends_only_its_own_log(rosrm, client, slaves, monkeypatch):
@@ -343,5 +426,7 @@ def test_a_host_that_is_lost_ends_only_its_own_log(rosrm, client, slaves, monkey
 
     monkeypatch.setattr(log_following.time, "sleep", lose)
     result = rosrm("logs", "talker", "ear", "-f")
-    assert result.out.splitlines() == ["ear    | a", "talker | half", "ear    | b"]
+    assert [line for line in result.out.splitlines() if "---" not in line] == [
+        "ear    | a", "talker | half", "ear    | b",
+    ]  # fmt: skip
     assert (result.code, result.err) == (3, "rosrm: talker: no slave answers on alpha\n")

@@ -146,13 +146,46 @@ def test_marks_cover_a_part(tmp_path, log) -> None:
     assert [mark[1] for mark in read(tmp_path, 2, 2).marks] == [4]
 
 
-def test_a_loop_of_crashes_without_output_is_read_to_its_end(tmp_path, log, monkeypatch) -> None:
-    """More starts at one place than fit into an answer do not keep the reader there."""
+def test_an_answer_with_many_marks_ends_sooner(tmp_path, log, monkeypatch) -> None:
+    """The next one continues there."""
     monkeypatch.setattr(log_reading, "_MOST_MARKS", 5)
     log_index.begin(str(log), Mark(10.0, 0, 1))
-    for pid in range(2, 20):
-        log_index.add(str(log), Mark(10.0, 0, pid))
-    assert everything(tmp_path)[0] == b"0123456789"
+    for offset in range(1, 11):
+        log_index.add(str(log), Mark(10.0, offset, 0))
+    assert read(tmp_path).next_offset == 4
+    assert everything(tmp_path) == (b"0123456789", [])
+
+
+DROPPED = [
+    ({}, b"whole\nend"), ({"tail": 9}, b"whole\nend"), ({"since": 5.0}, b"whole\nend"),
+    ({"tail": 1}, b"end"), ({"offset": 9}, b"alf\nwhole\nend"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("query", "content"), DROPPED)
+def test_what_follows_dropped_bytes_begins_with_a_whole_line(tmp_path, log, query, content) -> None:
+    """The rest of a line counts as dropped, except for a reader that has read its beginning."""
+    log.write_bytes(b"dropped\nhalf\nwhole\nend")
+    log_index.begin(str(log), Mark(10.0, 0, 0))
+    log_index.add(str(log), Mark(11.0, 22, 0))
+    rotate(str(log), 22, LogLimits(max_bytes=13, keep=1))
+    part = read(tmp_path, **query)
+    assert (part.content, part.offset) == (content, 22 - len(content))
+
+
+@pytest.mark.parametrize("content", [b"only a line\n", b"no line"])
+def test_the_only_line_after_dropped_bytes_stays(tmp_path, log, content) -> None:
+    rotate(str(log), 10, LogLimits(keep=0))
+    log.write_bytes(content)
+    assert everything(tmp_path) == (content, [(0, 10)])
+
+
+def test_what_a_program_wrote_first_after_dropped_bytes_stays(tmp_path, log) -> None:
+    """A start begins a line."""
+    rotate(str(log), 10, LogLimits(keep=0))
+    log_index.add(str(log), Mark(4e9, 10, 7))
+    log.write_bytes(b"first\nsecond\n")
+    assert everything(tmp_path) == (b"first\nsecond\n", [(0, 10)])
 
 
 def test_one_answer_is_bounded(tmp_path, log) -> None:
@@ -264,3 +297,17 @@ def test_an_index_is_bounded_like_its_log(tmp_path, keeper) -> None:
         files = log_path(tmp_path, P).parent.glob("*.times*")
         assert all(file.stat().st_size <= 100 + 24 for file in files)
     assert everything(tmp_path)[0] == b"." * 6
+
+
+def test_a_loop_of_crashes_without_output_does_not_let_an_index_grow(tmp_path, keeper) -> None:
+    """Of the starts without a byte between them the newest is known."""
+    for pid in range(7, 30):
+        start(keeper, pid)
+        keeper.release((P.process, P.number))
+    start(keeper, 30, b"a word\n")
+    keeper.release((P.process, P.number))
+    for pid in range(31, 50):
+        start(keeper, pid)
+        keeper.release((P.process, P.number))
+    with log_index.Index(str(log_path(tmp_path, P))) as index:
+        assert [mark[1:] for mark in index.marks(0, 99)] == [(0, 30), (7, 0), (7, 49)]
