@@ -37,6 +37,8 @@ _RESERVED: Final = 1000
 _ON_THE_WAY_BACK: Final = frozenset({ProcessPhase.ASSIGNED, ProcessPhase.STARTING})
 #: Of processes that wait for a host.
 WAITING: Final = (ProcessPhase.QUEUED, ProcessPhase.SET_ASIDE)
+#: Most removed processes of which replicas are still dropped.
+_REMOVED_KEPT: Final = 10_000
 #: No instance gets a number as large as this.
 _LARGEST: Final = 2**53
 
@@ -283,9 +285,20 @@ class MasterState:
         """Remove an ended process of which no instance may run from memory and journal."""
         del self.over[name]
         if self.processes.pop(name).spec.keeps_state:
-            self.keeping.removed[name] = self.next_instance
+            self._note_removed(name)
         self._unsaved.pop(name, None)
         self.emit(Intent("process", name, None))
+
+    def _note_removed(self, name: str) -> None:
+        """Journal that a process with state was removed: a host may return with a replica."""
+        removed = self.keeping.removed
+        removed.pop(name, None)  # the oldest stand first
+        removed[name] = self.next_instance
+        self.emit(Intent("removed", name, {"next": self.next_instance}))
+        if len(removed) > _REMOVED_KEPT:
+            oldest = next(iter(removed))
+            del removed[oldest]
+            self.emit(Intent("removed", oldest, None))
 
     def enqueue(self, process: Process, now: float, reason: str = "") -> None:
         """Queue a process at its place in the line."""
