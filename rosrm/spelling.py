@@ -36,6 +36,32 @@ def listed(names: Iterable[str], word: str = "and") -> str:
     return f"{', '.join(first)} {word} {last}" if first else last
 
 
+def few(names: Iterable[str], most: int = 3) -> str:
+    """Return names as `listed`, of more than `most` the first: "a, b and 2 more"."""
+    named = list(names)
+    if len(named) > most:
+        named = [*named[: most - 1], f"{len(named) - most + 1} more"]
+    return listed(named)
+
+
+def by_reason(reasons: Iterable[tuple[str, str]]) -> str:
+    """Return the reason of each name, an equal one once: "a and b: is lost; c: is full"."""
+    names: dict[str, list[str]] = {}
+    for name, reason in reasons:
+        names.setdefault(reason, []).append(name)
+    return "; ".join(f"{few(alike)}: {reason}" for reason, alike in names.items())
+
+
+def first_line(reason: str) -> str:
+    """Return a reason without the details in its further lines."""
+    return reason.partition("\n")[0]
+
+
+def one_line(reason: str) -> str:
+    """Return a reason with the details of its further lines in one line."""
+    return reason.replace("\n", "; ")
+
+
 def standing(state: str) -> str:
     """Return the state of a process as a sentence has it: "is in back-off", "has failed"."""
     return _STANDING.get(state, f"is {state.replace('_', ' ')}")

@@ -15,7 +15,14 @@ from rosrm.core.lost_tail import why_no_work
 from rosrm.core.model import EMPTY
 from rosrm.core.placement import Demand, Ranking
 from rosrm.core.state import MasterState, Process, ProcessPhase, larger
-from rosrm.core.verdicts import Decision, decide, refused_everywhere, why_all_away, why_never
+from rosrm.core.verdicts import (
+    Decision,
+    a_known_host_may,
+    decide,
+    refused_everywhere,
+    why_all_away,
+    why_never,
+)
 
 _AWAY: Final = (HostCondition.EXPECTED, HostCondition.LOST)
 _STATE_MAY_COME: Final = "a host that may have a snapshot of its state has not come back yet"
@@ -39,11 +46,12 @@ def demand_of(state: MasterState, process: Process) -> Demand:
 
 
 def demand_to_move(
-    state: MasterState, process: Process, seen: Mapping[str, float], source: str, headroom: float
-) -> Demand:
-    """What decides where a running process may go on."""
+    state: MasterState, process: Process, seen: Mapping[str, float], source: str, headroom: float,
+    lacking: Mapping[str, str] = EMPTY,
+) -> Demand:  # fmt: skip
+    """What decides where a running process may go on; `lacking`: hosts without an executor."""
     excluded = {
-        **process.excluded, **unable(state, process, source),
+        **process.excluded, **unable(state, process, source), **lacking,
         source: "it is the source of the move",
     }  # fmt: skip
     return Demand(
@@ -200,7 +208,7 @@ def _set_aside(state: MasterState, process: Process, reason: str, now: float) ->
             now, "failed", f"{process.name} failed: {process.reason}", process=process.name
         )
     else:
-        state.set_phase(process, ProcessPhase.SET_ASIDE, now, f"no host may take it: {reason}")
+        state.set_phase(process, ProcessPhase.SET_ASIDE, now, _why_aside(reason))
         state.set_aside.add(process.name)
         state.record(
             now, "set_aside", f"{process.name} is set aside: {process.reason}", process=process.name
@@ -208,8 +216,22 @@ def _set_aside(state: MasterState, process: Process, reason: str, now: float) ->
     state.save(process)
 
 
+def _why_aside(reason: str) -> str:
+    return f"no host may take it: {reason}"
+
+
+def _keep_aside(state: MasterState, process: Process, reason: str, now: float) -> None:
+    """Replace the reason of a process that is set aside, if there is another one now."""
+    if process.reason != _why_aside(reason):
+        state.set_phase(process, ProcessPhase.SET_ASIDE, now, _why_aside(reason))
+        state.save(process)
+
+
 def reconsider_set_aside(state: MasterState, now: float) -> None:
-    """Hosts came or changed: those that none could take return to the queue, in order."""
+    """Return what a host may take now to the queue, in order; keep the other reasons current.
+
+    As long as the limits of the hosts are not known, a process keeps its place and its reason.
+    """
     if not state.set_aside:
         return
     judged: dict[object, str] = {}
@@ -220,6 +242,9 @@ def reconsider_set_aside(state: MasterState, now: float) -> None:
         if demand.key not in judged:
             judged[demand.key] = why_never(state.hosts, demand)
         if judged[demand.key]:
+            _keep_aside(state, process, judged[demand.key], now)
+            continue
+        if not a_known_host_may(state.hosts, demand):
             continue
         state.set_aside.discard(process.name)
         state.enqueue(process, now)

@@ -28,6 +28,7 @@ from rosrm.core.runs import Run, run_to_dict
 from rosrm.core.settings import CoreSettings
 from rosrm.core.verdicts import Decision
 from rosrm.ports import Intent, MigrationStrategy, Record, ScoringPolicy
+from rosrm.spelling import one_line
 
 #: Records of one process that `explain` tells.
 _HISTORY: Final = 12
@@ -164,6 +165,7 @@ class MasterState:
         """Write a line of the event record; `by` is the client that asked for it."""
         if by:
             message, facts = f"{message} (by {by})", {**facts, "by": by}
+        message = one_line(message)
         self.emit(Record(kind, process, host, message, facts))
         known = self.processes.get(process)
         if known is not None:
