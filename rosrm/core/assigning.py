@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from math import inf
 from typing import Any, Final
 
 import numpy as np
@@ -23,9 +24,12 @@ from rosrm.core.verdicts import (
     why_all_away,
     why_never,
 )
+from rosrm.spelling import few
 
 _AWAY: Final = (HostCondition.EXPECTED, HostCondition.LOST)
 _STATE_MAY_COME: Final = "a host that may have a snapshot of its state has not come back yet"
+#: Seconds for which placement waits at most for the first request of a host that has registered.
+_FIRST_REQUEST: Final = 1.0
 _NOBODY: Final[frozenset[str]] = frozenset()
 
 
@@ -115,6 +119,10 @@ def place_waiting(state: MasterState, now: float) -> None:
     if why:
         state.processes[head].reason = why
         return
+    why = _first_request_awaited(state, now)
+    if why:
+        state.processes[head].reason = state.processes[head].reason or why
+        return
     passed_over = _passed_over(state, now)
     if state.settings.backfill:
         _place_any(state, passed_over, now)
@@ -122,6 +130,23 @@ def place_waiting(state: MasterState, now: float) -> None:
         _place_in_order(state, passed_over, now)
     if not passed_over:
         state.placed_at = _versions(state)
+
+
+def _first_request_awaited(state: MasterState, now: float) -> str:
+    """Return why placement waits for hosts that have registered just now; "" if it does not.
+
+    Without the wait, the host whose request comes first takes all that was submitted while the
+    hosts register. Further hosts that register do not prolong the wait.
+    """
+    awaited = state.hosts.about_to_ask(now - _FIRST_REQUEST)
+    if not len(awaited):
+        state.held_since = inf
+        return ""
+    state.held_since = min(state.held_since, now)
+    if now - state.held_since >= _FIRST_REQUEST:
+        return ""
+    names = few(state.hosts.hosts[column].name for column in awaited)
+    return f"waits for the first request for work of {names}, registered just now"
 
 
 def _passed_over(state: MasterState, now: float) -> frozenset[str]:

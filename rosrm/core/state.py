@@ -82,6 +82,7 @@ class MasterState:
         over: names of the processes that are over, in the order in which they ended.
         standbys: process name to the handoff whose destination is its standby.
         wants_standby: names of the processes that ask for one and are not over.
+        held_since: time since when placement waits for first requests for work; inf: it does not.
         in_company_since: time since when at least one host has been heard; inf: none is.
         tail: whether the journal has lost what was newest in it.
         plugins: guards every call of a plugin.
@@ -133,6 +134,7 @@ class MasterState:
         self.next_order_id = 1
         self.wall = 0.0
         self.in_company_since = inf
+        self.held_since = inf
         self.tail = Tail()
         self.missing_since: dict[int, float] = {}
         self.reviewed = float("-inf")
