@@ -59,7 +59,10 @@ class NoMaster(RosrmError):
 
 
 class LaunchError(RosrmError):
-    """A process that cannot be started on this host, and why."""
+    """A process that cannot be started on this host, and why.
+
+    Only the first line is the reason: details such as a whole PATH go into further lines.
+    """
 
 
 class JournalError(RosrmError):

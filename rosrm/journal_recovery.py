@@ -108,7 +108,7 @@ def _check_damaged(path: Path) -> None:
         raise JournalError(f"there is no journal to recover: {path} is no file")
     try:
         journal = SqliteJournal(path)
-        for table in ("cluster", "host", "process", "migration", "learned"):
+        for table in ("cluster", "host", "process", "migration", "learned", "removed"):
             journal.intents(table)
         journal.close()
     except JournalError as fault:
@@ -161,7 +161,7 @@ def _read_intents(database: sqlite3.Connection, found: _Found) -> None:
     hosts = sorted({str(event[5]) for event in found.events.values() if event[5]})
     known = [("cluster", "epoch"), ("cluster", "instances")]
     known += [("host", name) for name in hosts]
-    known += [(table, name) for name in processes for table in ("process", "migration")]
+    known += [(table, name) for name in processes for table in ("process", "migration", "removed")]
     rows = [row for query in _INTENTS for row in _rows(database, found, query)]
     rows += [row for at in known for row in _rows(database, found, _INTENT, *at)]
     for table, key, text in rows:

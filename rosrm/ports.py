@@ -423,7 +423,7 @@ class Intent:
     """What shall be, durably: the newest value under a key replaces the older ones.
 
     Attributes:
-        table: "process", "migration", "host", "learned", "cluster".
+        table: "process", "migration", "host", "learned", "cluster", "removed".
         key: within the table.
         value: JSON-able; None: the key is gone.
     """

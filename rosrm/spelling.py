@@ -31,15 +31,34 @@ def counted(number: int, singular: str, plural: str = "") -> str:
 
 
 def few(names: Iterable[str], most: int = 8) -> list[str]:
-    """Return names; in place of those beyond the first `most`, their number: "3 more"."""
+    """Return at most `most` names; the last one is the number of those left out: "3 more"."""
     first = list(names)
-    return first if len(first) <= most else [*first[:most], f"{len(first) - most} more"]
+    left_out = len(first) - most + 1
+    return first if left_out < 2 else [*first[: most - 1], f"{left_out} more"]
 
 
-def listed(names: Iterable[str], word: str = "and") -> str:
-    """Return names as a sentence lists them, `few` of them: "none", "a", "a, b and c"."""
-    *first, last = few(names) or ["none"]
+def listed(names: Iterable[str], word: str = "and", most: int = 8) -> str:
+    """Return `few` names as a sentence lists them: "none", "a", "a, b and c"."""
+    *first, last = few(names, most) or ["none"]
     return f"{', '.join(first)} {word} {last}" if first else last
+
+
+def by_reason(reasons: Iterable[tuple[str, str]]) -> str:
+    """Return the reason of each name, an equal one once: "a and b: is lost; c: is full"."""
+    names: dict[str, list[str]] = {}
+    for name, reason in reasons:
+        names.setdefault(reason, []).append(name)
+    return "; ".join(f"{listed(alike, most=3)}: {reason}" for reason, alike in names.items())
+
+
+def first_line(reason: str) -> str:
+    """Return a reason without the details in its further lines."""
+    return reason.partition("\n")[0]
+
+
+def one_line(reason: str) -> str:
+    """Return a reason with the details of its further lines in one line."""
+    return reason.replace("\n", "; ")
 
 
 def standing(state: str) -> str:

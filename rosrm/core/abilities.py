@@ -14,7 +14,7 @@ Nothing of it is durable, and until a host has answered nothing is moved to or f
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import inf
 from typing import TYPE_CHECKING, Final
@@ -25,6 +25,7 @@ from rosrm.core.hosts import Host, HostCondition
 from rosrm.core.plugin_calls import implements, required
 from rosrm.errors import PluginError
 from rosrm.ports import HostChecking
+from rosrm.spelling import listed
 
 if TYPE_CHECKING:
     from rosrm.core.state import MasterState
@@ -154,10 +155,8 @@ def fault(state: MasterState, strategy: str, source: Host, destination: Host) ->
     facts = []
     for host in (source, destination):
         answer = state.abilities.answers.get((strategy, host.name))
-        if answer is None or (answer.facts is None and not answer.reason):
-            return f"it is not known yet whether {strategy} works on {host.name}"
-        if answer.facts is None:
-            return f"{strategy} does not work on {host.name}: {answer.reason}"
+        if answer is None or answer.facts is None:
+            return _absent(strategy, answer, [host.name])
         facts.append(answer.facts)
     asked = checking
     try:
@@ -166,3 +165,26 @@ def fault(state: MasterState, strategy: str, source: Host, destination: Host) ->
         )
     except PluginError as error:
         return f"the check of the hosts by {strategy} failed: {error}"
+
+
+def faults(state: MasterState, strategy: str, source: Host) -> list[str]:
+    """Return why a strategy cannot move anything from a host to others, an equal reason once."""
+    absent: dict[str, tuple[Answer | None, list[str]]] = {}
+    others: dict[str, None] = {}
+    answers = state.abilities.answers
+    here = answers.get((strategy, source.name))
+    for host in state.hosts.listed():
+        found = "" if host is source else fault(state, strategy, source, host)
+        answer = answers.get((strategy, host.name))
+        if found and here and here.facts is not None and (answer is None or answer.facts is None):
+            absent.setdefault(answer.reason if answer else "", (answer, []))[1].append(host.name)
+        elif found:
+            others[found] = None
+    return [*(_absent(strategy, *alike) for alike in absent.values()), *others]
+
+
+def _absent(strategy: str, answer: Answer | None, hosts: Sequence[str]) -> str:
+    """Say that a strategy does not work on hosts, or has not answered there yet."""
+    if answer is None or not answer.reason:
+        return f"it is not known yet whether {strategy} works on {listed(hosts, most=3)}"
+    return f"{strategy} does not work on {listed(hosts, most=3)}: {answer.reason}"

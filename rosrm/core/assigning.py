@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from math import inf
 from typing import Any, Final
 
 import numpy as np
@@ -15,10 +16,20 @@ from rosrm.core.lost_tail import why_no_work
 from rosrm.core.model import EMPTY
 from rosrm.core.placement import Demand, Ranking
 from rosrm.core.state import MasterState, Process, ProcessPhase, larger
-from rosrm.core.verdicts import Decision, decide, refused_everywhere, why_all_away, why_never
+from rosrm.core.verdicts import (
+    Decision,
+    a_known_host_may,
+    decide,
+    refused_everywhere,
+    why_all_away,
+    why_never,
+)
+from rosrm.spelling import listed
 
 _AWAY: Final = (HostCondition.EXPECTED, HostCondition.LOST)
 _STATE_MAY_COME: Final = "a host that may have a snapshot of its state has not come back yet"
+#: Seconds for which placement waits at most for the first request of a host that has registered.
+_FIRST_REQUEST: Final = 1.0
 _NOBODY: Final[frozenset[str]] = frozenset()
 
 
@@ -39,11 +50,12 @@ def demand_of(state: MasterState, process: Process) -> Demand:
 
 
 def demand_to_move(
-    state: MasterState, process: Process, seen: Mapping[str, float], source: str, headroom: float
-) -> Demand:
-    """What decides where a running process may go on."""
+    state: MasterState, process: Process, seen: Mapping[str, float], source: str, headroom: float,
+    lacking: Mapping[str, str] = EMPTY,
+) -> Demand:  # fmt: skip
+    """What decides where a running process may go on; `lacking`: hosts without an executor."""
     excluded = {
-        **process.excluded, **unable(state, process, source),
+        **process.excluded, **unable(state, process, source), **lacking,
         source: "it is the source of the move",
     }  # fmt: skip
     return Demand(
@@ -107,6 +119,10 @@ def place_waiting(state: MasterState, now: float) -> None:
     if why:
         state.processes[head].reason = why
         return
+    why = _first_request_awaited(state, now)
+    if why:
+        state.processes[head].reason = state.processes[head].reason or why
+        return
     passed_over = _passed_over(state, now)
     if state.settings.backfill:
         _place_any(state, passed_over, now)
@@ -114,6 +130,23 @@ def place_waiting(state: MasterState, now: float) -> None:
         _place_in_order(state, passed_over, now)
     if not passed_over:
         state.placed_at = _versions(state)
+
+
+def _first_request_awaited(state: MasterState, now: float) -> str:
+    """Return why placement waits for hosts that have registered just now; "" if it does not.
+
+    Without the wait, the host whose request comes first takes all that was submitted while the
+    hosts register. Further hosts that register do not prolong the wait.
+    """
+    awaited = state.hosts.about_to_ask(now - _FIRST_REQUEST)
+    if not len(awaited):
+        state.held_since = inf
+        return ""
+    state.held_since = min(state.held_since, now)
+    if now - state.held_since >= _FIRST_REQUEST:
+        return ""
+    names = listed((state.hosts.hosts[column].name for column in awaited), most=3)
+    return f"waits for the first request for work of {names}, registered just now"
 
 
 def _passed_over(state: MasterState, now: float) -> frozenset[str]:
@@ -200,7 +233,7 @@ def _set_aside(state: MasterState, process: Process, reason: str, now: float) ->
             now, "failed", f"{process.name} failed: {process.reason}", process=process.name
         )
     else:
-        state.set_phase(process, ProcessPhase.SET_ASIDE, now, f"no host may take it: {reason}")
+        state.set_phase(process, ProcessPhase.SET_ASIDE, now, _why_aside(reason))
         state.set_aside.add(process.name)
         state.record(
             now, "set_aside", f"{process.name} is set aside: {process.reason}", process=process.name
@@ -208,8 +241,22 @@ def _set_aside(state: MasterState, process: Process, reason: str, now: float) ->
     state.save(process)
 
 
+def _why_aside(reason: str) -> str:
+    return f"no host may take it: {reason}"
+
+
+def _keep_aside(state: MasterState, process: Process, reason: str, now: float) -> None:
+    """Replace the reason of a process that is set aside, if there is another one now."""
+    if process.reason != _why_aside(reason):
+        state.set_phase(process, ProcessPhase.SET_ASIDE, now, _why_aside(reason))
+        state.save(process)
+
+
 def reconsider_set_aside(state: MasterState, now: float) -> None:
-    """Hosts came or changed: those that none could take return to the queue, in order."""
+    """Return what a host may take now to the queue, in order; keep the other reasons current.
+
+    As long as the limits of the hosts are not known, a process keeps its place and its reason.
+    """
     if not state.set_aside:
         return
     judged: dict[object, str] = {}
@@ -220,6 +267,9 @@ def reconsider_set_aside(state: MasterState, now: float) -> None:
         if demand.key not in judged:
             judged[demand.key] = why_never(state.hosts, demand)
         if judged[demand.key]:
+            _keep_aside(state, process, judged[demand.key], now)
+            continue
+        if not a_known_host_may(state.hosts, demand):
             continue
         state.set_aside.discard(process.name)
         state.enqueue(process, now)

@@ -14,30 +14,17 @@ from rosrm.core.plugin_calls import required
 from rosrm.core.state import MasterState, Process, ProcessPhase, Run
 from rosrm.core.steps import title
 from rosrm.errors import PluginError, describe_fault
-from rosrm.spelling import standing
+from rosrm.spelling import listed, standing
 
 #: The method of a strategy that plans for an aim.
 _HOOKS: Final = {Aim.MOVE: "propose", Aim.CHECKPOINT: "checkpoint", Aim.RESTORE: "restore"}
 
 
 def begin_move(
-    state: MasterState, process: Process, ranking: Ranking, destination: Host, cause: str,
-    now: float,
-) -> str:  # fmt: skip
-    """Begin to move a running process to a host that has room for it by a ranking.
-
-    Returns:
-        "" or why it cannot be moved; then nothing has changed.
-    """
-    refusal = why_immovable(state, process)
-    if refusal:
-        return refusal
-    run = plan_move(state, process, destination, cause, now)
-    if isinstance(run, str):
-        return run
-    lacking = why_no_executor(state, run)
-    if lacking:
-        return lacking
+    state: MasterState, process: Process, run: Run, ranking: Ranking, now: float
+) -> None:
+    """Begin a planned move to a host that has room for the process by a ranking."""
+    destination, cause = run.destination_host, run.cause
     state.runs[process.name] = run
     state.charge_ranked(run.destination, destination, now, ranking)
     state.set_phase(process, ProcessPhase.MIGRATING, now, f"to {destination.name}: {cause}")
@@ -55,7 +42,6 @@ def begin_move(
     )  # fmt: skip
     state.save(process)
     state.save_run(run)
-    return ""
 
 
 def plan_move(
@@ -122,22 +108,54 @@ def why_never_movable(state: MasterState, process: Process) -> str:
 
 def why_no_executor(state: MasterState, run: Run) -> str:
     """Return which host of a plan lacks an executor that it names; "": none does."""
-    own = state.declared.executors.get(run.strategy)
-    if own is None:
-        return ""  # its offer is not known
+    lacking = _lacking(state, run)
+    return "" if lacking is None else _lacks(state, run, lacking[0], [lacking[1].name])
+
+
+def without_executor(state: MasterState, run: Run) -> tuple[list[str], str]:
+    """Return all hosts that lack the executor that the destination of a plan lacks, and say so.
+
+    No host, if the plan can be carried out on its destination.
+    """
+    lacking = _lacking(state, run)
+    if lacking is None or lacking[1] is not run.destination_host:
+        return [], ""
+    executor, _ = lacking
+    hosts = [
+        host.name
+        for host in state.hosts.listed()
+        if host is not run.source_host and _has_not(host, executor)
+    ]
+    return hosts, _lacks(state, run, executor, hosts)
+
+
+def _lacking(state: MasterState, run: Run) -> tuple[str, Host] | None:
+    """Return an executor that a plan names and the host that lacks it."""
+    if run.strategy not in state.declared.executors:
+        return None  # its offer is not known
     commit = run.plan.steps[run.commit_index]
     named = [*executors_of(run.plan)]
     if isinstance(commit, Commit) and commit.image:
         named.append((commit.image, run.source_host.name))
     for executor, name in named:
-        host = state.hosts.by_name[name].description
-        if host.incarnation and executor not in host.executors:
-            brought_by = state.declared.brought_by.get(run.strategy) or "the plugin"
-            return (
-                f"{name} has no executor {executor!r}, which {run.strategy} needs there to move "
-                f"{run.process}: install {brought_by} on {name} and restart its slave"
-            )
-    return ""
+        host = state.hosts.by_name[name]
+        if _has_not(host, executor):
+            return executor, host
+    return None
+
+
+def _has_not(host: Host, executor: str) -> bool:
+    return bool(host.description.incarnation) and executor not in host.description.executors
+
+
+def _lacks(state: MasterState, run: Run, executor: str, hosts: list[str]) -> str:
+    brought_by = state.declared.brought_by.get(run.strategy) or "the plugin"
+    one = len(hosts) == 1
+    lacking = f"{listed(hosts, most=3)} {'has' if one else 'have'} no executor {executor!r}"
+    return (
+        f"{lacking}, which {run.strategy} needs there to move {run.process}: install {brought_by} on {hosts[0] if one else 'them'} "
+        f"and restart {'its slave' if one else 'their slaves'}"
+    )
 
 
 def proposed(state: MasterState, name: str, move: Move, aim: Aim = Aim.MOVE) -> Plan | str:

@@ -41,7 +41,7 @@ class HostColumns:
         closed: (H,) cordoned or draining.
         untold: (H,) it was lost, and has not said yet what it holds.
         stale: (H,) bit i: the reading of slot i, which has a limit, is stale.
-        heard: (H,) time of the newest message.
+        heard, registered: (H,) time of the newest message; of the registration.
         period: (H,) seconds between its readings.
         processes, bound: (H,) held or promised; most of them.
         incarnation, sequence: (H,) of the slave's run; of its newest reading.
@@ -70,6 +70,7 @@ class HostColumns:
             "untold": np.zeros(columns, np.bool_),
             "stale": np.zeros(columns, np.uint32),
             "heard": np.zeros(columns),
+            "registered": np.full(columns, -np.inf),
             "period": np.zeros(columns),
             "processes": np.zeros(columns, np.int64),
             "bound": np.full(columns, NO_BOUND, np.int64),
@@ -116,6 +117,7 @@ class HostColumns:
         self.untold: BoolArray = used["untold"]
         self.stale: npt.NDArray[np.uint32] = used["stale"]
         self.heard: FloatArray = used["heard"]
+        self.registered: FloatArray = used["registered"]
         self.period: FloatArray = used["period"]
         self.processes: IntArray = used["processes"]
         self.bound: IntArray = used["bound"]

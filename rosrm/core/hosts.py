@@ -150,7 +150,7 @@ class HostTable(HostColumns):
         self.condition[column] = HostCondition.UP
         self.asking[column] = self.accepting[column] = self.untold[column] = False
         self.stale[column] = 0
-        self.heard[column] = now
+        self.heard[column] = self.registered[column] = now
         self.bound[column] = description.max_processes or NO_BOUND
         self.period[column] = description.period
         self.incarnation[column] = description.incarnation
@@ -309,6 +309,20 @@ class HostTable(HostColumns):
         if not self.asking[column]:
             return "it has not asked for work yet"
         return ""
+
+    def without_reading(self) -> BoolArray:
+        """(H,) True: no reading of this run has come, so that the limits are unknown."""
+        # A reading that was refused has marked all that the host reads as stale.
+        unread = (self.sequence == 0) & (self.stale == 0)
+        return np.asarray((self.incarnation == 0) | unread)
+
+    def about_to_ask(self, since: float) -> IntArray:
+        """Columns of hosts that registered after a time and will ask for their first work."""
+        young = (self.registered > since) & (self.condition == HostCondition.UP) & ~self.closed
+        if not young.any():
+            return np.flatnonzero(young)
+        silent = self.without_reading() | (self.accepting & ~self.asking)
+        return np.flatnonzero(young & silent)
 
     def unheard(self) -> list[int]:
         """Numbers of the hosts that have reported, and have been silent for a moment or longer."""

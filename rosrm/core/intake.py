@@ -162,7 +162,10 @@ def process_requested(state: MasterState, event: happened.ProcessRequested, now:
 
 def readings_received(state: MasterState, event: happened.ReadingsReceived, now: float) -> None:
     """Note a batch of readings; nonsense is refused and said."""
+    first = bool(state.set_aside) and bool(state.hosts.without_reading().any())
     refused = take_readings(state.hosts, event, now)
+    if first:  # before the queue is served, which keeps the order
+        reconsider_set_aside(state, now)
     for row in np.flatnonzero(refused):
         host = state.hosts.find(int(event.host_id[row]), int(event.incarnation[row]))
         if host is not None:

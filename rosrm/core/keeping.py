@@ -14,13 +14,13 @@ it runs, and the policy gives no answer     as it chose last; where it has not c
                                             master started, `keep` on the hosts that keep a state
 it is cancelled, or has finished            `drop_kept` wherever something is kept of it
 it was submitted anew                       `drop_kept` of what is kept of its former life
-it was removed by this master               `drop_kept` wherever something is kept of it
+it was removed, says the journal            `drop_kept` wherever something is kept of it
 a host that is not chosen keeps a state     `drop_kept`, once a newer one lies where it should;
                                             never before the policy has chosen
 ==========================================  =====================================================
 
 What is kept of any other name that this master does not know is left alone: its journal may be
-lost.
+lost. Of the removed names the journal has the last 10,000.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from rosrm.ports import CheckpointChoice, CheckpointView
 
 #: Seconds between two looks at the same process.
 _LOOK_EVERY: Final = 1.0
-#: Most drop orders remembered, so as not to repeat them at once; also most removed processes.
+#: Most drop orders remembered, so as not to repeat them at once.
 _REMEMBERED: Final = 10_000
 #: What is kept of a process that ended so is of no use any more.
 _DONE: Final = frozenset({ProcessPhase.FINISHED, ProcessPhase.CANCELLED})
@@ -123,8 +123,6 @@ def review(state: MasterState, now: float) -> None:
     names = keeping.holdings.processes()
     if len(keeping.dropped_at) > _REMEMBERED:
         keeping.dropped_at.clear()
-    if len(keeping.removed) > _REMEMBERED:
-        keeping.removed.clear()
     share = min(1.0, (now - keeping.looked) / _LOOK_EVERY)
     keeping.looked = now
     if not keeping.waiting:
@@ -142,7 +140,7 @@ def review(state: MasterState, now: float) -> None:
 
 
 def _drop_removed(state: MasterState, name: str, now: float) -> None:
-    """Drop every replica of a process that this master has removed."""
+    """Drop every replica of a process that was removed and is not known again."""
     end = state.keeping.removed.get(name, 0)
     for host, holding in state.keeping.holdings.of(name).items():
         if holding.number < end:

@@ -13,6 +13,7 @@ import numpy as np
 
 from rosrm.core import host_loss
 from rosrm.core.assigning import reconsider_set_aside
+from rosrm.core.columns import FloatArray
 from rosrm.core.commands import Order
 from rosrm.core.hosts import Host, HostCondition
 from rosrm.core.state import MasterState
@@ -28,7 +29,7 @@ def review_liveness(state: MasterState, now: float) -> None:
         return
     age = now - table.heard
     condition = table.condition
-    grace = np.maximum(0.0, _REPORTS_MISSED * table.period - state.settings.suspect)
+    grace = _grace(state)
     fresh = age < state.settings.suspect + grace
     lease = state.settings.lease + grace
     gone = age >= lease
@@ -45,6 +46,16 @@ def review_liveness(state: MasterState, now: float) -> None:
         _lose(state, table.hosts[column], float(age[column]), float(lease[column]), now)
     for column in np.flatnonzero((suspect | lost) & fresh):
         welcome_back(state, table.hosts[column], now)
+
+
+def lease_of(state: MasterState, host: Host) -> float:
+    """Return the seconds of silence after which a host is lost."""
+    return state.settings.lease + float(_grace(state)[host.column])
+
+
+def _grace(state: MasterState) -> FloatArray:
+    """Return the seconds, (H,), by which hosts that report seldom may be silent for longer."""
+    return np.maximum(0.0, _REPORTS_MISSED * state.hosts.period - state.settings.suspect)
 
 
 def _note_company(state: MasterState, heard: bool, now: float) -> None:

@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Final
-
 from rosrm.core import events as happened
 from rosrm.core import lifecycle
 from rosrm.core.commands import Reply
 from rosrm.core.hosts import Host, HostCondition
+from rosrm.core.liveness import lease_of
 from rosrm.core.requests import count, known_host, known_processes, refuse
 from rosrm.core.state import MasterState, Process, Wanted
 from rosrm.ports import Intent
 from rosrm.spelling import counted
 
-_PRESENT: Final = (HostCondition.UP, HostCondition.SUSPECT)
-
 
 def prune_requested(state: MasterState, event: happened.PruneRequested, now: float) -> None:
     """Remove the named processes and hosts, or all that ended and left; all of them, or none."""
     if event.names or event.hosts:
-        found = _named(state, event)
+        found = _named(state, event, now)
         if found is None:
             return
         processes, hosts = found
@@ -31,7 +28,7 @@ def prune_requested(state: MasterState, event: happened.PruneRequested, now: flo
             for host in state.hosts.listed()
             if state.hosts.condition_of(host) is HostCondition.LEFT and not host.instances
         ]
-        hosts = [host for host in left if not _why_held(state, host)]
+        hosts = [host for host in left if not _why_held(state, host, now)]
     for process in processes:
         state.remove_process(process.name)
     for host in hosts:
@@ -43,7 +40,7 @@ def prune_requested(state: MasterState, event: happened.PruneRequested, now: flo
 
 
 def _named(
-    state: MasterState, event: happened.PruneRequested
+    state: MasterState, event: happened.PruneRequested, now: float
 ) -> tuple[list[Process], list[Host]] | None:
     """The processes and hosts that a request names; None: it was refused."""
     processes = known_processes(state, event.request, event.names)
@@ -56,7 +53,7 @@ def _named(
             return None
         hosts.append(host)
     faults = [_why_kept(state, process) for process in processes]
-    faults += [_why_held(state, host) for host in hosts]
+    faults += [_why_held(state, host, now) for host in hosts]
     for fault in faults:
         if fault:
             refuse(state, event.request, f"{fault}. Nothing was removed")
@@ -74,14 +71,24 @@ def _why_kept(state: MasterState, process: Process) -> str:
     return "" if state.is_gone(process) else f"the standby of {process.name} is being ended"
 
 
-def _why_held(state: MasterState, host: Host) -> str:
+def _why_held(state: MasterState, host: Host, now: float) -> str:
     """Return why a host cannot be removed; "" if it can."""
-    if state.hosts.condition_of(host) in _PRESENT:
+    condition = state.hosts.condition_of(host)
+    if condition is HostCondition.UP:
         return f"{host.name} is up; stop its slave first"
+    if condition is HostCondition.SUSPECT:
+        silence = now - float(state.hosts.heard[host.column])
+        return (
+            f"{host.name} is suspect: it has not reported for {silence:.1f} s and may report "
+            f"again. Stop its slave if it runs; a host can be pruned once it has left or is lost, "
+            f"which is after {lease_of(state, host):g} s of silence"
+        )
     for number in sorted(host.instances):
         instance = state.instances[number]
         process = state.owned_by(instance)
         if process is not None and process.wanted is not Wanted.CANCEL:
+            if condition is HostCondition.LEFT:
+                return f"{host.name} is still stopping {process.name}; wait until it has ended"
             return f"{host.name} may still run {process.name}; cancel it first"
         if instance.id.process in state.runs:
             return f"{instance.id.process} is moving from or to {host.name}"

@@ -8,11 +8,20 @@ from __future__ import annotations
 
 from typing import Final
 
-from rosrm.core.assigning import amounts_of, demand_to_move, ranking_of, unable
-from rosrm.core.begin import begin_move, moves_under_way, why_immovable, why_never_movable
+from rosrm.core import abilities
+from rosrm.core.assigning import amounts_of, demand_to_move, ranking_of
+from rosrm.core.begin import (
+    begin_move,
+    moves_under_way,
+    plan_move,
+    why_immovable,
+    why_never_movable,
+    why_no_executor,
+    without_executor,
+)
 from rosrm.core.hosts import Host
 from rosrm.core.model import InstanceState
-from rosrm.core.placement import Demand
+from rosrm.core.placement import Demand, Ranking
 from rosrm.core.state import Instance, MasterState, Process, Wanted
 from rosrm.core.verdicts import decide, may_ever_take, verdict_of
 from rosrm.spelling import counted, few, listed
@@ -128,36 +137,59 @@ def try_move(
 ) -> str:  # fmt: skip
     """Move a process to the host with the largest margin, or to a given one.
 
+    A host that lacks an executor of the plan is passed over, unless it was given.
+
     Returns:
         "" or why it cannot go; then nothing has changed.
     """
     refusal = why_immovable(state, process)
     if refusal:
         return refusal
-    source = state.instances[process.owner]
-    demand = demand_to_move(state, process, source.measured, source.host.name, headroom)
-    ranking = ranking_of(state, demand)
-    column = ranking.best() if host is None else host.column
-    if column < 0:
-        return f"no host has room for {process.name}{_and_why(state, process, source.host)}"
-    destination = state.hosts.hosts[column]
-    if destination is source.host:
-        return f"{process.name} runs on {destination.name} already"
-    if not ranking.fits(column):
-        why = verdict_of(ranking, column).reason
-        return f"{process.name} does not fit on {destination.name}: {why or 'no room'}"
-    decision = decide(ranking, chosen=column)
-    reason = begin_move(state, process, ranking, destination, cause, now)
-    if not reason:
-        state.note_decision(process, decision, "migrated", now)
-    return reason
+    source, lacking = state.instances[process.owner], dict[str, str]()
+    measured = source.measured
+    while True:
+        demand = demand_to_move(state, process, measured, source.host.name, headroom, lacking)
+        ranking = ranking_of(state, demand)
+        destination = _destination(state, process, ranking, source.host, host)
+        if isinstance(destination, str):
+            return "; ".join(dict.fromkeys(lacking.values())) or destination
+        run = plan_move(state, process, destination, cause, now)
+        if isinstance(run, str):
+            return run
+        refusal = why_no_executor(state, run)
+        if not refusal:
+            break
+        hosts, shared = without_executor(state, run)
+        if host is not None or not hosts:
+            return refusal
+        lacking.update(dict.fromkeys(hosts, shared))
+    decision = decide(ranking, chosen=destination.column)
+    begin_move(state, process, run, ranking, now)
+    state.note_decision(process, decision, "migrated", now)
+    return ""
+
+
+def _destination(
+    state: MasterState, process: Process, ranking: Ranking, source: Host, host: Host | None
+) -> Host | str:
+    """Return the best host of a ranking, or the given one if it fits; else why there is none."""
+    if host is None:
+        column = ranking.best()
+        if column < 0:
+            return f"no host has room for {process.name}{_and_why(state, process, source)}"
+        return state.hosts.hosts[column]
+    if host is source:
+        return f"{process.name} runs on {host.name} already"
+    if not ranking.fits(host.column):
+        why = verdict_of(ranking, host.column).reason
+        return f"{process.name} does not fit on {host.name}: {why or 'no room'}"
+    return host
 
 
 def _and_why(state: MasterState, process: Process, source: Host) -> str:
     """What its strategy has against hosts, a few of them; "" for nothing."""
-    faults = unable(state, process, source.name)
-    faults.pop(source.name, None)
-    return "".join(f"; {fault}" for fault in few(dict.fromkeys(faults.values()), _MOST_SAID))
+    faults = abilities.faults(state, process.spec.migration.strategy or "", source)
+    return "".join(f"; {fault}" for fault in few(faults, _MOST_SAID))
 
 
 # --- drain ------------------------------------------------------------------------------------

@@ -35,6 +35,8 @@ def restore(state: MasterState, intents: Callable[[str], _Table], now: float) ->
         )
     for program, amounts in intents("learned").items():
         state.learned.restore(program, amounts)
+    removed = ((int(one["next"]), name) for name, one in intents("removed").items())
+    state.keeping.removed.update((name, end) for end, name in sorted(removed))
     stored = sorted(intents("process").values(), key=lambda item: int(item["order"]))
     moves = intents("migration")
     for item in stored:

@@ -11,6 +11,7 @@ from rosrm.core.lazy import Lazy
 from rosrm.core.migration import Aim, Commit, Plan, ReportPhase, Step
 from rosrm.core.model import InstanceId, InstanceState, InstanceStatus
 from rosrm.core.plans import plan_to_dict
+from rosrm.spelling import one_line
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,7 +176,9 @@ class Run:
         if end is None:
             return "it was never started"
         status = end.status
-        return status.message or f"exit code {status.exit_code}, signal {status.exit_signal}"
+        return (
+            one_line(status.message) or f"exit code {status.exit_code}, signal {status.exit_signal}"
+        )
 
     def phases_of(self, instance: InstanceId) -> Mapping[ReportPhase, str]:
         """All that the source or the destination has said."""

@@ -28,6 +28,7 @@ from rosrm.core.runs import Run, run_to_dict
 from rosrm.core.settings import CoreSettings
 from rosrm.core.verdicts import Decision
 from rosrm.ports import Intent, MigrationStrategy, Record, ScoringPolicy
+from rosrm.spelling import one_line
 
 #: Records of one process that `explain` tells.
 _HISTORY: Final = 12
@@ -37,6 +38,8 @@ _RESERVED: Final = 1000
 _ON_THE_WAY_BACK: Final = frozenset({ProcessPhase.ASSIGNED, ProcessPhase.STARTING})
 #: Of processes that wait for a host.
 WAITING: Final = (ProcessPhase.QUEUED, ProcessPhase.SET_ASIDE)
+#: Most removed processes of which replicas are still dropped.
+_REMOVED_KEPT: Final = 10_000
 #: No instance gets a number as large as this.
 _LARGEST: Final = 2**53
 
@@ -79,6 +82,7 @@ class MasterState:
         over: names of the processes that are over, in the order in which they ended.
         standbys: process name to the handoff whose destination is its standby.
         wants_standby: names of the processes that ask for one and are not over.
+        held_since: time since when placement waits for first requests for work; inf: it does not.
         in_company_since: time since when at least one host has been heard; inf: none is.
         tail: whether the journal has lost what was newest in it.
         plugins: guards every call of a plugin.
@@ -130,6 +134,7 @@ class MasterState:
         self.next_order_id = 1
         self.wall = 0.0
         self.in_company_since = inf
+        self.held_since = inf
         self.tail = Tail()
         self.missing_since: dict[int, float] = {}
         self.reviewed = float("-inf")
@@ -162,6 +167,7 @@ class MasterState:
         """Write a line of the event record; `by` is the client that asked for it."""
         if by:
             message, facts = f"{message} (by {by})", {**facts, "by": by}
+        message = one_line(message)
         self.emit(Record(kind, process, host, message, facts))
         known = self.processes.get(process)
         if known is not None:
@@ -283,9 +289,20 @@ class MasterState:
         """Remove an ended process of which no instance may run from memory and journal."""
         del self.over[name]
         if self.processes.pop(name).spec.keeps_state:
-            self.keeping.removed[name] = self.next_instance
+            self._note_removed(name)
         self._unsaved.pop(name, None)
         self.emit(Intent("process", name, None))
+
+    def _note_removed(self, name: str) -> None:
+        """Journal that a process with state was removed: a host may return with a replica."""
+        removed = self.keeping.removed
+        removed.pop(name, None)  # the oldest stand first
+        removed[name] = self.next_instance
+        self.emit(Intent("removed", name, {"next": self.next_instance}))
+        if len(removed) > _REMOVED_KEPT:
+            oldest = next(iter(removed))
+            del removed[oldest]
+            self.emit(Intent("removed", oldest, None))
 
     def enqueue(self, process: Process, now: float, reason: str = "") -> None:
         """Queue a process at its place in the line."""

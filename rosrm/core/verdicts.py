@@ -6,7 +6,7 @@ it names, and spells its verdicts out when somebody reads them.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -21,7 +21,7 @@ from rosrm.core.placement import CLOSE, TIE, Demand, Labels, NamedPolicy, Names,
 from rosrm.core.plugin_calls import PluginCalls, required
 from rosrm.errors import PluginError
 from rosrm.ports import HostView, ProcessView, Scores
-from rosrm.spelling import amount, get_close_matches
+from rosrm.spelling import amount, by_reason, counted, first_line, get_close_matches, one_line
 
 #: An explanation names every host up to this many, else the best of those that fit.
 _NAMED_HOSTS: Final = 16
@@ -222,7 +222,7 @@ def _verdict(moment: Moment, scores: Scores | None, at: int, *, chosen: bool) ->
         reason = _said(moment, scores, at, veto=False)
         return Verdict(name, "chosen" if chosen else "fits", score, reason)
     if moment.closed[at]:
-        return Verdict(name, "excluded", None, moment.closed[at])
+        return Verdict(name, "excluded", None, one_line(moment.closed[at]))
     full = _full_reason(moment, at)
     if full:
         return Verdict(name, "full", None, full)
@@ -260,11 +260,24 @@ def why_never(table: HostTable, demand: Demand) -> str:
     """Why no host may take this process before something other than room changes; "" if one may.
 
     A host that is lost, has left or is cordoned may not, as long as another one is there: what
-    waits for it must not block those who do not. A host that is expected back has told no capacity
+    waits for it must not block those who do not. A host without a reading has reported no limits
     yet: that is not held against it.
     """
-    if not len(table):
+    if not len(table) or _possible(table, demand).any():
         return ""
+    unmeasured = _unmeasured(table, demand)
+    if unmeasured:
+        return unmeasured
+    return _host_by_host(table, lambda column: _never_reason(table, demand, column))
+
+
+def a_known_host_may(table: HostTable, demand: Demand) -> bool:
+    """Return True if a host whose limits are known may take a demand."""
+    return bool((_possible(table, demand) & ~table.without_reading()).any())
+
+
+def _possible(table: HostTable, demand: Demand) -> BoolArray:
+    """(H,) True: may take a demand before something other than room changes."""
     possible = may_ever_take(table, demand)
     away = table.away()
     if not away.all():
@@ -273,15 +286,7 @@ def why_never(table: HostTable, demand: Demand) -> str:
         host = table.by_name.get(name)
         if host is not None:
             possible[host.column] = False
-    if possible.any():
-        return ""
-    unmeasured = _unmeasured(table, demand)
-    if unmeasured:
-        return unmeasured
-    return "; ".join(
-        f"{host.name}: {_never_reason(table, demand, host.column)}"
-        for host in table.listed()[:_NAMED_HOSTS]
-    )
+    return possible
 
 
 def why_all_away(table: HostTable) -> str:
@@ -289,12 +294,15 @@ def why_all_away(table: HostTable) -> str:
     away = table.away() | (table.condition == HostCondition.EXPECTED)
     if not away.all():
         return ""
+    return f"every host is away: {_host_by_host(table, table.why_away)}"
+
+
+def _host_by_host(table: HostTable, reason: Callable[[int], str]) -> str:
+    """Return the reason against each host by its column, equal ones once; "" without hosts."""
     listed = table.listed()
-    named = "; ".join(
-        f"{host.name}: {table.why_away(host.column)}" for host in listed[:_NAMED_HOSTS]
-    )
+    said = by_reason((host.name, reason(host.column)) for host in listed[:_NAMED_HOSTS])
     more = len(listed) - _NAMED_HOSTS
-    return f"every host is away: {named}" + (f"; and {more} more" if more > 0 else "")
+    return f"{said}; and {counted(more, 'more host')}" if more > 0 else said
 
 
 def _unmeasured(table: HostTable, demand: Demand) -> str:
@@ -323,14 +331,15 @@ def may_ever_take(table: HostTable, demand: Demand) -> BoolArray:
     """
     need = table.fractions(demand.amounts, demand.estimated)
     too_large = ((need > table.limit + CLOSE) & (table.capacity > 0.0)).any(axis=0)
-    is_listed = table.condition != HostCondition.LEFT  # of a host that was not heard
-    return np.where(table.incarnation == 0, is_listed, eligible(table, demand) & ~too_large)
+    is_listed = table.condition != HostCondition.LEFT  # of a host without a reading
+    may_fit = eligible(table, demand) & ~too_large
+    return np.asarray(may_fit | (table.without_reading() & is_listed))
 
 
 def _never_reason(table: HostTable, demand: Demand, column: int) -> str:
     reason = _exclusion(table, demand, column) or table.why_away(column)
     if reason:
-        return reason
+        return first_line(reason)  # `rosrm explain` has the details
     need = table.fractions_of(table.hosts[column], demand.amounts, demand.estimated)
     row = int(np.argmax(need - table.limit[:, column]))
     name, limit = table.resources[row], float(table.limit[row, column])

@@ -14,7 +14,7 @@ from rosrm.recording.frames import CutShort, FrameKind, cut_short, frames
 from rosrm.version import __version__
 
 #: Tables of the journal from which a master's state is restored.
-TABLES = ("host", "learned", "process", "migration", "cluster")
+TABLES = ("host", "learned", "process", "migration", "cluster", "removed")
 
 _Table = Mapping[str, Mapping[str, Any]]
 

@@ -50,8 +50,8 @@ def _find_package(package: str, prefixes: Sequence[Path]) -> Path:
     where = ", ".join(str(prefix) for prefix in prefixes)
     near = _near(package, [name for prefix in prefixes for name in _listed(prefix / _PACKAGES)])
     raise LaunchError(
-        f"the ROS package {package!r} was not found in {where} (AMENT_PREFIX_PATH and the prefix "
-        f"of this Python){near or '; no package was found there at all'}"
+        f"the ROS package {package!r} was not found{near or '; no package was found at all'}\n"
+        f"searched: {where} (AMENT_PREFIX_PATH and the prefix of this Python)"
     )
 
 

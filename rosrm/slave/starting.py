@@ -23,6 +23,7 @@ from rosrm.slave.launch import launch_order
 from rosrm.slave.memos import to_memo
 from rosrm.slave.sessions import SessionTable
 from rosrm.slave.supervisor_link import SupervisorLink
+from rosrm.spelling import one_line
 
 
 @dataclass
@@ -131,7 +132,7 @@ class Starter:
                 )  # fmt: skip
                 orders.append(replace(order, memo=to_memo(held.memo)))
             except LaunchError as error:
-                self.say(f"{assignment.instance} cannot be started here: {error}")
+                self.say(f"{assignment.instance} cannot be started here: {one_line(str(error))}")
                 self.take(core.LaunchRefused(assignment.instance, str(error)))
         if orders:
             self.supervisor.start(orders)

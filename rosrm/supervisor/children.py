@@ -25,6 +25,8 @@ _EVERY_SIGNAL: Final = [
 class SpawnError(Exception):
     """The process cannot be started; its text says what was tried, where, and what is wrong.
 
+    Only the first line is the reason: details such as a whole PATH go into further lines.
+
     Attributes:
         transient: the same may work later.
     """
@@ -84,14 +86,14 @@ def find_executable(word: str, environment: Mapping[str, str]) -> str:
     if "/" in word:
         return word
     search = environment.get("PATH", os.defpath)
-    passed_over = ""
+    reason = f"program {word!r} is not on the PATH"
     for directory in search.split(os.pathsep):
         path = os.path.join(directory or ".", word)
         if os.path.isfile(path):
             if os.access(path, os.X_OK):
                 return path
-            passed_over = f" ({path} is there, but is not executable)"
-    raise SpawnError(f"no executable {word!r} was found in PATH, {search}{passed_over}")
+            reason = f"program {word!r} on the PATH, {path}, is not executable"
+    raise SpawnError(f"{reason}\nthe PATH is {search}")
 
 
 def _why(path: str, directory: str, error: OSError) -> str:

@@ -168,7 +168,7 @@ time.sleep(0.3)
 @pytest.mark.parametrize(
     ("argv", "directory", "said"),
     [
-        (("no-such-program",), None, "no executable 'no-such-program' was found in PATH, /"),
+        (("no-such-program",), None, "program 'no-such-program' is not on the PATH\nthe PATH is /"),
         (("/no/such/program",), None, "no executable '/no/such/program' exists"),
         (("/etc/passwd",), None, "/etc/passwd cannot be started: it is not executable"),
         (("./run.sh",), "{tmp}", "no executable '{tmp}/./run.sh' exists"),

@@ -146,6 +146,15 @@ def test_a_host_without_the_plugin_is_no_destination():
     assert "is not installed there" in cluster.migrate("p", "b").message
 
 
+def test_hosts_without_the_plugin_are_named_together():
+    """The reason is the same for all of them."""
+    cluster = frozen(Host("a"), *(Machine(name, busy={"memory": 0.5}) for name in "bcde"))
+    assert cluster.migrate("p").message == (
+        "no host has room for p; freezing does not work on b, c and 2 more: "
+        "the plugin of 'freezing' is not installed there"
+    )
+
+
 def test_a_strategy_that_fails_to_name_its_ability_is_asked_again():
     """One late call of its plugin must not keep it off every host until their slaves restart."""
     host, cluster = Host("a"), Cluster(strategies={"freezing": Freezing()})

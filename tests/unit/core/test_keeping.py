@@ -317,6 +317,22 @@ def test_the_replicas_of_a_pruned_process_are_dropped():
     assert cluster.machines[third].host_id not in dropped_on
 
 
+def test_what_was_pruned_is_not_forgotten_with_the_master():
+    """A host that returns after a restart of the master is ordered to drop it, and nothing else."""
+    cluster = running(Asked())
+    number, (other, *_) = cluster["p"].owner, others(cluster)
+    cluster.machines[where(cluster)].finish("p", cluster.now, code=1)
+    cluster.wait(2.0)
+    assert cluster.ask(happened.PruneRequested, ("p",), ()).accepted
+    cluster.restart_master()
+    before = len(cluster.orders("drop_kept"))
+    keep(cluster, other, ("p", number, 4), ("stranger", number, 4))
+    cluster.wait(2.0)
+    assert {(order.host_id, order.instance) for order in cluster.orders("drop_kept")[before:]} == {
+        (cluster.machines[other].host_id, InstanceId("p", number))
+    }
+
+
 def test_where_it_was_submitted_is_not_forgotten_with_the_master():
     """The state of a former life stays unused after a restart of the master too."""
     cluster = running(Asked())

@@ -446,6 +446,25 @@ def test_a_plan_is_refused_before_its_first_step_where_a_host_lacks_an_executor(
     assert cluster.state.hosts.processes.tolist() == [1, 0]
 
 
+def test_a_move_goes_to_the_next_host_where_the_best_lacks_an_executor() -> None:
+    """Only a host that was asked for by name is not replaced by another."""
+    cluster = sleepy("sleepy.wait")
+    assert not cluster.migrate("p", "b").accepted
+    cluster.add(Machine("c", busy={"memory": 0.55}))
+    cluster.add(Machine("d", busy={"memory": 0.6}, executors={"sleepy.wait": lambda arguments: {}}))
+    assert cluster.migrate("p").host == "d"
+
+
+def test_hosts_that_lack_an_executor_are_named_together() -> None:
+    """As one reason with one advice."""
+    cluster = sleepy("sleepy.wait")
+    cluster.add(Machine("c", busy={"memory": 0.55}))
+    assert cluster.migrate("p").message == (
+        "b and c have no executor 'sleepy.wait', which sleepy needs there to move p: install "
+        "rosrm-sleepy 1.0 on them and restart their slaves"
+    )
+
+
 def test_a_plan_that_names_an_executor_that_its_offer_lacks_is_unsound() -> None:
     """A misspelt one is found when the plan is checked, whatever the hosts have."""
     reply = sleepy("sleepy.wiat").migrate("p")

@@ -36,6 +36,32 @@ def test_equal_scores_go_to_the_host_with_fewer_processes_then_to_the_first() ->
     assert [cluster.where(name) for name in "pqr"] == [["a"], ["b"], ["a"]]
 
 
+def test_a_host_that_has_just_registered_takes_its_part_of_the_work(monkeypatch) -> None:
+    """The host whose first request comes a moment later is waited for; the reason says so."""
+    cluster = Cluster("a")
+    with monkeypatch.context() as patched:
+        patched.setattr(cluster, "ask_for_work", lambda machine: None)
+        cluster.add("b")
+    cluster.submit(process("p"), process("q"))
+    assert cluster["p"].reason == ("waits for the first request for work of b, registered just now")
+    cluster.wait(0.1)
+    assert cluster.counts() == {"a": 1, "b": 1}
+    assert cluster.told("waits") == []
+
+
+def test_hosts_that_register_and_never_ask_hold_up_no_work(monkeypatch) -> None:
+    """Placement waits 1 s at most, though another host registers every 0.4 s."""
+    cluster = Cluster("a")
+    monkeypatch.setattr(cluster, "ask_for_work", lambda machine: None)
+    for number in range(4):
+        cluster.add(f"b{number}")
+        if not number:
+            cluster.submit(process("p"))
+        assert not cluster.where("p") or number == 3
+        cluster.wait(0.4)
+    assert cluster.where("p") == ["a"]
+
+
 @pytest.mark.parametrize("needs", ["declared", "default", "learned"])
 def test_sixty_equal_processes_on_three_equal_hosts_end_20_20_20(needs: str) -> None:
     """What was just assigned counts before it shows, however its needs are known."""

@@ -137,6 +137,31 @@ def test_what_has_not_ended_or_left_is_refused_and_nothing_is_removed() -> None:
     assert seen(cluster) == (["done", "gone", "live"], ["a", "b"])
 
 
+def test_a_suspect_host_is_refused_as_suspect() -> None:
+    """With its silence and the time after which it is lost; then it is pruned."""
+    cluster = Cluster("a")
+    cluster.machines["a"].connected = False
+    cluster.wait(3.0)
+    assert prune(cluster, hosts=("a",)).message == (
+        "a is suspect: it has not reported for 3.0 s and may report again. Stop its slave if it "
+        "runs; a host can be pruned once it has left or is lost, which is after 10 s of silence. "
+        "Nothing was removed"
+    )
+    cluster.wait(8.0)
+    assert prune(cluster, hosts=("a",)).accepted
+
+
+def test_a_host_that_leaves_is_pruned_once_its_processes_have_ended() -> None:
+    """Its slave still stops them; the user has to wait, and need not cancel."""
+    cluster = Cluster("a")
+    cluster.submit(process("p"))
+    machine = cluster.machines["a"]
+    cluster.tell(happened.HostLeft(99, machine.host_id, machine.incarnation))
+    assert prune(cluster, hosts=("a",)).message == (
+        "a is still stopping p; wait until it has ended. Nothing was removed"
+    )
+
+
 def test_a_lost_host_is_pruned_once_all_that_it_may_run_was_cancelled() -> None:
     """Then they are cancelled; if the host returns after all, they are stopped there."""
     cluster = Cluster("a")

@@ -66,13 +66,11 @@ def test_that_somebody_waits_is_said_once() -> None:
 
 
 def test_who_may_never_run_is_set_aside_and_lets_the_others_pass() -> None:
-    """With its reason, host by host."""
+    """With the reason, which is said once for all hosts that it holds for."""
     cluster = Cluster("a", Machine("b", labels={"gpu": "old"}))
     cluster.submit(process("p", required_labels={"gpu": "new"}), process("q"))
     assert cluster.phase("p") == "set_aside"
-    reason = cluster["p"].reason
-    assert "a: it lacks the label gpu=new" in reason
-    assert "b: it lacks the label gpu=new" in reason
+    assert cluster["p"].reason == "no host may take it: a and b: it lacks the label gpu=new"
     assert cluster.where("q")
 
 
@@ -86,6 +84,20 @@ def test_who_is_too_large_for_every_host_is_set_aside() -> None:
         "needed: 944 MB"
     )
     assert cluster.restart("p").message.startswith("p is set aside: no host may take it: a: ")
+
+
+def test_nothing_is_set_aside_before_the_limits_are_known(monkeypatch) -> None:
+    """A host that has registered and sent no reading may yet turn out to be large enough."""
+    cluster = Cluster()
+    cluster.submit(process("p", memory=1200))
+    with monkeypatch.context() as patched:
+        patched.setattr(cluster, "read", lambda machine: None)
+        patched.setattr(cluster, "ask_for_work", lambda machine: None)
+        cluster.add(Machine("a", memory=1000 * MIB))
+        assert cluster.phase("p") == "queued"
+    cluster.wait(0.1)
+    assert cluster.phase("p") == "set_aside"
+    assert "of which 839 MB (80%) may be used" in cluster["p"].reason
 
 
 def test_a_misspelt_resource_is_named_with_the_nearest_that_is_reported() -> None:

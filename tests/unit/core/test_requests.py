@@ -395,6 +395,19 @@ def test_one_that_every_host_refuses_has_failed() -> None:
     assert cluster.phase("q") == "running"
 
 
+def test_equal_refusals_are_said_once_and_their_details_only_where_asked_for() -> None:
+    """The details are on further lines; events and the explanation have them in one line."""
+    refusal = "program 'p' is not on the PATH\nthe PATH is /bin"
+    cluster = Cluster(*[Machine(name, refuses={"p": refusal}) for name in "abcd"])
+    cluster.submit(process("p"))
+    assert cluster["p"].reason == (
+        "no host can start it: a, b and 2 more: program 'p' is not on the PATH"
+    )
+    said = "program 'p' is not on the PATH; the PATH is /bin"
+    assert cluster.told("queued")[0] == f"p returns to the queue: a cannot run it: {said}"
+    assert said in cluster.explain("p")["history"][-2]["message"]
+
+
 def test_a_slave_that_was_started_anew_may_find_what_it_lacked() -> None:
     """Its former refusal is forgotten."""
     a = Machine("a", refuses={"p": "no such package"})

@@ -26,6 +26,29 @@ def test_the_queue_keeps_its_order() -> None:
     assert cluster.where("aside") == ["b"]
 
 
+def test_what_is_set_aside_stays_so_while_the_hosts_come_back() -> None:
+    """With its reason and its age, as no host whose limits are known may take it."""
+    cluster = Cluster(Machine("a", memory=1000 * MIB))
+    cluster.submit(process("p", memory=900))
+    reason, since = cluster["p"].reason, cluster["p"].since
+    cluster.wait(5.0)
+    cluster.restart_master()
+    cluster.wait(1.0)
+    assert (cluster.phase("p"), cluster["p"].reason) == ("set_aside", reason)
+    assert cluster["p"].since == pytest.approx(since, abs=0.01)
+    assert len(cluster.told("set_aside")) == 1
+
+
+def test_the_reason_of_what_is_set_aside_follows_the_hosts() -> None:
+    """Of a host that comes later too."""
+    cluster = Cluster("a")
+    cluster.submit(process("p", required_labels={"x": "y"}))
+    cluster.add("b")
+    cluster.wait(0.2)
+    assert cluster["p"].reason == "no host may take it: a and b: it lacks the label x=y"
+    assert cluster.intents["process"]["p"]["reason"] == cluster["p"].reason
+
+
 def test_what_runs_runs_on_and_is_not_started_twice() -> None:
     """A process is expected on its host, and found there."""
     cluster = Cluster("a", "b")

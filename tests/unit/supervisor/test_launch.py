@@ -91,7 +91,7 @@ def test_a_program_that_is_to_be_checkpointed_is_looked_for(tmp_path, program):
     """The wrapper that is started in its place would fail on each host, one after the other."""
     options = {"checkpoint_every": 10.0}
     migration = MigrationPolicy("criu", options=options)
-    with pytest.raises(LaunchError, match=f"no executable '{program}'"):
+    with pytest.raises(LaunchError, match=f"'{program}' (is not on the PATH|exists)"):
         order(tmp_path, command=(program,), ros=True, migration=migration)
 
 
@@ -196,8 +196,8 @@ def test_packages_lie_in_the_prefix_of_python_too(tmp_path, prefix):
 @pytest.mark.parametrize(
     ("package", "executable", "said"),
     [
-        ("demo_node", "talker", ["'demo_node' was not found in", "did you mean demo_nodes?"]),
-        ("nothing", "talker", ["'nothing' was not found in", "it has demo_nodes"]),
+        ("demo_node", "talker", ["'demo_node' was not found; did", "did you mean demo_nodes?"]),
+        ("nothing", "talker", ["'nothing' was not found; it has", "it has demo_nodes"]),
         ("demo_nodes", "talk", ["has no executable 'talk'", "did you mean talker"]),
         ("demo_nodes", "notes", ["notes", "is not executable"]),
     ],
