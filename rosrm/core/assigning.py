@@ -17,7 +17,7 @@ from rosrm.core.placement import Demand, Ranking
 from rosrm.core.state import MasterState, Process, ProcessPhase, larger
 from rosrm.core.verdicts import Decision, decide, refused_everywhere, why_all_away, why_never
 
-_AWAY: Final = (HostCondition.EXPECTED, HostCondition.LOST)
+_AWAY: Final = (HostCondition.EXPECTED, HostCondition.LOST, HostCondition.DETACHED)
 _STATE_MAY_COME: Final = "a host that may have a snapshot of its state has not come back yet"
 _NOBODY: Final[frozenset[str]] = frozenset()
 

@@ -34,6 +34,7 @@ _AWAY: Final = {
     HostCondition.SUSPECT: "is suspect: its reports are late",
     HostCondition.LOST: "is lost",
     HostCondition.LEFT: "has left",
+    HostCondition.DETACHED: "is detached: its slave was stopped",
     HostCondition.EXPECTED: "has not come back since the master started",
 }
 

@@ -1,5 +1,8 @@
 """Silence: a host is first suspect (no new work), then, after its lease, lost.
 
+A host whose slave was stopped and left processes running is detached instead. What becomes of them
+follows the same lease (`host_loss`).
+
 Ages are judged by the master's own monotonic clock alone, and never by the ROS graph. A host that
 reports seldom, by its own word, is given as much more time as it needs for a few reports.
 """
@@ -45,6 +48,13 @@ def review_liveness(state: MasterState, now: float) -> None:
         _lose(state, table.hosts[column], float(age[column]), float(lease[column]), now)
     for column in np.flatnonzero((suspect | lost) & fresh):
         welcome_back(state, table.hosts[column], now)
+
+
+def lease_end(state: MasterState, host: Host) -> float:
+    """Return the time at which the lease of a host ends, unless the host is heard before."""
+    period = float(state.hosts.period[host.column])
+    grace = max(0.0, _REPORTS_MISSED * period - state.settings.suspect)
+    return float(state.hosts.heard[host.column]) + state.settings.lease + grace
 
 
 def _note_company(state: MasterState, heard: bool, now: float) -> None:

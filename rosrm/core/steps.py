@@ -47,7 +47,11 @@ _TITLES: Final[Mapping[type[Step], str]] = {
     SetRestart: "setting the restart policy of {0.instance} on {0.host} to {0.restart.when!r}",
 }
 #: Of a host that answers nothing, and may never do so again.
-_AWAY: Final = {HostCondition.LOST: "is lost", HostCondition.LEFT: "has left"}
+_AWAY: Final = {
+    HostCondition.LOST: "is lost",
+    HostCondition.LEFT: "has left",
+    HostCondition.DETACHED: "is detached: its slave was stopped",
+}
 
 
 def give_order(state: MasterState, run: Run, step: Step, now: float) -> None:
