@@ -26,8 +26,14 @@ def get_close_matches(
 
 
 def counted(number: int, singular: str, plural: str = "") -> str:
-    """Return a number with its noun: "1 process", "2 processes"; `plural` if "s" is not enough."""
-    return f"{number} {singular if number == 1 else plural or singular + 's'}"
+    """Return a number with its noun: "no processes", "1 process", "2 processes".
+
+    Args:
+        number: 0 is spelt out.
+        singular: noun of 1.
+        plural: noun of any other number; "": the singular with an s.
+    """
+    return f"{number or 'no'} {singular if number == 1 else plural or singular + 's'}"
 
 
 def few(names: Iterable[str], most: int = 8) -> list[str]:
@@ -64,6 +70,14 @@ def one_line(reason: str) -> str:
 def standing(state: str) -> str:
     """Return the state of a process as a sentence has it: "is in back-off", "has failed"."""
     return _STANDING.get(state, f"is {state.replace('_', ' ')}")
+
+
+def standing_for(state: str, time: str) -> str:
+    """Return a state and its time: "has been unreachable for 2 min", "finished 2 min ago"."""
+    verb, _, rest = standing(state).partition(" ")
+    if verb == "is":
+        return f"has been {rest} for {time}"
+    return f"{rest if verb == 'has' else f'{verb} {rest}'} {time} ago"
 
 
 def size(amount: float, *, binary: bool = False) -> str:

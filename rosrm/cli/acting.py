@@ -13,6 +13,7 @@ import typer
 from rosrm.cli import connection
 from rosrm.cli.options import Domain, Host, Name, Names
 from rosrm.errors import ConfigError
+from rosrm.spelling import counted
 
 if TYPE_CHECKING:
     from rosrm.core.model import ProcessSpec
@@ -101,8 +102,10 @@ def cancel(
         if not names:
             typer.echo("no process to cancel: all of them have ended, or were never submitted")
             return
-        typer.echo(client.cancel(names))
-        if wait:
+        outcome = client.cancel(names)
+        typer.echo(outcome)
+        # The reply of the master has the end of each already, where all of them waited.
+        if wait and outcome != f"{counted(len(names), 'process', 'processes')} cancelled":
             with interruptible("the processes are still being cancelled (`rosrm ps`)"):
                 _exit_unless(wait_for(client, names, limit, over, missing="done"))
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from rosrm.spelling import counted, get_close_matches
+from rosrm.spelling import counted, get_close_matches, listed
 
 if TYPE_CHECKING:
     from rosrm.config.settings import ClusterConfig
@@ -116,13 +116,16 @@ def _checked(file: Path, kind: KindOfFile | None, registry: Registry) -> str:
 
             comparison = load_workload(file, registry)
             hosts, processes = len(comparison.workload.hosts), len(comparison.workload.processes)
-            return f"a simulation: {hosts} hosts, {processes} processes"
+            held = counted(processes, "process", "processes")
+            return f"a simulation: {counted(hosts, 'host')}, {held}"
         case _:
             specs = load_work(file, registry)
             for warning in (*shared_nodes(specs), *_misspelt_needs(specs, registry)):
                 typer.echo(f"{file}: warning: {warning}", err=True)
             jobs = sum(spec.kind.value == "job" for spec in specs)
-            return f"work: {counted(jobs, 'job')} and {counted(len(specs) - jobs, 'service')}"
+            numbers = ((jobs, "job"), (len(specs) - jobs, "service"))
+            parts = [counted(number, noun) for number, noun in numbers if number]
+            return f"work: {listed(parts) if parts else 'no processes'}"
 
 
 def _misspelt_needs(specs: Iterable[ProcessSpec], registry: Registry) -> Iterator[str]:

@@ -40,7 +40,7 @@ def status_form(snapshot: Snapshot) -> dict[str, Any]:
         "trouble": snapshot.trouble,
         "hosts": _counts(row.state for row in snapshot.hosts),
         "processes": _counts(row.state for row in snapshot.processes),
-        "failing_plugins": [form(row) for row in snapshot.plugins if row.state == "failing"],
+        "failing_plugins": [form(row) for row in snapshot.plugins],
     }
 
 

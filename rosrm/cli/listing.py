@@ -20,7 +20,7 @@ def status(ctx: typer.Context, as_json: AsJson = False, domain: Domain = None) -
     from rosrm.cli.tables import show
 
     with connection.master(ctx, domain) as client:
-        snapshot = client.list(hosts=True, processes=True, plugins=True, events=True, newest=5)
+        snapshot = client.list(hosts=True, processes=True, plugins="failing", events=True, newest=5)
     connection.say_trouble(snapshot)
     if as_json:
         json_forms.show(json_forms.status_form(snapshot))

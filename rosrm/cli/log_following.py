@@ -18,7 +18,7 @@ from rosrm.cli import formats
 from rosrm.cli.log_writing import Piece, Stream, show
 from rosrm.config.units import Quantity
 from rosrm.errors import ConfigError, NoMaster, Refused, RosrmError
-from rosrm.spelling import standing
+from rosrm.spelling import standing, standing_for
 
 if TYPE_CHECKING:
     from rosrm.core.views import HostRow, ProcessRow, Snapshot
@@ -258,9 +258,8 @@ class _Copy:
         name = self.stream.name
         known = ""
         if row is not None:
-            reason = f", {row.reason}" if row.reason else ""
-            since = formats.duration(row.since)
-            known = f". State of {name} for {since}: {formats.words(row.state)}{reason}"
+            reason = f": {row.reason}" if row.reason else ""
+            known = f". {name} {standing_for(row.state, formats.duration(row.since))}{reason}"
         raise Refused(
             f"the log of {name} is on {host}, and {self._away[host]}{known}. `rosrm events "
             f"--process {name}` shows what happened; `--host HOST` reads an older part elsewhere"
@@ -315,4 +314,6 @@ def _why_away(row: HostRow | None, host: str) -> str:
     if row.state == "left":
         return f"{host} has left: no slave runs there"
     silent = formats.duration(row.reading_age)
+    if row.state == "detached":
+        return f"{host} is detached: its slave was stopped {silent} ago"
     return f"{host} is {row.state}: the master received its last reading {silent} ago"

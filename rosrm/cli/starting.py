@@ -79,14 +79,17 @@ def slave(
 
     registry = Registry.discover()
     settings = load_host(config, registry) if config else HostConfig()
+    settings = replace(settings, ros=_with_domain(settings.ros, ctx, domain))
     if stop_everything:
-        from rosrm.slave.stop_all import stop_all
-
-        typer.echo(stop_all(settings.state))
+        if not (settings.state / "supervisor").is_dir():
+            typer.echo(
+                f"nothing to stop: no slave was started with the state directory {settings.state}"
+            )
+            return
+        become("rosrm.slave.stop_all", settings.to_json())
         return
     if settings.probes is None:
         registry.default_probes()  # raises where there is none
-    settings = replace(settings, ros=_with_domain(settings.ros, ctx, domain))
     typer.echo(_says_of_host(settings), err=True)
     become("rosrm.slave.run", settings.to_json())
 

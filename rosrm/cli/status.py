@@ -67,7 +67,7 @@ def _troubles(processes: Iterable[ProcessRow]) -> Iterator[RenderableType]:
 
 
 def _failing(plugins: Iterable[PluginRow]) -> Iterator[RenderableType]:
-    rows = [row for row in plugins if row.state == "failing"]
+    rows = list(plugins)
     if rows:
         yield Text()
     for row in rows[:_MOST_NAMED]:

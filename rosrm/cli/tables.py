@@ -30,6 +30,7 @@ STYLES: Final = {
     "migrating": "cyan",
     "checkpointed": "cyan",
     "suspect": "yellow",
+    "detached": "yellow",
     "absent": "yellow",
     "failed": "red",
     "stuck": "bold red",

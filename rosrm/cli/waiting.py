@@ -117,8 +117,8 @@ def wait_for(
     while True:
         rows = {row.name: row for row in client.list(processes=True).processes}
         ours = [rows[name] for name in names if name in rows]
-        _say_news(ours, said)
         verdicts.update((row.name, judge(row)) for row in ours)
+        _say_news((row for row in ours if verdicts[row.name] != "done"), said)
         unseen = [
             name
             for name in names

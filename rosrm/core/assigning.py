@@ -26,7 +26,7 @@ from rosrm.core.verdicts import (
 )
 from rosrm.spelling import listed
 
-_AWAY: Final = (HostCondition.EXPECTED, HostCondition.LOST)
+_AWAY: Final = (HostCondition.EXPECTED, HostCondition.LOST, HostCondition.DETACHED)
 _STATE_MAY_COME: Final = "a host that may have a snapshot of its state has not come back yet"
 #: Seconds for which placement waits at most for the first request of a host that has registered.
 _FIRST_REQUEST: Final = 1.0

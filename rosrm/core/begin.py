@@ -153,8 +153,8 @@ def _lacks(state: MasterState, run: Run, executor: str, hosts: list[str]) -> str
     one = len(hosts) == 1
     lacking = f"{listed(hosts, most=3)} {'has' if one else 'have'} no executor {executor!r}"
     return (
-        f"{lacking}, which {run.strategy} needs there to move {run.process}: install {brought_by} on {hosts[0] if one else 'them'} "
-        f"and restart {'its slave' if one else 'their slaves'}"
+        f"{lacking}, which {run.strategy} needs there to move {run.process}: install {brought_by} "
+        f"on {hosts[0] if one else 'them'} and restart {'its slave' if one else 'their slaves'}"
     )
 
 

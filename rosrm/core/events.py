@@ -45,11 +45,17 @@ class HostRegistered:
 
 @dataclass(frozen=True, slots=True)
 class HostLeft:
-    """A slave stops in good order; its processes will be reported as ended."""
+    """A slave is stopped.
+
+    Attributes:
+        kept: all instances of a slave that leaves them running; (): it stops them, and reports
+            their ends.
+    """
 
     request: int
     host_id: int
     incarnation: int
+    kept: tuple[InstanceStatus, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,5 +1,8 @@
 """What becomes of the processes of a host that is lost, and of those that it brings back.
 
+A detached host, whose slave was stopped and left processes running, is as a lost one when its lease
+has passed: no process of it may start elsewhere sooner than after a loss.
+
 =========================  ======================================================================
 on a lost host             what follows
 =========================  ======================================================================
@@ -21,6 +24,8 @@ the master that was cut off, and its hosts come back one by one.
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 
 from rosrm.core import coming_back, failover, handoffs, lifecycle
@@ -30,15 +35,27 @@ from rosrm.core.migration import Aim
 from rosrm.core.processes import LeftBehind
 from rosrm.core.state import Instance, MasterState, Process, ProcessPhase, Wanted
 
+_OUT_OF_REACH: Final = (HostCondition.LOST, HostCondition.DETACHED)
+
 
 def lose_sight(state: MasterState, host: Host, now: float) -> None:
     """A host is lost: its processes are out of reach, not gone."""
     host.lost_since = now
+    _note_phases(state, host, now)
+    _review(state, host, now)
+
+
+def detach(state: MasterState, host: Host, lease_end: float, now: float) -> None:
+    """The slave of a host was stopped and left processes running, which are out of reach now."""
+    host.detached_since, host.lost_since = now, lease_end
+    _note_phases(state, host, now)
+
+
+def _note_phases(state: MasterState, host: Host, now: float) -> None:
     for number in host.instances:
         process = state.owned_by(state.instances[number])
         if process is not None and process.name not in state.runs:
             lifecycle.note_phase(state, process, state.instances[number], now)
-    _review(state, host, now)
 
 
 def regain_sight(state: MasterState, host: Host, now: float) -> None:
@@ -54,12 +71,14 @@ def regain_sight(state: MasterState, host: Host, now: float) -> None:
 
 
 def review_lost_hosts(state: MasterState, now: float) -> None:
-    """Give up what is due on every lost host."""
-    for column in np.flatnonzero(state.hosts.condition == HostCondition.LOST):
+    """Give up what is due on every lost or detached host."""
+    for column in np.flatnonzero(np.isin(state.hosts.condition, _OUT_OF_REACH)):
         _review(state, state.hosts.hosts[column], now)
 
 
 def _review(state: MasterState, host: Host, now: float) -> None:
+    if now < host.lost_since:
+        return
     for number in sorted(host.instances):
         instance = state.instances[number]
         if _is_given_up(state, instance, now):
@@ -100,14 +119,15 @@ def _may_be_active(state: MasterState, instance: Instance) -> bool:
 
 def _give_up(state: MasterState, instance: Instance, now: float) -> None:
     host, process = instance.host, state.processes.get(instance.id.process)
+    why = f"{host.name} {state.hosts.why_unreachable(host)}"
     state.record(
-        now, "given_up", f"{instance.id} is given up: {host.name} is lost",
+        now, "given_up", f"{instance.id} is given up: {why}",
         process=instance.id.process, host=host.name, facts={"number": instance.id.number},
     )  # fmt: skip
     if process is not None and _may_be_taken_back(process, instance):
         process.left_behind = LeftBehind(instance.id.number, host.name, instance.node_name)
     stays = process is not None and process.spec.host_loss.then == "stop"
-    lifecycle.gone(state, instance, now, f"{host.name} is lost", comes_again=not stays)
+    lifecycle.gone(state, instance, now, why, comes_again=not stays)
 
 
 def _may_be_taken_back(process: Process, instance: Instance) -> bool:

@@ -41,6 +41,7 @@ class HostCondition(IntEnum):
     LOST = 2
     LEFT = 3
     EXPECTED = 4  # known from the journal, not heard since this master's start
+    DETACHED = 5  # its slave was stopped and left processes running
 
     def words(self, *only: HostCondition) -> str:
         """Return how a host that is not up stands, without its name; "": in none of `only`."""
@@ -51,6 +52,7 @@ _WORDS: Final[Mapping[HostCondition, str]] = {
     HostCondition.SUSPECT: "is suspect: its reports are late",
     HostCondition.LOST: "is lost",
     HostCondition.LEFT: "has left",
+    HostCondition.DETACHED: "is detached: its slave was stopped and left processes running",
     HostCondition.EXPECTED: "has not come back since the master started",
 }
 
@@ -69,7 +71,9 @@ class Host:
         pruned: it is in no listing, until it registers.
         told: kind of a record that is not repeated at once, to when it was made.
         blocked: why nothing could leave it, by what was to be relieved: as last recorded.
-        lost_since: time at which it was lost, while it is.
+        detached_since: time at which its slave was stopped, while it is detached.
+        lost_since: time at which it was lost, while it is; of a detached host the time at which its
+            lease ends.
         failing: resource to the reason why its probe gives no readings, as the slave reports.
     """
 
@@ -84,6 +88,7 @@ class Host:
     over_at: dict[str, float] = field(default_factory=dict)
     told: dict[str, float] = field(default_factory=dict)
     blocked: dict[str, str] = field(default_factory=dict)
+    detached_since: float = 0.0
     lost_since: float = 0.0
     failing: Mapping[str, str] = field(default_factory=lambda: EMPTY)
 
@@ -207,7 +212,7 @@ class HostTable(HostColumns):
     def set_condition(self, host: Host, condition: HostCondition) -> None:
         """Note how well a host is heard."""
         self.condition[host.column] = condition
-        if condition is HostCondition.LEFT:
+        if condition in (HostCondition.LEFT, HostCondition.DETACHED):
             self.asking[host.column] = False
         self.changed()
 
@@ -326,19 +331,16 @@ class HostTable(HostColumns):
 
     def unheard(self) -> list[int]:
         """Numbers of the hosts that have reported, and have been silent for a moment or longer."""
-        silent = (self.condition == HostCondition.SUSPECT) | (self.condition == HostCondition.LOST)
+        silent = np.isin(self.condition, _SILENT)
         return [int(column) + 1 for column in np.flatnonzero(silent)]
 
     def away(self) -> BoolArray:
         """(H,) True: gets no work until somebody brings it back: lost, left, cordoned, drained."""
-        return np.asarray(
-            self.closed
-            | (self.condition == HostCondition.LOST) | (self.condition == HostCondition.LEFT)
-        )  # fmt: skip
+        return np.asarray(self.closed | np.isin(self.condition, _GONE))
 
     def why_unreachable(self, host: Host) -> str:
         """Return why a host cannot be reached, without its name; "" if it can."""
-        return self.condition_of(host).words(HostCondition.LOST, HostCondition.EXPECTED)
+        return self.condition_of(host).words(*_NO_ANSWER)
 
     def why_away(self, column: int) -> str:
         """Why a host is away, or may be; "" if it is there."""
@@ -399,3 +401,9 @@ class HostTable(HostColumns):
 def _over(usage: FloatArray, limit: FloatArray) -> BoolArray:
     """True: at or over its limit. A limit of 1 is none; NaN, no such resource, is over nothing."""
     return np.asarray((usage >= limit) & (limit < 1.0))
+
+
+#: Of hosts that reported before, and do not now.
+_SILENT: Final = (HostCondition.SUSPECT, HostCondition.LOST, HostCondition.DETACHED)
+_NO_ANSWER: Final = (HostCondition.LOST, HostCondition.DETACHED, HostCondition.EXPECTED)
+_GONE: Final = (HostCondition.LOST, HostCondition.LEFT, HostCondition.DETACHED)

@@ -11,10 +11,10 @@ from rosrm.core.charges import settle_charge
 from rosrm.core.commands import Order, Reply
 from rosrm.core.descriptions import description_fault
 from rosrm.core.hosts import Host, HostCondition
-from rosrm.core.liveness import welcome_back
+from rosrm.core.liveness import lease_end, welcome_back
 from rosrm.core.lost_tail import note_seen
 from rosrm.core.migration import Execute
-from rosrm.core.model import EMPTY
+from rosrm.core.model import EMPTY, InstanceStatus
 from rosrm.core.readings import take_readings
 from rosrm.core.state import MasterState, Wanted
 from rosrm.ports import Intent
@@ -136,10 +136,14 @@ def save_host(state: MasterState, host: Host) -> None:
 
 
 def host_left(state: MasterState, event: happened.HostLeft, now: float) -> None:
-    """A slave stops in good order: what it ends goes back to the queue."""
+    """A slave is stopped: what it ends goes back to the queue, and what it keeps is detached."""
     host = state.hosts.find(event.host_id, event.incarnation)
     if host is None:
         state.emit(Reply(event.request, False, "unknown", "this host is not registered"))
+        return
+    if event.kept:
+        _detach(state, host, event.kept, now)
+        state.emit(Reply(event.request))
         return
     state.hosts.set_condition(host, HostCondition.LEFT)
     state.record(now, "host_left", f"{host.name} leaves: its slave stops", host=host.name)
@@ -149,6 +153,18 @@ def host_left(state: MasterState, event: happened.HostLeft, now: float) -> None:
             process.wanted = Wanted.REQUEUE
             state.save(process)
     state.emit(Reply(event.request))
+
+
+def _detach(state: MasterState, host: Host, kept: tuple[InstanceStatus, ...], now: float) -> None:
+    """Take in what a slave that was stopped left running; what it does not hold has not begun."""
+    state.hosts.set_condition(host, HostCondition.DETACHED)
+    held = counted(sum(not one.state.ended for one in kept), "process", "processes")
+    state.record(
+        now, "host_detached", f"{host.name} is detached: its slave was stopped and left {held} "
+        f"running", host=host.name,
+    )  # fmt: skip
+    lifecycle.reconcile(state, host, kept, now, registering=True)
+    host_loss.detach(state, host, lease_end(state, host), now)
 
 
 def process_requested(state: MasterState, event: happened.ProcessRequested, now: float) -> None:

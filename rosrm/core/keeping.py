@@ -85,8 +85,8 @@ def awaits_states(state: MasterState, process: Process, now: float) -> bool:
 
 
 def _may_come_back(state: MasterState, host: Host, now: float) -> bool:
-    lost = state.hosts.condition_of(host) is HostCondition.LOST
-    return lost and now < host.lost_since + state.settings.lease
+    away = state.hosts.condition_of(host) in (HostCondition.LOST, HostCondition.DETACHED)
+    return away and now < host.lost_since + state.settings.lease
 
 
 def _was_left_on(process: Process, host: str) -> bool:

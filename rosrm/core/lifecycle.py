@@ -44,8 +44,8 @@ _ALIVE: Final = frozenset({InstanceState.STARTING, InstanceState.RUNNING, Instan
 def statuses_received(state: MasterState, event: happened.StatusesReceived, now: float) -> None:
     """Take in what a slave says of its instances, in order; what comes late is known already."""
     host = state.hosts.find(event.host_id, event.incarnation)
-    if host is None:
-        return
+    if host is None or state.hosts.condition_of(host) is HostCondition.DETACHED:
+        return  # the last message of a slave that leaves processes running has all that it holds
     is_next = state.hosts.note_statuses(host, event.sequence, now)
     if is_next is None:
         return
@@ -132,7 +132,9 @@ def _follow(
     phase = phase_of(process, instance)
     state.set_phase(process, phase, now, status.message)
     if phase is not before:
-        kind = "ready" if phase is ProcessPhase.RUNNING else phase.value
+        # A job that has begun is not ready for anything: it runs to its end.
+        is_ready = phase is ProcessPhase.RUNNING and process.spec.kind is not Kind.JOB
+        kind = "ready" if is_ready else phase.value
         kind = "reachable" if repeated else kind
         state.record(
             now, kind, f"{process.name} {standing(kind)} on {instance.host.name}"
@@ -386,6 +388,8 @@ def note_phase(state: MasterState, process: Process, owner: Instance, now: float
     if process.wanted is Wanted.CANCEL:
         where = f"; it may still run on {host.name}, which {unreachable}" if unreachable else ""
         ends = f", and ends when {host.name} returns" if unreachable else ""
+        if state.hosts.condition_of(host) is HostCondition.DETACHED:
+            where, ends = f": waits for {host.name}, whose slave was stopped", ""
         state.set_phase(process, ProcessPhase.STOPPING, now, f"being cancelled{where}{ends}")
     elif unreachable:
         lost = state.hosts.condition_of(host) is HostCondition.LOST

@@ -9,7 +9,7 @@ from rosrm.core import periodic
 from rosrm.core.assigning import decide_now
 from rosrm.core.hosts import Host, HostCondition
 from rosrm.core.images import reason_of
-from rosrm.core.state import Instance, MasterState, Process, ProcessPhase
+from rosrm.core.state import Instance, MasterState, Process, ProcessPhase, Wanted
 from rosrm.core.views import HostRow, ProcessRow, ResourceRow
 
 _CONDITION: Final = {
@@ -18,6 +18,7 @@ _CONDITION: Final = {
     HostCondition.LOST: "lost",
     HostCondition.LEFT: "left",
     HostCondition.EXPECTED: "lost",
+    HostCondition.DETACHED: "detached",
 }
 #: Of hosts that report: one that leaves reports until all that it held has ended.
 _HEARD: Final = (HostCondition.UP, HostCondition.LEFT)
@@ -65,6 +66,8 @@ def process_row(state: MasterState, process: Process, now: float) -> ProcessRow:
     phase, reason = process.phase.value, reason_of(state, process) or _of_standby(process)
     if silence and process.phase in _OBSERVED:
         phase, reason = "unknown", f"{silence}; last known: {phase}"
+    if owner is not None and process.wanted is Wanted.CANCEL and process.name not in state.runs:
+        reason += _awaited(state, owner.host, now)
     return ProcessRow(
         name=process.name, kind=process.spec.kind.value, state=phase,
         host=_host_of(process, owner), number=process.owner,
@@ -82,6 +85,17 @@ def _silence(state: MasterState, owner: Instance | None, now: float) -> str:
         return ""
     age = now - float(state.hosts.heard[owner.host.column])
     return f"{owner.host.name} has been silent for {age:.0f} s"
+
+
+def _awaited(state: MasterState, host: Host, now: float) -> str:
+    """Return for how long the end of a cancelled process waits for its host; "" if it does not."""
+    condition = state.hosts.condition_of(host)
+    if condition is HostCondition.DETACHED:
+        return f" {now - host.detached_since:.0f} s ago"
+    if condition is HostCondition.SUSPECT:
+        silence = now - float(state.hosts.heard[host.column])
+        return f": waits for {host.name}, which has been silent for {silence:.0f} s"
+    return ""
 
 
 def _host_of(process: Process, owner: Instance | None) -> str:

@@ -1,5 +1,8 @@
 """Silence: a host is first suspect (no new work), then, after its lease, lost.
 
+A host whose slave was stopped and left processes running is detached instead. What becomes of them
+follows the same lease (`host_loss`).
+
 Ages are judged by the master's own monotonic clock alone, and never by the ROS graph. A host that
 reports seldom, by its own word, is given as much more time as it needs for a few reports.
 """
@@ -51,6 +54,11 @@ def review_liveness(state: MasterState, now: float) -> None:
 def lease_of(state: MasterState, host: Host) -> float:
     """Return the seconds of silence after which a host is lost."""
     return state.settings.lease + float(_grace(state)[host.column])
+
+
+def lease_end(state: MasterState, host: Host) -> float:
+    """Return the time at which the lease of a host ends, unless the host is heard before."""
+    return float(state.hosts.heard[host.column]) + lease_of(state, host)
 
 
 def _grace(state: MasterState) -> FloatArray:

@@ -4,7 +4,8 @@
 what happened           what the core does
 ======================  =========================================================================
 HostRegistered          takes the host in, compares what it holds with what is intended
-HostLeft                gives it no more work; its processes return to the queue as they end
+HostLeft                gives it no more work; its processes return to the queue as they end, or
+                        are out of reach where the slave left them running
 ProcessRequested        notes that the host asks; places what waits
 ReadingsReceived        notes readings; places what waits
 StatusesReceived        moves processes through their phases; drives migrations

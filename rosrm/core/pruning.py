@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 from rosrm.core import events as happened
 from rosrm.core import lifecycle
 from rosrm.core.commands import Reply
@@ -10,7 +12,9 @@ from rosrm.core.liveness import lease_of
 from rosrm.core.requests import count, known_host, known_processes, refuse
 from rosrm.core.state import MasterState, Process, Wanted
 from rosrm.ports import Intent
-from rosrm.spelling import counted
+from rosrm.spelling import counted, listed
+
+_DEPARTED: Final = (HostCondition.LEFT, HostCondition.DETACHED)
 
 
 def prune_requested(state: MasterState, event: happened.PruneRequested, now: float) -> None:
@@ -26,7 +30,7 @@ def prune_requested(state: MasterState, event: happened.PruneRequested, now: flo
         left = [
             host
             for host in state.hosts.listed()
-            if state.hosts.condition_of(host) is HostCondition.LEFT and not host.instances
+            if state.hosts.condition_of(host) in _DEPARTED and not host.instances
         ]
         hosts = [host for host in left if not _why_held(state, host, now)]
     for process in processes:
@@ -35,8 +39,10 @@ def prune_requested(state: MasterState, event: happened.PruneRequested, now: flo
         _prune_host(state, host, event.by, now)
     if processes:
         state.record(now, "pruned", f"{count(len(processes))} removed", by=event.by)
-    removed = f"{count(len(processes))} and {counted(len(hosts), 'host')} removed"
-    state.emit(Reply(event.request, message=removed))
+    removed = [count(len(processes))] if processes else []
+    removed += [counted(len(hosts), "host")] if hosts else []
+    message = f"{listed(removed)} removed" if removed else "nothing to remove"
+    state.emit(Reply(event.request, message=message))
 
 
 def _named(

@@ -47,7 +47,7 @@ _TITLES: Final[Mapping[type[Step], str]] = {
     SetRestart: "setting the restart policy of {0.instance} on {0.host} to {0.restart.when!r}",
 }
 #: Of a host that answers nothing, and may never do so again.
-_AWAY: Final = (HostCondition.LOST, HostCondition.LEFT)
+_AWAY: Final = (HostCondition.LOST, HostCondition.LEFT, HostCondition.DETACHED)
 
 
 def give_order(state: MasterState, run: Run, step: Step, now: float) -> None:

@@ -332,8 +332,7 @@ def may_ever_take(table: HostTable, demand: Demand) -> BoolArray:
     need = table.fractions(demand.amounts, demand.estimated)
     too_large = ((need > table.limit + CLOSE) & (table.capacity > 0.0)).any(axis=0)
     is_listed = table.condition != HostCondition.LEFT  # of a host without a reading
-    may_fit = eligible(table, demand) & ~too_large
-    return np.asarray(may_fit | (table.without_reading() & is_listed))
+    return np.where(table.without_reading(), is_listed, eligible(table, demand) & ~too_large)
 
 
 def _never_reason(table: HostTable, demand: Demand, column: int) -> str:

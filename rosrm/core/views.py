@@ -32,7 +32,8 @@ class HostRow:
     """One host.
 
     Attributes:
-        state: "up", "suspect", "lost" or "left".
+        state: "up", "suspect", "lost", "left" or "detached" (its slave was stopped and left
+            processes running).
         accepting: the slave is under all its limits and has asked for work.
         reading_age: seconds since the newest `resource_info`.
         drained: it is draining, and no process is left on it that can leave.

@@ -54,7 +54,7 @@ class Reading:
             trouble=self._trouble(),
             hosts=listing.host_rows(state, now) if request.hosts else (),
             processes=self._processes(request.process, now) if request.processes else (),
-            plugins=self._all_plugins() if request.plugins else (),
+            plugins=self._plugin_rows(request) if request.plugins else (),
             events=self._events(request) if request.events else (),
         )
 
@@ -71,14 +71,27 @@ class Reading:
         )  # fmt: skip
         return [_event_row(one) for one in stored]
 
-    def _all_plugins(self) -> list[PluginRow]:
+    def _plugin_rows(self, request: Any) -> list[PluginRow]:
+        if not request.failing:
+            return self._all_plugins()
+        rows = [row for row in self._own_plugins() if row.state == "failing"]
+        return rows + [
+            _probe_row(host, resource)
+            for host in self._state.hosts.hosts if host.failing
+            for resource in host.description.resources if resource.name in host.failing
+        ]  # fmt: skip
+
+    def _own_plugins(self) -> list[PluginRow]:
         failing = self._state.plugins.failing
-        rows = [
+        return [
             replace(row, state="failing", reason=known.reason)
             if (known := failing.get((row.kind, row.name))) is not None
             else row
             for row in self._plugins
         ]
+
+    def _all_plugins(self) -> list[PluginRow]:
+        rows = self._own_plugins()
         for host in self._state.hosts.hosts:
             described = host.description
             rows += [_probe_row(host, resource) for resource in described.resources]

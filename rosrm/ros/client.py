@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 from rosrm.core.model import ProcessSpec
 from rosrm.core.views import Snapshot
@@ -291,13 +291,18 @@ class MasterClient:
     # --- what can be read ----------------------------------------------------------------
 
     def list(
-        self, *, hosts: bool = False, processes: bool = False, plugins: bool = False,
-        events: bool = False, process: str = "", host: str = "", after: int = 0, newest: int = 0,
+        self, *, hosts: bool = False, processes: bool = False,
+        plugins: bool | Literal["failing"] = False, events: bool = False, process: str = "",
+        host: str = "", after: int = 0, newest: int = 0,
     ) -> Snapshot:  # fmt: skip
-        """The listings that are asked for; the other arguments narrow the events."""
+        """The listings that are asked for, of plugins all or those that fail.
+
+        The arguments after `events` narrow the events.
+        """
         request = srv.List.Request(
-            protocol_version=PROTOCOL_VERSION, hosts=hosts, processes=processes, plugins=plugins,
-            events=events, process=process, host=host, after_sequence=after, max_events=newest,
+            protocol_version=PROTOCOL_VERSION, hosts=hosts, processes=processes,
+            plugins=bool(plugins), failing=plugins == "failing", events=events, process=process,
+            host=host, after_sequence=after, max_events=newest,
         )  # fmt: skip
         answer = self._call(srv.List, self._names(names.LIST), request, "the master")
         return Snapshot(

@@ -175,10 +175,11 @@ class MasterServices:
         self._tell(happened.HostRegistered(token, description, statuses, seen, kept))
 
     def _left(self, request: srv.Leave.Request, token: int) -> happened.Event:
+        kept = tuple(convert.status_from_msg(status) for status in request.kept)
         link = self._links.find(request.host_id, request.incarnation)
         if link is not None:
             self._links.left(link)
-        return happened.HostLeft(token, request.host_id, request.incarnation)
+        return happened.HostLeft(token, request.host_id, request.incarnation, kept)
 
     def _take_poll(self, request: srv.RequestProcess.Request, respond: _Respond) -> None:
         link = self._links.find(request.host_id, request.incarnation)

@@ -401,14 +401,20 @@ class SlaveEndpoint:
                 f"the master did not acknowledge the last statuses within {_LAST_WORDS:g} s"
             )
 
-    def leave(self, done: Callable[[], None]) -> None:
-        """Say that this host stops in good order; `done` when the master knows, or is silent."""
+    def leave(self, done: Callable[[], None], kept: Sequence[InstanceStatus] = ()) -> None:
+        """Report that this slave stops; `done` is called when the master knows, or is silent.
+
+        Args:
+            done: called once.
+            kept: all instances, where the slave leaves them running; (): it stops them.
+        """
         if self.link is not Link.REGISTERED:
             done()
             return
         request = srv.Leave.Request(
             envelope=self._control.envelope(self._master_beat, self._epoch),
             host_id=self.host_id, incarnation=self._description.incarnation,
+            kept=[convert.status_to_msg(status) for status in kept],
         )  # fmt: skip
         self._control.call(
             self._clients[srv.Leave], request, time.monotonic() + 1.0, lambda _: done()

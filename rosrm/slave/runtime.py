@@ -60,6 +60,16 @@ _PATIENCE_TOLD: Final = 10.0
 #: At slow rates a request is still meant after so many of our own beats.
 _BEATS_MISSED: Final = 3
 
+#: Seconds for the master to take note that this slave ends.
+_LEAVE_PATIENCE: Final = 2.0
+#: Seconds in which `--stop-all` looks for the master before it stops the processes.
+_MASTER_PATIENCE: Final = 5.0
+#: Seconds for a re-adopted process to end: this run of the slave does not know its `stop`.
+_LONGEST_STOP: Final = 600.0
+_MOST_NAMED: Final = 8
+#: The option of `rosrm slave`, and the cause of the end that it brings.
+STOP_ALL: Final = "--stop-all"
+
 #: Told of the outcome of an order: why it was refused; "": it is done.
 Settled = Callable[[str], None]
 
@@ -80,6 +90,7 @@ class SlaveRuntime:
         self._config = config
         self._incarnation = _random_number()
         self._stopping = ""
+        self._ending = self._stops_all = self._detaching = self._said_leave = False
         self._left = False
         self._accepting = False
         max_age = max(config.control.max_age, _BEATS_MISSED * config.period)
@@ -172,6 +183,35 @@ class SlaveRuntime:
             self._serve(lambda: not self._stopping and not self._endpoint.failure)
             return self._end()
 
+    def stop_all(self) -> int:
+        """Stop what a former slave left running, and report it; returns the exit code.
+
+        The slave registers, if it finds the master in time, accepts no work, and ends.
+        """
+        self._stopping, self._stops_all = STOP_ALL, True
+        self._supervisor.listen()
+        with self._closing:
+            deadline = time.monotonic() + _MASTER_PATIENCE
+            self._serve(
+                lambda: (
+                    not (self._is_registered or self._endpoint.failure or self._left)
+                    and time.monotonic() < deadline
+                )
+            )
+            reached = self._is_registered
+            code = self._end()
+            if not reached:
+                self.say(
+                    f"the master was not reached within {_MASTER_PATIENCE:g} s and does not know "
+                    f"of these ends: it lists the processes as before. The next start of this "
+                    f"slave reports them, or another `rosrm slave {STOP_ALL}`"
+                )
+            return code
+
+    @property
+    def _is_registered(self) -> bool:
+        return self._endpoint.link is Link.REGISTERED
+
     def _serve(self, goes_on: Callable[[], bool]) -> None:
         now = time.monotonic()
         next_sample = next_usage = next_graph = next_health = now
@@ -191,7 +231,8 @@ class SlaveRuntime:
             if now >= next_health:
                 next_health = now + core.LOOK_PERIOD
                 self._events.extend(self._health.look(self._state.watched(), now))
-            if self._endpoint.link is Link.SEARCHING and now - told >= _PATIENCE_TOLD:
+            searches = self._endpoint.link is Link.SEARCHING and not self._ending
+            if searches and now - told >= _PATIENCE_TOLD:
                 told = now
                 self.say(f"looking for a master on {self._config.ros.describe()}")
             self._work(now)
@@ -277,7 +318,8 @@ class SlaveRuntime:
 
     def _carry_out(self, command: core.Command) -> None:
         if isinstance(command, core.Launch):
-            self._starter.launch(command.assignments)
+            if not self._detaching:  # the master was told that nothing more begins here
+                self._starter.launch(command.assignments)
         elif isinstance(command, core.Report):
             self._endpoint.publish_statuses(command.statuses, complete=command.complete)
         elif isinstance(command, core.Settle):
@@ -372,14 +414,23 @@ class SlaveRuntime:
 
     def _end(self) -> int:
         """End the slave: inform the master, then stop the processes or leave them running."""
+        self._ending = True
         failure = self._endpoint.failure
         if failure:
             _log.error("%s", failure)
-        live = self._state.live()
-        if self._left or self._config.on_stop == "keep":
-            self._say_kept(0 if self._left else live)
+        if self._left:
+            if not failure:
+                self._leave()
+            self.say(f"{self._end_cause()}; no process is left running")
             return 1 if failure else 0
-        if live and failure and not self._endpoint.superseded:
+        kept = self._begun()
+        if self._config.on_stop == "keep" and (running := _running(kept)):
+            self._detaching = True
+            self._leave(kept)
+            self._say_kept(running)
+            return 1 if failure else 0
+        live = self._state.live()
+        if live and failure and not self._endpoint.superseded and not self._stops_all:
             count = counted(live, "process keeps", "processes keep")
             _log.error("%s running; correct the error and start the slave again", count)
             return 1
@@ -388,37 +439,62 @@ class SlaveRuntime:
                 f"stopping {counted(live, 'process', 'processes')} ({self._stopping or 'refused'})"
             )
         self._starter.close()
-        self._endpoint.leave(self._supervisor.shut_down)
+        self._leave()
+        self._supervisor.shut_down()
         deadline = time.monotonic() + self._longest_stop()
         self._serve(lambda: not self._left and time.monotonic() < deadline)
         return self._ended(failure, live)
 
-    def _say_kept(self, live: int) -> None:
-        ended = f"slave of {self._config.host} ended ({self._stopping or 'refused'})"
-        if live:
-            keep = counted(live, "process keeps", "processes keep")
-            self.say(
-                f"{ended}; {keep} running (supervisor pid {self._supervisor.pid}). Start the slave "
-                f"again to manage what runs, or end it by `rosrm slave --stop-all` with the same "
-                f"--config"
-            )
-        else:
-            self.say(f"{ended}; it left no process running")
+    def _leave(self, kept: Sequence[InstanceStatus] = ()) -> None:
+        """Report the end of this slave, and wait until the master knows or is silent."""
+        self._endpoint.leave(self._note_said, kept)
+        deadline = time.monotonic() + _LEAVE_PATIENCE
+        self._serve(lambda: not self._said_leave and time.monotonic() < deadline)
+
+    def _note_said(self) -> None:
+        self._said_leave = True
+
+    def _begun(self) -> list[InstanceStatus]:
+        """All instances, without those that still wait for their start."""
+        return [one for one in self._state.statuses() if self._starter.has_begun(one.instance)]
+
+    def _end_cause(self) -> str:
+        return f"slave of {self._config.host} ended ({self._stopping or 'refused'})"
+
+    def _say_kept(self, running: int) -> None:
+        keep = counted(running, "process keeps", "processes keep")
+        self.say(
+            f"{self._end_cause()}; {keep} running (supervisor pid {self._supervisor.pid}). Start "
+            f"the slave again to manage what runs, or end it by `rosrm slave {STOP_ALL}` with the "
+            f"same --config"
+        )
 
     def _ended(self, failure: str, stopped: int) -> int:
         if not self._left:
-            _log.error("the supervisor did not end in time; it still stops the processes")
+            _log.error(
+                "not ended in time: %s; the supervisor (pid %d) still stops them",
+                ", ".join(self._live_names()[:_MOST_NAMED]) or "the supervisor",
+                self._supervisor.pid,
+            )
             return 1
         self._work(time.monotonic())
         self._endpoint.wait_until_heard()
-        count = counted(stopped, "process was", "processes were")
-        self.say(f"slave of {self._config.host} ended; {count} stopped")
+        part = "supervisor" if self._stops_all else "slave"
+        count = counted(stopped, "process was stopped", "processes were stopped")
+        self.say(f"{part} of {self._config.host} ended; {count}")
         return 1 if failure else 0
+
+    def _live_names(self) -> list[str]:
+        return sorted(str(one.instance) for one in self._state.statuses() if not one.state.ended)
 
     def _longest_stop(self) -> float:
         live = [held for held in self._state.held.values() if not held.status.state.ended]
-        rules = [StopPolicy() if held.spec is None else held.spec.stop for held in live]
-        return max((rule.timeout for rule in rules), default=StopPolicy().timeout)
+        longest = [_LONGEST_STOP if held.spec is None else held.spec.stop.timeout for held in live]
+        return max(longest, default=StopPolicy().timeout)
+
+
+def _running(statuses: Sequence[InstanceStatus]) -> int:
+    return sum(not one.state.ended for one in statuses)
 
 
 def _random_number() -> int:

@@ -10,7 +10,8 @@ probes do. The rules:
   fresh one at the next cycle. A probe is never read twice at a time, so a hanging probe costs one
   thread, however long it hangs.
 - A probe that is late, raises or answers nonsense makes its readings *stale*: they keep their last
-  value, never zero. Why is reported once, and so is the recovery.
+  value, never zero. Why is reported once, and so is the recovery. A probe that changes often stays
+  stale until its changes are rarer, so the mark and the newest report always agree.
 - Before its first reading a resource counts as full and stale, so that no work is drawn to a host
   that has not been measured.
 
@@ -56,7 +57,7 @@ class ProbeReport:
 
     Attributes:
         resources: names of the readings concerned.
-        reason: why they are stale; on recovery "", or a remark.
+        reason: why they are stale; "" on recovery.
     """
 
     probe: str
@@ -69,7 +70,7 @@ class ProbeReport:
         names = ", ".join(self.resources)
         if self.stale:
             return f"probe {self.probe}: {names} stale: {self.reason}"
-        return f"probe {self.probe}: {names} read again" + (self.reason and f"; {self.reason}")
+        return f"probe {self.probe}: {names} read again"
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,7 +128,6 @@ class Sampler:
             self._watched.append(watched)
             first += len(watched.names)
         self._usage[:first] = [1.0] * first
-        self._stale = self.present
 
     @property
     def present(self) -> int:
@@ -146,11 +146,11 @@ class Sampler:
                 self._mind_running(watched, now)
             elif watched.outcome is not None:
                 self._take_outcome(watched, watched.outcome)
-            if bool(watched.reason) != watched.reported_stale:
-                reports += watched.report(now)
+            reports += watched.report(now)
             if now >= watched.due and not watched.busy:
                 watched.lane.put(watched.prepare(now))
-        return Sample(np.array(self._usage, np.float32), self._stale, tuple(reports))
+        stale = sum(watched.mask for watched in self._watched if watched.is_stale)
+        return Sample(np.array(self._usage, np.float32), stale, tuple(reports))
 
     def settle(self, timeout: float) -> bool:
         """Wait until no read is under way.
@@ -209,17 +209,15 @@ class Sampler:
                     other.lane = self._shared
             watched.lane = _Lane(f"rosrm-probe-{watched.name}")
         if now - watched.asked > watched.deadline:
-            self._mark(watched, f"no answer within {watched.deadline:g} s")
+            watched.reason = f"no answer within {watched.deadline:g} s"
 
     def _take_outcome(self, watched: _Watched, outcome: _Outcome) -> None:
         """A read has ended: publish its values, and choose the thread of the next."""
-        watched.outcome = None
+        watched.outcome, watched.measured = None, True
         if outcome.values:
             self._usage[watched.slots] = outcome.values
-        if outcome.age > watched.deadline:
-            self._mark(watched, f"answered after {outcome.age:.3g} s")
-        else:
-            self._mark(watched, outcome.reason)
+        late = outcome.age > watched.deadline
+        watched.reason = f"answered after {outcome.age:.3g} s" if late else outcome.reason
         self._choose_lane(watched, outcome.seconds)
 
     def _choose_lane(self, watched: _Watched, seconds: float) -> None:
@@ -233,13 +231,6 @@ class Sampler:
             watched.lane.end()
             self._left = [lane for lane in self._left if lane.alive()] + [watched.lane]
             watched.lane = self._shared
-
-    def _mark(self, watched: _Watched, reason: str) -> None:
-        watched.reason = reason
-        if reason:
-            self._stale |= watched.mask
-        else:
-            self._stale &= ~watched.mask
 
 
 class _Lane:
@@ -326,7 +317,8 @@ class _Watched:
         self._clock = clock
         self._progress = progress
         self.due = self._nominal = -math.inf
-        self.reported_stale = False
+        self.measured = False
+        self._reported_stale = False
         self._report_times: list[float] = []
 
     def prepare(self, now: float) -> Callable[[], None]:
@@ -344,18 +336,27 @@ class _Watched:
         """Seconds since the read under way began; 0 while it is queued."""
         return 0.0 if self._started is None else now - self._started
 
+    @property
+    def is_stale(self) -> bool:
+        """The readings are old by the newest report, or there are none yet."""
+        return self._reported_stale or not self.measured
+
     def report(self, now: float) -> list[ProbeReport]:
-        """The readings went stale or came back: what there is to say, bounded in number."""
+        """The readings went stale or came back: what there is to say, bounded in number.
+
+        A recovery is put off where no report would be left for the next failure.
+        """
+        if bool(self.reason) == self._reported_stale:
+            return []
         self._report_times = [t for t in self._report_times if now - t < REPORT_WINDOW]
-        if len(self._report_times) >= REPORTS:
+        if not self.reason and len(self._report_times) >= REPORTS - 1:
             return []
         self._report_times.append(now)
-        self.reported_stale = bool(self.reason)
+        self._reported_stale = bool(self.reason)
         reason = self.reason
-        if len(self._report_times) == REPORTS:
-            remark = f"it changes often, so this is the last report for up to {REPORT_WINDOW:g} s"
-            reason = f"{reason}; {remark}" if reason else remark
-        return [ProbeReport(self.name, self.names, self.reported_stale, reason)]
+        if reason and len(self._report_times) >= REPORTS - 1:
+            reason += f"; it changes often, so it counts as stale for up to {REPORT_WINDOW:g} s"
+        return [ProbeReport(self.name, self.names, self._reported_stale, reason)]
 
     def close(self) -> None:
         """Close the probe, in the thread that reads it."""

@@ -98,6 +98,10 @@ class Starter:
         """Nothing more is started."""
         self._closed = True
 
+    def has_begun(self, instance: InstanceId) -> bool:
+        """Return True if the supervisor has the instance, or had it."""
+        return instance not in self.state.waiting and not self.keeping.is_preparing(instance)
+
     def look_at_graph(self, awaited: Mapping[InstanceId, core.Held]) -> None:
         """See whether nodes that were started have come up."""
         for instance, held in awaited.items():

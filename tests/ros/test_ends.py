@@ -121,6 +121,9 @@ def test_keep_leaves_the_processes_running(make_cluster) -> None:
     log = cluster.log_of("h0")
     assert "slave of h0 ended (SIGINT); 2 processes keep running (supervisor pid " in log
     assert "`rosrm slave --stop-all`" in log
+    view = cluster.client.list(hosts=True, processes=True)
+    assert [row.state for row in view.hosts] == ["detached"]
+    assert {row.state for row in view.processes} == {"unreachable"}
     go.touch()  # it ends while no slave is there
 
     cluster.start_slave(host("h0"))
@@ -129,6 +132,16 @@ def test_keep_leaves_the_processes_running(make_cluster) -> None:
     row = cluster.ended("short")
     assert (row.state, row.exit_code) == ("failed", 3)
     assert "1 process re-adopted; 1 had ended" in cluster.log_of("h0")
+
+
+def test_a_slave_that_keeps_nothing_leaves(make_cluster) -> None:
+    """`on_stop: keep` with no process: the host has left at once, and no supervisor stays."""
+    cluster = make_cluster(host("h0", on_stop="keep"))
+    assert cluster.run(job("p", "true"))[0].state == "finished"
+    assert end(cluster.slaves["h0"], signal.SIGTERM) == 0
+    assert "slave of h0 ended; no processes were stopped" in cluster.log_of("h0")
+    assert wait_until_none(cluster.directory / "hosts") == {}
+    assert [row.state for row in cluster.client.list(hosts=True).hosts] == ["left"]
 
 
 @pytest.mark.parametrize("role", ["master", "slave"])
@@ -448,6 +461,74 @@ def by_hand(make_cluster):
         f"ros: {{domain: {cluster.domain}}}\n"
     )
     return cluster, state, [sys.executable, "-m", "rosrm.cli", "slave", "--config", str(config)]
+
+
+@pytest.fixture
+def kept(by_hand):
+    """Two processes of which the slave was stopped: the cluster, their rows, `--stop-all`."""
+    cluster, _, command = by_hand
+    config = Path(command[-1])
+    config.write_text(config.read_text() + "on_stop: keep\n")
+    with (cluster.directory / "kept.log").open("wb") as sink, subprocess.Popen(
+        command, stdin=subprocess.DEVNULL, stdout=sink, stderr=sink
+    ) as slave:  # fmt: skip
+        cluster.wait_until("host t", lambda v: any(row.accepting for row in v.hosts))
+        cluster.submit(service("p"), service("q"))
+        rows = [cluster.wait(name, "running") for name in ("p", "q")]
+        slave.terminate()
+        assert slave.wait(PATIENCE) == 0
+    return cluster, rows, [*command, "--stop-all"]
+
+
+def stop_all(command) -> str:
+    """Stop what is left; what was printed."""
+    done = subprocess.run(
+        command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+        text=True, timeout=PATIENCE, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout
+    assert "Traceback" not in done.stdout
+    return done.stdout
+
+
+def test_stop_all_ends_what_a_slave_has_left_and_reports_it(kept) -> None:
+    """A process that is being cancelled is cancelled then; the others wait for another host."""
+    cluster, rows, command = kept
+    assert "being cancelled: waits for t, whose slave was stopped" in cluster.client.cancel(["p"])
+    assert "whose slave was stopped" in cluster.process("p").reason
+    assert "supervisor of t ended; 2 processes were stopped" in stop_all(command)
+    assert not [row.pid for row in rows if alive(row.pid)]
+    assert cluster.ended("p").state == "cancelled"
+    cluster.wait("q", "queued")
+    assert [row.state for row in cluster.client.list(hosts=True).hosts] == ["left"]
+    assert "no processes were stopped" in stop_all(command)
+
+
+def test_stop_all_without_a_master_says_what_follows(kept) -> None:
+    """The processes end all the same; the master learns of it when the slave is started again."""
+    cluster, rows, command = kept
+    assert end(cluster.master, signal.SIGTERM) == 0
+    said = stop_all(command)
+    assert "2 processes were stopped" in said
+    assert "the master was not reached within 5 s and does not know of these ends" in said
+    assert said.count("looking for a master") == 1
+    assert not [row.pid for row in rows if alive(row.pid)]
+
+
+def test_stop_all_is_refused_while_the_slave_runs(by_hand) -> None:
+    """Its own end stops the processes."""
+    cluster, _, command = by_hand
+    with (cluster.directory / "slave.log").open("wb") as sink, subprocess.Popen(
+        command, stdin=subprocess.DEVNULL, stdout=sink, stderr=sink
+    ) as slave:  # fmt: skip
+        cluster.wait_until("host t", lambda v: any(row.accepting for row in v.hosts))
+        refused = subprocess.run(
+            [*command, "--stop-all"], capture_output=True, text=True, timeout=PATIENCE, check=False
+        )
+        slave.terminate()
+        assert slave.wait(PATIENCE) == 0
+    assert refused.returncode != 0
+    assert "Stop it first" in refused.stderr
 
 
 def test_ctrl_c_in_a_terminal(by_hand) -> None:

@@ -254,7 +254,16 @@ def test_cancel_wait_ends_when_all_have_ended(rosrm, client, monkeypatch):
 
     monkeypatch.setattr("rosrm.cli.waiting.time.sleep", later)
     result = rosrm("cancel", "a", "b", "--wait")
-    assert (result.code, result.out) == (0, "cancelled\n1 cancelled, 1 finished\n")
+    said = "cancelled\n1 cancelled, 1 finished\n"
+    assert (result.code, result.out, result.err) == (0, said, "")
+
+
+def test_cancel_wait_says_once_what_has_become_of_each(rosrm, client):
+    """Neither each process nor the sum again, where the reply has the end of all of them."""
+    client.processes = [process("a", "cancelled"), process("b", "cancelled")]
+    client.cancel = lambda names: f"{len(names)} processes cancelled"
+    result = rosrm("cancel", "a", "b", "--wait")
+    assert (result.code, result.out, result.err) == (0, "2 processes cancelled\n", "")
 
 
 def test_restart_wait_ends_when_each_runs_in_another_run(rosrm, client, monkeypatch):

@@ -35,8 +35,8 @@ def file(tmp_path):
             "ok, a cluster: scoring weighted, migration relaunch, checkpoint none\n",
         ),
         ("host: h1\nros: {domain: 1}", "ok, a host: h1, probes cpu\n"),
-        ("processes: [{name: a, command: x, kind: job}]", "ok, work: 1 job and 0 services\n"),
-        ("defaults: {kind: job}\nprocesses: [{name: a, command: x}]", "ok, work: 1 job and 0"),
+        ("processes: [{name: a, command: x, kind: job}]", "ok, work: 1 job\n"),
+        ("defaults: {kind: job}\nprocesses: [{name: a, command: x}]", "ok, work: 1 job\n"),
     ],
 )
 def test_the_kind_of_a_right_file_is_known_by_its_keys(rosrm, file, text, said):
@@ -63,7 +63,7 @@ SIMULATION = "hosts: [{name: a, memory: 1GiB, cpu: 1}]\nprocesses: [{name: p, du
         ("cluster.yaml", "ros: {domain: 1}", "ok, a cluster"),
         ("lab.cluster.yaml", "ros: {domain: 1}", "ok, a cluster"),
         ("host.yaml", "ros: {domain: 1}", "ok, a host"),
-        ("evening.sim.yaml", SIMULATION, "ok, a simulation: 1 hosts, 1 processes"),
+        ("evening.sim.yaml", SIMULATION, "ok, a simulation: 1 host, 1 process\n"),
         ("f.yaml", f"name: evening\nseed: 1\n{SIMULATION}", "ok, a simulation"),
     ],
 )

@@ -241,7 +241,7 @@ def test_a_process_that_waits_or_is_unknown_is_said(rosrm, client, slaves):
     assert "there is no process 'nobody'" in result.err
 
 
-@pytest.mark.parametrize("state", ["lost", "suspect", "left"])
+@pytest.mark.parametrize("state", ["lost", "suspect", "left", "detached"])
 def test_a_host_that_is_away_is_not_asked(rosrm, client, slaves, state):
     """The answer comes from the master's knowledge, at once, in the name of the host."""
     client.hosts = [host("alpha", state)]
@@ -252,7 +252,7 @@ def test_a_host_that_is_away_is_not_asked(rosrm, client, slaves, state):
         f"the log of talker is on alpha, and alpha {'has' if state == 'left' else 'is'}"
         in result.err
     )
-    assert "State of talker for 12 s: unreachable, alpha is lost" in result.err
+    assert "talker has been unreachable for 12 s: alpha is lost. `rosrm events" in result.err
     assert ("read_log", "alpha") not in client.asked
 
 

@@ -398,6 +398,21 @@ class Cluster:
         self.settle()
         return reply
 
+    def detach(self, machine: Machine) -> Reply:
+        """A slave is stopped and leaves running what it runs; no slave is there after that."""
+        kept = machine.begun()
+        reply = self.ask(happened.HostLeft, machine.host_id, machine.incarnation, kept)
+        machine.connected = False
+        return reply
+
+    def attach(self, machine: Machine) -> Reply:
+        """The slave of a host is started again."""
+        machine.connected = True
+        machine.restart_slave(self.now)
+        reply = self.register(machine)
+        self.settle()
+        return reply
+
     # --- time and wires ------------------------------------------------------------------
 
     def settle(self) -> None:

@@ -342,6 +342,11 @@ class Machine:
             for instance, program in self.programs.items()
         ]
 
+    def begun(self) -> tuple[InstanceStatus, ...]:
+        """All instances, without those that wait for their start."""
+        waiting = self.slave.waiting
+        return tuple(one for one in self.slave.statuses() if one.instance not in waiting)
+
     def stop_unheard(self, now: float) -> None:
         """The slave is stopped while no master hears it: it ends all that it runs."""
         for instance in list(self.programs):

@@ -44,7 +44,7 @@ def test_without_names_all_that_ended_and_all_hosts_that_left_are_removed() -> N
     prune(cluster, "next")
     cluster.restart_master()
     assert seen(cluster) == (["live"], ["a"])
-    assert prune(cluster).message == "0 processes and 0 hosts removed"
+    assert prune(cluster).message == "nothing to remove"
 
 
 def test_a_process_that_every_listed_host_refused_fails() -> None:

@@ -513,3 +513,11 @@ def test_a_process_without_an_owner_is_cancelled_when_its_last_instance_has_ende
     cluster.register(cluster.machines["a"])
     cluster.wait(1.0)
     assert cluster.phase("p") == "cancelled"
+
+
+def test_a_job_that_has_begun_runs() -> None:
+    """Only a service is ready for others."""
+    cluster = Cluster("a")
+    cluster.submit(process("p"), job("q"))
+    assert cluster.told("ready") == ["p is ready on a"]
+    assert cluster.told("running") == ["q is running on a"]

@@ -529,6 +529,7 @@ class Play(RuleBasedStateMachine):
                 "killed",
                 "leaves",
                 "leaves unheard",
+                "is detached",
                 "loses power",
                 "loses a poll",
                 "full",
@@ -550,6 +551,10 @@ class Play(RuleBasedStateMachine):
             self.ask(happened.HostLeft, machine.host_id, machine.incarnation)
             for instance in list(machine.programs):
                 machine.tell(slave.StopOrdered(instance), self.cluster.now)
+        elif what == "is detached" and self.known(machine):
+            # Until it is killed, or all is well, no slave is there.
+            self.ask(happened.HostLeft, machine.host_id, machine.incarnation, machine.begun())
+            machine.restart_slave(self.cluster.now)
         elif what in ("leaves unheard", "loses power"):
             if what == "leaves unheard":
                 machine.stop_unheard(self.cluster.now)

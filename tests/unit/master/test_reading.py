@@ -15,13 +15,15 @@ from tests.unit.core.cluster import Cluster
 SELECTED = PluginRow("scoring", "eq1", "mine 1.0", "selected", "the summary")
 
 
-def rows(cluster: Cluster) -> list[PluginRow]:
-    """The rows of `rosrm plugins`."""
+def rows(cluster: Cluster, *, failing: bool = False) -> list[PluginRow]:
+    """The rows of `rosrm plugins`, or those that `rosrm status` asks for."""
     reading = Reading(
         "m", cluster.state, SimpleNamespace(last_sequence=0), [SELECTED],
         uptime=lambda: 0.0, core_now=lambda: cluster.now, trouble=lambda: "",
     )  # fmt: skip
-    asked = SimpleNamespace(hosts=False, processes=False, plugins=True, events=False)
+    asked = SimpleNamespace(
+        hosts=False, processes=False, plugins=True, events=False, failing=failing
+    )
     return list(reading.snapshot(asked).plugins)
 
 
@@ -45,6 +47,7 @@ def test_a_policy_that_fails_is_shown_as_failing() -> None:
     row = named(cluster, "eq1")
     assert row.state == "failing"
     assert row.reason.startswith("score: ZeroDivisionError: division by zero (")
+    assert rows(cluster, failing=True) == [row]
 
 
 def test_a_probe_that_fails_is_shown_as_failing_on_its_host() -> None:
@@ -60,3 +63,5 @@ def test_a_probe_that_fails_is_shown_as_failing_on_its_host() -> None:
         )
         states = {row.host: row.state for row in rows(cluster) if row.name == "cpu"}
         assert states == {"a": state, "b": "selected"}
+        fails = [("cpu", "a")] if failing else []
+        assert [(row.name, row.host) for row in rows(cluster, failing=True)] == fails

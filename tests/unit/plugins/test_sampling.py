@@ -310,17 +310,23 @@ def test_probe_is_read_once_a_period():
 
 
 def test_flapping_probe_floods_nothing(rig):
-    """Of a probe that fails at every second read, a few reports a minute are made."""
+    """Of a probe that fails at every second read, a few reports a minute are made.
+
+    Its readings are stale as the newest report says, so that both listings show the same.
+    """
     probe = FakeProbe(cpu=0.25)
     made = rig(bad=probe)
+    made.tick(2)
     for cycle in range(200):
         probe.fault = OSError("flaps") if cycle % 2 else None
-        made.tick(1)
-    assert len(made.reports) == REPORTS
+        sample = made.tick(1)
+        reported = bool(made.reports) and "read again" not in made.reports[-1]
+        assert bool(sample.stale) is reported
+    assert len(made.reports) <= REPORTS
     assert "changes often" in made.reports[-1]
     probe.fault = None
     made.clock.advance(60.0)
-    made.tick(2)
+    assert made.tick(2).stale == 0
     probe.fault = OSError("again")
     made.tick(2)
     assert "again" in made.reports[-1]

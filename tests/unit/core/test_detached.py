@@ -1,0 +1,173 @@
+"""Hosts whose slave was stopped and left processes running."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from rosrm.core import events as happened
+from rosrm.core import listing
+from rosrm.core.model import HostLossPolicy, ProcessSpec
+from tests.unit.core.cluster import Cluster, job, process
+
+REASON = "a is detached: its slave was stopped and left processes running"
+
+
+def detached(spec: ProcessSpec, **settings: Any) -> Cluster:
+    """A process runs on host a, whose slave was stopped; host b takes what is queued."""
+    cluster = Cluster("a", **settings)
+    cluster.submit(spec)
+    cluster.add("b")
+    cluster.wait(11.0)  # some host has been heard for a whole lease
+    assert cluster.where(spec.name) == ["a"]
+    cluster.detach(cluster.machines["a"])
+    return cluster
+
+
+def state_of(cluster: Cluster, host: str) -> str:
+    rows = listing.host_rows(cluster.state, cluster.now)
+    return next(row.state for row in rows if row.description.name == host)
+
+
+def row_of(cluster: Cluster, name: str) -> Any:
+    return listing.process_row(cluster.state, cluster[name], cluster.now)
+
+
+def test_a_host_is_detached_however_long() -> None:
+    """Neither suspect nor lost; its processes are unreachable at once, with the reason."""
+    cluster = detached(process("p"))
+    assert cluster.told("host_detached") == [
+        "a is detached: its slave was stopped and left 1 process running"
+    ]
+    for _ in range(3):
+        assert state_of(cluster, "a") == "detached"
+        row = row_of(cluster, "p")
+        assert (row.state, row.reason, row.stale) == ("unreachable", REASON, True)
+        cluster.wait(50.0)
+    assert cluster.told("host_suspect") == cluster.told("host_lost") == []
+
+
+def test_the_next_slave_takes_the_processes_over() -> None:
+    """Also after the lease: it is the same instance."""
+    cluster = detached(process("p"))
+    number = cluster["p"].owner
+    cluster.wait(50.0)
+    assert cluster.attach(cluster.machines["a"]).accepted
+    assert (cluster.phase("p"), cluster["p"].owner) == ("running", number)
+    assert state_of(cluster, "a") == "up"
+
+
+def test_a_process_goes_elsewhere_no_sooner_than_after_a_loss() -> None:
+    """The instance has a fence, which counts from the last beat: it needs the whole lease."""
+    cluster = detached(process("p", host_loss=HostLossPolicy("elsewhere", 5.0)))
+    lease = cluster.settings.lease
+    cluster.wait(lease + 4.0)
+    assert cluster.where("p") == ["a"]
+    cluster.wait(2.0)
+    assert cluster["p"].owner in {one.number for one in cluster.machines["b"].programs}
+    assert cluster.told("given_up") == [f"p#1 is given up: {REASON}"]
+    cluster.attach(cluster.machines["a"])
+    assert cluster.where("p") == ["b"]
+
+
+def test_beats_name_a_detached_host() -> None:
+    """So a slave that has not quite ended takes no beat as a sign that the master hears it."""
+    cluster = detached(process("p"))
+    assert cluster.state.hosts.unheard() == [cluster.machines["a"].host_id]
+
+
+def test_what_ended_before_the_slave_stopped_is_known_with_its_end() -> None:
+    """The last message has all that the slave holds, also what the master has not heard yet."""
+    cluster = Cluster("a")
+    cluster.submit(process("p"), job("q"))
+    machine = cluster.machines["a"]
+    machine.finish("q", cluster.now)
+    machine.said.clear()  # on its way, and overtaken
+    cluster.detach(machine)
+    assert cluster.phase("q") == "finished"
+
+
+def test_what_has_not_begun_there_is_queued_again() -> None:
+    """An assignment that is on its way is not taken up: the slave starts nothing more."""
+    cluster = detached(process("p"))
+    cluster.attach(cluster.machines["a"])
+    cluster.machines["b"].takes = False
+    cluster.wait(1.0)
+    cluster.ask(happened.SubmissionReceived, (process("q"),), settle=False)
+    assert cluster["q"].phase.value == "assigned"
+    cluster.detach(cluster.machines["a"])
+    assert (cluster.phase("p"), cluster.phase("q")) == ("unreachable", "queued")
+
+
+def test_a_late_report_changes_nothing() -> None:
+    """A report that was on its way says less than the last message."""
+    cluster = Cluster("a")
+    cluster.submit(process("p"))
+    machine = cluster.machines["a"]
+    kept = machine.begun()
+    machine.said.clear()
+    late = happened.StatusesReceived(
+        machine.host_id, machine.incarnation, machine.batches + 1, False, kept
+    )
+    cluster.detach(machine)
+    cluster.tell(late)
+    assert cluster.phase("p") == "unreachable"
+
+
+@pytest.mark.parametrize("first", ["cancelled", "detached"])
+def test_a_cancelled_process_names_the_host_that_it_waits_for(first: str) -> None:
+    """At once, with the time; it is cancelled when the next slave reports its end."""
+    if first == "detached":
+        cluster = detached(process("p"))
+        cluster.wait(7.0)
+        reply = cluster.cancel("p")
+        assert reply.message == (
+            "1 process being cancelled; p is being cancelled: waits for a, whose slave was stopped"
+        )
+    else:
+        cluster = Cluster("a")
+        cluster.submit(process("p"))
+        cluster.machines["a"].stubborn.add("p")
+        cluster.cancel("p")
+        cluster.detach(cluster.machines["a"])
+        cluster.wait(7.0)
+    row = row_of(cluster, "p")
+    reason = "being cancelled: waits for a, whose slave was stopped 7 s ago"
+    assert (row.state, row.reason) == ("stopping", reason)
+    cluster.machines["a"].stubborn.clear()
+    cluster.attach(cluster.machines["a"])
+    cluster.wait(2.0 * cluster.settings.order_retry)
+    assert (cluster.phase("p"), cluster.where("p")) == ("cancelled", [])
+
+
+def test_a_cancelled_process_on_a_silent_host_names_the_host() -> None:
+    """While the host is suspect, too."""
+    cluster = Cluster("a")
+    cluster.submit(process("p"))
+    cluster.machines["a"].connected = False
+    cluster.wait(4.0)
+    cluster.cancel("p")
+    assert row_of(cluster, "p").reason == (
+        "being cancelled: waits for a, which has been silent for 4 s"
+    )
+
+
+def test_a_slave_that_ends_its_processes_after_all_leaves() -> None:
+    """As `rosrm slave --stop-all` does: the master learns of the end of a cancelled process."""
+    cluster = detached(process("p"))
+    cluster.cancel("p")
+    machine = cluster.machines["a"]
+    cluster.attach(machine)
+    cluster.leave(machine)
+    assert (cluster.phase("p"), state_of(cluster, "a")) == ("cancelled", "left")
+
+
+def test_a_detached_host_is_pruned_once_nothing_is_left_there() -> None:
+    """By its name also what is being cancelled there is given up."""
+    cluster = detached(process("p"))
+    cluster.ask(happened.PruneRequested)
+    assert state_of(cluster, "a") == "detached"
+    cluster.cancel("p")
+    assert cluster.ask(happened.PruneRequested, (), ("a",)).accepted
+    assert cluster.phase("p") == "cancelled"
