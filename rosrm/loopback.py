@@ -1,8 +1,8 @@
 """ROS that does not leave this machine, for clusters of several hosts on one: demos and tests.
 
 ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST keeps it here on any machine, at a price: the first 32
-participants of a domain find each other, and shared memory is always among the transports, with
-what killed processes leave there (docs/decisions/0015). In a network namespace where nothing but
+participants of a domain find each other, and nodes always use shared memory, with what killed
+processes leave there (docs/decisions/0015). In a network namespace where nothing but
 loopback has an address neither holds.
 """
 

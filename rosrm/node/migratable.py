@@ -45,7 +45,8 @@ class Migratable(_Base):  # type: ignore[misc]  # rclpy brings no types
         if identity is not None:
             self._be_the_only_one(identity)
             self._rosrm = Handoff(self, super(), identity)
-        with contextlib.nullcontext() if identity is None else announcing(os.environ, "movable"):
+        profile = announcing(os.environ, "steady", udp=False)
+        with contextlib.nullcontext() if identity is None else profile:
             super().__init__(*arguments, **named)
         if self._rosrm is not None:
             self._rosrm.begin()

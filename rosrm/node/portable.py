@@ -114,7 +114,7 @@ class PortableNode(rclpy.node.Node):  # type: ignore[misc]  # rclpy brings no ty
     def _portable_enter(self, named: dict[str, Any]) -> None:
         controlled = VARIABLE in os.environ
         # Shared memory of a participant would lie in the dumped process; over UDP none is left.
-        profile = announcing(os.environ, "movable", udp=True)
+        profile = announcing(os.environ, "steady", udp=True)
         before = open_sockets()
         with profile if controlled else contextlib.nullcontext():
             super().__init__(*self._portable_arguments[0], **named)

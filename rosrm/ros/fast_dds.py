@@ -12,42 +12,37 @@ _VARIABLES: Final = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES
 _PROFILES: Final = Path(__file__).parent / "profiles"
 
 _TRANSPORTS: Final = "FASTDDS_BUILTIN_TRANSPORTS"
+_UDP: Final = "UDPv4"
 
-Pace = Literal["eager", "steady", "movable"]
-#: Of rosrm's own parts. They speak UDP alone: a process that was killed leaves ports in shared
-#: memory that hold up its peers, or keep them from being heard; nodes may pay that price for large
-#: messages, who watches over them may not.
-_OF_PARTS: Final = ("eager", "steady")
+Pace = Literal["eager", "steady"]
 
 
-def announcements(
-    environment: Mapping[str, str], pace: Pace, *, udp: bool = False
-) -> dict[str, str]:
-    """Variables that Fast DDS makes a participant by; none where a user set a profile.
+def announcements(environment: Mapping[str, str], pace: Pace, *, udp: bool) -> dict[str, str]:
+    """Return the variables that configure a participant; none if the user has set a profile.
 
     Args:
-        environment: that a user may have set a profile, or transports, in.
-        pace: the profile.
-        udp: over UDP alone, also where it is no part of rosrm.
+        environment: may have a profile, or transports, of the user.
+        pace: of the announcements.
+        udp: receive by UDP alone, unless the user has set other transports. A killed process leaves
+            ports in shared memory that delay its peers. Nodes may accept that for large messages;
+            the parts of rosrm must not.
     """
     if any(variable in environment for variable in _VARIABLES):
         return {}
-    variables = {_VARIABLES[0]: str(_PROFILES / f"{pace}.xml")}
-    if (udp or pace in _OF_PARTS) and _TRANSPORTS not in environment:
-        variables[_TRANSPORTS] = "UDPv4"
-    return variables
+    if not udp or environment.get(_TRANSPORTS, _UDP) != _UDP:
+        return {_VARIABLES[0]: str(_PROFILES / f"{pace}.xml")}
+    variables = {_VARIABLES[0]: str(_PROFILES / f"{pace}-udp.xml"), _TRANSPORTS: _UDP}
+    return {name: value for name, value in variables.items() if name not in environment}
 
 
 @contextlib.contextmanager
-def announcing(
-    environment: MutableMapping[str, str], pace: Pace, *, udp: bool = False
-) -> Iterator[None]:
+def announcing(environment: MutableMapping[str, str], pace: Pace, *, udp: bool) -> Iterator[None]:
     """Give Fast DDS a profile while a participant is made, unless the user has given one.
 
     Args:
         environment: of this process; it is as it was afterwards, for who is started by it.
-        pace: the profile.
-        udp: over UDP alone, also where it is no part of rosrm.
+        pace: see `announcements`.
+        udp: see `announcements`.
     """
     added = announcements(environment, pace, udp=udp)
     environment.update(added)

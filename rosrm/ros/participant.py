@@ -64,7 +64,7 @@ class Participant:
         os.environ.update(settings.environment())
         self.settings = settings
         self.context = rclpy.Context()
-        with announcing(os.environ, pace):
+        with announcing(os.environ, pace, udp=True):
             rclpy.init(
                 context=self.context,
                 domain_id=settings.domain,

@@ -98,5 +98,5 @@ def process_environment(
     environment["PYTHONUNBUFFERED"] = "1"
     environment.update(spec.environment)
     if assignment.shadow:  # a move waits until it has found everybody
-        environment.update(announcements(environment, "movable"))
+        environment.update(announcements(environment, "steady", udp=False))
     return environment

@@ -443,35 +443,55 @@ def test_no_master(tmp_path) -> None:
 
 def test_a_cluster_by_hand(tmp_path) -> None:
     """`rosrm master`, `rosrm slave`, `rosrm submit`, and Ctrl-C for both: clean, code 0."""
+    with by_hand(tmp_path) as (terminal, master, slave):
+        work = terminal.file("work.yaml", "processes:\n  - {name: p, command: [sleep, '1000']}\n")
+        terminal.run("submit", work, "--wait")
+        (row,) = terminal.json("ps")
+        assert (row["name"], row["host"], row["state"]) == ("p", "hand", "running")
+        for part in (slave, master):
+            part.send_signal(signal.SIGINT)
+            _, errors = part.communicate(timeout=PATIENCE)
+            assert part.returncode == 0, errors
+            assert "Traceback" not in errors
+        assert not alive(row["pid"])
+        assert wait_until_none(tmp_path) == {}
+
+
+def test_no_part_receives_through_shared_memory(tmp_path) -> None:
+    """Also with LOCALHOST: the port of a killed part delays the next commands for seconds."""
+    with by_hand(tmp_path, ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST") as (terminal, *parts):
+        work = terminal.file("work.yaml", "processes:\n  - {name: p, command: [sleep, '1000']}\n")
+        terminal.run("submit", work, "--wait")
+        for part in parts:
+            assert "fastrtps_port" not in Path(f"/proc/{part.pid}/maps").read_text()
+
+
+@contextlib.contextmanager
+def by_hand(
+    directory: Path, **environment: str
+) -> Iterator[tuple[Terminal, subprocess.Popen, subprocess.Popen]]:
+    """A terminal, a master and a slave in a domain of their own."""
     domain, claim = claim_domain()
-    terminal = Terminal(domain, tmp_path)
+    terminal = Terminal(domain, directory)
+    terminal.environment |= environment
     ros = f"ros: {{domain: {domain}}}\n"
-    cluster = terminal.file("cluster.yaml", f"name: hand\nstate: {tmp_path}/m\n{ros}")
-    slave = terminal.file(
+    cluster = terminal.file("cluster.yaml", f"name: hand\nstate: {directory}/m\n{ros}")
+    host_file = terminal.file(
         "host.yaml",
-        f"host: hand\nstate: {tmp_path}/s\nscope: slice\nbudget: {{memory: 1GiB, cpu: 4}}\n"
+        f"host: hand\nstate: {directory}/s\nscope: slice\nbudget: {{memory: 1GiB, cpu: 4}}\n"
         f"probes: {{memory: {{}}, cpu: {{}}}}\n{ros}",
     )
     parts = []
     try:
         with claim:
             parts.append(terminal.start("master", "--config", cluster, start_new_session=True))
-            parts.append(terminal.start("slave", "--config", slave, start_new_session=True))
-            work = terminal.file(
-                "work.yaml", "processes:\n  - {name: p, command: [sleep, '1000']}\n"
-            )
-            terminal.run("submit", work, "--wait")
-            (row,) = terminal.json("ps")
-            assert (row["name"], row["host"], row["state"]) == ("p", "hand", "running")
-            for part in reversed(parts):
-                part.send_signal(signal.SIGINT)
-                _, errors = part.communicate(timeout=PATIENCE)
-                assert part.returncode == 0, errors
-                assert "Traceback" not in errors
-        assert not alive(row["pid"])
-        assert wait_until_none(tmp_path) == {}
+            parts.append(terminal.start("slave", "--config", host_file, start_new_session=True))
+            yield terminal, *parts
     finally:
-        for part in parts:
-            if part.poll() is None:
-                part.kill()
-                part.communicate()
+        for part in reversed(parts):
+            with part:
+                part.send_signal(signal.SIGINT)
+                try:
+                    part.wait(PATIENCE)
+                finally:
+                    part.kill()

@@ -13,7 +13,7 @@ from rosrm.ros.fast_dds import announcements, announcing
 def test_fast_dds_is_given_a_profile_while_the_node_is_made():
     """And what the process starts later is not."""
     environment = {"HOME": "/home/robot"}
-    with announcing(environment, "movable"):
+    with announcing(environment, "steady", udp=False):
         (profile,) = set(environment) - {"HOME"}
         text = Path(environment[profile]).read_text()
     assert "heartbeatPeriod" in text
@@ -22,28 +22,39 @@ def test_fast_dds_is_given_a_profile_while_the_node_is_made():
 
 
 @pytest.mark.parametrize("pace", ["eager", "steady"])
-def test_the_parts_speak_udp_alone(pace):
-    """What killed processes leave in shared memory must not hold them up."""
-    assert announcements({}, pace)["FASTDDS_BUILTIN_TRANSPORTS"] == "UDPv4"
+@pytest.mark.parametrize("chosen", [{}, {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}])
+def test_udp_alone_is_chosen_by_transports_and_by_locators(pace, chosen):
+    """LOCALHOST replaces the transports, but not the locators; a variable of the user stays."""
+    environment = dict(chosen)
+    with announcing(environment, pace, udp=True):
+        assert environment["FASTDDS_BUILTIN_TRANSPORTS"] == "UDPv4"
+        text = Path(environment["FASTRTPS_DEFAULT_PROFILES_FILE"]).read_text()
+    assert "<defaultUnicastLocatorList><locator><udpv4/>" in text
+    assert environment == chosen
 
 
 @pytest.mark.parametrize("pace", ["eager", "steady"])
-def test_the_users_choice_of_transports_stands(pace):
-    """Also where it is shared memory."""
-    chosen = {"FASTDDS_BUILTIN_TRANSPORTS": "SHM"}
-    assert "FASTDDS_BUILTIN_TRANSPORTS" not in announcements(chosen, pace)
-
-
-def test_transports_of_nodes_are_the_users():
+@pytest.mark.parametrize(
+    ("udp", "chosen"), [(False, {}), (True, {"FASTDDS_BUILTIN_TRANSPORTS": "SHM"})]
+)
+def test_no_transport_is_chosen_for_nodes_or_over_the_users_choice(pace, udp, chosen):
     """Large messages may need shared memory."""
-    assert "FASTDDS_BUILTIN_TRANSPORTS" not in announcements({}, "movable")
+    variables = announcements(chosen, pace, udp=udp)
+    assert list(variables) == ["FASTRTPS_DEFAULT_PROFILES_FILE"]
+    assert "Locator" not in Path(variables["FASTRTPS_DEFAULT_PROFILES_FILE"]).read_text()
 
 
-def test_a_node_that_is_to_be_dumped_speaks_udp_alone():
-    """Shared memory could not be dumped; the user's own choice stands."""
-    assert announcements({}, "movable", udp=True)["FASTDDS_BUILTIN_TRANSPORTS"] == "UDPv4"
-    chosen = {"FASTDDS_BUILTIN_TRANSPORTS": "SHM"}
-    assert "FASTDDS_BUILTIN_TRANSPORTS" not in announcements(chosen, "movable", udp=True)
+@pytest.mark.parametrize("pace", ["eager", "steady"])
+def test_the_profile_for_udp_differs_by_its_locators_alone(pace):
+    """Two files for one pace must not drift apart."""
+    plain, udp = (
+        Path(announcements({}, pace, udp=udp)["FASTRTPS_DEFAULT_PROFILES_FILE"])
+        .read_text()
+        .split("-->", 1)[1]
+        .splitlines()
+        for udp in (False, True)
+    )
+    assert [line for line in udp if "defaultUnicastLocatorList" not in line] == plain
 
 
 @pytest.mark.parametrize(
@@ -52,6 +63,6 @@ def test_a_node_that_is_to_be_dumped_speaks_udp_alone():
 def test_what_the_user_has_set_stands(variable):
     """Also afterwards."""
     environment = {variable: "/etc/robot.xml"}
-    with announcing(environment, "movable"):
+    with announcing(environment, "steady", udp=True):
         assert environment == {variable: "/etc/robot.xml"}
     assert environment == {variable: "/etc/robot.xml"}
