@@ -26,15 +26,15 @@ RESULTS = ROOT / "build" / "test-results"
 #: In this order: what fails fast comes first.
 LAYERS = ("unit", "contract", "integration", "ros", "faults")
 
-#: Workers of the folders whose tests share nothing but the load of the machine. Where there is a
-#: ROS graph, each worker has a network of its own, if it may; the tests of a file share a cluster.
-#: The files with the most tests come first, or those that take long (tests/conftest.py).
-_BY_FILE = ["-n", "2", "--dist", "loadfile"]
+#: Workers of the folders that run in parallel. Tests in real time mostly wait, so that a core
+#: serves two of them. Where there is a ROS graph, each worker has a network of its own, if it may.
+#: Tests that share a cluster run on one worker, the longest first (tests/conftest.py).
+_REAL_TIME_WORKERS = ["-n", "4", "--dist", "loadscope", "--no-loadscope-reorder"]
 WORKERS = {
     "unit": ["-n", "2"],
-    "integration": _BY_FILE,
-    "ros": [*_BY_FILE, "--no-loadscope-reorder"],
-    "faults": _BY_FILE,
+    "integration": _REAL_TIME_WORKERS,
+    "ros": _REAL_TIME_WORKERS,
+    "faults": _REAL_TIME_WORKERS,
 }
 
 #: Folders whose tests depend on the load of the machine: a failed test gets a second chance.

@@ -1,9 +1,11 @@
-"""What all tests share: each is marked with the folder that it lies in."""
+"""Marks, order and distribution of all tests."""
 
 from __future__ import annotations
 
+import functools
 import os
 import signal
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -14,16 +16,15 @@ from tests.criu_kit import criu, theatre  # noqa: F401 - fixtures of several lay
 
 HERE = Path(__file__).parent
 
-#: Whose tests make labs: one at a time is enough for a machine, and only its own may come and go.
-LABS = tuple(f"tests/integration/{one}" for one in ("lab/", "test_chaos.py", "test_paper.py"))
+#: Whose tests make labs, in two groups: each runs on one worker, so that no more than two labs take
+#: memory and CPU at once. The second group measures, on labs that each take a minute.
+LABS = {
+    "labs": ("tests/integration/lab/",),
+    "benchmarks": ("tests/integration/test_chaos.py", "tests/integration/test_paper.py"),
+}
 
 # By default DDS multicasts on every interface: what a test starts stays on this machine.
 os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-
-# Under `nohup` a program ignores SIGHUP, its children inherit that, and rosrm respects it.
-# Children do not inherit a handler: the tests still ignore SIGHUP, the programs they start do not.
-if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
-    signal.signal(signal.SIGHUP, lambda *_: None)
 
 # Where `make setup` has put CRIU, if it could be had.
 os.environ.setdefault("ROSRM_CRIU_PREFIX", str(HERE.parent / ".venv/criu"))
@@ -33,24 +34,49 @@ settings.register_profile("rosrm", deadline=None)
 settings.load_profile("rosrm")
 
 
+# `nohup` and shells without job control start programs that ignore these signals. What a test starts
+# would inherit that, and rosrm respects it. A handler is not inherited.
+for _number in (signal.SIGHUP, signal.SIGINT, signal.SIGQUIT):
+    if signal.getsignal(_number) is signal.SIG_IGN:
+        signal.signal(_number, lambda *_: None)
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         layer = item.path.relative_to(HERE).parts[0]
         item.add_marker(getattr(pytest.mark, layer))
-    # What takes long comes first: where two workers take file by file, none has it left at the end.
-    slow = {item.path for item in items if item.get_closest_marker("slow")}
-    items.sort(key=lambda item: item.path not in slow)
+    # The longest unit of work comes first, so that no worker has it left at the end: units with a
+    # slow test, then those with the most tests.
+    unit_of = {item: unit_of_work(item.nodeid) for item in items}
+    slow = {unit_of[item] for item in items if item.get_closest_marker("slow")}
+    size = Counter(unit_of.values())
+    items.sort(key=lambda item: (unit_of[item] not in slow, -size[unit_of[item]]))
+
+
+def unit_of_work(nodeid: str) -> str:
+    """Return the name of the tests that run one after the other on one worker."""
+    for name, places in LABS.items():
+        if nodeid.startswith(places):
+            return name
+    file = nodeid.partition("::")[0]
+    return file if shares_fixtures(file) else nodeid
+
+
+@functools.cache
+def shares_fixtures(file: str) -> bool:
+    """Return True if the tests of a file share what a fixture starts, such as a cluster."""
+    return 'scope="module"' in (HERE.parent / file).read_text(encoding="utf-8")
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """Workers that take file by file (`--dist loadfile`) take the labs as if they were one."""
-    if config.getoption("dist") != "loadfile":
+    """Let `--dist loadscope` distribute units of work, in the order in which they are collected."""
+    if config.getoption("dist") != "loadscope":
         return None
-    from xdist.scheduler import LoadFileScheduling
+    from xdist.scheduler import LoadScopeScheduling
 
-    class Scheduling(LoadFileScheduling):
+    class Scheduling(LoadScopeScheduling):
         def _split_scope(self, nodeid: str) -> str:
-            return "labs" if nodeid.startswith(LABS) else super()._split_scope(nodeid)
+            return unit_of_work(nodeid)
 
     return Scheduling(config, log)

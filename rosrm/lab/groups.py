@@ -8,6 +8,7 @@ lab itself needs: the first process, and the relays. (Version 2 wants processes 
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import re
 import signal
@@ -36,6 +37,9 @@ _ABOUT_SWAP: Final = ("memory.memsw.limit_in_bytes", "memory.swap.max")
 #: Seconds for killed processes to leave their group, and for the kernel to give up the group.
 _GONE: Final = 10.0
 _LOOK: Final = 0.01
+#: Of a path below a deleted group, and of one of its files that was still open.
+_GROUP_IS_GONE: Final = (errno.ENOENT, errno.ENODEV)
+_ATTEMPTS: Final = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -263,12 +267,21 @@ def _mounted(root: Path) -> Iterator[tuple[int, Path, frozenset[str]]]:
 
 def _make_group(hierarchy: Hierarchy, group: Path) -> None:
     """Make a group and those above it; in version 2 each hands our controllers on to the next."""
-    above = hierarchy.mount
-    for part in group.relative_to(hierarchy.mount).parts:
-        if hierarchy.version == 2:
-            _hand_on(above, hierarchy.controllers)
-        above = above / part
-        above.mkdir(exist_ok=True)
+    parts = group.relative_to(hierarchy.mount).parts
+    for attempts_left in reversed(range(_ATTEMPTS)):
+        above = hierarchy.mount
+        try:
+            for part in parts:
+                if hierarchy.version == 2:
+                    _hand_on(above, hierarchy.controllers)
+                above = above / part
+                above.mkdir(exist_ok=True)
+        except OSError as error:
+            # The removal of another lab deletes the top group while no lab has a group in it.
+            if error.errno not in _GROUP_IS_GONE or not attempts_left:
+                raise
+        else:
+            return
 
 
 def _hand_on(group: Path, controllers: Sequence[str]) -> None:

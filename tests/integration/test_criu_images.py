@@ -370,7 +370,7 @@ def test_signals_come_through_the_hold(theatre, counter):
 
 @pytest.mark.parametrize("group", [True, False])
 def test_sigkill_of_the_hold_ends_all_of_it(theatre, group):
-    """Also a daemon that has left group and session. It takes milliseconds; a second is wide."""
+    """Also a daemon that has left group and session. It takes milliseconds on an idle machine."""
     code = f"""
 import os, signal
 def become_two(*_):
@@ -394,7 +394,7 @@ signal.signal(signal.SIGHUP, become_two)
         restored.process.kill()
     killed = time.monotonic()
     eventually(lambda: not living_in(namespace), "the end of all in the namespace")
-    assert time.monotonic() - killed < 1.0
+    assert time.monotonic() - killed < 10.0
     assert restored.process.wait(TIMEOUT) == -signal.SIGKILL
 
 

@@ -113,11 +113,18 @@ class Stage:
             return self.add(make(context=self.context, **named))
 
     def spin_until(
-        self, condition: Callable[[], bool], what: str, timeout: float = PATIENCE
+        self,
+        condition: Callable[[], bool],
+        what: str,
+        timeout: float = PATIENCE,
+        seen: Callable[[], object] = lambda: "",
     ) -> None:
+        """Let the nodes work until a condition holds; `seen`: what there is instead."""
         deadline = time.monotonic() + timeout
         while not condition():
-            assert time.monotonic() < deadline, f"{what} did not come about in {timeout:g} s"
+            assert time.monotonic() < deadline, (
+                f"{what} did not come about in {timeout:g} s: {seen()}"
+            )
             self.spin(0.05)
 
     def spin(self, seconds: float) -> None:
@@ -182,8 +189,9 @@ class Conductor:
         """Until an instance reports a phase."""
         self._stage.spin_until(
             lambda: phase in self.of(number),
-            f"report {phase} of {number}: {self.of(number)}",
+            f"report {phase} of {number}",
             timeout,
+            lambda: [(report.instance, report.phase, report.message) for report in self.reports],
         )
         return next(
             report for report in reversed(self.reports)

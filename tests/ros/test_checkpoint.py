@@ -21,7 +21,17 @@ from rosrm.config.settings import MigrationSettings, ProcessDefaults
 from rosrm.core.model import MigrationPolicy, ProcessSpec, RestartPolicy
 from rosrm.core.views import ProcessRow
 from rosrm.errors import Refused
-from tests.ros.clusters import MIB, PATIENCE, QUICK, alive, host, node, python, wait_until
+from tests.ros.clusters import (
+    MIB,
+    PATIENCE,
+    QUICK,
+    STEADY,
+    alive,
+    host,
+    node,
+    python,
+    wait_until,
+)
 
 pytestmark = pytest.mark.timeout(240)
 
@@ -80,10 +90,10 @@ class Ear:
 
 
 @pytest.fixture
-def cluster(make_shared):
+def cluster(make_cluster):
     """One host."""
-    return make_shared(
-        host("robot"),
+    return make_cluster(
+        host("robot"), liveness=STEADY,
         migration=MigrationSettings(strategies={"relaunch": {}, "criu": {}}, automatic=False),
         defaults=ProcessDefaults(needs={"memory": MIB}),
     )  # fmt: skip
@@ -203,11 +213,11 @@ def test_the_commands_wait_until_it_is_done(criu, cluster, ear):
     cluster.cancel("counter")
 
 
-def test_a_portable_node_moves_on_after_a_restore(criu, make_shared):
+def test_a_portable_node_moves_on_after_a_restore(criu, make_cluster):
     """It is not asked to leave for a checkpoint, and can be for a move later."""
     alone()
-    cluster = make_shared(
-        host("left"), host("right"),
+    cluster = make_cluster(
+        host("left"), host("right"), liveness=STEADY,
         migration=MigrationSettings(strategies={"criu": {}}, automatic=False),
         defaults=ProcessDefaults(needs={"memory": MIB}),
     )  # fmt: skip

@@ -524,8 +524,11 @@ def test_a_part_that_did_not_change_goes_on_from_successor_to_successor(stage):
     conductor.hand_over()
     conductor.say(C.DONE)
     stage.remove(first)
+    conductor = Conductor(stage, source=2, destination=3)
+    conductor.say(C.SHADOW)
+    stage.spin_until(lambda: second._rosrm._source._channel, "the channel of the second handoff")
     third = stage.instance(Mapper, 3, alias="counter_18", shadow=True)
-    Conductor(stage, source=2, destination=3).hand_over()
+    conductor.hand_over()
     assert (second.map, third.map) == ("drawn", "drawn")
 
 

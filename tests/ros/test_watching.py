@@ -71,13 +71,13 @@ def test_a_second_publisher_is_heard(qos):
     with publishing("source", qos):
         thread = threading.Thread(target=lambda: heard.append(listen()))
         thread.start()
-        time.sleep(3.0)
+        time.sleep(1.0)
         assert not heard
         with publishing("destination", qos):
             thread.join(15.0)
     (result,) = heard
-    assert result["heard"] > 50
-    assert result["seconds"] > 2.5
+    assert result["heard"] > 10
+    assert result["seconds"] > 0.9
 
 
 def test_a_second_publisher_that_was_first_is_heard():

@@ -124,9 +124,11 @@ ROUND = """
 import socket, sys, time
 s = socket.socket(socket.AF_INET, socket.SOCK_DGRAM); s.settimeout(5)
 s.sendto(b'x', (sys.argv[1], 9200)); s.recv(9)
-begin = time.monotonic()
-s.sendto(b'x', (sys.argv[1], 9200)); s.recv(9)
-print(time.monotonic() - begin)
+def seconds():
+    begin = time.monotonic()
+    s.sendto(b'x', (sys.argv[1], 9200)); s.recv(9)
+    return time.monotonic() - begin
+print(min(seconds() for _ in range(5)))
 """
 BACK = """
 import socket

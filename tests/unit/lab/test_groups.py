@@ -126,6 +126,23 @@ def test_version_2_hands_the_controllers_down_to_the_leaves(tmp_path, monkeypatc
     assert groups.doors([hierarchy], "lab", "host1", "limited") == [limited / "cgroup.procs"]
 
 
+def test_a_top_group_that_another_lab_removes_is_made_again(tmp_path, monkeypatch):
+    """The removal of the last other lab deletes the top group before this lab has a group in it."""
+    hierarchy = Hierarchy(1, tmp_path, ("memory",))
+    real, removals = Path.mkdir, []
+
+    def mkdir(path, *words, **more):
+        if path == hierarchy.top / "lab" and not removals:
+            removals.append(path)
+            hierarchy.top.rmdir()
+        real(path, *words, **more)
+
+    monkeypatch.setattr(Path, "mkdir", mkdir)
+    groups.make([hierarchy], "lab", HostPlan("host1"))
+    assert removals
+    assert all(hierarchy.group("lab", "host1", leaf).is_dir() for leaf in groups.LEAVES)
+
+
 def test_a_group_that_holds_processes_is_explained(tmp_path, monkeypatch):
     """In a container of version 2 the top group holds the container's processes."""
     root = tree(tmp_path, V2.format(at=""), controllers="cpu memory")
