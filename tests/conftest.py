@@ -34,8 +34,8 @@ settings.register_profile("rosrm", deadline=None)
 settings.load_profile("rosrm")
 
 
-# `nohup` and shells without job control start programs that ignore these signals. What a test starts
-# would inherit that, and rosrm respects it. A handler is not inherited.
+# `nohup` and shells without job control start programs that ignore these signals. What a test
+# starts would inherit that, and rosrm respects it. A handler is not inherited.
 for _number in (signal.SIGHUP, signal.SIGINT, signal.SIGQUIT):
     if signal.getsignal(_number) is signal.SIG_IGN:
         signal.signal(_number, lambda *_: None)
