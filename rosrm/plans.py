@@ -27,7 +27,7 @@ from rosrm.core.migration import (
     Step,
     Stop,
 )
-from rosrm.core.model import InstanceId, ProcessSpec, RestartPolicy
+from rosrm.core.model import InstanceId, MigrationPolicy, ProcessSpec, RestartPolicy
 
 __all__ = [
     "AwaitReady",
@@ -37,6 +37,7 @@ __all__ = [
     "Execute",
     "HandoffPhase",
     "InstanceId",
+    "MigrationPolicy",
     "Move",
     "Plan",
     "ProcessSpec",

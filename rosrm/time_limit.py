@@ -10,6 +10,8 @@ from typing import Final, TypeVar
 
 T = TypeVar("T")
 
+#: Seconds for a call of a policy or strategy by the master.
+CALL_LIMIT: Final = 1.0
 #: Seconds between two alarms, for a plugin that catches the first.
 _AGAIN: Final = 0.05
 

@@ -26,8 +26,6 @@ from rosrm.core.columns import (
 from rosrm.core.model import EMPTY, HostDescription
 from rosrm.spelling import counted
 
-#: A usage above this is no measurement but a mistake (a CPU reading of 1.2 can be real).
-ABSURD_USAGE: Final = 64.0
 #: An estimate, unlike a declared need, fills at most this part of a host's limit: a guess alone
 #: must not keep a process off every host for ever.
 _MOST_GUESSED: Final = 0.5

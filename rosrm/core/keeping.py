@@ -231,7 +231,10 @@ def _choice(
     policy = keeping.policy
     try:
         return state.plugins.ask(
-            "checkpoint", keeping.policy_name, "choose", lambda: _sound(policy.choose(view), view)
+            "checkpoint",
+            keeping.policy_name,
+            "choose",
+            lambda: sound_choice(policy.choose(view), view),
         )
     except PluginError:
         return None
@@ -249,16 +252,19 @@ def _newest_size(holdings: Mapping[str, Holding]) -> int:
     return max(((one.age, one.size) for one in holdings.values()), default=((0, 0), 0))[1]
 
 
-def _sound(choice: CheckpointChoice | None, view: CheckpointView) -> CheckpointChoice | None:
+def sound_choice(choice: CheckpointChoice | None, view: CheckpointView) -> CheckpointChoice | None:
     """A choice that keeps to the contract; raises for any other."""
     if choice is None:
         return None
     required(choice, CheckpointChoice)
     strange = [name for name in choice.hosts if name not in view.hosts or name == view.host]
     if strange or len(set(choice.hosts)) != len(choice.hosts):
-        raise ValueError(f"it chose {', '.join(choice.hosts)} for a process on {view.host}")
+        raise PluginError(
+            f"it chose {', '.join(choice.hosts)} for a process on {view.host}; allowed: each of "
+            f"{', '.join(name for name in view.hosts if name != view.host) or 'no host'} once"
+        )
     if not 0.0 < choice.every < math.inf:
-        raise ValueError(f"it chose every {choice.every} s; allowed: more than 0")
+        raise PluginError(f"it chose every {choice.every} s; allowed: more than 0")
     return choice
 
 

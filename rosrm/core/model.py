@@ -14,6 +14,8 @@ from typing import Any, Final
 
 #: Slots of a `resource_info` message: as many resources can be reported by one host.
 RESOURCE_SLOTS: Final = 16
+#: A usage above this is no measurement but a mistake (a CPU reading of 1.2 can be real).
+ABSURD_USAGE: Final = 64.0
 
 EMPTY: Final[Mapping[str, Any]] = MappingProxyType({})
 

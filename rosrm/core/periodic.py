@@ -195,12 +195,14 @@ def _pace(
             return None, ""
         view = MemoryView(process.spec, host.name, asked, dumped.size, dumped.pause)
         asked_of = name
-        return state.plugins.ask("checkpoint", name, "pace", lambda: _sound(pacing.pace(view))), ""
+        return state.plugins.ask(
+            "checkpoint", name, "pace", lambda: sound_pace(pacing.pace(view))
+        ), ""  # fmt: skip
     except PluginError as error:
         return None, f"{asked_of!r} sets no pace: {error}"
 
 
-def _sound(pace: float | None) -> float | None:
+def sound_pace(pace: float | None) -> float | None:
     """A pace that keeps to the contract; raises for any other."""
     if pace is not None and not 0.0 < pace < inf:
         raise PluginError(f"one every {pace} s; allowed: more than 0")

@@ -277,21 +277,21 @@ def sound(scores: Scores, hosts: HostView, fits: BoolArray) -> tuple[FloatArray,
     required(scores, Scores)
     value = np.asarray(scores.value, np.float64)
     if value.shape != (size,):
-        raise ValueError(f"scores of shape {value.shape} for {size} hosts")
+        raise PluginError(f"scores of shape {value.shape} for {size} hosts")
     veto = None
     asked = fits
     if scores.veto is not None:
         veto = np.asarray(scores.veto)
         if veto.shape != (size,):
-            raise ValueError(f"vetoes of shape {veto.shape} for {size} hosts")
+            raise PluginError(f"vetoes of shape {veto.shape} for {size} hosts")
         if veto.dtype != np.bool_:
-            raise ValueError(f"vetoes of type {veto.dtype}; booleans are required, True: vetoed")
+            raise PluginError(f"vetoes of type {veto.dtype}; booleans are required, True: vetoed")
         asked = fits & ~veto
     if np.count_nonzero(np.isfinite(value)) < size:
         wrong = np.flatnonzero(asked & ~np.isfinite(value))
         if len(wrong):
             row = int(wrong[0])
-            raise ValueError(
+            raise PluginError(
                 f"the score of host {hosts.names[row]} is {value[row]}{_unread_by(hosts, row)}"
             )
     return value, veto

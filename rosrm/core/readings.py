@@ -8,8 +8,8 @@ import numpy as np
 
 from rosrm.core.columns import BoolArray, FloatArray, IntArray
 from rosrm.core.events import ReadingsReceived
-from rosrm.core.hosts import ABSURD_USAGE, HostTable
-from rosrm.core.model import RESOURCE_SLOTS
+from rosrm.core.hosts import HostTable
+from rosrm.core.model import ABSURD_USAGE, RESOURCE_SLOTS
 
 _SLOT_BITS: Final = np.left_shift(np.uint32(1), np.arange(RESOURCE_SLOTS, dtype=np.uint32))
 

@@ -10,7 +10,7 @@ from typing import TypeVar
 
 from rosrm.core.plugin_calls import Plugin
 from rosrm.errors import PluginError, describe_plugin_fault
-from rosrm.time_limit import limited
+from rosrm.time_limit import CALL_LIMIT, limited
 
 T = TypeVar("T")
 
@@ -30,7 +30,7 @@ class Deadlines:
         spent: seconds that all calls took so far.
     """
 
-    def __init__(self, seconds: float = 1.0, pause: float = 30.0) -> None:
+    def __init__(self, seconds: float = CALL_LIMIT, pause: float = 30.0) -> None:
         self._seconds = seconds
         self._pause = pause
         self._late: dict[Plugin, tuple[float, str]] = {}

@@ -32,7 +32,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 import numpy.typing as npt
 
-from rosrm.core.model import RESOURCE_SLOTS, Reading
+from rosrm.core.model import ABSURD_USAGE, RESOURCE_SLOTS, Reading
 from rosrm.core.plugin_calls import required
 from rosrm.errors import PluginError, describe_plugin_fault
 
@@ -44,8 +44,6 @@ if TYPE_CHECKING:
 QUICK: Final = 0.05
 #: As many quick reads in a row earn a probe its place in the shared thread.
 TRUSTED_AFTER: Final = 10
-#: A usage above this is no measurement but a mistake; the master refuses it (`core/hosts.py`).
-ABSURD_USAGE: Final = 64.0
 #: At most this many reports of one probe in REPORT_WINDOW seconds: a flapping probe floods nothing.
 REPORTS: Final = 6
 REPORT_WINDOW: Final = 60.0
@@ -372,8 +370,8 @@ class _Watched:
         values: tuple[float, ...] = ()
         reason = ""
         try:
-            values = _values(self._probe, self.names)
-        except (_Nonsense, PluginError) as nonsense:
+            values = read_values(self._probe, self.names)
+        except PluginError as nonsense:
             reason = str(nonsense)
         except BaseException as error:  # noqa: BLE001 - the guard: whatever a plugin raises, even
             # SystemExit, makes its readings stale and harms nothing else.
@@ -384,24 +382,27 @@ class _Watched:
         self._progress.set()
 
 
-class _Nonsense(Exception):
-    """What a probe answered cannot be a reading; the text says why."""
+def read_values(probe: Probe, names: tuple[str, ...]) -> tuple[float, ...]:
+    """Return one usage for each resource of a probe, in the order of `names`.
 
-
-def _values(probe: Probe, names: tuple[str, ...]) -> tuple[float, ...]:
-    """Read a probe and check every value before any is used."""
+    Raises:
+        PluginError: the answer is not one reading of each resource; the text says why.
+    """
     values: dict[str, float] = {}
     for answer in required(probe.read(), Iterable):  # type: ignore[type-abstract]
         reading = required(answer, Reading)
         if reading.resource not in names:
-            raise _Nonsense(f"a reading of {reading.resource!r}, which it did not announce")
+            raise PluginError(f"a reading of {reading.resource!r}, which it did not announce")
         if reading.resource in values:
-            raise _Nonsense(f"two readings of {reading.resource!r}")
+            raise PluginError(f"two readings of {reading.resource!r}")
         usage = float(reading.usage)
         if not 0.0 <= usage <= ABSURD_USAGE:  # also where it is NaN
-            raise _Nonsense(f"usage {usage} of {reading.resource!r} is not a fraction of it")
+            raise PluginError(
+                f"usage {usage} of {reading.resource!r}; allowed: 0 to {ABSURD_USAGE:g}, "
+                "where 1 is the whole capacity"
+            )
         values[reading.resource] = usage
     missing = [name for name in names if name not in values]
     if missing:
-        raise _Nonsense(f"no reading of {', '.join(missing)}")
+        raise PluginError(f"no reading of {', '.join(missing)}")
     return tuple(values[name] for name in names)

@@ -9,8 +9,9 @@ A contract is what the core relies on; rosrm's own plugins pass the same ones. W
         offer = register_probes()[0]
         options = {"sensor": "cpu"}
 
-Where a plugin says that it is absent (`SkipPlugin`), its contract is skipped with that reason.
-For readable failures, `pytest.register_assert_rewrite("rosrm.testing")` in a conftest.py.
+`options` is written as in a file of the configuration: `{"period": "500ms"}` is allowed. Each call
+has the time limit that rosrm grants, and a failure says in a sentence what is wrong. Where a plugin
+says that it is absent (`SkipPlugin`), its contract is skipped with that reason.
 """
 
 from rosrm.testing.checkpoints import CheckpointContract

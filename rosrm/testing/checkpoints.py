@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import islice, permutations
 from typing import Any, ClassVar, Final
 
+from rosrm.core.keeping import sound_choice
 from rosrm.core.model import EMPTY, MigrationPolicy, ProcessSpec
+from rosrm.core.periodic import sound_pace
 from rosrm.core.plugin_calls import implements
 from rosrm.ports import (
+    CheckpointChoice,
     CheckpointOffer,
     CheckpointPolicy,
     CheckpointView,
     MemoryPacing,
     MemoryView,
 )
+from rosrm.testing.calls import call, made
+from rosrm.time_limit import CALL_LIMIT
 
 #: Orders of the hosts that keep a state, of those that are tried.
 _ORDERS: Final = 24
@@ -27,7 +31,7 @@ class CheckpointContract:
 
     Attributes:
         offer: what is tested.
-        options: settings by name; the others have their defaults.
+        options: by name, as cluster.yaml has them; the others have their defaults.
         spec: of a stateful process.
     """
 
@@ -39,7 +43,12 @@ class CheckpointContract:
 
     def make(self) -> CheckpointPolicy:
         """A new policy; override it where more is needed."""
-        return self.offer.create(self.offer.options(**self.options))
+        policy: CheckpointPolicy = made("checkpoint", self.offer, self.options)
+        return policy
+
+    def _choice(self, policy: CheckpointPolicy, view: CheckpointView) -> CheckpointChoice | None:
+        """Return a choice; the limit and the checks are those of the master."""
+        return call("choose", CALL_LIMIT, lambda: sound_choice(policy.choose(view), view))
 
     def views(self) -> Sequence[CheckpointView]:
         """A process on one of five hosts: kept nowhere else yet, kept already, and all alone."""
@@ -53,25 +62,17 @@ class CheckpointContract:
         ]
 
     def test_chooses_hosts_that_are_there(self) -> None:
-        """Each once, never the process's own."""
+        """Each once, never the process's own; and every so many seconds, more than 0."""
         for view in self.views():
-            choice = self.make().choose(view)
-            if choice is not None:
-                assert set(choice.hosts) <= view.hosts.keys() - {view.host}
-                assert len(set(choice.hosts)) == len(choice.hosts)
-
-    def test_says_how_often(self) -> None:
-        """Seconds, more than none."""
-        for view in self.views():
-            choice = self.make().choose(view)
-            if choice is not None:
-                assert 0.0 < choice.every < math.inf
+            self._choice(self.make(), view)
 
     def test_is_pure(self) -> None:
         """The same view gives the same choice, also with another object of the policy."""
         policy, twin = self.make(), self.make()
         for view in self.views():
-            assert policy.choose(view) == policy.choose(view) == twin.choose(view)
+            first = self._choice(policy, view)
+            for again in (self._choice(policy, view), self._choice(twin, view)):
+                assert again == first, f"for the same view it chose {first}, then {again}"
 
     def test_stays_with_its_choice(self) -> None:
         """Once its hosts keep the state, nothing travels to another one.
@@ -79,10 +80,11 @@ class CheckpointContract:
         In whatever order they are listed: the newest goes first, and that changes by the second.
         """
         for view in self.views():
-            choice = self.make().choose(view)
+            choice = self._choice(self.make(), view)
             if choice is not None:
                 for order in islice(permutations(choice.hosts), _ORDERS):
-                    again = self.make().choose(replace(view, age=0.1, kept_on=order))
+                    kept = replace(view, age=0.1, kept_on=order)
+                    again = self._choice(self.make(), kept)
                     assert again is None or set(again.hosts) == set(choice.hosts), (
                         f"kept on {', '.join(order)} it chooses {', '.join(again.hosts)}"
                     )
@@ -96,6 +98,9 @@ class CheckpointContract:
         for asked in (0.5, 60.0):
             for size, pause in ((0, 0.0), (1 << 30, 8.0)):
                 view = MemoryView(self.spec, "h0", asked, size, pause)
-                pace = policy.pace(view)
-                assert pace is None or 0.0 < pace < math.inf
-                assert policy.pace(view) == pace == twin.pace(view)
+                first, *others = (self._pace(one, view) for one in (policy, policy, twin))
+                for again in others:
+                    assert again == first, f"for the same view the pace was {first}, then {again}"
+
+    def _pace(self, policy: MemoryPacing, view: MemoryView) -> float | None:
+        return call("pace", CALL_LIMIT, lambda: sound_pace(policy.pace(view)))

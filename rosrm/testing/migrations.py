@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
+from functools import partial
+from itertools import takewhile
 from math import inf
 from pathlib import Path
 from typing import Any, ClassVar, Final, get_type_hints
 
 from rosrm.config.own_options import merged_options
-from rosrm.config.plain import to_plain
 from rosrm.core.migration import (
     Aim,
     Commit,
@@ -27,9 +28,11 @@ from rosrm.core.migration import (
 )
 from rosrm.core.migration import plan_fault as fault_of
 from rosrm.core.model import EMPTY, InstanceId, ProcessSpec
-from rosrm.core.plans import plan_from_dict, plan_to_dict
-from rosrm.core.plugin_calls import implements
+from rosrm.core.plans import checked_plan
+from rosrm.core.plugin_calls import implements, required
 from rosrm.ports import Imaging, MigrationOffer, MigrationStrategy, PeriodicImaging
+from rosrm.testing.calls import ContractBroken, as_json, call, checked_options, made
+from rosrm.time_limit import CALL_LIMIT
 
 #: A unit of each quantity that an option may have.
 _UNITS: Final = {"duration": "s", "size": "B", "cores": "cores"}
@@ -41,12 +44,12 @@ def with_options(move: Move, offer: MigrationOffer, **cluster: Any) -> Move:
     Args:
         move: of a process that may have options of its own, as text or numbers.
         offer: of the strategy.
-        cluster: its options for all processes, by name; the others have their defaults.
+        cluster: its options for all processes, by name, as cluster.yaml has them.
     """
     migration, wanted = move.spec.migration, offer.own_options or offer.options
     own = migration.options if migration.strategy in (None, offer.name) else EMPTY
-    plain = to_plain(offer.options(**cluster))
-    return replace(move, options=merged_options(wanted, plain, own))
+    given = checked_options(offer.options, cluster)
+    return replace(move, options=merged_options(wanted, given, own))
 
 
 class MigrationContract:
@@ -54,7 +57,7 @@ class MigrationContract:
 
     Attributes:
         offer: what is tested.
-        options: settings by name; the others have their defaults.
+        options: by name, as cluster.yaml has them; the others have their defaults.
         spec: of a process that the strategy can move.
         not_called: executors that a test cannot call, by name, with the reason.
     """
@@ -66,7 +69,11 @@ class MigrationContract:
 
     def make(self) -> MigrationStrategy:
         """A new strategy; override it where more is needed."""
-        return self.offer.create(self.offer.options(**self.options))
+        strategy: MigrationStrategy = made("migration", self.offer, self.options)
+        return strategy
+
+    def _plan(self, strategy: MigrationStrategy, move: Move) -> Plan:
+        return _plan("propose", partial(strategy.propose, move))
 
     def moves(self) -> Sequence[Move]:
         """The same move of a process that may overlap with itself, and of one that may not."""
@@ -91,7 +98,8 @@ class MigrationContract:
     def test_plan_is_sound(self) -> None:
         """One commit point, hosts of this move only, a time-out for every wait."""
         for move in self.moves():
-            assert fault_of(self.make().propose(move), move) == ""
+            fault = fault_of(self._plan(self.make(), move), move)
+            assert not fault, f"the plan is unsound: {fault}"
 
     def test_checkpoints_and_restores_are_sound(self) -> None:
         """Of a strategy that takes images: on one host, and owned by the image in between."""
@@ -100,44 +108,53 @@ class MigrationContract:
             return
         for move in self.moves():
             here = replace(move, destination_host=move.source_host)
-            for make, aim in (
-                (strategy.checkpoint, Aim.CHECKPOINT),
-                (strategy.restore, Aim.RESTORE),
+            for hook, make, aim in (
+                ("checkpoint", strategy.checkpoint, Aim.CHECKPOINT),
+                ("restore", strategy.restore, Aim.RESTORE),
             ):
-                plan = make(here)
-                assert fault_of(plan, here, aim) == ""
-                assert make(here) == plan
-                assert plan_from_dict(json.loads(json.dumps(plan_to_dict(plan)))) == plan
+                plan = _plan(hook, partial(make, here))
+                fault = fault_of(plan, here, aim)
+                assert not fault, f"the plan of {hook} is unsound: {fault}"
+                again = _plan(hook, partial(make, here))
+                assert again == plan, f"{hook} gave another plan for the same move"
+                assert checked_plan(plan) == plan, f"the journal changes the plan of {hook}"
 
     def test_periodic_checkpoints_are_sound(self) -> None:
         """Of a strategy that makes them: a step on the instance's host, each time another one."""
         strategy: object = self.make()
         if not implements(strategy, PeriodicImaging):
             return
-        assert strategy.checkpoint_every(self.spec) >= 0.0
-        assert {strategy.discard} <= self.offer.executors.keys()
+        every = call("checkpoint_every", CALL_LIMIT, partial(strategy.checkpoint_every, self.spec))
+        assert every >= 0.0, f"checkpoint_every answered {every}; allowed: 0 or more seconds"
         instance = InstanceId(self.spec.name, 1)
-        first, again, later = (
-            strategy.periodic(self.spec, instance, "a", now) for now in (1, 1, 2)
-        )
-        assert first == again != later
+
+        def periodic(now: int) -> Execute:
+            step = partial(strategy.periodic, self.spec, instance, "a", now)
+            return call("periodic", CALL_LIMIT, lambda: required(step(), Execute))
+
+        first, again, later = periodic(1), periodic(1), periodic(2)
+        assert first == again, "periodic gave another step for the same time"
+        assert first != later, "periodic gave the same step for another time"
         for step in (first, later):
-            assert step.executor in self.offer.executors
-            assert (step.host, step.undo) == ("a", None)
-            assert 0.0 < step.timeout < inf
-            json.dumps(dict(step.arguments))
+            self._check_executor(step)
+            assert step.host == "a", (
+                f"periodic names the host {step.host!r}; the instance is on 'a'"
+            )
+            assert step.undo is None, "the step of periodic has an undo, which is never run"
+            assert 0.0 < step.timeout < inf, f"the timeout of periodic is {step.timeout} s"
 
     def test_is_pure(self) -> None:
         """The same move gives the same plan, also with another object of the strategy."""
         strategy, twin = self.make(), self.make()
         for move in self.moves():
-            assert strategy.propose(move) == strategy.propose(move)
-            assert twin.propose(move) == strategy.propose(move)
+            plan = self._plan(strategy, move)
+            for one, whose in ((strategy, "the same object"), (twin, "another object")):
+                assert self._plan(one, move) == plan, f"{whose} gave another plan for the same move"
 
     def test_can_be_undone_before_the_commit(self) -> None:
         """A started destination would be stopped again, and a stopped source started."""
         for move in self.moves():
-            for step in before_commit(self.make().propose(move)):
+            for step in before_commit(self._plan(self.make(), move)):
                 if isinstance(step, Start) and step.instance == move.destination:
                     assert isinstance(step.undo, (Stop, Execute)), "the start has no way back"
                 if isinstance(step, Stop) and step.instance == move.source:
@@ -146,14 +163,17 @@ class MigrationContract:
     def test_numbers_are_used_once(self) -> None:
         """A source that is started again runs under the number kept for it, not its old one."""
         for move in self.moves():
-            for step in self.make().propose(move).steps:
+            for step in self._plan(self.make(), move).steps:
                 if isinstance(step, Stop) and isinstance(step.undo, Start):
-                    assert step.undo.instance == move.fallback
+                    number = step.undo.instance
+                    assert number == move.fallback, (
+                        f"the source starts again as {number}; required: move.fallback"
+                    )
 
     def test_an_overlap_is_declared(self) -> None:
         """A destination of the same name that starts before the source has stopped says so."""
         for move in self.moves():
-            plan = self.make().propose(move)
+            plan = self._plan(self.make(), move)
             stopped = False
             for step in plan.steps:
                 stopped = stopped or isinstance(step, Execute)  # what that does is not known here
@@ -161,14 +181,20 @@ class MigrationContract:
                     stopped = True
                 if isinstance(step, Start) and step.instance == move.destination and not stopped:
                     same_name = step.node_name in ("", move.spec.name)
-                    assert plan.overlap > 0 or not same_name
-                    assert move.spec.migration.overlap or not same_name
+                    assert plan.overlap > 0 or not same_name, (
+                        "the destination starts before the source has stopped, and the plan "
+                        "declares no overlap"
+                    )
+                    assert move.spec.migration.overlap or not same_name, (
+                        "the destination starts before the source has stopped, and the process "
+                        "has `overlap: false`"
+                    )
 
     def test_survives_the_journal(self) -> None:
         """A master that is started anew goes on with the very same plan."""
         for move in self.moves():
-            plan = self.make().propose(move)
-            assert plan_from_dict(json.loads(json.dumps(plan_to_dict(plan)))) == plan
+            plan = self._plan(self.make(), move)
+            assert checked_plan(plan) == plan, "the journal gives back another plan"
 
     def test_a_shadow_is_released_after_the_commit(self) -> None:
         """Its slave restarts it as its spec says, once it owns the name and not before.
@@ -176,55 +202,66 @@ class MigrationContract:
         So it is with one that is restored from an image.
         """
         for move in self.moves():
-            plan = self.make().propose(move)
+            plan = self._plan(self.make(), move)
             commit = len(before_commit(plan))
             given = [
                 at > commit and step.restart == move.spec.restart
                 for at, step in enumerate(plan.steps)
                 if isinstance(step, SetRestart) and step.instance == move.destination
             ]
-            assert given == [True] * len(shadows(plan))
+            assert given == [True] * len(shadows(plan)), (
+                "each start of a destination in silence needs one SetRestart of the destination "
+                "after the Commit, with the restart policy of the spec"
+            )
 
     def test_a_source_that_is_not_restarted_for_a_while_is_again_if_it_stays(self) -> None:
         """What suspends its policy is undone by giving it back."""
         for move in self.moves():
-            for step in before_commit(self.make().propose(move)):
+            for step in before_commit(self._plan(self.make(), move)):
                 if isinstance(step, SetRestart):
                     undo = step.undo
-                    assert isinstance(undo, SetRestart)
-                    assert undo.instance == step.instance
-                    assert undo.restart == move.spec.restart
+                    given = (undo.instance, undo.restart) if isinstance(undo, SetRestart) else None
+                    assert given == (step.instance, move.spec.restart), (
+                        "a SetRestart before the Commit needs an undo with the policy of the spec"
+                    )
 
     def test_a_silent_source_goes_on_only_when_its_successor_has_given_up(self) -> None:
         """SWITCH is undone by ABORT, and before that stands a SHADOW that is undone by RESUME."""
         for move in self.moves():
             undone_by = {
                 step.phase: step.undo.phase
-                for step in before_commit(self.make().propose(move))
+                for step in before_commit(self._plan(self.make(), move))
                 if isinstance(step, Configure) and isinstance(step.undo, Configure)
             }
             if HandoffPhase.SWITCH in undone_by:
                 assert list(undone_by.items()) == [
                     (HandoffPhase.SHADOW, HandoffPhase.RESUME),
                     (HandoffPhase.SWITCH, HandoffPhase.ABORT),
-                ]
+                ], "SWITCH needs the undo ABORT, and before it a SHADOW with the undo RESUME"
 
     def test_executors_are_its_own(self) -> None:
         """An open step names an executor of the same offer, with arguments that are JSON."""
         for move in self.moves():
-            for step in self.make().propose(move).steps:
+            for step in self._plan(self.make(), move).steps:
                 if isinstance(step, Execute):
-                    assert step.executor in self.offer.executors
-                    json.dumps(dict(step.arguments))
+                    self._check_executor(step)
+
+    def _check_executor(self, step: Execute) -> None:
+        own = self.offer.executors
+        assert step.executor in own, (
+            f"a step names the executor {step.executor!r}; those of the offer: "
+            f"{', '.join(sorted(own)) or 'none'}"
+        )
+        as_json(f"the step of the executor {step.executor!r} has the arguments", step.arguments)
 
     def test_executors_answer_with_json_objects(self, tmp_path: Path) -> None:
-        """Each that a plan names is called as on a slave; one may raise, for that is a failed step.
+        """Each that a plan names answers as on a slave, within the `timeout` of its step.
 
-        Those in `not_called` are left out.
+        One may raise, for that is a failed step. Those in `not_called` are left out.
         """
         for move in self.moves():
             results: dict[str, Any] = {}
-            for step in self.make().propose(move).steps:
+            for step in self._plan(self.make(), move).steps:
                 if not isinstance(step, Execute) or step.executor in self.not_called:
                     continue
                 pids = {str(move.source): os.getpid()}
@@ -232,17 +269,20 @@ class MigrationContract:
                     "host": step.host, "state": str(tmp_path), "pids": pids,
                     "instances": list(pids),
                 }  # fmt: skip
-                told = json.loads(json.dumps({**step.arguments, "results": results, "here": here}))
+                self._check_executor(step)
+                told = {**step.arguments, "results": results, "here": here}
+                told = json.loads(json.dumps(told))
+                who, execute = (
+                    f"the executor {step.executor!r}",
+                    self.offer.executors[step.executor],
+                )
                 try:
-                    answer: object = self.offer.executors[step.executor](told)
+                    answer = call(who, step.timeout, partial(execute, told))
+                except ContractBroken:
+                    raise
                 except Exception:  # noqa: BLE001, S112 - to raise is to fail the step, and allowed
                     continue
-                given = "None" if answer is None else repr(answer)
-                assert isinstance(answer, Mapping), (
-                    f"the executor {step.executor!r} answered {given}; a mapping is required"
-                )
-                assert all(isinstance(key, str) for key in answer), answer
-                results[step.executor] = json.loads(json.dumps(dict(answer), allow_nan=False))
+                results[step.executor] = as_json(f"{who} answered", answer)
 
     def test_options_of_a_process_are_read_from_the_move(self) -> None:
         """A work file may write the same quantities with their units: the plan stays the same.
@@ -254,8 +294,11 @@ class MigrationContract:
             text = dict(quantities_as_text(move.options if move.options is not None else wanted()))
             policy = replace(move.spec.migration, options={**move.spec.migration.options, **text})
             written = self.with_options(replace(move, spec=replace(move.spec, migration=policy)))
-            assert written.options == move.options
-            assert self.make().propose(written) == self.make().propose(move), (
+            assert written.options == move.options, (
+                f"written {text}, the options are {written.options}, not {move.options}"
+            )
+            plan = self._plan(self.make(), move)
+            assert self._plan(self.make(), written) == plan, (
                 f"the plan is another one where the process's own options are written {text}"
             )
 
@@ -277,6 +320,16 @@ def shadows(plan: Plan) -> Sequence[Start]:
 
 
 def before_commit(plan: Plan) -> Sequence[Step]:
-    """The steps of a plan that can still be undone."""
-    commit = next(at for at, step in enumerate(plan.steps) if isinstance(step, Commit))
-    return plan.steps[:commit]
+    """The steps of a plan that can still be undone: all, where it lacks a commit."""
+    return list(takewhile(lambda step: not isinstance(step, Commit), plan.steps))
+
+
+def _plan(hook: str, ask: Callable[[], Plan]) -> Plan:
+    """Return a plan; the limit and the checks are those of the master."""
+
+    def checked() -> Plan:
+        plan = required(ask(), Plan)
+        checked_plan(plan)
+        return plan
+
+    return call(hook, CALL_LIMIT, checked)

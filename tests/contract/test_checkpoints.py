@@ -26,7 +26,7 @@ class TestOtherHostWithCopiesApart(CheckpointContract):
 
 def test_each_shipped_policy_is_here():
     """A policy that is added to the plugin must be added here."""
-    assert set(OFFERS) == {contract.offer.name for contract in CheckpointContract.__subclasses__()}
+    assert set(OFFERS) <= {contract.offer.name for contract in CheckpointContract.__subclasses__()}
 
 
 def view(name: str = "p", **fields) -> CheckpointView:

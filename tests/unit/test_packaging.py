@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import shlex
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -98,3 +100,10 @@ def test_every_distribution_runs_on_the_same_pythons_under_the_same_licence(proj
 
     assert settings["requires-python"] == ">=3.10"
     assert settings["license"] == "Apache-2.0"
+
+
+def test_the_readme_installs_all_that_runs() -> None:
+    """Its one pip command names rosrm with ROS 2, the interfaces and each plugin, pinned."""
+    (line,) = re.findall(r"^\$ pip install (.*)$", (ROOT / "README.md").read_text(), re.MULTILINE)
+    needed = [f"./{p.parent}" for p in PROJECTS if p.parent not in (Path(), Path("examples"))]
+    assert sorted(shlex.split(line)) == sorted(["-c", "constraints.txt", ".[ros]", *needed])

@@ -1,0 +1,142 @@
+"""Calls of a plugin by its contract, with the limits and checks of master and slave."""
+
+from __future__ import annotations
+
+import json
+import signal
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from types import SimpleNamespace
+from typing import Any, Final, TypeVar
+from unittest import SkipTest
+
+from rosrm.config.checking import validated
+from rosrm.config.documents import Problems, parse
+from rosrm.config.plain import to_plain
+from rosrm.errors import ConfigError, PluginError
+from rosrm.hookspecs import hookimpl
+from rosrm.loading import HOOKS, Offer
+from rosrm.registry import Registry
+from rosrm.time_limit import limited
+
+T = TypeVar("T")
+
+_HOOK_OF: Final = {kind: hook for hook, (kind, _) in HOOKS.items()}
+
+
+class ContractBroken(AssertionError):
+    """A plugin breaks its contract; the text says how."""
+
+
+def call(hook: str, seconds: float, ask: Callable[[], T]) -> T:
+    """Return the answer of a plugin.
+
+    Args:
+        hook: that is called, for messages.
+        seconds: the limit of master or slave for this call.
+        ask: calls the hook and checks the answer; raises `PluginError` for a wrong one.
+
+    Raises:
+        ContractBroken: the call took longer, or its answer is wrong.
+    """
+    late = ""
+
+    def expired() -> str:
+        nonlocal late
+        late = f"{hook} took longer than {seconds:g} s, which is its limit in rosrm"
+        return late
+
+    try:
+        with _other_timer_kept():
+            answer = limited(seconds, ask, expired)
+    except Exception as fault:
+        if late:
+            raise ContractBroken(late) from fault
+        if isinstance(fault, PluginError):
+            raise ContractBroken(f"{hook}: {fault}") from None
+        raise
+    if late:  # the plugin caught the exception
+        raise ContractBroken(late)
+    return answer
+
+
+@contextmanager
+def _other_timer_kept() -> Iterator[None]:
+    """Set the alarm of a test runner again: a process has one timer, and the limit uses it."""
+    handler, (left, _) = signal.getsignal(signal.SIGALRM), signal.getitimer(signal.ITIMER_REAL)
+    try:
+        yield
+    finally:
+        if left and threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGALRM, handler)
+            signal.setitimer(signal.ITIMER_REAL, left)
+
+
+def checked_options(wanted: type[Any], given: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return options as `rosrm config check` reads them from a file, as plain values.
+
+    Raises:
+        ContractBroken: for an unknown name, or a value that is not allowed.
+    """
+    problems = Problems()
+    value = validated(wanted, parse(json.dumps(to_plain(given)), "options"), problems)
+    if value is None:
+        raise ContractBroken("; ".join(f"options: {text}" for _, text in problems.found))
+    return dict(to_plain(value))
+
+
+def made(kind: str, offer: Offer, options: Mapping[str, Any], *context: Any) -> Any:
+    """Return the object of an offer, made and checked as by master or slave.
+
+    Args:
+        kind: as in `Registry.offer`.
+        offer: of the plugin.
+        options: as a file gives them.
+        context: of a probe.
+
+    Raises:
+        ContractBroken: the offer or what it makes is wrong.
+        SkipTest: the plugin says that it is absent here.
+    """
+    hook = _HOOK_OF[kind]
+    plugin = SimpleNamespace(**{hook: hookimpl(specname=hook)(lambda: [offer])})
+    registry = Registry.of(tested=plugin)
+    if registry.broken:
+        raise ContractBroken(registry.broken[0].reason)
+    name, plain = offer.name, checked_options(offer.options, options)
+    try:
+        with _other_timer_kept():
+            if kind == "probe":
+                present = registry.probes({name: plain}, *context).made
+                thing: Any = present[0].probe if present else None
+            elif kind == "migration":
+                thing = registry.migrations({name: plain})[name]
+            else:
+                thing = getattr(registry, kind)(name, plain)
+    except (ConfigError, PluginError):
+        thing = None
+    (row,) = registry.rows(kind)
+    if row.state == "absent":
+        raise SkipTest(f"{name} is absent here: {row.reason}")
+    if thing is None:
+        raise ContractBroken(row.reason)
+    return thing
+
+
+def as_json(what: str, value: object) -> Mapping[str, Any]:
+    """Return a JSON object as it arrives on the other side.
+
+    Raises:
+        ContractBroken: it is none; `what` begins the message.
+    """
+    if not isinstance(value, Mapping):
+        given = "None" if value is None else repr(value)
+        raise ContractBroken(f"{what} {given}; a mapping is required")
+    strange = [key for key in value if not isinstance(key, str)]
+    if strange:
+        raise ContractBroken(f"{what} {value!r}; the key {strange[0]!r} is no text")
+    try:
+        return dict(json.loads(json.dumps(dict(value), allow_nan=False)))
+    except (TypeError, ValueError) as fault:
+        raise ContractBroken(f"{what} {value!r}, which is no JSON object: {fault}") from None

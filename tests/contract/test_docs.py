@@ -1,0 +1,42 @@
+"""The plugins that the reference shows as a whole keep their contracts."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from types import ModuleType
+
+from rosrm.registry import Registry
+from rosrm.testing import CheckpointContract, ProbeContract
+
+PAGE = Path(__file__).resolve().parents[2] / "docs/reference/plugins.md"
+
+
+def _module(text: str) -> ModuleType:
+    module = ModuleType("shown")
+    exec(text, vars(module))
+    return module
+
+
+PROBE, POLICY = map(
+    _module,
+    re.findall(
+        r"<!-- plugin -->\n```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL
+    ),
+)
+
+
+class TestProbeThatIsShown(ProbeContract):
+    offer = PROBE.register_probes()[0]
+
+
+class TestCheckpointPolicyThatIsShown(CheckpointContract):
+    offer = POLICY.register_checkpoint_policies()[0]
+
+
+def test_both_are_found_by_their_hooks():
+    """With the mark and the name that a hook needs."""
+    registry = Registry.of(probe=PROBE, policy=POLICY)
+    assert not registry.broken
+    assert registry.names("probe") == ("open_files",)
+    assert registry.names("checkpoint") == ("first-host",)

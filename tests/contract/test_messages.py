@@ -1,0 +1,189 @@
+"""A contract that fails says in a sentence what is wrong, and no plugin can hang its tests."""
+
+from __future__ import annotations
+
+import signal
+import time
+from dataclasses import dataclass
+from types import SimpleNamespace
+from unittest import SkipTest
+
+import pytest
+
+from rosrm.config.units import Bytes, PositiveSeconds
+from rosrm.core.migration import Execute
+from rosrm.errors import SkipPlugin
+from rosrm.plans import Plan, Start
+from rosrm.ports import (
+    CheckpointChoice,
+    CheckpointOffer,
+    MigrationOffer,
+    ProbeOffer,
+    Scores,
+    ScoringOffer,
+)
+from rosrm.testing import (
+    CheckpointContract,
+    FakeProbe,
+    MigrationContract,
+    ProbeContract,
+    ScoringContract,
+)
+
+KINDS = {
+    ProbeContract: (ProbeOffer, "read"),
+    ScoringContract: (ScoringOffer, "score"),
+    MigrationContract: (MigrationOffer, "propose"),
+    CheckpointContract: (CheckpointOffer, "choose"),
+}
+
+
+@dataclass(frozen=True)
+class _Options:
+    pause: PositiveSeconds = 2.0
+    room: Bytes = 0
+
+
+def contract_of(kind, thing, **fields):
+    """The contract of an offer that makes one thing."""
+    contract = kind()
+    offer, _ = KINDS[kind]
+    if offer is ProbeOffer:
+        contract.offer = ProbeOffer("a", lambda options, context: thing, **fields)
+    else:
+        contract.offer = offer("a", lambda options: thing, **fields)
+    return contract
+
+
+def thing_of(kind, answer):
+    """A plugin whose main method is a function without arguments."""
+    thing = FakeProbe(a=0.5) if kind is ProbeContract else SimpleNamespace()
+    setattr(thing, KINDS[kind][1], lambda *_: answer())
+    return thing
+
+
+FIRST = {
+    ProbeContract: "test_reads_each_resource_once",
+    ScoringContract: "test_is_pure",
+    MigrationContract: "test_can_be_undone_before_the_commit",
+    CheckpointContract: "test_chooses_hosts_that_are_there",
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_answer_of_another_type_is_named(kind):
+    """Not by an attribute that it lacks."""
+    contract = contract_of(kind, thing_of(kind, lambda: 5))
+    with pytest.raises(AssertionError, match=r"answered a int; \w+ is required"):
+        getattr(contract, FIRST[kind])()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_object_without_its_method_is_named(kind):
+    """As by `rosrm config check`."""
+    with pytest.raises(AssertionError, match=r"made None; an object with .* is required"):
+        getattr(contract_of(kind, None), FIRST[kind])()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("stubborn", [False, True])
+def test_a_call_that_takes_too_long_is_ended_and_named(kind, stubborn, monkeypatch):
+    """Also where the plugin catches the exception that ends the call."""
+    monkeypatch.setattr(f"{kind.__module__}.CALL_LIMIT", 0.05, raising=False)
+
+    def hang():
+        try:
+            time.sleep(30.0)
+        except TimeoutError:
+            if not stubborn:
+                raise
+
+    fields = {"deadline": 0.05} if kind is ProbeContract else {}
+    contract = contract_of(kind, thing_of(kind, hang), **fields)
+    with pytest.raises(AssertionError, match=rf"^{KINDS[kind][1]} took longer than 0\.05 s"):
+        getattr(contract, FIRST[kind])()
+
+
+def test_an_executor_that_hangs_is_ended_after_the_timeout_of_its_step(tmp_path):
+    """The tests go on, and the message names the executor."""
+    plan = Plan((Execute("a.wait", "a", {}, 0.05),))
+    contract = contract_of(
+        MigrationContract, SimpleNamespace(propose=lambda move: plan),
+        executors={"a.wait": lambda _: time.sleep(30.0)},
+    )  # fmt: skip
+    with pytest.raises(AssertionError, match=r"executor 'a\.wait' took longer than 0\.05 s"):
+        contract.test_executors_answer_with_json_objects(tmp_path)
+
+
+def test_a_plan_without_a_commit_is_named():
+    """By the test of sound plans; the others look at all its steps."""
+
+    def propose(move):
+        return Plan((Start(move.destination, move.destination_host, 5.0),))
+
+    contract = contract_of(MigrationContract, SimpleNamespace(propose=propose))
+    with pytest.raises(AssertionError, match="unsound: it has 0 commit points"):
+        contract.test_plan_is_sound()
+    with pytest.raises(AssertionError, match="no way back"):
+        contract.test_can_be_undone_before_the_commit()
+
+
+def test_a_score_of_nan_is_named_with_its_host():
+    """By each test of the contract."""
+    policy = SimpleNamespace(score=lambda hosts, process: Scores(hosts.usage[:, -1] * 1.0))
+    with pytest.raises(AssertionError, match=r"score: the score of host h\d+ is nan"):
+        contract_of(ScoringContract, policy).test_is_pure()
+
+
+@pytest.mark.parametrize("usage", [64.5, 914.0, -0.1])
+def test_a_usage_that_the_slave_refuses_fails_the_contract(usage):
+    """By the same check."""
+    contract = contract_of(ProbeContract, FakeProbe(a=usage))
+    with pytest.raises(AssertionError, match=r"read: usage .* of 'a'; allowed: 0 to 64"):
+        contract.test_reads_each_resource_once()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_options_of_a_contract_are_written_as_in_a_file(kind):
+    """With units; and a wrong one is named."""
+    seen = []
+    contract = contract_of(kind, None, options=_Options)
+    made = thing_of(kind, CheckpointChoice)
+    contract.offer = type(contract.offer)(
+        "a", lambda options, *context: seen.append(options) or made, _Options
+    )
+    contract.options = {"pause": "100ms", "room": "2GiB"}
+    contract.make()
+    assert seen == [_Options(0.1, 2 << 30)]
+    contract.options = {"pauze": 1}
+    with pytest.raises(AssertionError, match=r"^options: unknown key 'pauze'.*Allowed: pause"):
+        contract.make()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_contract_is_skipped_where_the_plugin_is_absent(kind):
+    """With its reason."""
+
+    def absent(options, *context):
+        raise SkipPlugin("no sensor")
+
+    contract = kind()
+    contract.offer = KINDS[kind][0]("a", absent)
+    with pytest.raises(SkipTest, match="a is absent here: no sensor"):
+        contract.make()
+
+
+def test_the_alarm_of_a_test_runner_stays_set():
+    """A process has one timer; the limits of the calls give it back."""
+    heard = []
+    before = signal.signal(signal.SIGALRM, lambda *_: heard.append(True))
+    left, _ = signal.setitimer(signal.ITIMER_REAL, 0.2)
+    try:
+        contract_of(ProbeContract, FakeProbe(a=0.5)).test_reads_each_resource_once()
+        end = time.monotonic() + 5.0
+        while not heard:
+            assert time.monotonic() < end
+            time.sleep(0.01)
+    finally:
+        signal.signal(signal.SIGALRM, before)
+        signal.setitimer(signal.ITIMER_REAL, left)
