@@ -29,6 +29,10 @@ os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
 # Where `make setup` has put CRIU, if it could be had.
 os.environ.setdefault("ROSRM_CRIU_PREFIX", str(HERE.parent / ".venv/criu"))
 
+# pytest imports readline, which sets these for the workers of xdist; tables in pipes obey them.
+for _size in ("COLUMNS", "LINES"):
+    os.environ.pop(_size, None)
+
 # A busy machine may take its time for one example.
 settings.register_profile("rosrm", deadline=None)
 settings.load_profile("rosrm")
