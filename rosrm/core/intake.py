@@ -57,11 +57,20 @@ def host_registered(state: MasterState, event: happened.HostRegistered, now: flo
     note_seen(state, host.name, event.journal_seen, now)
     keeping.note_states(state, host, event.kept, now)  # it decides where what is queued goes on
     host_loss.regain_sight(state, host, now)
+    stopping = [number for number in sorted(host.instances) if state.instances[number].stopping]
     lifecycle.reconcile(state, host, event.instances, now, registering=True)
+    _stop_again(state, stopping, now)
     _forgive(state, host)
     _execute_again(state, host)
     reconsider_set_aside(state, now)
     state.emit(Reply(event.request, host_id=host.host_id))
+
+
+def _stop_again(state: MasterState, stopping: list[int], now: float) -> None:
+    """Order the stops again at once that the former run of a slave may not have taken."""
+    for number in stopping:
+        if number in state.instances:
+            lifecycle.stop_instance(state, state.instances[number], now)
 
 
 def _execute_again(state: MasterState, host: Host) -> None:

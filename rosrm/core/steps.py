@@ -58,6 +58,9 @@ def give_order(state: MasterState, run: Run, step: Step, now: float) -> None:
         run.order, run.order_at = 0, now
         handoffs.publish(state, run, step.phase)
         return
+    if isinstance(step, Start) and _in_the_way(state, run, step, now):
+        run.order = 0
+        return
     host = state.hosts.by_name[step.host]
     run.order, run.order_at = state.order_id(), now
     state.runs_by_order[run.order] = run.process
@@ -97,8 +100,6 @@ def _order_restart_policy(state: MasterState, run: Run, step: SetRestart, host: 
 def _order_start(state: MasterState, run: Run, step: Start, host: Host, now: float) -> None:
     process = state.processes[run.process]
     spec, number = process.spec, step.instance.number
-    if _in_the_way(state, run, step, now):
-        return
     run.launched.add(number)
     if step.shadow or step.restored:
         run.suspended.add(number)
@@ -136,13 +137,21 @@ def _in_the_way(state: MasterState, run: Run, step: Start, now: float) -> bool:
 
 
 def give_order_again(state: MasterState, run: Run, step: Step, now: float) -> None:
-    """A start, a stop or a restart policy may be given twice without harm; one may be lost."""
+    """Order again a start, a stop or a restart policy: one may be lost, and two do no harm.
+
+    A start that another instance delayed is ordered as soon as that one has ended.
+    """
     if isinstance(step, Configure):
         handoffs.say_again(state, run, step, now)
     elif isinstance(step, Execute | AwaitReady | AwaitReleased | Commit):
         return
-    elif now - run.order_at >= state.settings.order_retry:
+    elif _has_waited(run, step) or now - run.order_at >= state.settings.order_retry:
         give_order(state, run, step, now)
+
+
+def _has_waited(run: Run, step: Step) -> bool:
+    """Return True if the start was not ordered yet, because another instance was in its way."""
+    return isinstance(step, Start) and step.instance.number not in run.launched
 
 
 def timed_out(state: MasterState, run: Run, step: Step, now: float) -> str | None:

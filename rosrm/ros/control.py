@@ -7,6 +7,7 @@ delivers requests seconds late after a cut. Repeated ids are answered again, not
 
 from __future__ import annotations
 
+import math
 import os
 from collections import OrderedDict
 from collections.abc import Callable
@@ -237,7 +238,5 @@ class ControlClient:
             self.participant.guard.call(call.done, None)
 
     def forget(self) -> None:
-        """Drop every call without an answer: the other side is another run by now."""
-        for call in self._calls:
-            call.client.remove_pending_request(call.future)
-        self._calls.clear()
+        """End every call without an answer: the other side is another run by now."""
+        self.expire(math.inf)

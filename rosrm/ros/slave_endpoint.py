@@ -96,7 +96,7 @@ class SlaveEndpoint:
         self._registered_with = 0  # the incarnation of the newest that took us in
         self._taken_since: float | None = None
         self._waits_since: float | None = None
-        self._told = ""
+        self._leaves: Sequence[InstanceStatus] | None = None  # what it keeps running as it leaves
         self._poll: Call | None = None
         self._poll_at = 0.0
         self._poll_anew = _FIRST_POLL_ANEW
@@ -146,8 +146,8 @@ class SlaveEndpoint:
             self.link = Link.SEARCHING
         if self.link is Link.REGISTERED and self._missed(_MISSED_BEATS, now):
             silence = now - self._beat_at
-            reason = f"the master has been silent for {silence:.1f} s; processes keep running"
-            self._lose_master(reason)
+            keep = "; processes keep running" if self._leaves is None else ""
+            self._lose_master(f"the master has been silent for {silence:.1f} s{keep}")
 
     def _greet(self, now: float) -> None:
         self.link = Link.GREETING
@@ -227,6 +227,8 @@ class SlaveEndpoint:
             f"registered with master {greeting.master} (pid {greeting.pid} on {greeting.hostname}) "
             f"as host {self.host_id}"
         )
+        if self._leaves is not None:  # the former master was gone before it took note
+            self._send_leave(self._leaves, lambda: None)
 
     def _wait_for_journal(self, why: str, now: float) -> None:
         """The master can take nobody in just now: ask again, and say so once."""
@@ -404,13 +406,19 @@ class SlaveEndpoint:
     def leave(self, done: Callable[[], None], kept: Sequence[InstanceStatus] = ()) -> None:
         """Report that this slave stops; `done` is called when the master knows, or is silent.
 
+        A master that this slave finds after that is informed as well.
+
         Args:
             done: called once.
             kept: all instances, where the slave leaves them running; (): it stops them.
         """
-        if self.link is not Link.REGISTERED:
+        self._leaves = kept
+        if self.link is Link.REGISTERED:
+            self._send_leave(kept, done)
+        else:
             done()
-            return
+
+    def _send_leave(self, kept: Sequence[InstanceStatus], done: Callable[[], None]) -> None:
         request = srv.Leave.Request(
             envelope=self._control.envelope(self._master_beat, self._epoch),
             host_id=self.host_id, incarnation=self._description.incarnation,

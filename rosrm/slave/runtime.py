@@ -24,7 +24,6 @@ from rosrm.core.model import (
     InstanceStatus,
     KeptState,
     RestartPolicy,
-    StopPolicy,
 )
 from rosrm.entry import handle_stop_signals
 from rosrm.errors import Refused
@@ -36,6 +35,7 @@ from rosrm.ros.kept_endpoint import KeptEndpoint
 from rosrm.ros.names import token
 from rosrm.ros.participant import Participant
 from rosrm.ros.slave_endpoint import Link, LogQuery, LogSlice, SlaveEndpoint
+from rosrm.slave.ending import STOP_ALL, Ending
 from rosrm.slave.executing import Done, Here, execute
 from rosrm.slave.health import HealthWatch
 from rosrm.slave.keeping import Keeping
@@ -60,15 +60,8 @@ _PATIENCE_TOLD: Final = 10.0
 #: At slow rates a request is still meant after so many of our own beats.
 _BEATS_MISSED: Final = 3
 
-#: Seconds for the master to take note that this slave ends.
-_LEAVE_PATIENCE: Final = 2.0
 #: Seconds in which `--stop-all` looks for the master before it stops the processes.
 _MASTER_PATIENCE: Final = 5.0
-#: Seconds for a re-adopted process to end: this run of the slave does not know its `stop`.
-_LONGEST_STOP: Final = 600.0
-_MOST_NAMED: Final = 8
-#: The option of `rosrm slave`, and the cause of the end that it brings.
-STOP_ALL: Final = "--stop-all"
 
 #: Told of the outcome of an order: why it was refused; "": it is done.
 Settled = Callable[[str], None]
@@ -90,8 +83,6 @@ class SlaveRuntime:
         self._config = config
         self._incarnation = _random_number()
         self._stopping = ""
-        self._ending = self._stops_all = self._detaching = self._said_leave = False
-        self._left = False
         self._accepting = False
         max_age = max(config.control.max_age, _BEATS_MISSED * config.period)
         self._state = core.SlaveState(
@@ -119,7 +110,8 @@ class SlaveRuntime:
             handle_stop_signals(self._stop)
             self._supervisor = SupervisorLink(
                 config.state / "supervisor", config.logs, post=self._post, take=self.take,
-                follow=self._follow_session, say=self.say, ended=self._supervisor_ended,
+                follow=self._follow_session, say=self.say,
+                ended=self._supervisor_ended,
             )  # fmt: skip
             opened.callback(self._supervisor.close)
             self._participant = Participant(
@@ -146,6 +138,10 @@ class SlaveRuntime:
             self._starter = Starter(
                 config, self._incarnation, kept, self._state, self._supervisor, self._endpoint,
                 self._keeping, graph, sessions, take=self.take, say=self.say,
+            )  # fmt: skip
+            self._ending = Ending(
+                config, self._state, self._starter, self._supervisor, self._endpoint,
+                serve=self._serve, say=self.say,
             )  # fmt: skip
             self._closing = opened.pop_all()
         self._adopt()
@@ -181,25 +177,26 @@ class SlaveRuntime:
         self._supervisor.listen()
         with self._closing:
             self._serve(lambda: not self._stopping and not self._endpoint.failure)
-            return self._end()
+            return self._ending.carry_out(self._stopping)
 
     def stop_all(self) -> int:
         """Stop what a former slave left running, and report it; returns the exit code.
 
         The slave registers, if it finds the master in time, accepts no work, and ends.
         """
-        self._stopping, self._stops_all = STOP_ALL, True
+        self._stopping = STOP_ALL
         self._supervisor.listen()
         with self._closing:
             deadline = time.monotonic() + _MASTER_PATIENCE
             self._serve(
                 lambda: (
-                    not (self._is_registered or self._endpoint.failure or self._left)
+                    not (self._is_registered or self._endpoint.failure)
+                    and not self._ending.supervisor_left
                     and time.monotonic() < deadline
                 )
             )
             reached = self._is_registered
-            code = self._end()
+            code = self._ending.carry_out(self._stopping)
             if not reached:
                 self.say(
                     f"the master was not reached within {_MASTER_PATIENCE:g} s and does not know "
@@ -231,7 +228,7 @@ class SlaveRuntime:
             if now >= next_health:
                 next_health = now + core.LOOK_PERIOD
                 self._events.extend(self._health.look(self._state.watched(), now))
-            searches = self._endpoint.link is Link.SEARCHING and not self._ending
+            searches = self._endpoint.link is Link.SEARCHING and not self._ending.has_begun
             if searches and now - told >= _PATIENCE_TOLD:
                 told = now
                 self.say(f"looking for a master on {self._config.ros.describe()}")
@@ -257,7 +254,7 @@ class SlaveRuntime:
             self._endpoint.publish_statuses((), complete=False)
         present = self._sampler.present
         under = core.under_limits(sample.usage, self._limit, present, sample.stale)
-        self._accepting = under and not self._stopping
+        self._accepting = under and not (self._stopping or self._ending.has_begun)
         self._endpoint.publish_reading(
             sample.usage, self._limit, present, sample.stale, accepting=self._accepting,
             processes=self._state.live(),
@@ -318,7 +315,7 @@ class SlaveRuntime:
 
     def _carry_out(self, command: core.Command) -> None:
         if isinstance(command, core.Launch):
-            if not self._detaching:  # the master was told that nothing more begins here
+            if not self._ending.keeps:  # the master was told that nothing more begins here
                 self._starter.launch(command.assignments)
         elif isinstance(command, core.Report):
             self._endpoint.publish_statuses(command.statuses, complete=command.complete)
@@ -343,9 +340,8 @@ class SlaveRuntime:
         with contextlib.suppress(Exception):
             self._participant.wake()
 
-    def _supervisor_ended(self, failure: str) -> None:
-        self._left = True
-        self._endpoint.failure = self._endpoint.failure or failure
+    def _supervisor_ended(self, fault: str) -> None:
+        self._ending.note_supervisor_left(fault)
 
     def _follow_session(self, status: InstanceStatus) -> None:
         self._usage.follow(status)
@@ -409,92 +405,6 @@ class SlaveRuntime:
         pids = {str(one): it.status.pid for one, it in held if not it.status.state.ended}
         here = Here(self._config.host, self._config.state, pids)
         execute(self._executors, executor, arguments, here=here, post=self._post, done=done)
-
-    # --- the end -------------------------------------------------------------------------
-
-    def _end(self) -> int:
-        """End the slave: inform the master, then stop the processes or leave them running."""
-        self._ending = True
-        failure = self._endpoint.failure
-        if failure:
-            _log.error("%s", failure)
-        if self._left:
-            if not failure:
-                self._leave()
-            self.say(f"{self._end_cause()}; no process is left running")
-            return 1 if failure else 0
-        kept = self._begun()
-        if self._config.on_stop == "keep" and (running := _running(kept)):
-            self._detaching = True
-            self._leave(kept)
-            self._say_kept(running)
-            return 1 if failure else 0
-        live = self._state.live()
-        if live and failure and not self._endpoint.superseded and not self._stops_all:
-            count = counted(live, "process keeps", "processes keep")
-            _log.error("%s running; correct the error and start the slave again", count)
-            return 1
-        if live:
-            self.say(
-                f"stopping {counted(live, 'process', 'processes')} ({self._stopping or 'refused'})"
-            )
-        self._starter.close()
-        self._leave()
-        self._supervisor.shut_down()
-        deadline = time.monotonic() + self._longest_stop()
-        self._serve(lambda: not self._left and time.monotonic() < deadline)
-        return self._ended(failure, live)
-
-    def _leave(self, kept: Sequence[InstanceStatus] = ()) -> None:
-        """Report the end of this slave, and wait until the master knows or is silent."""
-        self._endpoint.leave(self._note_said, kept)
-        deadline = time.monotonic() + _LEAVE_PATIENCE
-        self._serve(lambda: not self._said_leave and time.monotonic() < deadline)
-
-    def _note_said(self) -> None:
-        self._said_leave = True
-
-    def _begun(self) -> list[InstanceStatus]:
-        """All instances, without those that still wait for their start."""
-        return [one for one in self._state.statuses() if self._starter.has_begun(one.instance)]
-
-    def _end_cause(self) -> str:
-        return f"slave of {self._config.host} ended ({self._stopping or 'refused'})"
-
-    def _say_kept(self, running: int) -> None:
-        keep = counted(running, "process keeps", "processes keep")
-        self.say(
-            f"{self._end_cause()}; {keep} running (supervisor pid {self._supervisor.pid}). Start "
-            f"the slave again to manage what runs, or end it by `rosrm slave {STOP_ALL}` with the "
-            f"same --config"
-        )
-
-    def _ended(self, failure: str, stopped: int) -> int:
-        if not self._left:
-            _log.error(
-                "not ended in time: %s; the supervisor (pid %d) still stops them",
-                ", ".join(self._live_names()[:_MOST_NAMED]) or "the supervisor",
-                self._supervisor.pid,
-            )
-            return 1
-        self._work(time.monotonic())
-        self._endpoint.wait_until_heard()
-        part = "supervisor" if self._stops_all else "slave"
-        count = counted(stopped, "process was stopped", "processes were stopped")
-        self.say(f"{part} of {self._config.host} ended; {count}")
-        return 1 if failure else 0
-
-    def _live_names(self) -> list[str]:
-        return sorted(str(one.instance) for one in self._state.statuses() if not one.state.ended)
-
-    def _longest_stop(self) -> float:
-        live = [held for held in self._state.held.values() if not held.status.state.ended]
-        longest = [_LONGEST_STOP if held.spec is None else held.spec.stop.timeout for held in live]
-        return max(longest, default=StopPolicy().timeout)
-
-
-def _running(statuses: Sequence[InstanceStatus]) -> int:
-    return sum(not one.state.ended for one in statuses)
 
 
 def _random_number() -> int:

@@ -329,17 +329,22 @@ class SupervisorClient:
         except BlockingIOError:
             return
         except OSError as error:
-            self._fail(SupervisorGone(f"{self._name()} is gone: {error.strerror}"))
+            self._lose(f"{self._name()} is gone: {error.strerror}")
             return
-        if not data and self._ending:
-            self._fail(SupervisorEnded(f"{self._name()} has ended, and all its processes"))
-        elif not data:
-            self._fail(SupervisorGone(f"{self._name()} is gone; its processes go on"))
+        if not data:
+            self._lose(f"{self._name()} is gone; its processes go on")
         try:
             for line in self._lines.feed(data):
                 self._take(lines.parse(line))
         except (lines.ProtocolError, KeyError, TypeError, ValueError) as error:
             self._fail(SupervisorError(f"{self._name()} cannot be understood: {error}"))
+
+    def _lose(self, reason: str) -> None:
+        """Note that the connection has ended: after `ended`, also by orders that nobody read."""
+        if self._ending:
+            self._fail(SupervisorEnded(f"{self._name()} has ended, and all its processes"))
+        else:
+            self._fail(SupervisorGone(reason))
 
     def _take(self, fields: Mapping[str, object]) -> None:
         told = fields["tell"]

@@ -66,14 +66,22 @@ def test_a_slave_that_is_stopped_stops_its_processes(make_cluster, number) -> No
     assert cluster.wait("p3", "running").host == "h0"
 
 
-def test_a_slave_that_is_stopped_after_its_master_loses_no_process(make_cluster) -> None:
-    """Master first, then the slave: what it ran is queued again when both are back."""
+@pytest.mark.parametrize("after", [0.0, 1.3])
+def test_a_slave_that_is_stopped_after_its_master_loses_no_process(make_cluster, after) -> None:
+    """Master first, then the slave: what it ran is queued again when both are back.
+
+    The silence of the master may be noticed while the slave stops.
+    """
     cluster = make_cluster(host("h0"))
     cluster.submit(service("p"), service("q", restart=RestartPolicy("on-failure", delay=0.1)))
     before = {name: cluster.wait(name, "running").number for name in ("p", "q")}
     assert end(cluster.master, signal.SIGINT) == 0
+    time.sleep(after)  # the instant is what is tested
     assert end(cluster.slaves["h0"], signal.SIGINT) == 0
     assert wait_until_none(cluster.directory / "hosts") == {}
+    stopping = cluster.log_of("h0").partition("stopping 2 processes")[2]
+    assert "slave of h0 ended; 2 processes were stopped" in stopping
+    assert "keep running" not in stopping
 
     cluster.reconnect()
     cluster.start_master()

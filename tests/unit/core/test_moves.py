@@ -158,6 +158,21 @@ def test_a_fallback_is_not_started_beside_a_source_that_has_not_ended() -> None:
     assert cluster["p"].owner == 3
 
 
+def test_a_fallback_starts_as_soon_as_the_source_has_ended() -> None:
+    """The stop took too long: the way back then loses no time to `order_retry`."""
+    cluster = two_hosts(overlap=False)
+    cluster.machines["a"].stubborn.add("p")
+    cluster.migrate("p")
+    cluster.wait(10.5)
+    assert cluster.phase("p") == "migrating"
+    assert cluster.told("migration_undone")
+    cluster.machines["a"].let_go("p", cluster.now)
+    cluster.settle()
+    assert [order.instance.number for order in cluster.orders("start")] == [3]
+    ready_on(cluster, "a")
+    assert (cluster.phase("p"), cluster["p"].owner) == ("running", 3)
+
+
 def test_when_neither_side_can_run_it_the_process_returns_to_the_queue() -> None:
     """Destination and fallback refused: it is placed anew rather than lost."""
     cluster = two_hosts(overlap=False)

@@ -308,6 +308,27 @@ def test_a_silent_master_is_lost(slave) -> None:
     assert core.MasterLost() in slave.host.events
 
 
+def test_a_slave_that_leaves_does_not_wait_for_a_master_that_fell_silent(slave) -> None:
+    """It is told with the silence of the master, and does not claim that processes keep running."""
+    slave.join(Master(slave, 11))
+    slave.pass_time(1.6)
+    told = []
+    slave.endpoint.leave(lambda: told.append(slave.clock.now))
+    slave.pass_time(0.6)
+    assert slave.link is not Link.REGISTERED
+    assert len(told) == 1
+    assert not [line for line in slave.host.said if "keep running" in line]
+
+
+def test_a_master_that_comes_back_is_told_that_the_slave_leaves(slave) -> None:
+    """The stop may take long: meanwhile its host is not taken for one that stays."""
+    slave.join(Master(slave, 11))
+    slave.endpoint.leave(lambda: None)
+    slave.pass_time(3.0)
+    slave.join(Master(slave, 12, epoch=2))
+    assert [call.request.envelope.epoch for call in slave.sent(srv.Leave)] == [1, 2]
+
+
 def test_a_request_for_work_that_was_lost_is_soon_repeated(slave) -> None:
     """The first after a registration may be; one that is open for long is repeated seldom."""
     master = Master(slave, 11)

@@ -1,0 +1,89 @@
+"""What a slave says at its end is true: the last line names each process that may still run."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+
+from rosrm.core import slave as core
+from rosrm.core.model import InstanceId, InstanceState, InstanceStatus, ProcessSpec, StopPolicy
+from rosrm.slave import ending
+from rosrm.slave.ending import Ending
+
+STOP = StopPolicy(interrupt_grace=1.0, terminate_grace=1.0)
+
+
+class Slave:
+    """The end of a slave with two processes, and a supervisor that does what a test says."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+        self.said: list[str] = []
+        self.when_stopped = lambda: None
+        self.endpoint = SimpleNamespace(
+            failure="", superseded=False, leave=lambda done, _kept: done(),
+            wait_until_heard=lambda: None,
+        )  # fmt: skip
+        self.state = core.SlaveState()
+        for name in "pq":
+            self.report(name, InstanceState.RUNNING)
+        self.ending = Ending(
+            SimpleNamespace(host="h0", on_stop="stop"), self.state,
+            SimpleNamespace(close=lambda: None, has_begun=lambda _instance: True),
+            SimpleNamespace(pid=7, shut_down=self.shut_down),
+            self.endpoint, serve=self.serve, say=self.said.append,
+        )  # fmt: skip
+
+    def serve(self, goes_on) -> None:
+        while goes_on():
+            self.now += 1.0
+
+    def shut_down(self) -> None:
+        self.when_stopped()
+
+    def report(self, name: str, state: InstanceState) -> None:
+        instance = InstanceId(name, 1)
+        spec = ProcessSpec(name, command=("sleep",), stop=STOP)
+        self.state.held[instance] = core.Held(InstanceStatus(instance, state), spec)
+
+    def end(self) -> int:
+        return self.ending.carry_out("SIGINT")
+
+
+@pytest.fixture
+def slave(monkeypatch) -> Slave:
+    slave = Slave()
+    monkeypatch.setattr(ending, "time", SimpleNamespace(monotonic=lambda: slave.now))
+    return slave
+
+
+def test_an_order_to_stop_that_was_not_taken_is_no_stop(slave, caplog) -> None:
+    """The supervisor hangs: what it has not begun to stop is named, with the way to stop it."""
+    slave.when_stopped = lambda: slave.report("q", InstanceState.STOPPING)
+    assert slave.end() == 1
+    assert "(pid 7) still stops q#1 and has not begun to stop p#1. End what runs" in caplog.text
+
+
+def test_what_is_still_being_stopped_is_named(slave, caplog) -> None:
+    """Processes that need longer than their `stop` allows."""
+    slave.when_stopped = lambda: [slave.report(name, InstanceState.STOPPING) for name in "pq"]
+    assert slave.end() == 1
+    assert f"not ended within {STOP.timeout:g} s: the supervisor (pid 7) still stops" in caplog.text
+    assert "p#1 and q#1" in caplog.text
+
+
+def test_a_supervisor_that_is_gone_has_stopped_nothing(slave, caplog) -> None:
+    """No "2 processes were stopped" where the supervisor was killed and none takes its place."""
+    slave.when_stopped = lambda: slave.ending.note_supervisor_left("the supervisor is gone")
+    assert slave.end() == 1
+    assert "p#1 and q#1 may still run: the supervisor is gone" in caplog.text
+    assert slave.said == ["stopping 2 processes (SIGINT)"]
+
+
+def test_a_slave_whose_supervisor_was_gone_before_says_so(slave, caplog) -> None:
+    """No "no process is left running" where nothing stopped them."""
+    slave.ending.note_supervisor_left("the supervisor is gone")
+    assert slave.end() == 1
+    assert "p#1 and q#1 may still run" in caplog.text
+    assert not slave.said

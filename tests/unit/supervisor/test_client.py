@@ -1,0 +1,22 @@
+"""The slave's side of its supervisor, without one: a socket pair."""
+
+from __future__ import annotations
+
+import socket
+from pathlib import Path
+
+import pytest
+
+from rosrm.supervisor import protocol
+from rosrm.supervisor.client import SupervisorClient, SupervisorEnded
+
+
+def test_a_supervisor_that_ended_beside_an_order_has_ended(tmp_path: Path) -> None:
+    """An order that it did not read any more breaks the connection: that is no crash."""
+    ours, its = socket.socketpair()
+    with SupervisorClient(ours, tmp_path) as client:
+        client.heard(1.0, 1.0)
+        its.sendall(protocol.encode_ended())
+        its.close()
+        with pytest.raises(SupervisorEnded):
+            client.receive(5.0)
