@@ -11,7 +11,8 @@ probes do. The rules:
   thread, however long it hangs.
 - A probe that is late, raises or answers nonsense makes its readings *stale*: they keep their last
   value, never zero. Why is reported once, and so is the recovery. A probe that changes often stays
-  stale until its changes are rarer, so the mark and the newest report always agree.
+  stale until its changes are rarer, so the mark and the newest report always agree. Recoveries are
+  held back so, failures never. Another error of a stale probe is reported at most every 10 s.
 - Before its first reading a resource counts as full and stale, so that no work is drawn to a host
   that has not been measured.
 
@@ -33,7 +34,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rosrm.core.model import RESOURCE_SLOTS, Reading
-from rosrm.core.plugin_calls import required
+from rosrm.core.plugin_calls import given, required
 from rosrm.errors import PluginError, describe_plugin_fault
 
 if TYPE_CHECKING:
@@ -49,6 +50,8 @@ ABSURD_USAGE: Final = 64.0
 #: At most this many reports of one probe in REPORT_WINDOW seconds: a flapping probe floods nothing.
 REPORTS: Final = 6
 REPORT_WINDOW: Final = 60.0
+#: Seconds after a report before another error of a probe that is still stale is reported.
+ANOTHER_ERROR: Final = 10.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +59,8 @@ class ProbeReport:
     """The readings of a probe went stale, or came back.
 
     Attributes:
-        resources: names of the readings concerned.
+        resources: names of the readings concerned; none of a probe that could not be made and
+            whose resources others read.
         reason: why they are stale; "" on recovery.
     """
 
@@ -68,6 +72,8 @@ class ProbeReport:
     def __str__(self) -> str:
         """One sentence for the event record."""
         names = ", ".join(self.resources)
+        if self.stale and not names:
+            return f"probe {self.probe} fails: {self.reason}"
         if self.stale:
             return f"probe {self.probe}: {names} stale: {self.reason}"
         return f"probe {self.probe}: {names} read again"
@@ -319,6 +325,8 @@ class _Watched:
         self.due = self._nominal = -math.inf
         self.measured = False
         self._reported_stale = False
+        self._reported = ""
+        self._reported_at = -math.inf
         self._report_times: list[float] = []
 
     def prepare(self, now: float) -> Callable[[], None]:
@@ -346,17 +354,26 @@ class _Watched:
 
         A recovery is put off where no report would be left for the next failure.
         """
+        if self.reason and self._reported_stale:
+            return self._report_another_error(now)
         if bool(self.reason) == self._reported_stale:
             return []
         self._report_times = [t for t in self._report_times if now - t < REPORT_WINDOW]
         if not self.reason and len(self._report_times) >= REPORTS - 1:
             return []
         self._report_times.append(now)
-        self._reported_stale = bool(self.reason)
+        self._reported_at = now
+        self._reported_stale, self._reported = bool(self.reason), self.reason
         reason = self.reason
         if reason and len(self._report_times) >= REPORTS - 1:
             reason += f"; it changes often, so it counts as stale for up to {REPORT_WINDOW:g} s"
         return [ProbeReport(self.name, self.names, self._reported_stale, reason)]
+
+    def _report_another_error(self, now: float) -> list[ProbeReport]:
+        if self.reason == self._reported or now - self._reported_at < ANOTHER_ERROR:
+            return []
+        self._reported, self._reported_at = self.reason, now
+        return [ProbeReport(self.name, self.names, True, self.reason)]
 
     def close(self) -> None:
         """Close the probe, in the thread that reads it."""
@@ -391,17 +408,32 @@ class _Nonsense(Exception):
 def _values(probe: Probe, names: tuple[str, ...]) -> tuple[float, ...]:
     """Read a probe and check every value before any is used."""
     values: dict[str, float] = {}
-    for answer in required(probe.read(), Iterable):  # type: ignore[type-abstract]
+    answers: object = probe.read()
+    if not isinstance(answers, Iterable):
+        raise _Nonsense(f"read() answered {given(answers)}; a list of Readings is required")
+    for answer in answers:
         reading = required(answer, Reading)
         if reading.resource not in names:
             raise _Nonsense(f"a reading of {reading.resource!r}, which it did not announce")
         if reading.resource in values:
             raise _Nonsense(f"two readings of {reading.resource!r}")
-        usage = float(reading.usage)
-        if not 0.0 <= usage <= ABSURD_USAGE:  # also where it is NaN
-            raise _Nonsense(f"usage {usage} of {reading.resource!r} is not a fraction of it")
+        usage = _fraction(reading)
         values[reading.resource] = usage
     missing = [name for name in names if name not in values]
     if missing:
         raise _Nonsense(f"no reading of {', '.join(missing)}")
     return tuple(values[name] for name in names)
+
+
+def _fraction(reading: Reading) -> float:
+    """Return the usage of a reading; raise `_Nonsense` where it is none."""
+    try:
+        usage = float(reading.usage)
+    except (TypeError, ValueError, OverflowError):
+        usage = math.nan
+    if not 0.0 <= usage <= ABSURD_USAGE:  # also where it is NaN
+        raise _Nonsense(
+            f"usage {reading.usage!r} of {reading.resource!r}; a fraction of its capacity is "
+            f"required, 1.0 where it is full and at most {ABSURD_USAGE:g}"
+        )
+    return usage
