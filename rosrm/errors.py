@@ -21,6 +21,10 @@ SkipPlugin                  not an error: a plugin says that it is absent here, 
 from __future__ import annotations
 
 from traceback import walk_tb
+from typing import Final
+
+#: Packages through which a plugin is loaded and called: their frames are never the plugin's own.
+_LOADERS: Final = frozenset({"rosrm", "pkgutil", "importlib", "pluggy"})
 
 
 class RosrmError(Exception):
@@ -137,7 +141,7 @@ def _place_in_plugin(fault: BaseException) -> str:
     The plugin may call libraries, so the package of the first frame outside rosrm is the plugin's.
     """
     frames = _frames(fault)
-    own = next((package for package, _ in frames if package != "rosrm"), "")
+    own = next((package for package, _ in frames if package not in _LOADERS), "")
     return _innermost(frames, own) if own else ""
 
 

@@ -9,19 +9,18 @@ from __future__ import annotations
 import inspect
 import logging
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import partial
 from pkgutil import resolve_name
 from types import SimpleNamespace
-from typing import Any, Final, TypeAlias
+from typing import Any, Final, TypeAlias, TypeVar
 
 import pluggy
 
 from rosrm import hookspecs
 from rosrm.core.declared import SPEC_FIELDS
-from rosrm.errors import describe_fault
+from rosrm.errors import describe_plugin_fault
 from rosrm.handover import PluginAddress
 from rosrm.ports import (
     CheckpointOffer,
@@ -30,7 +29,9 @@ from rosrm.ports import (
     ScoringOffer,
 )
 from rosrm.spelling import get_close_matches
+from rosrm.time_limit import limited
 
+T = TypeVar("T")
 Offer: TypeAlias = "ProbeOffer | ScoringOffer | MigrationOffer | CheckpointOffer"
 
 #: What each hook registers, and of which type its offers are.
@@ -43,6 +44,8 @@ HOOKS: Final[Mapping[str, tuple[str, type[Any]]]] = {
 
 #: Seconds after which a plugin that is still being loaded is named in the log.
 SLOW_LOADING: Final = 5.0
+#: Seconds for the import of a plugin, and for each of its hooks.
+LOADING_LIMIT: Final = 30.0
 
 #: What a plugin may do wrong; a plugin that calls `sys.exit` must not end the master.
 FAULTS: Final = (Exception, SystemExit)
@@ -88,13 +91,12 @@ class Loaded:
     broken: list[Broken]
 
 
-def load_addresses(addresses: Iterable[PluginAddress], slow_after: float = SLOW_LOADING) -> Loaded:
+def load_addresses(addresses: Iterable[PluginAddress]) -> Loaded:
     """Load every plugin of an installation."""
     loaded = Loaded([], [])
     for address in addresses:
         source = Source(address.name, address.distribution)
-        with _said_when_slow(source, slow_after):
-            _load(loaded, source, partial(resolve_name, address.target))
+        _load(loaded, source, address.target, partial(resolve_name, address.target))
     return loaded
 
 
@@ -102,7 +104,7 @@ def load_objects(plugins: Mapping[str, object]) -> Loaded:
     """Take modules or objects as plugins, by name, without an installation (for tests)."""
     loaded = Loaded([], [])
     for name, plugin in plugins.items():
-        _load(loaded, Source(name), lambda plugin=plugin: plugin)  # type: ignore[misc]
+        _load(loaded, Source(name), name, lambda plugin=plugin: plugin)  # type: ignore[misc]
     return loaded
 
 
@@ -115,26 +117,35 @@ def definition(function: object) -> str:
         return ""
 
 
-@contextmanager
-def _said_when_slow(source: Source, after: float) -> Iterator[None]:
-    def say() -> None:
-        _log.warning("%s is still being loaded after %g s", source, after)
+def _in_time(source: Source, what: str, call: Callable[[], T]) -> T:
+    """Return the answer of plugin code; name it in the log when it is slow, end it when it hangs.
 
-    timer = threading.Timer(after, say)
+    Raises:
+        TimeoutError: it took longer than `LOADING_LIMIT`.
+    """
+
+    def say() -> None:
+        _log.warning(
+            "%s is still being loaded after %g s: %s has not returned; it is ended after %g s",
+            source, SLOW_LOADING, what, LOADING_LIMIT,
+        )  # fmt: skip
+
+    timer = threading.Timer(SLOW_LOADING, say)
     timer.daemon = True
     timer.start()
+    late = f"it did not return within {LOADING_LIMIT:g} s; do in `create` what takes long"
     try:
-        yield
+        return limited(LOADING_LIMIT, call, lambda: late)
     finally:
         timer.cancel()
 
 
-def _load(loaded: Loaded, source: Source, load: Callable[[], object]) -> None:
+def _load(loaded: Loaded, source: Source, target: str, load: Callable[[], object]) -> None:
     try:
-        plugin = load()
+        plugin = _in_time(source, f"the import of {target}", load)
         marked = _marked(plugin)
     except FAULTS as fault:
-        loaded.broken.append(Broken(source, f"does not import: {describe_fault(fault)}"))
+        loaded.broken.append(Broken(source, f"does not import: {describe_plugin_fault(fault)}"))
         return
     for reason in _misspelt(plugin, marked):
         loaded.broken.append(Broken(source, reason))
@@ -172,9 +183,10 @@ def _take(loaded: Loaded, source: Source, hook: str, function: Callable[..., Any
     kind, wanted = HOOKS[hook]
     place = f"{hook} ({definition(function)})"
     try:
-        answer = _call(hook, function)
+        answer = _in_time(source, place, partial(_call, hook, function))
     except FAULTS as fault:
-        loaded.broken.append(Broken(source, f"{place} failed with {describe_fault(fault)}", kind))
+        reason = f"{place} failed with {describe_plugin_fault(fault)}"
+        loaded.broken.append(Broken(source, reason, kind))
         return
     if isinstance(answer, str) or not isinstance(answer, Sequence):
         given = "None" if answer is None else type(answer).__name__
@@ -219,7 +231,21 @@ def _fault_of(offer: object, wanted: type[Any]) -> str:
     if bare:
         return f"{name!r}: option {bare[0]!r} has no default"
     fault = _fault_of_reads(offer) if isinstance(offer, ScoringOffer) else ""
+    fault = _fault_of_executors(offer) if isinstance(offer, MigrationOffer) else fault
     return f"{name!r}: {fault}" if fault else ""
+
+
+def _fault_of_executors(offer: MigrationOffer) -> str:
+    """Return why the executors of a migration strategy cannot be called; "": they can."""
+    executors: object = offer.executors
+    if not isinstance(executors, Mapping):
+        return f'`executors` is {executors!r}; a mapping is required, as {{"name": function}}'
+    wrong = [
+        f"executor {name!r} is {function!r}; a name and a function are required"
+        for name, function in executors.items()
+        if not isinstance(name, str) or not callable(function)
+    ]
+    return wrong[0] if wrong else ""
 
 
 def _fault_of_reads(offer: ScoringOffer) -> str:

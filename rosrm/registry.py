@@ -6,7 +6,6 @@ checked; `rosrm.config.options` checks those of a file against the same offers.
 
 from __future__ import annotations
 
-import logging
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,14 +16,13 @@ from rosrm.config.own_options import merged_options
 from rosrm.config.plain import from_plain
 from rosrm.core.declared import Declared
 from rosrm.core.descriptions import resource_fault
-from rosrm.core.model import EMPTY, RESOURCE_SLOTS, ProcessSpec, ResourceDescription
+from rosrm.core.model import EMPTY, RESOURCE_SLOTS, ProcessSpec, Reading, ResourceDescription
 from rosrm.core.plugin_calls import TITLES, implements
 from rosrm.core.views import PluginRow
 from rosrm.errors import ConfigError, PluginError, SkipPlugin, describe_fault, describe_plugin_fault
 from rosrm.handover import PluginAddress
 from rosrm.loading import (
     FAULTS,
-    SLOW_LOADING,
     Broken,
     Loaded,
     Offer,
@@ -68,7 +66,10 @@ _SHIPPED_IN: Final[Mapping[str, str]] = {
 #: Seconds for a `create`, which may load a large library.
 CREATE_LIMIT: Final = 30.0
 
-_log = logging.getLogger("rosrm.plugins")
+#: Seconds between two reads of what stands for a probe that could not be made.
+_FAILED_PERIOD: Final = 10.0
+#: Broken plugins that a message names where none of them is certainly meant.
+_MOST_BROKEN: Final = 3
 
 Executor = Callable[[Mapping[str, Any]], Mapping[str, Any]]
 NameToOptions = Mapping[str, Mapping[str, Any]]
@@ -91,12 +92,43 @@ class Probes:
     """The probes of a host.
 
     Attributes:
-        made: those present.
-        absent: name to the reason, of those that are absent or broken here.
+        made: those present, and a `FailedProbe` for each that could not be made.
+        absent: name to the reason, of those that say that they are absent here.
     """
 
     made: tuple[MadeProbe, ...]
     absent: Mapping[str, str]
+
+
+class FailedProbe:
+    """Stands for a chosen probe that could not be made: each read fails with the reason.
+
+    So its resources are stale, and a limit on one of them keeps work away as it does where a probe
+    fails in reading.
+
+    Attributes:
+        resources: declared by the offer and read by no other probe, of unknown capacity.
+        reason: why there is no probe, with the plugin and the place.
+    """
+
+    def __init__(self, resources: Sequence[ResourceDescription], reason: str) -> None:
+        self.resources = resources
+        self.reason = reason
+
+    def read(self) -> Iterable[Reading]:
+        """Raise `PluginError` with the reason."""
+        raise PluginError(self.reason)
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+@dataclass(frozen=True)
+class OfferedExecutor:
+    """An executor, and the name of the migration strategy whose offer has it."""
+
+    strategy: str
+    call: Executor
 
 
 class Registry:
@@ -107,24 +139,22 @@ class Registry:
         self._broken: list[Broken] = list(loaded.broken)
         self._outcome: dict[tuple[str, str], tuple[str, str]] = {}
         self._keep_single(loaded.offers)
+        self._refuse_shared_executors()
 
     @classmethod
-    def discover(cls, slow_after: float = SLOW_LOADING) -> Registry:
+    def discover(cls) -> Registry:
         """Find and load the installed plugins.
 
         What is broken is kept with its reason, and raises nothing.
-
-        Args:
-            slow_after: seconds after which a plugin that is still being loaded is logged by name.
         """
         from rosrm.installed import installed_plugins  # noqa: PLC0415 - not for the runtimes
 
-        return cls.load(installed_plugins(), slow_after)
+        return cls.load(installed_plugins())
 
     @classmethod
-    def load(cls, addresses: Iterable[PluginAddress], slow_after: float = SLOW_LOADING) -> Registry:
+    def load(cls, addresses: Iterable[PluginAddress]) -> Registry:
         """Load plugins that were found before; otherwise as `discover`."""
-        return cls(load_addresses(addresses, slow_after))
+        return cls(load_addresses(addresses))
 
     @classmethod
     def of(cls, **plugins: object) -> Registry:
@@ -250,41 +280,65 @@ class Registry:
             },
         )
 
-    def executors(self) -> dict[str, Executor]:
-        """What the open steps of plans may name on this host, from all migration offers.
+    def executors(self) -> dict[str, OfferedExecutor]:
+        """Return what the open steps of plans may name on this host, from all migration offers."""
+        return {
+            executor: OfferedExecutor(name, function)
+            for name in self.names("migration")
+            for executor, function in self._executors_of(name).items()
+        }
 
-        A name that two offers give belongs to neither, as with offers; it is logged.
-        """
-        given: dict[str, list[tuple[str, Executor]]] = {}
-        for name in self.names("migration"):
-            offer = cast(MigrationOffer, self.offer("migration", name))
-            for executor, function in offer.executors.items():
-                given.setdefault(executor, []).append((name, function))
-        for executor, offers in given.items():
-            if len(offers) > 1:
-                names = " and ".join(name for name, _ in offers)
-                _log.warning("the executor %r is left out: %s both register it", executor, names)
-        return {executor: offers[0][1] for executor, offers in given.items() if len(offers) == 1}
+    def broken_strategies(self) -> dict[str, str]:
+        """Return the migration offers that are broken here, by name, and why."""
+        return {
+            broken.name or broken.source.plugin: f"{broken.source}: {broken.reason}"
+            for broken in self._broken
+            if broken.kind == "migration"
+        }
+
+    def _executors_of(self, name: str) -> Mapping[str, Executor]:
+        return cast(MigrationOffer, self.offer("migration", name)).executors
 
     def probes(self, chosen: NameToOptions | None, context: ProbeContext) -> Probes:
         """Make the probes of a host, the default ones for None.
 
-        One that is absent here or fails is left out with its reason, and the others go on.
+        One that says that it is absent here is left out with its reason. One that fails in any
+        other way is replaced by a `FailedProbe`.
 
         Raises:
             ConfigError: for an unknown name or option.
         """
         made: list[MadeProbe] = []
         absent: dict[str, str] = {}
+        failed: dict[str, str] = {}
         for name, options in (self.default_probes() if chosen is None else chosen).items():
             try:
                 made.append(self._probe(name, options, context, made))
             except SkipPlugin as skip:
                 absent[name] = str(skip)
                 self._outcome["probe", name] = ("absent", str(skip))
-            except PluginError as fault:
-                absent[name] = str(fault)
+            except PluginError:
+                source, (_, reason) = (
+                    self._offers["probe", name].source,
+                    self._outcome["probe", name],
+                )
+                failed[name] = f"{source}: {reason}"
+        for name, reason in failed.items():
+            made.append(self._failed_probe(name, reason, made))
         return Probes(tuple(made), absent)
+
+    def _failed_probe(self, name: str, reason: str, others: Sequence[MadeProbe]) -> MadeProbe:
+        """Return what stands for a probe that could not be made."""
+        taken = {resource.name for other in others for resource in other.resources}
+        declared = cast(ProbeOffer, self.offer("probe", name)).resources
+        described = [
+            ResourceDescription(resource, "1", 1.0, "unknown")
+            for resource in dict.fromkeys(declared)
+            if resource not in taken
+        ]
+        valid = [one for one in described if not resource_fault(one)]
+        probe = FailedProbe(tuple(valid[: RESOURCE_SLOTS - len(taken)]), reason)
+        return MadeProbe(name, probe, tuple(probe.resources), _FAILED_PERIOD, 1.0)
 
     def _probe(
         self,
@@ -298,10 +352,11 @@ class Registry:
         try:
             resources = tuple(probe.resources)
             fault = _fault_of_resources(resources, offer, before)
+            fault = fault and f"{type(probe).__name__} ({definition(type(probe))}) {fault}"
         except FAULTS as raised:
             resources, fault = (), f"its `resources` raised {describe_plugin_fault(raised)}"
         if fault:
-            _close_quietly(probe)
+            close_quietly(probe)
             raise self._fault("probe", name, fault)
         return MadeProbe(name, probe, resources, offer.period, offer.deadline)
 
@@ -335,7 +390,7 @@ class Registry:
         except (SkipPlugin, ConfigError):  # its own word on this host, or on its options
             raise
         except FAULTS as fault:
-            reason = f"`create` ({definition(create)}) raised {describe_fault(fault)}"
+            reason = f"`create` ({definition(create)}) raised {describe_plugin_fault(fault)}"
             raise self._fault(kind, name, reason) from fault
         lacks = _missing_method(kind, thing)
         if lacks:
@@ -363,6 +418,32 @@ class Registry:
                 reason = f"offered twice, by {sources}: uninstall one"
                 self._broken.append(Broken(offered.source, reason, *key))
 
+    def _refuse_shared_executors(self) -> None:
+        """Break all offers of which an executor has the same name: orders name nothing else.
+
+        Offers that share one function may share its name.
+        """
+        owners: dict[str, list[str]] = {}
+        for name in self.names("migration"):
+            for executor in self._executors_of(name):
+                owners.setdefault(executor, []).append(name)
+        found: dict[str, str] = {}
+        for executor, names in owners.items():
+            for name in names:
+                function = self._executors_of(name)[executor]
+                others = [
+                    f"{other!r} of {self._offers['migration', other].source}"
+                    for other in names
+                    if self._executors_of(other)[executor] is not function
+                ]
+                if others:
+                    reason = f"its executor {executor!r} has the name of one of "
+                    reason += f"{' and '.join(others)}: uninstall one, or rename the executor"
+                    found.setdefault(name, reason)
+        for name, reason in found.items():
+            source = self._offers.pop(("migration", name)).source
+            self._broken.append(Broken(source, reason, "migration", name))
+
     def _offered(self, kind: str, name: str) -> Offered:
         if (kind, name) in self._offers:
             return self._offers[kind, name]
@@ -384,6 +465,8 @@ class Registry:
         meant = [b for b in might if not name or name == b.name]
         if not meant:
             meant = [b for b in might if not b.name and _is_named_like(b.source, name)]
+        if not meant:  # any of those without a name may be what is looked for
+            meant = [b for b in might if not b.name][:_MOST_BROKEN]
         reasons = dict.fromkeys(f"{b.source}: {b.reason}" for b in meant)
         note = " Broken: " + "; ".join(reasons) + "." if reasons else ""
         others = len(might) - len(meant)
@@ -420,8 +503,10 @@ def _missing_method(kind: str, thing: object) -> str:
 def _fault_of_resources(
     resources: Sequence[ResourceDescription], offer: ProbeOffer, before: Sequence[MadeProbe]
 ) -> str:
-    """Why a host cannot take these resources; "" where it can."""
+    """Why a host cannot take these resources, without its subject; "" where it can."""
     taken = {resource.name: other.name for other in before for resource in other.resources}
+    if not resources:
+        return "describes no resource; raise SkipPlugin in `create` where there is nothing to read"
     for resource in resources:
         fault = resource_fault(resource)
         if fault:
@@ -439,7 +524,7 @@ def _fault_of_resources(
     return ""
 
 
-def _close_quietly(probe: Probe) -> None:
+def close_quietly(probe: Probe) -> None:
     """Close what is given up; that it fails to close as well adds nothing."""
     try:
         probe.close()

@@ -32,10 +32,14 @@ def limited(seconds: float, call: Callable[[], T], late: Callable[[], str]) -> T
         if running:  # else the call ended in the very last moment
             raise TimeoutError(late())
 
-    signal.signal(signal.SIGALRM, expired)
-    signal.setitimer(signal.ITIMER_REAL, seconds, _AGAIN)
+    # A process has one timer: that of a test runner, or of an outer limit, is set again afterwards.
+    before = signal.signal(signal.SIGALRM, expired)
+    left, interval = signal.setitimer(signal.ITIMER_REAL, seconds, _AGAIN)
     try:
         return call()
     finally:
         running = False
         signal.setitimer(signal.ITIMER_REAL, 0.0)
+        if left:
+            signal.signal(signal.SIGALRM, before)
+            signal.setitimer(signal.ITIMER_REAL, left, interval)

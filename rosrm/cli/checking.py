@@ -15,7 +15,7 @@ import typer
 from rosrm.spelling import counted, get_close_matches, listed
 
 if TYPE_CHECKING:
-    from rosrm.config.settings import ClusterConfig
+    from rosrm.config.settings import ClusterConfig, HostConfig
     from rosrm.core.model import ProcessSpec
     from rosrm.registry import Registry
 
@@ -91,6 +91,29 @@ def _make(file: Path, cluster: ClusterConfig, registry: Registry) -> None:
         raise ConfigError("\n".join(wrong))
 
 
+def _make_probes(file: Path, host: HostConfig, registry: Registry) -> None:
+    """Make the probes that a slave would make; raises `ConfigError` with all that fail.
+
+    One that says that it is absent here is none of them: the file may be for another host.
+    """
+    from rosrm.errors import ConfigError
+    from rosrm.ports import ProbeContext
+    from rosrm.registry import FailedProbe, close_quietly
+    from rosrm.slave.sessions import SessionTable
+
+    context = ProbeContext(host.scope, host.budget, host.state, SessionTable())
+    made = registry.probes(host.probes, context).made
+    wrong = [
+        f"{file}: probes: {one.name}: {one.probe.reason}"
+        for one in made
+        if isinstance(one.probe, FailedProbe)
+    ]
+    for one in made:
+        close_quietly(one.probe)
+    if wrong:
+        raise ConfigError("\n".join(wrong))
+
+
 def _checked(file: Path, kind: KindOfFile | None, registry: Registry) -> str:
     """A summary of a file; raises `ConfigError`."""
     from rosrm.config import load_cluster, load_host, load_work
@@ -109,6 +132,7 @@ def _checked(file: Path, kind: KindOfFile | None, registry: Registry) -> str:
             )
         case "host":
             host = load_host(file, registry)
+            _make_probes(file, host, registry)
             probes = ", ".join(registry.default_probes() if host.probes is None else host.probes)
             return f"a host: {host.host}, probes {probes or 'none'}"
         case "simulation":
@@ -129,13 +153,13 @@ def _checked(file: Path, kind: KindOfFile | None, registry: Registry) -> str:
 
 
 def _misspelt_needs(specs: Iterable[ProcessSpec], registry: Registry) -> Iterator[str]:
-    """Warn of resources in `needs` that are nearly named as a probe that is installed here.
+    """Warn of resources in `needs` that are nearly named as one that a probe installed here reads.
 
     Only a warning: another host may have a probe that this machine lacks.
     """
-    probes = [row.name for row in registry.rows() if row.kind == "probe"]
+    read = registry.resources()
     for spec in specs:
         for name in spec.needs:
-            near = get_close_matches(name, probes, n=1, cutoff=_NEAR)
-            if near and name not in probes:
-                yield f"{spec.name}: needs: no probe is named {name!r}; did you mean {near[0]!r}?"
+            near = get_close_matches(name, read, n=1, cutoff=_NEAR)
+            if near and name not in read:
+                yield f"{spec.name}: needs: no probe reads {name!r}; did you mean {near[0]!r}?"

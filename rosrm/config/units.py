@@ -104,7 +104,8 @@ class Quantity:
     def range(self) -> str:
         """The allowed values in words."""
         if math.isfinite(self.high):
-            return f"within {self.low:g}..{self.high:g}"
+            form = ".0f" if self.whole else "g"
+            return f"within {self.low:{form}}..{self.high:{form}}"
         return f"greater than {self.low:g}" if self.above else f"at least {self.low:g}"
 
     def _outside(self, value: float) -> bool:

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Final
 from rosrm.core import events as happened
 from rosrm.core.commands import Order
 from rosrm.core.hosts import Host, HostCondition
-from rosrm.core.plugin_calls import implements, required
+from rosrm.core.plugin_calls import implements, required, why_broken
 from rosrm.errors import PluginError
 from rosrm.ports import HostChecking
 from rosrm.spelling import listed
@@ -100,8 +100,11 @@ def _ask(state: MasterState, name: str, strategy: HostChecking, host: Host, now:
         state.abilities.answers[name, host.name] = answer
         return
     if ability not in host.description.executors:
-        reason = f"the plugin of {name!r} is not installed there"
-        state.abilities.answers[name, host.name] = Answer(incarnation, 0, reason=reason)
+        reason = why_broken(host, name) or f"the plugin of {name!r} is not installed there"
+        # Looked at again, because the slave reports what is broken after its registration.
+        state.abilities.answers[name, host.name] = Answer(
+            incarnation, 0, reason=reason, ask_at=now + _ASK_AGAIN
+        )
         return
     state.abilities.last_order += 1
     order = state.abilities.last_order

@@ -10,7 +10,7 @@ from rosrm.core.images import reason_of
 from rosrm.core.migration import Aim, Commit, Move, Plan, Start, executors_of, plan_fault
 from rosrm.core.placement import Ranking
 from rosrm.core.plans import checked_plan
-from rosrm.core.plugin_calls import required
+from rosrm.core.plugin_calls import required, why_broken
 from rosrm.core.state import MasterState, Process, ProcessPhase, Run
 from rosrm.core.steps import title
 from rosrm.errors import PluginError, describe_fault
@@ -152,8 +152,13 @@ def _lacks(state: MasterState, run: Run, executor: str, hosts: list[str]) -> str
     brought_by = state.declared.brought_by.get(run.strategy) or "the plugin"
     one = len(hosts) == 1
     lacking = f"{listed(hosts, most=3)} {'has' if one else 'have'} no executor {executor!r}"
+    lacking += f", which {run.strategy} needs there to move {run.process}"
+    broken = ((name, why_broken(state.hosts.by_name[name], run.strategy)) for name in hosts)
+    faults = [f"on {name} {reason}" for name, reason in broken if reason]
+    if faults:
+        return f"{lacking}: {faults[0]}; then restart its slave"
     return (
-        f"{lacking}, which {run.strategy} needs there to move {run.process}: install {brought_by} "
+        f"{lacking}: install {brought_by} "
         f"on {hosts[0] if one else 'them'} and restart {'its slave' if one else 'their slaves'}"
     )
 

@@ -92,7 +92,8 @@ class ReadingsReceived:
 class StatusesReceived:
     """Changes of instances on a host; `complete`: these are all that the host holds.
 
-    `failing` is complete in each: resource to the reason why its probe gives no readings.
+    Complete in each are `failing`, resource to the reason why its probe gives no readings, and
+    `failing_strategies`, migration strategy to the reason why its executors fail there.
     """
 
     host_id: int
@@ -101,6 +102,12 @@ class StatusesReceived:
     complete: bool
     statuses: tuple[InstanceStatus, ...]
     failing: Mapping[str, str] = field(default_factory=lambda: EMPTY)
+    failing_strategies: Mapping[str, str] = field(default_factory=lambda: EMPTY)
+
+    def failing_plugins(self) -> dict[tuple[str, str], str]:
+        """Return all plugins that fail there by kind and name, and why."""
+        by_kind = (("probe", self.failing), ("migration", self.failing_strategies))
+        return {(kind, name): why for kind, found in by_kind for name, why in found.items()}
 
 
 @dataclass(frozen=True, slots=True)

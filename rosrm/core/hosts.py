@@ -23,7 +23,8 @@ from rosrm.core.columns import (
     HostColumns,
     IntArray,
 )
-from rosrm.core.model import EMPTY, HostDescription
+from rosrm.core.model import HostDescription
+from rosrm.core.plugin_calls import Failing, Plugin
 from rosrm.spelling import counted
 
 #: An estimate, unlike a declared need, fills at most this part of a host's limit: a guess alone
@@ -72,7 +73,8 @@ class Host:
         detached_since: time at which its slave was stopped, while it is detached.
         lost_since: time at which it was lost, while it is; of a detached host the time at which its
             lease ends.
-        failing: resource to the reason why its probe gives no readings, as the slave reports.
+        failing: kind and name of the plugins that fail there, as the slave reports. A probe goes by
+            the resource that it reads.
     """
 
     column: int
@@ -88,7 +90,7 @@ class Host:
     blocked: dict[str, str] = field(default_factory=dict)
     detached_since: float = 0.0
     lost_since: float = 0.0
-    failing: Mapping[str, str] = field(default_factory=lambda: EMPTY)
+    failing: dict[Plugin, Failing] = field(default_factory=dict)
 
     @property
     def host_id(self) -> int:
@@ -165,8 +167,8 @@ class HostTable(HostColumns):
     def prune(self, host: Host) -> None:
         """Leave a host out of every listing until its slave registers, then as a new host."""
         host.pruned, host.description = True, HostDescription(host.name, 0)
-        host.failing, self._listed = EMPTY, None
-        for known in (host.over_since, host.over_at, host.told, host.blocked):
+        self._listed = None
+        for known in (host.over_since, host.over_at, host.told, host.blocked, host.failing):
             known.clear()
         self.incarnation[host.column] = 0
         self._labelled.clear()

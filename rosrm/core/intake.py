@@ -14,7 +14,7 @@ from rosrm.core.hosts import Host, HostCondition
 from rosrm.core.liveness import lease_end, welcome_back
 from rosrm.core.lost_tail import note_seen
 from rosrm.core.migration import Execute
-from rosrm.core.model import EMPTY, InstanceStatus
+from rosrm.core.model import InstanceStatus
 from rosrm.core.readings import take_readings
 from rosrm.core.state import MasterState, Wanted
 from rosrm.ports import Intent
@@ -41,7 +41,7 @@ def host_registered(state: MasterState, event: happened.HostRegistered, now: flo
         return
     is_new = known is None or known.pruned
     host = state.hosts.register(description, now)
-    host.failing = EMPTY  # the slave reports what fails in this run
+    host.failing.clear()  # the slave reports what fails in this run
     if is_new:
         save_host(state, host)
     held = counted(len(event.instances), "process", "processes")

@@ -21,7 +21,7 @@ from rosrm.core.model import (
     Kind,
     RestartPolicy,
 )
-from rosrm.core.plugin_calls import note_probes
+from rosrm.core.plugin_calls import note_on_host
 from rosrm.core.runs import End, Run
 from rosrm.core.state import WAITING, Instance, MasterState, Process, ProcessPhase, Wanted
 from rosrm.spelling import standing
@@ -49,7 +49,7 @@ def statuses_received(state: MasterState, event: happened.StatusesReceived, now:
     is_next = state.hosts.note_statuses(host, event.sequence, now)
     if is_next is None:
         return
-    note_probes(state, host, event.failing, now)
+    note_on_host(state, host, event.failing_plugins(), now)
     if event.complete:
         state.missing_since.pop(host.column, None)
         state.hosts.set_untold(host, untold=False)

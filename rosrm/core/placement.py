@@ -23,7 +23,7 @@ from rosrm.core.columns import BUSY, CAPACITY, LIMIT, BoolArray, FloatArray, Int
 from rosrm.core.declared import declared_spec
 from rosrm.core.hosts import Host, HostTable
 from rosrm.core.model import EMPTY, ProcessSpec
-from rosrm.core.plugin_calls import PluginCalls, required
+from rosrm.core.plugin_calls import PluginCalls, given, required
 from rosrm.errors import PluginError
 from rosrm.ports import HostView, ProcessView, Scores, ScoringPolicy
 
@@ -275,7 +275,13 @@ def sound(scores: Scores, hosts: HostView, fits: BoolArray) -> tuple[FloatArray,
     """The value and veto of an answer that keeps to the contract; raises for any other."""
     size = len(fits)
     required(scores, Scores)
-    value = np.asarray(scores.value, np.float64)
+    try:
+        value = np.asarray(scores.value, np.float64)
+    except (TypeError, ValueError):
+        raise PluginError(
+            f"answered scores that are no numbers: {given(scores.value)}; {size} numbers are "
+            f"required, one for each host"
+        ) from None
     if value.shape != (size,):
         raise PluginError(f"scores of shape {value.shape} for {size} hosts")
     veto = None

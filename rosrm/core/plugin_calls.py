@@ -4,6 +4,8 @@
 a plugin      what changes that, and is recorded
 ============  ============================================================================
 selected      a call raises, is late, or answers what the contract does not allow: `failing`
+failing       a call fails with another error than was recorded last: recorded at most once in
+              `TOLD_AGAIN` seconds
 failing       a call is good, and no call has failed for `WORKS_AFTER` seconds: `selected`
 ============  ============================================================================
 """
@@ -13,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from inspect import getattr_static
+from math import inf
 from typing import TYPE_CHECKING, Any, Final, TypeGuard, TypeVar
 
 from rosrm.errors import PluginError, describe_plugin_fault
@@ -39,6 +42,8 @@ TITLES: Final[Mapping[str, str]] = {
 #: Seconds without a failure after which a good answer ends the state "failing". Otherwise a plugin
 #: that fails for every second process would be recorded with each of them.
 WORKS_AFTER: Final = 10.0
+#: Seconds between two records of one plugin's errors. An error may name what differs in each call.
+TOLD_AGAIN: Final = 60.0
 
 
 @dataclass(slots=True)
@@ -51,9 +56,19 @@ class Failing:
         last: time of the last failure.
     """
 
-    error: str
-    count: int
-    last: float
+    error: str = ""
+    count: int = 0
+    last: float = -inf
+    _told: str = ""
+    _told_at: float = -inf
+
+    def note(self, error: str, count: int, now: float) -> bool:
+        """Take in the newest error; return True if it is to be recorded."""
+        self.error, self.count, self.last = error, self.count + count, now
+        if error == self._told or now - self._told_at < TOLD_AGAIN:
+            return False
+        self._told, self._told_at = error, now
+        return True
 
     @property
     def reason(self) -> str:
@@ -98,7 +113,7 @@ class PluginCalls:
             raise
         except BaseException as fault:  # whatever a plugin raises, even SystemExit
             reason = describe_plugin_fault(fault)
-            noted = self._failed.setdefault(plugin, Failing("", 0, 0.0))
+            noted = self._failed.setdefault(plugin, Failing())
             noted.error, noted.count = f"{hook}: {reason}", noted.count + 1
             raise PluginError(reason) from fault
         if plugin in self.failing:
@@ -108,12 +123,8 @@ class PluginCalls:
     def note(self, state: MasterState, now: float) -> None:
         """Record which plugins began to fail since the last call, and which work again."""
         for plugin, noted in self._failed.items():
-            known = self.failing.setdefault(plugin, noted)
-            if known is noted:
+            if self.failing.setdefault(plugin, Failing()).note(noted.error, noted.count, now):
                 _record(state, plugin, "plugin_failed", f"fails: {noted.error}", now)
-            else:
-                known.error, known.count = noted.error, known.count + noted.count
-            known.last = now
         for plugin in self._worked - self._failed.keys():
             if now - self.failing[plugin].last >= WORKS_AFTER:
                 del self.failing[plugin]
@@ -128,21 +139,36 @@ def _record(state: MasterState, plugin: Plugin, event: str, outcome: str, now: f
     state.record(now, event, f"the {TITLES[kind]} {name!r} {outcome}", facts=facts)
 
 
-def note_probes(state: MasterState, host: Host, failing: Mapping[str, str], now: float) -> None:
-    """Note which probes of a host fail by the report of its slave, and record what changed.
+def note_on_host(state: MasterState, host: Host, failing: Mapping[Plugin, str], now: float) -> None:
+    """Note which plugins fail on a host by the report of its slave, and record what changed.
 
     Args:
-        failing: resource to the reason why its probe gives no readings.
+        failing: all that fail there, and why. A probe goes by the resource that it reads.
     """
-    for resource in sorted(failing.keys() ^ host.failing.keys()):
-        fails = resource in failing
-        state.record(
-            now, "plugin_failed" if fails else "plugin_works",
-            f"the probe of {resource} on {host.name} "
-            + (f"fails: {failing[resource]}" if fails else "works again"),
-            host=host.name, facts={"plugin": "probe", "name": resource},
-        )  # fmt: skip
-    host.failing = failing
+    for plugin in sorted(failing.keys() | host.failing.keys()):
+        if plugin not in failing:
+            del host.failing[plugin]
+            _record_on_host(state, host, plugin, "works again", now)
+        elif host.failing.setdefault(plugin, Failing()).note(failing[plugin], 1, now):
+            _record_on_host(state, host, plugin, f"fails: {failing[plugin]}", now)
+
+
+def why_broken(host: Host, strategy: str) -> str:
+    """Return why a migration strategy fails on a host, as its slave reports; "": it does not."""
+    known = host.failing.get(("migration", strategy))
+    return "" if known is None else known.error
+
+
+def _record_on_host(
+    state: MasterState, host: Host, plugin: Plugin, outcome: str, now: float
+) -> None:
+    kind, name = plugin
+    title = f"probe of {name}" if kind == "probe" else f"{TITLES[kind]} {name!r}"
+    state.record(
+        now, "plugin_works" if outcome == "works again" else "plugin_failed",
+        f"the {title} on {host.name} {outcome}", host=host.name,
+        facts={"plugin": kind, "name": name},
+    )  # fmt: skip
 
 
 def implements(plugin: object, contract: Callable[..., T]) -> TypeGuard[T]:
@@ -159,6 +185,10 @@ def implements(plugin: object, contract: Callable[..., T]) -> TypeGuard[T]:
 def required(answer: object, kind: type[T]) -> T:
     """Return an answer of the required type; raise `PluginError` for any other."""
     if not isinstance(answer, kind):
-        given = "None" if answer is None else f"a {type(answer).__name__}"
-        raise PluginError(f"answered {given}; {kind.__name__} is required")
+        raise PluginError(f"answered {given(answer)}; {kind.__name__} is required")
     return answer
+
+
+def given(answer: object) -> str:
+    """Return the type of a wrong answer, for messages."""
+    return "None" if answer is None else f"a {type(answer).__name__}"

@@ -52,7 +52,11 @@ def _note_limits(state: MasterState, now: float) -> None:
     """Note since when each host is over which of its limits."""
     over = {int(column) for column in state.hosts.hosts_over_limit()}
     for host in state.hosts.listed():
-        names = state.hosts.over_limit(host.column) if host.column in over else ()
+        # A stale reading tells neither that the host is over its limit nor that it is under it.
+        stale = state.hosts.stale_resources(host) if state.hosts.stale[host.column] else ()
+        names = state.hosts.over_limit(host.column) if host.column in over else []
+        names = [name for name in names if name not in stale]
+        host.over_at.update({name: now for name in stale if name in host.over_at})
         for name in names:
             host.over_since.setdefault(name, now)
             if name not in host.over_at:

@@ -280,10 +280,18 @@ def migration_requested(state: MasterState, event: happened.MigrationRequested, 
     (process,) = processes
     reason = try_move(state, process, asked_for(event.by), now, host=host)
     if reason:
+        _note_refused_move(state, process, reason, now)
         refuse(state, event.request, reason)
         return
     name = state.runs[process.name].destination_host.name
     state.emit(Reply(event.request, message=f"{process.name} moves to {name}", host=name))
+
+
+def _note_refused_move(state: MasterState, process: Process, reason: str, now: float) -> None:
+    """Record why a process was not moved, unless that is the newest record of it already."""
+    message = f"{process.name} is not moved: {reason}"
+    if not process.history or process.history[-1][2] != message:
+        state.record(now, "migration_refused", message, process=process.name)
 
 
 def checkpoint_requested(

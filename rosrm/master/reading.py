@@ -9,7 +9,6 @@ from typing import Any, Final
 
 from rosrm.core import listing
 from rosrm.core.hosts import Host
-from rosrm.core.model import ResourceDescription
 from rosrm.core.state import MasterState
 from rosrm.core.views import EventRow, PluginRow, Snapshot
 from rosrm.journal import SqliteJournal
@@ -75,11 +74,7 @@ class Reading:
         if not request.failing:
             return self._all_plugins()
         rows = [row for row in self._own_plugins() if row.state == "failing"]
-        return rows + [
-            _probe_row(host, resource)
-            for host in self._state.hosts.hosts if host.failing
-            for resource in host.description.resources if resource.name in host.failing
-        ]  # fmt: skip
+        return rows + [row for host in self._state.hosts.hosts for row in _failing_rows(host)]
 
     def _own_plugins(self) -> list[PluginRow]:
         failing = self._state.plugins.failing
@@ -94,7 +89,12 @@ class Reading:
         rows = self._own_plugins()
         for host in self._state.hosts.hosts:
             described = host.description
-            rows += [_probe_row(host, resource) for resource in described.resources]
+            rows += [
+                PluginRow("probe", one.name, "", "selected", f"scope {one.scope}", host.name)
+                for one in described.resources
+                if ("probe", one.name) not in host.failing
+            ]
+            rows += _failing_rows(host)
             rows += [
                 PluginRow("probe", name, "", "absent", reason, host.name)
                 for name, reason in described.absent.items()
@@ -107,13 +107,12 @@ class Reading:
         return None if story is None else json.dumps(story, default=dict)
 
 
-def _probe_row(host: Host, resource: ResourceDescription) -> PluginRow:
-    """A probe of a host, by the resource that it reads."""
-    reason = host.failing.get(resource.name, "")
-    state = "failing" if reason else "selected"
-    return PluginRow(
-        "probe", resource.name, "", state, reason or f"scope {resource.scope}", host.name
-    )
+def _failing_rows(host: Host) -> list[PluginRow]:
+    """Return what fails on a host; a probe goes by the resource that it reads."""
+    return [
+        PluginRow(kind, name, "", "failing", known.error, host.name)
+        for (kind, name), known in host.failing.items()
+    ]
 
 
 def _event_row(stored: StoredRecord) -> EventRow:

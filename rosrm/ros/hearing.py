@@ -103,7 +103,7 @@ class Hearing:
             return
         try:
             statuses = tuple(convert.status_from_msg(status) for status in message.statuses)
-            failing = {row.name: row.reason for row in message.failing}
+            failing = {one: _failing(message, one) for one in ("probe", "migration")}
         except Refused as refusal:
             self._refuse(who, str(refusal))
             return
@@ -114,7 +114,8 @@ class Hearing:
                 message.sequence,
                 message.complete,
                 statuses,
-                failing,
+                failing["probe"],
+                failing["migration"],
             )
         )
 
@@ -140,6 +141,10 @@ class Hearing:
             return
         states = tuple(convert.kept_from_msg(one) for one in message.states)
         self._tell(happened.KeptStatesReceived(message.host_id, message.incarnation, states))
+
+
+def _failing(message: msg.ProcessStatusBatch, kind: str) -> dict[str, str]:
+    return {row.name: row.reason for row in message.failing if row.kind == kind}
 
 
 def _never_called(_message: object) -> None:

@@ -14,6 +14,7 @@ from rclpy.duration import Duration
 
 from rosrm.core import slave as core
 from rosrm.core.model import HostDescription, InstanceStatus, KeptState
+from rosrm.core.plugin_calls import Plugin
 from rosrm.errors import Refused
 from rosrm.ros import convert, names, qos
 from rosrm.ros.control import Call, ControlClient, Gate, version_refusal
@@ -66,7 +67,8 @@ class SlaveEndpoint:
         failure: why it must give up; "" while it need not.
         superseded: it must because another slave lives under its name.
         cluster: name of the master that greeted us last; "" before the first one.
-        failing: resource to the reason why its probe gives no readings; goes with the statuses.
+        failing: kind and name of each plugin that fails here, and why; goes with the statuses. A
+            probe goes by the resource that it reads.
     """
 
     def __init__(
@@ -81,7 +83,7 @@ class SlaveEndpoint:
         self.failure = ""
         self.superseded = False
         self.cluster = ""
-        self.failing: dict[str, str] = {}
+        self.failing: dict[Plugin, str] = {}
         self.host_id = 0
         self._epoch = 0
         self._master_beat = 0
@@ -358,8 +360,8 @@ class SlaveEndpoint:
                 incarnation=self._description.incarnation, sequence=self._status_sequence,
                 complete=complete, statuses=[convert.status_to_msg(one) for one in statuses],
                 failing=[
-                    msg.PluginState(kind="probe", name=name, state="failing", reason=reason)
-                    for name, reason in self.failing.items()
+                    msg.PluginState(kind=kind, name=name, state="failing", reason=reason)
+                    for (kind, name), reason in self.failing.items()
                 ],
             )
         )  # fmt: skip

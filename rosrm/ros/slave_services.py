@@ -66,11 +66,13 @@ class Host(Protocol):
         """
 
     def execute(
-        self, executor: str, arguments: dict[str, Any], done: Callable[[str, str, str], None]
-    ) -> None:
+        self, executor: str, arguments: dict[str, Any], timeout: float,
+        done: Callable[[str, str, str], None],
+    ) -> None:  # fmt: skip
         """Run an executor; `done(code, message, result)` is called in the loop's thread.
 
-        The code is "" where the executor did its work.
+        The code is "" where the executor did its work. Its strategy counts as failing, if it takes
+        longer than `timeout` seconds.
         """
 
     def keep(self, instance: InstanceId, hosts: Sequence[str], every: float) -> None:
@@ -144,7 +146,7 @@ class SlaveServices:
             respond(srv.ControlHost.Response(answer=answer, result=result))
 
         arguments = convert.json_object(request.arguments, "the arguments of an executor")
-        self._host.execute(request.executor, arguments, done)
+        self._host.execute(request.executor, arguments, request.timeout, done)
 
     def _take_log(self, request: srv.ReadLog.Request, open_request: OpenRequest) -> None:
         fault = version_refusal(request.protocol_version, "a reader of logs")

@@ -36,7 +36,7 @@ from rosrm.ros.names import token
 from rosrm.ros.participant import Participant
 from rosrm.ros.slave_endpoint import Link, LogQuery, LogSlice, SlaveEndpoint
 from rosrm.slave.ending import STOP_ALL, Ending
-from rosrm.slave.executing import Done, Here, execute
+from rosrm.slave.executing import Done, Executors, Here
 from rosrm.slave.health import HealthWatch
 from rosrm.slave.keeping import Keeping
 from rosrm.slave.log_reading import newest_instance, nothing_yet, read_log
@@ -91,7 +91,10 @@ class SlaveRuntime:
         self._events: deque[core.Event] = deque()
         self._from_threads: deque[Callable[[], None]] = deque()
         self._unsettled: dict[tuple[InstanceId, RestartPolicy], list[Settled]] = {}
-        self._executors = registry.executors()
+        self._executors = Executors(
+            registry.executors(), registry.broken_strategies(),
+            post=self._post, changed=self._note_executors,
+        )  # fmt: skip
         self._closing = contextlib.ExitStack()
         with contextlib.ExitStack() as opened:
             opened.enter_context(
@@ -129,6 +132,9 @@ class SlaveRuntime:
                 JournalSeen(config.state / "journal_seen"),
             )
             self._note_probes(first)
+            self._endpoint.failing.update(self._executors.failing_plugins())
+            for strategy, reason in self._executors.failing.items():
+                self.say(f"migration strategy {strategy} is broken: {reason}")
             kept = config.state / "kept"
             self._keeping = Keeping(
                 kept, config.host, config.keep,
@@ -158,7 +164,7 @@ class SlaveRuntime:
             name=config.host, incarnation=self._incarnation, hostname=socket.gethostname(),
             pid=os.getpid(), software_version=__version__, labels=config.labels,
             resources=tuple(self._sampler.resources), max_processes=config.max_processes,
-            period=config.period, executors=tuple(self._executors), absent=absent,
+            period=config.period, executors=self._executors.names, absent=absent,
         )  # fmt: skip
 
     def _adopt(self) -> None:
@@ -267,11 +273,20 @@ class SlaveRuntime:
         failing = self._endpoint.failing
         for report in reports:
             self.say(str(report))
-            for resource in report.resources:
+            for resource in report.resources or (report.probe,):
                 if report.stale:
-                    failing[resource] = f"probe {report.probe}: {report.reason}"
+                    failing["probe", resource] = f"probe {report.probe}: {report.reason}"
                 else:
-                    failing.pop(resource, None)
+                    failing.pop(("probe", resource), None)
+
+    def _note_executors(self, message: str) -> None:
+        """Log which migration strategy fails or works again, and report that to the master."""
+        self.say(message)
+        failing = self._endpoint.failing
+        for plugin in [one for one in failing if one[0] == "migration"]:
+            del failing[plugin]
+        failing.update(self._executors.failing_plugins())
+        self._endpoint.publish_statuses((), complete=False)
 
     def _say_usage(self) -> None:
         seen = self._usage.after_reading()
@@ -399,12 +414,12 @@ class SlaveRuntime:
             return InstanceId(process, max(held))
         return newest_instance(self._supervisor.state, process)
 
-    def execute(self, executor: str, arguments: dict[str, Any], done: Done) -> None:
+    def execute(self, executor: str, arguments: dict[str, Any], timeout: float, done: Done) -> None:
         """Run an executor in a thread of its own; raises `Refused`."""
         held = self._state.held.items()
         pids = {str(one): it.status.pid for one, it in held if not it.status.state.ended}
         here = Here(self._config.host, self._config.state, pids)
-        execute(self._executors, executor, arguments, here=here, post=self._post, done=done)
+        self._executors.execute(executor, arguments, timeout, here=here, done=done)
 
 
 def _random_number() -> int:

@@ -11,7 +11,8 @@ probes do. The rules:
   thread, however long it hangs.
 - A probe that is late, raises or answers nonsense makes its readings *stale*: they keep their last
   value, never zero. Why is reported once, and so is the recovery. A probe that changes often stays
-  stale until its changes are rarer, so the mark and the newest report always agree.
+  stale until its changes are rarer, so the mark and the newest report always agree. Recoveries are
+  held back so, failures never. Another error of a stale probe is reported at most every 10 s.
 - Before its first reading a resource counts as full and stale, so that no work is drawn to a host
   that has not been measured.
 
@@ -33,7 +34,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rosrm.core.model import ABSURD_USAGE, RESOURCE_SLOTS, Reading
-from rosrm.core.plugin_calls import required
+from rosrm.core.plugin_calls import given, required
 from rosrm.errors import PluginError, describe_plugin_fault
 
 if TYPE_CHECKING:
@@ -47,6 +48,8 @@ TRUSTED_AFTER: Final = 10
 #: At most this many reports of one probe in REPORT_WINDOW seconds: a flapping probe floods nothing.
 REPORTS: Final = 6
 REPORT_WINDOW: Final = 60.0
+#: Seconds after a report before another error of a probe that is still stale is reported.
+ANOTHER_ERROR: Final = 10.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +57,8 @@ class ProbeReport:
     """The readings of a probe went stale, or came back.
 
     Attributes:
-        resources: names of the readings concerned.
+        resources: names of the readings concerned; none of a probe that could not be made and
+            whose resources others read.
         reason: why they are stale; "" on recovery.
     """
 
@@ -66,6 +70,8 @@ class ProbeReport:
     def __str__(self) -> str:
         """One sentence for the event record."""
         names = ", ".join(self.resources)
+        if self.stale and not names:
+            return f"probe {self.probe} fails: {self.reason}"
         if self.stale:
             return f"probe {self.probe}: {names} stale: {self.reason}"
         return f"probe {self.probe}: {names} read again"
@@ -317,6 +323,8 @@ class _Watched:
         self.due = self._nominal = -math.inf
         self.measured = False
         self._reported_stale = False
+        self._reported = ""
+        self._reported_at = -math.inf
         self._report_times: list[float] = []
 
     def prepare(self, now: float) -> Callable[[], None]:
@@ -344,17 +352,26 @@ class _Watched:
 
         A recovery is put off where no report would be left for the next failure.
         """
+        if self.reason and self._reported_stale:
+            return self._report_another_error(now)
         if bool(self.reason) == self._reported_stale:
             return []
         self._report_times = [t for t in self._report_times if now - t < REPORT_WINDOW]
         if not self.reason and len(self._report_times) >= REPORTS - 1:
             return []
         self._report_times.append(now)
-        self._reported_stale = bool(self.reason)
+        self._reported_at = now
+        self._reported_stale, self._reported = bool(self.reason), self.reason
         reason = self.reason
         if reason and len(self._report_times) >= REPORTS - 1:
             reason += f"; it changes often, so it counts as stale for up to {REPORT_WINDOW:g} s"
         return [ProbeReport(self.name, self.names, self._reported_stale, reason)]
+
+    def _report_another_error(self, now: float) -> list[ProbeReport]:
+        if self.reason == self._reported or now - self._reported_at < ANOTHER_ERROR:
+            return []
+        self._reported, self._reported_at = self.reason, now
+        return [ProbeReport(self.name, self.names, True, self.reason)]
 
     def close(self) -> None:
         """Close the probe, in the thread that reads it."""
@@ -389,20 +406,32 @@ def read_values(probe: Probe, names: tuple[str, ...]) -> tuple[float, ...]:
         PluginError: the answer is not one reading of each resource; the text says why.
     """
     values: dict[str, float] = {}
-    for answer in required(probe.read(), Iterable):  # type: ignore[type-abstract]
+    answers: object = probe.read()
+    if not isinstance(answers, Iterable):
+        raise PluginError(f"answered {given(answers)}; a list of Readings is required")
+    for answer in answers:
         reading = required(answer, Reading)
         if reading.resource not in names:
             raise PluginError(f"a reading of {reading.resource!r}, which it did not announce")
         if reading.resource in values:
             raise PluginError(f"two readings of {reading.resource!r}")
-        usage = float(reading.usage)
-        if not 0.0 <= usage <= ABSURD_USAGE:  # also where it is NaN
-            raise PluginError(
-                f"usage {usage} of {reading.resource!r}; allowed: 0 to {ABSURD_USAGE:g}, "
-                "where 1 is the whole capacity"
-            )
+        usage = _fraction(reading)
         values[reading.resource] = usage
     missing = [name for name in names if name not in values]
     if missing:
         raise PluginError(f"no reading of {', '.join(missing)}")
     return tuple(values[name] for name in names)
+
+
+def _fraction(reading: Reading) -> float:
+    """Return the usage of a reading; raise `PluginError` where it is none."""
+    try:
+        usage = float(reading.usage)
+    except (TypeError, ValueError, OverflowError):
+        usage = math.nan
+    if not 0.0 <= usage <= ABSURD_USAGE:  # also where it is NaN
+        raise PluginError(
+            f"usage {reading.usage!r} of {reading.resource!r}; a fraction of its capacity is "
+            f"required, 1.0 where it is full and at most {ABSURD_USAGE:g}"
+        )
+    return usage

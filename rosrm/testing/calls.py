@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import json
-import signal
-import threading
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from types import SimpleNamespace
 from typing import Any, Final, TypeVar
 from unittest import SkipTest
@@ -17,7 +14,7 @@ from rosrm.config.plain import to_plain
 from rosrm.errors import ConfigError, PluginError
 from rosrm.hookspecs import hookimpl
 from rosrm.loading import HOOKS, Offer
-from rosrm.registry import Registry
+from rosrm.registry import FailedProbe, Registry
 from rosrm.time_limit import limited
 
 T = TypeVar("T")
@@ -48,8 +45,7 @@ def call(hook: str, seconds: float, ask: Callable[[], T]) -> T:
         return late
 
     try:
-        with _other_timer_kept():
-            answer = limited(seconds, ask, expired)
+        answer = limited(seconds, ask, expired)
     except Exception as fault:
         if late:
             raise ContractBroken(late) from fault
@@ -59,18 +55,6 @@ def call(hook: str, seconds: float, ask: Callable[[], T]) -> T:
     if late:  # the plugin caught the exception
         raise ContractBroken(late)
     return answer
-
-
-@contextmanager
-def _other_timer_kept() -> Iterator[None]:
-    """Set the alarm of a test runner again: a process has one timer, and the limit uses it."""
-    handler, (left, _) = signal.getsignal(signal.SIGALRM), signal.getitimer(signal.ITIMER_REAL)
-    try:
-        yield
-    finally:
-        if left and threading.current_thread() is threading.main_thread():
-            signal.signal(signal.SIGALRM, handler)
-            signal.setitimer(signal.ITIMER_REAL, left)
 
 
 def checked_options(wanted: type[Any], given: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -106,14 +90,13 @@ def made(kind: str, offer: Offer, options: Mapping[str, Any], *context: Any) -> 
         raise ContractBroken(registry.broken[0].reason)
     name, plain = offer.name, checked_options(offer.options, options)
     try:
-        with _other_timer_kept():
-            if kind == "probe":
-                present = registry.probes({name: plain}, *context).made
-                thing: Any = present[0].probe if present else None
-            elif kind == "migration":
-                thing = registry.migrations({name: plain})[name]
-            else:
-                thing = getattr(registry, kind)(name, plain)
+        if kind == "probe":
+            probes = [one.probe for one in registry.probes({name: plain}, *context).made]
+            thing: Any = next((one for one in probes if not isinstance(one, FailedProbe)), None)
+        elif kind == "migration":
+            thing = registry.migrations({name: plain})[name]
+        else:
+            thing = getattr(registry, kind)(name, plain)
     except (ConfigError, PluginError):
         thing = None
     (row,) = registry.rows(kind)

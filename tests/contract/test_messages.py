@@ -74,7 +74,7 @@ FIRST = {
 def test_an_answer_of_another_type_is_named(kind):
     """Not by an attribute that it lacks."""
     contract = contract_of(kind, thing_of(kind, lambda: 5))
-    with pytest.raises(AssertionError, match=r"answered a int; \w+ is required"):
+    with pytest.raises(AssertionError, match=r"answered a int; [\w ]+ is required"):
         getattr(contract, FIRST[kind])()
 
 
@@ -139,7 +139,7 @@ def test_a_score_of_nan_is_named_with_its_host():
 def test_a_usage_that_the_slave_refuses_fails_the_contract(usage):
     """By the same check."""
     contract = contract_of(ProbeContract, FakeProbe(a=usage))
-    with pytest.raises(AssertionError, match=r"read: usage .* of 'a'; allowed: 0 to 64"):
+    with pytest.raises(AssertionError, match=r"read: usage .* of 'a'; a fraction of"):
         contract.test_reads_each_resource_once()
 
 

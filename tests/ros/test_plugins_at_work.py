@@ -260,11 +260,24 @@ def test_a_probe_that_fails_is_listed_until_it_works_again(make_cluster, third_p
     assert row().state == "selected"
 
 
-def test_a_probe_whose_description_cannot_be_sent_is_broken(make_cluster, third_party) -> None:
-    """The plugin is named, and the host registers without it."""
-    cluster = make_cluster(host("h0", probes=probes("no_unit")))
+def test_a_probe_that_cannot_be_made_fails_from_the_start(make_cluster, third_party) -> None:
+    """The plugin and the place are in the log, the event and the row; a limit on it bites."""
+    cluster = make_cluster()
+    cluster.start_slave(host("h0", probes=probes("no_unit"), limits={"no_unit": 0.9}))
+    event = cluster.wait_for_event("plugin_failed", host="h0")
+    assert event.message.startswith("the probe of no_unit on h0 fails: ")
     (row,) = [row for row in plugins(cluster) if row.name == "no_unit" and row.host]
-    assert (row.state, "unit None" in row.reason) == ("absent", True)
+    for said in (event.message, row.reason, cluster.log_of("h0")):
+        assert "plugin 'odd' of odd-plugin 1.0: NoUnit (" in said
+        assert "odd_plugin.py:" in said
+        assert "the unit None" in said
+    assert row.state == "failing"
+    cluster.submit(job("waits", "true"))
+    wait_until(
+        lambda: "its reading of no_unit is stale" in str(cluster.client.explain("waits")),
+        "the reason why h0 takes nothing",
+    )
+    cluster.cancel("waits")
 
 
 def test_a_probe_that_is_absent_or_broken_is_listed(cluster) -> None:
@@ -273,6 +286,7 @@ def test_a_probe_that_is_absent_or_broken_is_listed(cluster) -> None:
     assert (rows["absent_one"].state, rows["absent_one"].reason) == (
         "absent", "no such hardware here",
     )  # fmt: skip
+    assert rows["broken_one"].state == "failing"
     assert "cannot be made" in rows["broken_one"].reason
     assert rows["memory"].state == "selected"
     assert cluster.run(job("works", "true"))[0].state == "finished"
@@ -322,7 +336,10 @@ def test_a_strategy_that_hangs_or_exits(make_cluster, third_party, strategy, sai
     ],
 )
 def test_an_executor_that_fails(make_cluster, third_party, strategy, said) -> None:
-    """The step fails with that sentence, the move is undone, and the process runs as before."""
+    """The step fails with that sentence, the move is undone, and the process runs as before.
+
+    The strategy is failing on the host.
+    """
     cluster = make_cluster(
         host("h0"), host("h1"), migration=MigrationSettings({strategy: {}, "relaunch": {}})
     )
@@ -331,6 +348,10 @@ def test_an_executor_that_fails(make_cluster, third_party, strategy, said) -> No
     cluster.client.migrate("p")
     assert said in cluster.wait_for_event("stayed", process="p").message
     assert cluster.wait("p", "running").pid == before.pid
+    event = cluster.wait_for_event("plugin_failed", host=before.host)
+    assert f"the migration strategy '{strategy}' on {before.host} fails: executor " in event.message
+    rows = [row for row in plugins(cluster) if row.name == strategy and row.host]
+    assert [(row.state, said in row.reason) for row in rows] == [("failing", True)]
     cluster.cancel("p")
 
 

@@ -6,9 +6,11 @@ from types import SimpleNamespace
 
 import pytest
 
+from rosrm.errors import SkipPlugin
 from rosrm.hookspecs import hookimpl
-from rosrm.ports import CheckpointOffer, MigrationOffer, ScoringOffer
+from rosrm.ports import CheckpointOffer, MigrationOffer, ProbeOffer, ScoringOffer
 from rosrm.registry import Registry
+from rosrm.testing import FakeProbe
 
 from .test_starting import OURS
 
@@ -150,7 +152,7 @@ def test_plugins_that_cannot_be_made_are_found(rosrm, file, monkeypatch):
     [
         (
             "processes: [{name: a, command: x, needs: {cpus: 1}}]",
-            "a: needs: no probe is named 'cpus'; did you mean 'cpu'?",
+            "a: needs: no probe reads 'cpus'; did you mean 'cpu'?",
         ),
         (
             """
@@ -167,6 +169,55 @@ def test_what_may_be_a_mistake_is_a_warning(rosrm, tmp_path, text, warning):
     result = rosrm("config", "check", file)
     assert result.code == 0
     assert result.err == f"{file}: warning: {warning}\n"
+
+
+def test_a_resource_in_needs_is_compared_with_all_that_probes_read(rosrm, file, monkeypatch):
+    """By the name of the resource, and not of the probe that reads it."""
+    use_probes(monkeypatch, ProbeOffer("thermal", fails, resources=("temperature",)))
+    text = "processes: [{name: a, command: x, needs: {temprature: 1}}]"
+    result = rosrm("config", "check", file(text))
+    assert result.code == 0
+    assert "a: needs: no probe reads 'temprature'; did you mean 'temperature'?" in result.err
+
+
+def fails(options, context):
+    raise KeyError("bus")
+
+
+def is_absent(options, context):
+    raise SkipPlugin("no bus")
+
+
+def use_probes(monkeypatch, *offers):
+    """Install these probes and nothing else."""
+
+    @hookimpl
+    def register_probes():
+        return list(offers)
+
+    ours = SimpleNamespace(register_probes=register_probes)
+    monkeypatch.setattr(Registry, "discover", lambda: Registry.of(ours=ours))
+
+
+def test_probes_that_cannot_be_made_are_found_and_absent_ones_are_none_of_them(
+    rosrm, file, monkeypatch
+):
+    """Only what says so is absent here: the file may be for a host that has the hardware."""
+    made = FakeProbe(fine=0.5)
+    use_probes(
+        monkeypatch, ProbeOffer("fine", lambda options, context: made),
+        ProbeOffer("gone", is_absent), ProbeOffer("wrong", fails),
+        ProbeOffer("none", lambda options, context: None),
+    )  # fmt: skip
+    assert rosrm("config", "check", file("host: h\nprobes: [fine, gone]")).code == 0
+    result = rosrm("config", "check", file("host: h\nprobes: [fine, gone, wrong, none]"))
+    assert result.code == 2
+    line = fails.__code__.co_firstlineno + 1
+    assert "f.yaml: probes: wrong: plugin 'ours': `create` (" in result.err
+    assert f"raised KeyError: 'bus' ({__file__}:{line})" in result.err
+    assert "f.yaml: probes: none: plugin 'ours': `create` (" in result.err
+    assert "made None; an object with `resources` and `read` and `close`" in result.err
+    assert made.closed == 2
 
 
 def test_a_resource_that_no_probe_here_measures_is_no_mistake(rosrm, tmp_path):

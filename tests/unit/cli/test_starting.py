@@ -15,11 +15,16 @@ from rosrm.installed import installed_plugins
 from rosrm.journal import SqliteJournal
 from rosrm.ports import Intent, MigrationOffer, ProbeOffer, ScoringOffer
 from rosrm.registry import Registry
+from rosrm.testing import FakeProbe
+
+
+def cpu(options, context):
+    return FakeProbe(cpu=0.5)
 
 
 @hookimpl
 def register_probes():
-    return [ProbeOffer("cpu", lambda options, context: None, default=True)]
+    return [ProbeOffer("cpu", cpu, default=True)]
 
 
 @hookimpl

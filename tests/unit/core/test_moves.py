@@ -470,6 +470,26 @@ def test_a_move_goes_to_the_next_host_where_the_best_lacks_an_executor() -> None
     assert cluster.migrate("p").host == "d"
 
 
+def test_a_host_that_lacks_an_executor_as_its_plugin_is_broken_says_so() -> None:
+    """To install what is installed there would not help; `rosrm explain` shows the refusal, too."""
+    cluster = sleepy("sleepy.wait")
+    machine = cluster.machines["b"]
+    machine.batches += 1
+    reason = "plugin 'sleepy': its executor 'sleepy.wait' has the name of one of 'weary'"
+    cluster.tell(
+        happened.StatusesReceived(
+            machine.host_id, machine.incarnation, machine.batches, False, (),
+            failing_strategies={"sleepy": reason},
+        )
+    )  # fmt: skip
+    said = f"which sleepy needs there to move p: on b {reason}; then restart its slave"
+    for _ in range(2):
+        assert cluster.migrate("p").message.endswith(said)
+    (refused,) = cluster.told("migration_refused")
+    assert refused.startswith("p is not moved: b has no executor 'sleepy.wait'")
+    assert refused in [one["message"] for one in cluster.explain("p")["history"]]
+
+
 def test_hosts_that_lack_an_executor_are_named_together() -> None:
     """As one reason with one advice."""
     cluster = sleepy("sleepy.wait")

@@ -9,7 +9,7 @@ import pytest
 
 from rosrm.core import events as happened
 from rosrm.core.model import MigrationPolicy, Readiness
-from rosrm.core.plugin_calls import WORKS_AFTER, PluginCalls, required
+from rosrm.core.plugin_calls import TOLD_AGAIN, WORKS_AFTER, PluginCalls, required
 from rosrm.errors import PluginError
 from rosrm.ports import HostView, ProcessView, Scores
 from tests.unit.core.cluster import Cluster, Eq1, StartFirstOrStopFirst, process
@@ -113,16 +113,43 @@ def test_ctrl_c_passes_the_guard() -> None:
 def test_a_probe_that_fails_is_recorded_when_that_changes() -> None:
     """Every report of a slave is complete: what is missing in the next one works again."""
     cluster = Cluster("a")
-    machine = cluster.machines["a"]
     for failing in ({"lidar": "no such sensor"}, {"lidar": "no such sensor"}, {}):
-        machine.batches += 1
-        cluster.tell(
-            happened.StatusesReceived(
-                machine.host_id, machine.incarnation, machine.batches, False, (), failing
-            )
-        )
+        fails_there(cluster, failing)
     assert cluster.told("plugin_failed") == ["the probe of lidar on a fails: no such sensor"]
     assert cluster.told("plugin_works") == ["the probe of lidar on a works again"]
+
+
+def test_a_strategy_whose_executors_fail_is_recorded_with_its_host() -> None:
+    """The slave that runs them reports it."""
+    cluster = Cluster("a")
+    for failing in ({"acme": "executor rest raised OSError: no arm"}, {}):
+        fails_there(cluster, {}, failing)
+    said = "the migration strategy 'acme' on a"
+    assert cluster.told("plugin_failed") == [f"{said} fails: executor rest raised OSError: no arm"]
+    assert cluster.told("plugin_works") == [f"{said} works again"]
+
+
+def fails_there(cluster: Cluster, *failing: dict[str, str]) -> None:
+    """Let the slave of `a` report the probes and the strategies that fail there."""
+    machine = cluster.machines["a"]
+    machine.batches += 1
+    cluster.tell(
+        happened.StatusesReceived(
+            machine.host_id, machine.incarnation, machine.batches, False, (), *failing
+        )
+    )
+
+
+def test_another_error_of_a_failing_plugin_is_recorded_once_a_minute() -> None:
+    """An error may name the process, and so differ in each call."""
+    cluster = Cluster("a")
+    for error in ("unplugged", "no permission", "too hot"):
+        fails_there(cluster, {"lidar": error})
+    assert cluster.state.hosts.by_name["a"].failing["probe", "lidar"].error == "too hot"
+    cluster.wait(TOLD_AGAIN + 1.0)
+    fails_there(cluster, {"lidar": "too cold"})
+    said = "the probe of lidar on a fails: "
+    assert cluster.told("plugin_failed") == [f"{said}unplugged", f"{said}too cold"]
 
 
 #: Of a strategy whose processes ask for periodic checkpoints.

@@ -93,7 +93,7 @@ BROKEN = [
     (a_number, "answered a float; Scores is required"),
     (nothing, "answered None; Scores is required"),
     (exits, "SystemExit: 3"),
-    (words, "ValueError"),
+    (words, "scores that are no numbers: a list; 3 numbers are required, one for each host"),
     (wrong_veto, "vetoes of shape (1,) for 3 hosts"),
     (veto_in_words, "vetoes of type <U2; booleans are required, True: vetoed"),
     (by_name, "'name' of the spec, which its offer does not declare: say ScoringOffer(..., reads="),

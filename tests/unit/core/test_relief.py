@@ -47,6 +47,25 @@ def test_the_largest_relief_leaves_a_host_that_is_over_its_limit() -> None:
     assert cluster.explain("large")["decision"]["kind"] == "migrated"
 
 
+def test_a_stale_reading_says_nothing_of_a_limit() -> None:
+    """It does not change when processes leave, so all of them would. Nor is it under the limit."""
+    cluster = cluster_of(machine("a"))
+    on_a(cluster, large=300, middle=200)
+    cluster.add(machine("b"))
+    cluster.machines["a"].stale.add("memory")
+    cluster.machines["a"].busy["memory"] = 0.5
+    cluster.wait(5.0)
+    assert cluster.told("over_limit") == []
+    assert cluster.counts() == {"a": 2, "b": 0}
+    cluster.machines["a"].stale.clear()
+    cluster.wait(0.5)
+    cluster.machines["a"].stale.add("memory")
+    cluster.wait(5.0)
+    assert cluster.told("over_limit") == ["a reached its limit of memory"]
+    assert cluster.told("under_limit") == []
+    assert cluster.counts() == {"a": 2, "b": 0}
+
+
 def test_a_reading_that_crosses_the_limit_each_second_is_recorded_once() -> None:
     """The end is on record when the host has been under its limits for the hysteresis."""
     cluster = cluster_of(machine("a"))

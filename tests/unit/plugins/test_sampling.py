@@ -5,8 +5,9 @@ import time
 
 import pytest
 
-from rosrm.core.model import RESOURCE_SLOTS, Reading
-from rosrm.slave.sampling import REPORTS, TRUSTED_AFTER, Sampler
+from rosrm.core.model import RESOURCE_SLOTS, Reading, ResourceDescription
+from rosrm.registry import FailedProbe
+from rosrm.slave.sampling import ANOTHER_ERROR, REPORTS, TRUSTED_AFTER, Sampler
 from rosrm.testing import FakeClock, FakeProbe, made_probe
 
 TICK = 0.1
@@ -50,7 +51,8 @@ def rig():
     yield make
     for made, probes in rigs:
         for probe in probes.values():
-            probe.gate.set()
+            if isinstance(probe, FakeProbe):
+                probe.gate.set()
         made.sampler.settle(5.0)
         made.sampler.close()
     end = time.monotonic() + 5.0
@@ -94,8 +96,12 @@ def test_sample_is_not_changed_by_later_ones(rig):
         ({"cpu": float("inf")}, "usage inf of 'cpu'"),
         ({"cpu": -0.1}, "usage -0.1 of 'cpu'"),
         ({"cpu": 1e6}, "usage 1000000.0 of 'cpu'"),
-        ({"cpu": "full"}, "could not convert string to float"),
-        ({"cpu": None}, "TypeError"),
+        ({"cpu": "full"}, "usage 'full' of 'cpu'"),
+        ({"cpu": None}, "usage None of 'cpu'"),
+        (
+            {"cpu": {}},
+            "a fraction of its capacity is required, 1.0 where it is full and at most 64",
+        ),
         ({}, "no reading of cpu"),
         ({"cpu": 0.1, "gpu": 0.1}, "'gpu', which it did not announce"),
     ],
@@ -140,7 +146,7 @@ def test_raising_probe_is_stale_and_recovers(rig, fault):
 @pytest.mark.parametrize(
     ("answer", "reason"),
     [
-        (None, "answered None; Iterable is required"),
+        (None, "answered None; a list of Readings is required"),
         ([0.5], "answered a float; Reading is required"),
     ],
 )
@@ -291,6 +297,46 @@ def test_late_answer_is_kept_but_stale(rig):
     sample = made.tick(3)
     assert (sample.usage[0], sample.stale) == (0.25, 1)
     assert "answered after 1.5 s" in made.reports[0]
+
+
+def test_a_failure_is_reported_at_once_however_often_the_probe_changed(rig):
+    """Recoveries are held back, failures never: one that fails for good is shown as stale."""
+    probe = FakeProbe(cpu=0.25)
+    made = rig(bad=probe)
+    made.tick(2)
+    for cycle in range(20):
+        probe.fault = OSError("flaps") if cycle % 2 else None
+        made.tick(2)
+        probe.fault = OSError("gone for good")
+        assert made.tick(2).stale == 1
+        assert "stale: " in made.reports[-1]
+
+
+def test_another_error_is_reported_after_a_while(rig):
+    """The newest one, so that the listing does not show one that was corrected long ago."""
+    probe = FakeProbe(cpu=0.25)
+    made = rig(bad=probe)
+    made.tick(2)
+    for error in ("unplugged", "no permission"):
+        probe.fault = OSError(error)
+        made.tick(2)
+    assert len(made.reports) == 1
+    made.clock.advance(ANOTHER_ERROR)
+    made.tick(5)
+    assert len(made.reports) == 2
+    assert "no permission" in made.reports[1]
+
+
+def test_a_probe_that_could_not_be_made_is_full_and_stale(rig):
+    """As one that never gave a reading; where others read all of its resources it only fails."""
+    lidar = FailedProbe([ResourceDescription("lidar", "1", 1.0)], "plugin 'acme': no `read`")
+    made = rig(lidar=lidar, none=FailedProbe([], "plugin 'acme': reads 'cpu', as ..."))
+    sample = made.tick(3)
+    assert (sample.usage[0], sample.stale) == (1.0, 1)
+    assert made.reports == [
+        "probe lidar: lidar stale: plugin 'acme': no `read`",
+        "probe none fails: plugin 'acme': reads 'cpu', as ...",
+    ]
 
 
 def test_probe_is_read_once_a_period():

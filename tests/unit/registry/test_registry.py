@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 import threading
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ from rosrm.core.model import Reading, ResourceDescription
 from rosrm.errors import ConfigError, PluginError, SkipPlugin
 from rosrm.hookspecs import hookimpl
 from rosrm.ports import CheckpointOffer, MigrationOffer, ProbeContext, ProbeOffer, ScoringOffer
-from rosrm.registry import Registry
+from rosrm.registry import FailedProbe, Probes, Registry
 
 
 @dataclass(frozen=True)
@@ -61,6 +62,11 @@ def offered(name, create=None, **more):
     return ProbeOffer(name, create or (lambda options, context: Probe(name)), **more)
 
 
+def failed(result: Probes) -> dict[str, str]:
+    """The probes that could not be made, and why."""
+    return {one.name: one.probe.reason for one in result.made if isinstance(one.probe, FailedProbe)}
+
+
 @pytest.fixture
 def context(tmp_path):
     return ProbeContext("machine", {}, tmp_path, SimpleNamespace())
@@ -99,7 +105,10 @@ def test_an_unknown_name_is_refused_with_what_is_there_and_what_is_broken():
 
 
 def test_of_broken_plugins_only_the_one_that_is_meant_is_told():
-    """By the name of its offer, or its own; of the others their number and where they stand."""
+    """By the name of its offer, or its own; of the others their number and where they stand.
+
+    Where none is certainly meant, those are told that broke before they offered a name.
+    """
     nameless = plugin(register_scoring_policies=OSError("no such table"))
     bare = ScoringOffer("s", lambda options: None, options=dict)
     registry = Registry.of(
@@ -114,7 +123,9 @@ def test_of_broken_plugins_only_the_one_that_is_meant_is_told():
         registry.scoring("s")
     with pytest.raises(ConfigError) as refused:
         registry.scoring("weighted")
-    assert "3 plugins are broken: see" in str(refused.value)
+    assert "Broken: plugin 'rosrm_rack': register_scoring_policies (" in str(refused.value)
+    assert "plugin 'other': register_scoring_policies (" in str(refused.value)
+    assert str(refused.value).endswith("1 plugin is broken besides: see `rosrm plugins --local`.")
 
 
 @pytest.mark.parametrize(
@@ -162,19 +173,19 @@ def test_fields_that_a_spec_lacks_cannot_be_declared(reads, said):
     ],
 )
 def test_a_resource_that_no_message_can_carry_is_refused(context, described, said):
-    """Its probe is left out by name, and the others are made."""
+    """Its probe fails with the class and its place, and the others are made."""
     probe = Probe("a")
     probe.resources = [described]
     result = probes(offered("a", lambda options, context: probe)).probes({"a": {}}, context)
-    assert result.made == ()
-    assert said in result.absent["a"]
+    assert result.absent == {}
+    assert f"Probe ({__file__}:{inspect.getsourcelines(Probe)[1]}) {said}" in failed(result)["a"]
 
 
 def test_a_probe_reads_only_what_its_offer_declares(context):
     """So that names of resources in a file can be checked before anything is made."""
     registry = probes(offered("fds", lambda options, context: Probe("files")))
-    absent = registry.probes({"fds": {}}, context).absent
-    assert "which its offer does not declare: say ProbeOffer(..., resources=(" in absent["fds"]
+    reason = failed(registry.probes({"fds": {}}, context))["fds"]
+    assert "which its offer does not declare: say ProbeOffer(..., resources=(" in reason
     assert registry.resources() == ("fds",)
 
 
@@ -198,7 +209,8 @@ def test_a_plugin_that_raises_when_it_is_made_is_named_with_its_definition():
     said = str(refused.value)
     assert said.startswith("scoring policy 's' of plugin 'ours': `create` (")
     assert "test_registry.py:" in said
-    assert said.endswith("raised KeyError: 'weight'")
+    line = create.__code__.co_firstlineno + 1
+    assert said.endswith(f"raised KeyError: 'weight' ({__file__}:{line})")
     assert registry.rows("scoring")[0].state == "broken"
 
 
@@ -273,7 +285,9 @@ def test_a_hook_with_an_argument_that_it_does_not_get_is_reported():
     assert "{'config'} are declared in the hookimpl but can not be found" in broken.reason
 
 
-def test_probes_that_are_absent_or_broken_are_left_out_with_their_reason(context):
+def test_only_a_probe_that_says_so_is_absent_and_any_other_fault_is_an_error(context):
+    """The resources of one that fails are read, always without success: never taken for absent."""
+
     def skip(options, context):
         raise SkipPlugin("no NVIDIA driver")
 
@@ -282,9 +296,14 @@ def test_probes_that_are_absent_or_broken_are_left_out_with_their_reason(context
 
     registry = probes(offered("cpu"), offered("gpu", skip), offered("net", fail))
     result = registry.probes({"cpu": {}, "gpu": {}, "net": {}}, context)
-    assert [made.name for made in result.made] == ["cpu"]
-    assert result.absent["gpu"] == "no NVIDIA driver"
-    assert "raised OSError: no /proc" in result.absent["net"]
+    assert result.absent == {"gpu": "no NVIDIA driver"}
+    cpu, net = result.made
+    assert (cpu.name, isinstance(cpu.probe, FailedProbe)) == ("cpu", False)
+    assert (net.name, [one.name for one in net.resources]) == ("net", ["net"])
+    line = fail.__code__.co_firstlineno + 1
+    said = rf"^plugin 'ours': .* raised OSError: no /proc \({__file__}:{line}\)$"
+    with pytest.raises(PluginError, match=said):
+        net.probe.read()
     states = {row.name: row.state for row in registry.rows("probe", host="h")}
     assert states == {"cpu": "selected", "gpu": "absent", "net": "broken"}
 
@@ -322,6 +341,7 @@ def described(**fields):
         (Probe("b", capacity=0.0), "gives 'b' a capacity of 0.0; a number above 0"),
         (Probe("b", capacity=float("nan")), "gives 'b' a capacity of nan"),
         (Probe(*(f"r{i}" for i in range(16))), "more than 16"),
+        (Probe(), "describes no resource; raise SkipPlugin in `create`"),
         (SimpleNamespace(), "made a SimpleNamespace, which has no `resources`"),
         (described(unit=None), "gives 'b' the unit None; text is required"),
         (described(scope=None), "gives 'b' the scope None; text is required"),
@@ -330,7 +350,8 @@ def described(**fields):
         (SimpleNamespace(resources=["b"], read=None, close=None), "describes a resource by 'b'"),
     ],
 )
-def test_a_probe_whose_resources_cannot_be_taken_is_closed_and_left_out(context, second, said):
+def test_a_probe_whose_resources_cannot_be_taken_is_closed_and_fails(context, second, said):
+    """What stands for it has the resources that it declares and no other probe reads, up to 16."""
     registry = probes(
         offered("first", lambda options, context: Probe("a"), resources=("a",)),
         offered(
@@ -340,27 +361,61 @@ def test_a_probe_whose_resources_cannot_be_taken_is_closed_and_left_out(context,
         ),
     )
     result = registry.probes({"first": {}, "second": {}}, context)
-    assert [made.name for made in result.made] == ["first"]
-    assert said in result.absent["second"]
+    assert [made.name for made in result.made] == ["first", "second"]
+    assert said in failed(result)["second"]
+    names = [resource.name for made in result.made for resource in made.resources]
+    assert names == ["a", "b", *(f"r{i}" for i in range(14))]
     assert getattr(second, "closed", True)
 
 
-def test_executors_come_from_every_migration_offer_and_a_shared_name_is_left_out(caplog):
-    def run(arguments):
-        return {}
+def run(arguments):
+    return {}
 
-    def offer(name, executor):
-        return MigrationOffer(name, lambda options: None, executors={executor: run})
 
-    good = Registry.of(
-        ours=plugin(register_migration_strategies=[offer("a", "x"), offer("b", "y")])
+def moving(name, executors):
+    """A plugin with one migration strategy."""
+    offer = MigrationOffer(name, lambda options: None, executors=executors)
+    return plugin(register_migration_strategies=[offer])
+
+
+def test_executors_come_from_every_migration_offer():
+    """Two offers may share one function."""
+    registry = Registry.of(ours=moving("a", {"x": run, "y": run}), theirs=moving("b", {"x": run}))
+    strategies = {name: one.strategy for name, one in registry.executors().items()}
+    assert strategies == {"x": "b", "y": "a"}
+    assert registry.broken == ()
+
+
+def test_offers_with_executors_of_one_name_are_both_broken_and_name_each_other():
+    """An order names nothing but the executor, so which one runs would be chance."""
+    registry = Registry.of(
+        acme=moving("acme", {"rest": run, "other": run}),
+        announce=moving("announce", {"rest": lambda arguments: {}}),
+        good=moving("good", {"stretch": run}),
     )
-    assert sorted(good.executors()) == ["x", "y"]
-    both = Registry.of(
-        ours=plugin(register_migration_strategies=[offer("a", "x"), offer("b", "x")])
-    )
-    assert both.executors() == {}
-    assert "the executor 'x' is left out: a and b both register it" in caplog.text
+    assert sorted(registry.executors()) == ["stretch"]
+    said = "its executor 'rest' has the name of one of {} of plugin {}: uninstall one, or rename"
+    reasons = registry.broken_strategies()
+    assert sorted(reasons) == ["acme", "announce"]
+    assert said.format("'announce'", "'announce'") in reasons["acme"]
+    assert said.format("'acme'", "'acme'") in reasons["announce"]
+    with pytest.raises(ConfigError, match=r"unknown migration strategy 'acme'.*executor 'rest'"):
+        registry.migrations({"acme": {}})
+    states = {row.name: row.state for row in registry.rows("migration")}
+    assert states == {"acme": "broken", "announce": "broken", "good": "available"}
+
+
+@pytest.mark.parametrize(
+    ("executors", "said"),
+    [
+        (None, "'m': `executors` is None; a mapping is required"),
+        ({"rest": 3}, "'m': executor 'rest' is 3; a name and a function are required"),
+    ],
+)
+def test_executors_that_cannot_be_called_break_their_offer(executors, said):
+    """When plugins are loaded, not at the first move."""
+    (broken,) = Registry.of(ours=moving("m", executors)).broken
+    assert said in broken.reason
 
 
 def test_an_ability_that_is_no_executor_of_the_offer_is_refused():
@@ -391,7 +446,7 @@ def test_an_ability_that_cannot_be_read_is_the_plugins_fault():
 
 
 def test_a_create_that_hangs_is_ended_and_named(monkeypatch, context):
-    """A probe is left out, and what the master cannot do without is an error; nothing hangs."""
+    """A probe fails, and what the master cannot do without is an error; nothing hangs."""
     monkeypatch.setattr("rosrm.registry.CREATE_LIMIT", 0.05)
 
     def hangs(*_):
@@ -407,8 +462,29 @@ def test_a_create_that_hangs_is_ended_and_named(monkeypatch, context):
     said += r"waits for, or leave '{}' out of the configuration"
     with pytest.raises(PluginError, match=said.format("s")):
         registry.scoring("s")
-    absent = registry.probes({"slow": {}}, context).absent["slow"]
-    assert re.search(said.format("slow"), absent)
+    reason = failed(registry.probes({"slow": {}}, context))["slow"]
+    assert re.search(said.format("slow"), reason)
+
+
+def test_a_hook_that_hangs_is_named_while_it_does_and_ended(monkeypatch, caplog):
+    """With the hook, its place, and the line in which it hangs; the others go on."""
+    monkeypatch.setattr("rosrm.loading.LOADING_LIMIT", 0.3)
+    monkeypatch.setattr("rosrm.loading.SLOW_LOADING", 0.1)
+
+    @hookimpl
+    def register_probes():
+        threading.Event().wait()
+
+    slow = SimpleNamespace(register_probes=register_probes)
+    registry = Registry.of(slow=slow, good=plugin(register_probes=[offered("fine")]))
+    assert registry.names("probe") == ("fine",)
+    (broken,) = registry.broken
+    place = f"{__file__}:{register_probes.__code__.co_firstlineno}"
+    said = "failed with TimeoutError: it did not return within 0.3 s; do in `create` what takes "
+    assert broken.reason.startswith(f"register_probes ({place}) {said}")
+    assert broken.reason.endswith(f"({__file__}:{register_probes.__code__.co_firstlineno + 2})")
+    said = "plugin 'slow' is still being loaded after 0.1 s: register_probes ("
+    assert f"{said}{place}) has not returned; it is ended after 0.3 s" in caplog.text
 
 
 def test_options_that_cannot_be_read_are_the_plugins_fault():
@@ -430,4 +506,4 @@ def test_a_plugin_that_raises_when_it_is_looked_at_is_broken():
 
     registry = Registry.of(angry=Angry(), good=plugin(register_probes=[offered("fine")]))
     assert registry.names("probe") == ("fine",)
-    assert registry.broken[0].reason == "does not import: OSError: no"
+    assert registry.broken[0].reason.startswith("does not import: OSError: no (")

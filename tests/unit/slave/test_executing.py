@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
+import threading
 from collections import ChainMap
 from pathlib import Path
 from queue import Queue
@@ -11,21 +13,38 @@ from queue import Queue
 import pytest
 
 from rosrm.core.events import BAD_RESULT
+from rosrm.core.plugin_calls import WORKS_AFTER
 from rosrm.errors import CriuError, Refused
-from rosrm.slave.executing import Here, execute
+from rosrm.registry import OfferedExecutor
+from rosrm.slave.executing import UNABLE, Executors, Here
+from rosrm.testing import FakeClock
 
 HERE = Here("alpha", Path("/state"), {})
 
 
+class Rig:
+    """The executor `wait` of the strategy `acme`, run as the slave's loop runs it."""
+
+    def __init__(self, function) -> None:
+        self.posted, self.said, self.clock = Queue(), [], FakeClock()
+        self.executors = Executors(
+            {"wait": OfferedExecutor("acme", function)}, {},
+            post=self.posted.put, changed=self.said.append, clock=self.clock,
+        )  # fmt: skip
+
+    def run(self, timeout=60.0) -> list[tuple[str, str, str]]:
+        """Run the executor until the loop is called back; returns what it has settled."""
+        outcomes = []
+        self.executors.execute(
+            "wait", {}, timeout, here=HERE, done=lambda *outcome: outcomes.append(outcome)
+        )
+        self.posted.get(timeout=10.0)()
+        return outcomes
+
+
 def outcome(function) -> tuple[str, str, str]:
     """Code, message and result of an executor."""
-    posted, outcomes = Queue(), []
-    execute(
-        {"wait": function}, "wait", {}, here=HERE, post=posted.put,
-        done=lambda *outcome: outcomes.append(outcome),
-    )  # fmt: skip
-    posted.get(timeout=10.0)()
-    return outcomes[0]
+    return Rig(function).run()[0]
 
 
 @pytest.mark.parametrize(
@@ -62,16 +81,81 @@ def test_an_error_of_rosrm_is_the_whole_message() -> None:
     def fails(_arguments) -> None:
         raise CriuError("no CRIU here: install it")
 
-    assert outcome(fails) == ("failed", "no CRIU here: install it", "")
+    assert outcome(fails) == (UNABLE, "no CRIU here: install it", "")
 
 
-def test_an_answer_that_json_cannot_hold_is_a_failure() -> None:
-    """The thread ends with an outcome, not with an exception that no log shows."""
-    code, message, _ = outcome(lambda _: {"x": object()})
-    assert (code, "TypeError" in message) == ("failed", True)
+@pytest.mark.parametrize(
+    ("answer", "said"),
+    [
+        ({"x": object()}, "x: object"),
+        ({"fine": [1, "a", None, 0.5], "pose": {"at": [0.0, {1}]}}, "pose.at[1]: set"),
+        ({(1, 2): 3}, "the key (1, 2): tuple"),
+    ],
+)
+def test_an_answer_that_json_cannot_hold_is_named_by_its_key_and_type(answer, said) -> None:
+    """Asked again the executor would answer so for ever, as where it answers no object."""
+    expected = f"wait answered something that is no JSON: {said}"
+    assert outcome(lambda _: answer) == (BAD_RESULT, expected, "")
+
+
+def raises(_arguments) -> None:
+    raise OSError("no arm")
+
+
+def hangs(_arguments) -> None:
+    threading.Event().wait()
+
+
+@pytest.mark.parametrize(
+    ("function", "said"),
+    [
+        (lambda _: None, r"executor wait answered None; a JSON object is required \(.*:\d+\)"),
+        (lambda _: {"x": {1}}, r"executor wait answered something .* x: set \(.*:\d+\)"),
+        (raises, r"executor wait raised OSError: no arm \(.*:\d+\)"),
+        (exits, r"executor wait raised SystemExit: 3 \(.*:\d+\)"),
+        (hangs, r"executor wait did not return within 0.05 s \(.*:\d+\)"),
+    ],
+)
+def test_an_executor_that_fails_makes_its_strategy_failing(function, said) -> None:
+    """With the executor, the error and the place; said once as long as the error stays."""
+    rig = Rig(function)
+    for _ in range(2):
+        rig.run(0.05 if function is hangs else 60.0)
+    ((strategy, error),) = rig.executors.failing.items()
+    assert strategy == "acme"
+    assert re.fullmatch(said, error)
+    assert __file__ in error
+    assert rig.said == [f"migration strategy acme fails: {error}"]
+
+
+@pytest.mark.parametrize("answer", [ValueError("arm is in use"), CriuError("no CRIU here")])
+def test_a_refusal_by_an_executor_is_an_answer_and_no_failure(answer) -> None:
+    """A `ValueError`, as in `propose`, or an error of rosrm."""
+
+    def refuses(_arguments) -> None:
+        raise answer
+
+    rig = Rig(refuses)
+    ((code, message, _),) = rig.run()
+    assert (code, str(answer) in message) == (UNABLE, True)
+    assert rig.executors.failing == {}
+
+
+def test_a_strategy_works_again_with_a_good_answer_after_a_while() -> None:
+    """Not with the first one: an executor that fails every second time would fill the record."""
+    rig = Rig(lambda arguments: {} if good else None)
+    good = False
+    rig.run()
+    good = True
+    rig.run()
+    assert "acme" in rig.executors.failing
+    rig.clock.advance(WORKS_AFTER)
+    rig.run()
+    assert rig.executors.failing == {}
+    assert rig.said[1:] == ["migration strategy acme works again"]
 
 
 def test_an_unknown_executor_is_refused_with_those_that_there_are() -> None:
     """Before anything runs."""
     with pytest.raises(Refused, match=r"no executor 'wit' on alpha; there are: wait"):
-        execute({"wait": exits}, "wit", {}, here=HERE, post=lambda _: None, done=lambda *_: None)
+        Rig(exits).executors.execute("wit", {}, 1.0, here=HERE, done=lambda *_: None)
