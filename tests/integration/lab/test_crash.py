@@ -265,7 +265,8 @@ def test_down_ends_what_ignores_signals_and_daemons(lab):
         time.sleep(0.02)
     pids = lab.pids("host1")
     assert lab.down()
-    assert process.wait(PATIENCE) == -signal.SIGKILL
+    # The shell may see the end of its sleeper before its own.
+    assert process.wait(PATIENCE) in (-signal.SIGKILL, 128 + signal.SIGKILL)
     assert not [pid for pid in pids if Path(f"/proc/{pid}/status").exists() and _alive(pid)]
 
 

@@ -160,8 +160,9 @@ def test_default_probes_are_lean():
     """The slave's memory is budgeted: what only some hosts need is not imported on all of them."""
     code = (
         "import sys; import rosrm_resources.plugin as plugin\n"
-        "from rosrm.registry import Registry; from rosrm.testing import probe_context\n"
-        "Registry.of(resources=plugin).probes(None, probe_context())\n"
+        "from pathlib import Path; from rosrm.ports import ProbeContext\n"
+        "from rosrm.registry import Registry\n"
+        "Registry.of(resources=plugin).probes(None, ProbeContext('machine', {}, Path('/'), None))\n"
         "print(*sorted({'psutil', 'pydantic'} & set(sys.modules)))"
     )
     done = subprocess.run(
