@@ -9,6 +9,7 @@ from rosrm.core import periodic
 from rosrm.core.assigning import decide_now
 from rosrm.core.hosts import Host, HostCondition
 from rosrm.core.images import reason_of
+from rosrm.core.model import StopPolicy
 from rosrm.core.state import Instance, MasterState, Process, ProcessPhase, Wanted
 from rosrm.core.views import HostRow, ProcessRow, ResourceRow
 
@@ -68,6 +69,8 @@ def process_row(state: MasterState, process: Process, now: float) -> ProcessRow:
         phase, reason = "unknown", f"{silence}; last known: {phase}"
     if owner is not None and process.wanted is Wanted.CANCEL and process.name not in state.runs:
         reason += _awaited(state, owner.host, now)
+    elif owner is not None and process.phase is ProcessPhase.STOPPING:
+        reason = _stopped_by_slave(state, owner, process.spec.stop, reason)
     return ProcessRow(
         name=process.name, kind=process.spec.kind.value, state=phase,
         host=_host_of(process, owner), number=process.owner,
@@ -85,6 +88,14 @@ def _silence(state: MasterState, owner: Instance | None, now: float) -> str:
         return ""
     age = now - float(state.hosts.heard[owner.host.column])
     return f"{owner.host.name} has been silent for {age:.0f} s"
+
+
+def _stopped_by_slave(state: MasterState, owner: Instance, stop: StopPolicy, reason: str) -> str:
+    """Return the reason with the cause and the longest duration where a slave ends its host."""
+    if state.hosts.condition_of(owner.host) is not HostCondition.LEFT:
+        return reason
+    until = f"SIGKILL after {stop.interrupt_grace + stop.terminate_grace:g} s"
+    return "; ".join(filter(None, (f"the slave of {owner.host.name} was stopped", reason, until)))
 
 
 def _awaited(state: MasterState, host: Host, now: float) -> str:

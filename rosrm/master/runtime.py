@@ -27,7 +27,9 @@ from rosrm.core.commands import (
     Withdraw,
 )
 from rosrm.core.declared import Declared
+from rosrm.core.hosts import HostCondition
 from rosrm.core.master import step
+from rosrm.core.processes import Instance
 from rosrm.core.state import MasterState
 from rosrm.core.views import PluginRow
 from rosrm.entry import handle_stop_signals
@@ -50,7 +52,7 @@ from rosrm.recording.reading import TABLES, Header
 from rosrm.ros.client import find_master
 from rosrm.ros.master_endpoint import Identity, MasterEndpoint
 from rosrm.ros.participant import Participant
-from rosrm.spelling import counted
+from rosrm.spelling import counted, listed
 from rosrm.state_directory import only_one
 from rosrm.version import __version__
 
@@ -252,12 +254,9 @@ class MasterRuntime:
             self._write([Record("master_stopped", message=f"master stopped: {self._stopping}")], [])
         except JournalBlocked as fault:
             _log.warning("%s; what was decided last was not written, nor carried out", fault)
-        live = sum(instance.runs for instance in self._state.instances.values())
-        keeps = counted(live, "process keeps", "processes keep")
         _log.info(
-            "master %s ended (%s); %s running; start the master again to manage what runs",
-            self._config.name, self._stopping, keeps,
-        )  # fmt: skip
+            "master %s ended (%s); %s", self._config.name, self._stopping, what_runs(self._state)
+        )
 
     def _stop(self, number: int, _frame: Any) -> None:
         self._stopping = self._stopping or signal.Signals(number).name
@@ -386,6 +385,29 @@ class MasterRuntime:
         self, records: Sequence[Record], intents: Sequence[Intent]
     ) -> Sequence[StoredRecord]:
         return self._journal.write(records, intents, self._now() - self._started)
+
+
+def what_runs(state: MasterState) -> str:
+    """Return how many processes keep running without the master, and what slaves still stop."""
+    stopping: list[Instance] = []
+    running = 0
+    for instance in state.instances.values():
+        if state.hosts.condition_of(instance.host) is HostCondition.LEFT:
+            if instance.state is not None and not instance.state.ended:
+                stopping.append(instance)
+        else:
+            running += instance.runs
+    said = []
+    if stopping:
+        hosts = sorted({instance.host.name for instance in stopping})
+        slaves = f"slave{'s' * (len(hosts) > 1)} of {listed(hosts)}"
+        count = counted(len(stopping), "process is", "processes are")
+        said.append(f"{count} still being stopped by the {slaves}")
+    if running or not stopping:
+        said.append(f"{counted(running, 'process keeps', 'processes keep')} running")
+    if running:
+        said.append("start the master again to manage what runs")
+    return "; ".join(said)
 
 
 def _boot() -> str:

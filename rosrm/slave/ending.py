@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -55,6 +56,7 @@ class Ending:
     supervisor_left: bool = False
     _supervisor_fault: str = field(init=False, default="")
     _is_informed: bool = field(init=False, default=False)
+    _kill_at: float = field(init=False, default=0.0)  # monotonic; 0.0: nothing is stopped
 
     def note_supervisor_left(self, fault: str) -> None:
         """Note that there is no supervisor any more; without a fault it has stopped everything."""
@@ -74,9 +76,8 @@ class Ending:
         failure = self.endpoint.failure
         if failure:
             _log.error("%s", failure)
-        ended = f"slave of {self.config.host} ended ({cause or 'refused'})"
         if self.supervisor_left:
-            return self._end_without_supervisor(ended)
+            return self._fail_without_supervisor()
         begun = self._begun()
         running = _live(begun)
         if running and self.config.on_stop == "keep":
@@ -84,9 +85,9 @@ class Ending:
             self._inform_master(begun)
             keep = counted(len(running), "process keeps", "processes keep")
             self.say(
-                f"{ended}; {keep} running (supervisor pid {self.supervisor.pid}). Start the slave "
-                f"again to manage what runs, or end it by `rosrm slave {STOP_ALL}` with the same "
-                f"--config"
+                f"slave of {self.config.host} ended ({cause or 'refused'}); {keep} running "
+                f"(supervisor pid {self.supervisor.pid}). Start the slave again to manage what "
+                f"runs, or end it by `rosrm slave {STOP_ALL}` with the same --config"
             )
             return 1 if failure else 0
         live = self.state.live()
@@ -95,18 +96,19 @@ class Ending:
             _log.error("%s running; correct the error and start the slave again", count)
             return 1
         if live:
-            self.say(f"stopping {counted(live, 'process', 'processes')} ({cause or 'refused'})")
+            count = counted(live, "process", "processes")
+            self._kill_at = self._next_kill()
+            self.say(f"stopping {count} ({cause or 'refused'}){self._kill_after()}")
         self.starter.close()
         self._inform_master()
         return self._stop_processes(1 if failure else 0, live, cause)
 
-    def _end_without_supervisor(self, ended: str) -> int:
-        if self._supervisor_fault:
-            return self._fail_without_supervisor()
-        if not self.endpoint.failure:
-            self._inform_master()
-        self.say(f"{ended}; no process is left running")
-        return 1 if self.endpoint.failure else 0
+    def say_progress(self) -> None:
+        """Log what is still being stopped and how long that may take: the user signals again."""
+        left = _live(self._begun())
+        if self._kill_at and left:
+            names = listed(str(one.instance) for one in left)
+            self.say(f"still stopping {names}{self._kill_after()}")
 
     def _fail_without_supervisor(self) -> int:
         left = _live(self._begun())
@@ -120,6 +122,7 @@ class Ending:
 
     def _stop_processes(self, code: int, live: int, cause: str) -> int:
         longest = self._longest_stop()
+        self._kill_at = self._next_kill()  # the answer of the master may have taken a while
         self.supervisor.shut_down()
         deadline = time.monotonic() + longest
         self.serve(lambda: not self.supervisor_left and time.monotonic() < deadline)
@@ -150,9 +153,27 @@ class Ending:
         return [one for one in self.state.statuses() if self.starter.has_begun(one.instance)]
 
     def _longest_stop(self) -> float:
-        live = [held for held in self.state.held.values() if not held.status.state.ended]
-        longest = [_LONGEST_STOP if held.spec is None else held.spec.stop.timeout for held in live]
+        longest = [_LONGEST_STOP if stop is None else stop.timeout for stop in self._stops()]
         return max(longest, default=StopPolicy().timeout)
+
+    def _next_kill(self) -> float:
+        """Return when SIGKILL is sent at the latest; infinite: the `stop` of one is not known."""
+        graces = [
+            math.inf if stop is None else stop.interrupt_grace + stop.terminate_grace
+            for stop in self._stops()
+        ]
+        return time.monotonic() + max(graces, default=0.0)
+
+    def _stops(self) -> list[StopPolicy | None]:
+        live = [held for held in self.state.held.values() if not held.status.state.ended]
+        return [None if held.spec is None else held.spec.stop for held in live]
+
+    def _kill_after(self) -> str:
+        """Return the end of a sentence: when SIGKILL follows; "": unknown, or it was sent."""
+        left = self._kill_at - time.monotonic()
+        if not 0.0 < left < math.inf:
+            return ""
+        return f"; what has not ended within {math.ceil(left)} s is killed (SIGKILL)"
 
     def _unfinished(self) -> str:
         """Return what the supervisor has reported last of each process that has not ended."""

@@ -248,7 +248,12 @@ class SlaveRuntime:
                 self._endpoint.ask(now)
 
     def _stop(self, number: int, _frame: Any) -> None:
+        if self._stopping:  # the handler may interrupt a log call: the loop logs instead
+            self._from_threads.append(self._say_progress)
         self._stopping = self._stopping or signal.Signals(number).name
+
+    def _say_progress(self) -> None:
+        self._ending.say_progress()
 
     def _cycle(self, now: float) -> None:
         """What is done at the rate of `resource_info`."""

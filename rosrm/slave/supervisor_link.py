@@ -15,6 +15,7 @@ from rosrm.core.model import InstanceId, InstanceState, InstanceStatus
 from rosrm.errors import SupervisorError
 from rosrm.slave.environment import SHADOW
 from rosrm.slave.memos import from_memo, to_memo
+from rosrm.spelling import counted
 from rosrm.supervisor.client import (
     Amended,
     LaunchOrder,
@@ -159,7 +160,7 @@ class SupervisorLink:
             while True:
                 told = client.receive(None)
                 self._post(partial(self._take_told, told))
-        except SupervisorGone as gone:
+        except (SupervisorGone, SupervisorEnded) as gone:  # ended: by a SIGTERM to it alone
             if self._is_shutting_down or self._is_closed:
                 raise
             self._post(partial(self._say, f"{gone}; connecting to the next one"))
@@ -214,12 +215,17 @@ class SupervisorLink:
 
     def _replace(self, client: SupervisorClient) -> None:
         """Another one is there."""
-        self._client.close()
+        former = self._client
+        former.close()
         self._client = client
         if self._is_closed:
             client.close()
             return
         self.take_over()
+        live = sum(not status.state.ended for status in client.instances) + len(self._unanswered)
+        which = "the same" if client.pid == former.pid else "a new"
+        manages = counted(live, "process", "processes")
+        self._say(f"{which} supervisor (pid {client.pid}) manages {manages}")
         if self._is_shutting_down:  # the former one may not have heard of it
             self.shut_down()
 

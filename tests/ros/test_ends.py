@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from rosrm.config.settings import LivenessSettings
-from rosrm.core.model import RestartPolicy
+from rosrm.core.model import RestartPolicy, StopPolicy
 from tests.ros.clusters import (
     PATIENCE,
     STEADY,
@@ -113,6 +113,32 @@ def test_a_master_that_is_stopped_touches_no_process(make_cluster, number) -> No
     cluster.start_master()
     after = cluster.wait("p", "running")
     assert (after.pid, after.number, after.host) == (before.pid, before.number, before.host)
+
+
+def test_parts_that_are_stopped_at_once_say_what_becomes_of_the_processes(make_cluster) -> None:
+    """No process keeps running, and neither log says so; a second signal tells what is left.
+
+    The slave cannot be ready for the second signal before it has begun to stop.
+    """
+    cluster = make_cluster(host("h0"))
+    deaf = "trap '' INT TERM; while :; do sleep 0.1; done"
+    cluster.submit(service("deaf", "sh", "-c", deaf, stop=StopPolicy(3.0, 3.0)))
+    cluster.wait("deaf", "running")
+    slave = cluster.slaves["h0"]
+
+    slave.process.send_signal(signal.SIGINT)
+    wait_until(lambda: "h0 leaves" in cluster.log_of("master"), "the master knows")
+    assert end(cluster.master, signal.SIGINT) == 0
+    assert end(slave, signal.SIGINT) == 0
+
+    ended = cluster.log_of("master").rpartition("master ")[2]
+    assert "ended (SIGINT); 1 process is still being stopped by the slave of h0" in ended
+    log = cluster.log_of("h0")
+    assert "stopping 1 process (SIGINT); what has not ended within 6 s is killed" in log
+    assert "still stopping deaf#1; what has not ended within " in log
+    assert "slave of h0 ended; 1 process was stopped" in log
+    assert "running" not in log.partition("stopping 1 process")[2]
+    assert wait_until_none(cluster.directory / "hosts") == {}
 
 
 def test_keep_leaves_the_processes_running(make_cluster) -> None:

@@ -90,12 +90,29 @@ def test_a_killed_supervisor_is_replaced_without_the_loop(loop, monkeypatch) -> 
     os.kill(loop.pid, signal.SIGKILL)
     wait_gone(loop.pid)
     loop.wait(lambda: len(loop.replaced()) == 2, "another one has taken over")
-    assert loop.supervisor() != loop.pid
+    next_pid = loop.supervisor()
+    assert next_pid != loop.pid
     assert [status.instance.process for status in loop.replaced()[1].statuses] == ["one"]
+    assert loop.said[-1] == f"a new supervisor (pid {next_pid}) manages 1 process"
     assert by
     assert threading.current_thread() not in by
     loop.link.carry_out(core.Stop(InstanceId("one", 1)))
     loop.wait(lambda: not loop.host.alive(), "the next one takes orders")
+
+
+def test_a_supervisor_that_was_ended_by_another_is_replaced(loop) -> None:
+    """SIGTERM to it alone: the slave reports what it stopped, and the next one takes orders."""
+    loop.link.start([loop.host.order("one", "sleep", "1000")])
+    loop.wait(loop.started, "it runs")
+    os.kill(loop.pid, signal.SIGTERM)
+    loop.wait(lambda: len(loop.replaced()) == 2, "another one has taken over")
+    next_pid = loop.supervisor()
+    assert loop.said[-1] == f"a new supervisor (pid {next_pid}) manages no processes"
+    assert not loop.ended
+    (status,) = loop.replaced()[1].statuses
+    assert status.state is InstanceState.WITHDRAWN
+    loop.link.start([loop.host.order("two", "sleep", "1000")])
+    loop.wait(lambda: InstanceId("two", 1) in loop.started(), "the next one starts processes")
 
 
 def test_orders_to_a_stopped_supervisor_wait_for_it(loop) -> None:

@@ -8,8 +8,16 @@ import numpy as np
 import pytest
 
 from rosrm.core import events as happened
-from rosrm.core import slave
-from rosrm.core.model import RESOURCE_SLOTS, Assignment, InstanceId, ResourceDescription
+from rosrm.core import listing, slave
+from rosrm.core.model import (
+    RESOURCE_SLOTS,
+    Assignment,
+    InstanceId,
+    InstanceState,
+    InstanceStatus,
+    ResourceDescription,
+    StopPolicy,
+)
 from tests.unit.core.cluster import MIB, Cluster, Machine, job, process
 
 
@@ -376,6 +384,24 @@ def test_a_job_that_completes_as_its_host_leaves_has_finished() -> None:
     machine.finish("p", cluster.now)
     cluster.settle()
     assert cluster.phase("p") == "finished"
+
+
+def test_what_a_slave_that_was_stopped_still_ends_says_so_and_how_long() -> None:
+    """A bare "SIGINT" would not tell the user why, nor whether the process ever ends."""
+    cluster = Cluster("a")
+    cluster.submit(process("deaf", stop=StopPolicy(2.0, 3.0)))
+    machine = cluster.machines["a"]
+    cluster.ask(happened.HostLeft, machine.host_id, machine.incarnation, settle=False)
+    (instance,) = machine.programs
+    status = InstanceStatus(instance, InstanceState.STOPPING, pid=7, message="SIGINT")
+    cluster.tell(
+        happened.StatusesReceived(
+            machine.host_id, machine.incarnation, machine.sequence + 1, False, (status,)
+        )
+    )
+    row = listing.process_row(cluster.state, cluster["deaf"], cluster.now)
+    assert row.state == "stopping"
+    assert row.reason == "the slave of a was stopped; SIGINT; SIGKILL after 5 s"
 
 
 def test_a_host_that_left_and_says_no_more_is_lost_with_what_it_held() -> None:

@@ -78,7 +78,8 @@ def test_a_supervisor_that_is_gone_has_stopped_nothing(slave, caplog) -> None:
     slave.when_stopped = lambda: slave.ending.note_supervisor_left("the supervisor is gone")
     assert slave.end() == 1
     assert "p#1 and q#1 may still run: the supervisor is gone" in caplog.text
-    assert slave.said == ["stopping 2 processes (SIGINT)"]
+    (said,) = slave.said
+    assert said.startswith("stopping 2 processes (SIGINT)")
 
 
 def test_a_slave_whose_supervisor_was_gone_before_says_so(slave, caplog) -> None:
@@ -87,3 +88,33 @@ def test_a_slave_whose_supervisor_was_gone_before_says_so(slave, caplog) -> None
     assert slave.end() == 1
     assert "p#1 and q#1 may still run" in caplog.text
     assert not slave.said
+
+
+def test_a_second_signal_is_answered_with_what_is_left_and_until_when(slave) -> None:
+    """The first line has the time as well; before the end has begun there is nothing to log."""
+
+    def stop() -> None:
+        slave.report("p", InstanceState.EXITED)
+        slave.now += 1.5
+        slave.ending.say_progress()
+        slave.now += 1.0
+        slave.ending.say_progress()
+        slave.ending.note_supervisor_left("")
+
+    slave.when_stopped = stop
+    slave.ending.say_progress()
+    assert slave.end() == 0
+    assert slave.said == [
+        "stopping 2 processes (SIGINT); what has not ended within 2 s is killed (SIGKILL)",
+        "still stopping q#1; what has not ended within 1 s is killed (SIGKILL)",
+        "still stopping q#1",
+        "slave of h0 ended; 2 processes were stopped",
+    ]
+
+
+def test_a_time_that_is_not_known_is_not_claimed(slave) -> None:
+    """A re-adopted process: this run of the slave does not know its `stop`."""
+    slave.state.held[InstanceId("q", 1)].spec = None
+    slave.when_stopped = lambda: slave.ending.note_supervisor_left("")
+    assert slave.end() == 0
+    assert slave.said[0] == "stopping 2 processes (SIGINT)"
