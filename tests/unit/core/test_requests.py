@@ -41,8 +41,24 @@ def test_the_name_of_a_live_process_refuses_all() -> None:
     cluster.submit(process("p"))
     reply = cluster.submit(process("q"), process("p"))
     assert (reply.accepted, reply.code) == (False, "name_taken")
-    assert "in use already by a live process: p" in reply.message
+    assert reply.message == (
+        "the name p is in use already; `rosrm cancel` with the name or the file cancels it. "
+        "Nothing was queued"
+    )
     assert list(cluster.state.processes) == ["p"]
+
+
+def test_every_name_that_is_in_use_is_named() -> None:
+    """Those of live processes, and those whose processes are being cancelled, with the reason."""
+    cluster = Cluster("a")
+    cluster.submit(*(process(name) for name in "pqrs"))
+    cluster.detach(cluster.machines["a"])
+    cluster.cancel("p", "q")
+    assert cluster.submit(*(process(name) for name in "pqrst")).message == (
+        "the names p and q are still in use: being cancelled: waits for a, whose slave was "
+        "stopped; the names r and s are in use already; `rosrm cancel` with the name or the file "
+        "cancels them. Nothing was queued"
+    )
 
 
 def test_the_name_of_a_process_that_is_over_can_be_used_again() -> None:
@@ -392,6 +408,9 @@ def test_one_that_every_host_refuses_has_failed() -> None:
     cluster.submit(process("p", required_labels={"x": "y"}), process("q"))
     assert cluster.phase("p") == "failed"
     assert "no host can start it: a: not on a; b: not on b" in cluster["p"].reason
+    decision = cluster.explain("p")["decision"]
+    found = {one["name"]: (one["verdict"], one["reason"]) for one in decision["hosts"]}
+    assert (decision["chosen"], found["a"]) == (None, ("excluded", "not on a"))
     assert cluster.phase("q") == "running"
 
 
