@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from rosrm.core import events as happened
-from rosrm.core import slave
+from rosrm.core import listing, slave
 from rosrm.core.migration import Move, Plan
 from rosrm.core.model import (
     InstanceId,
@@ -13,6 +13,7 @@ from rosrm.core.model import (
     InstanceStatus,
     MigrationPolicy,
     ProcessSpec,
+    RestartPolicy,
 )
 from tests.unit.core.cluster import Cluster, Machine, job, movable, node, process
 
@@ -540,3 +541,29 @@ def test_a_job_that_has_begun_runs() -> None:
     cluster.submit(process("p"), job("q"))
     assert cluster.told("ready") == ["p is ready on a"]
     assert cluster.told("running") == ["q is running on a"]
+
+
+def test_a_process_that_is_not_in_the_graph_yet_says_what_it_waits_for() -> None:
+    """With the node's full name and the longest time; then it has nothing to say."""
+    cluster = Cluster("a")
+    cluster.submit(node("p", namespace="/robot"))
+    waits = "waits for its node /robot/p in the ROS graph, for at most 20 s"
+    row = listing.process_row(cluster.state, cluster["p"], cluster.now)
+    assert (row.state, row.reason, cluster.explain("p")["reason"]) == ("starting", waits, waits)
+    cluster.machines["a"].seen_in_graph("p", cluster.now)
+    cluster.settle()
+    row = listing.process_row(cluster.state, cluster["p"], cluster.now)
+    assert (row.state, row.reason) == ("running", "")
+
+
+def test_an_explanation_says_what_to_do_next() -> None:
+    """Of a failed process its logs and a restart, of one out of reach the start of its slave."""
+    cluster = Cluster("a")
+    cluster.submit(process("p", restart=RestartPolicy("never")), process("q"))
+    cluster.machines["a"].finish("p", cluster.now, code=2)
+    cluster.settle()
+    assert cluster.explain("p")["reason"] == (
+        "exit code 2; `rosrm logs p` shows its output, `rosrm restart p` starts it again"
+    )
+    cluster.detach(cluster.machines["a"])
+    assert cluster.explain("q")["reason"].endswith("; start the slave of a again")
