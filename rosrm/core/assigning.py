@@ -229,6 +229,7 @@ def _set_aside(state: MasterState, process: Process, reason: str, now: float) ->
     state.queue.remove(process.name)
     if refused_everywhere(state.hosts, demand_of(state, process)):
         state.set_phase(process, ProcessPhase.FAILED, now, f"no host can start it: {reason}")
+        state.note_decision(process, decide_now(state, process), "set_aside", now)
         state.record(
             now, "failed", f"{process.name} failed: {process.reason}", process=process.name
         )

@@ -47,7 +47,7 @@ def _take_back(
     process.owner, process.left_behind = left.number, None
     state.set_phase(process, ProcessPhase.STARTING, now)
     state.record(
-        now, "readopted", f"{host.name} reports again: {instance.id} is re-adopted",
+        now, "readopted", f"{host.name} reports again: {instance.id} still runs there",
         process=process.name, host=host.name, facts={"number": left.number},
     )  # fmt: skip
     state.save(process)

@@ -35,7 +35,7 @@ TITLES: Final[Mapping[HandoffPhase, str]] = {
 _REPORTS: Final[Mapping[ReportPhase, str]] = {
     ReportPhase.ATTACHED: "takes part in the handoff",
     ReportPhase.SILENT: "has stopped publishing",
-    ReportPhase.RELEASED: "has nothing more to do",
+    ReportPhase.RELEASED: "has handed everything over",
     ReportPhase.RESUMED: "publishes again",
     ReportPhase.SHADOWING: "receives the state of the source",
     ReportPhase.READY: "has the state of the source and can take over",
@@ -55,12 +55,13 @@ def publish(state: MasterState, run: Run, phase: HandoffPhase) -> None:
     state.emit(
         PublishStateConfig(
             run.process, phase, run.source.number, run.destination.number,
-            _qualified(spec, run.source_node), _qualified(spec, run.destination_node),
+            qualified(spec, run.source_node), qualified(spec, run.destination_node),
         )
     )  # fmt: skip
 
 
-def _qualified(spec: ProcessSpec, node_name: str) -> str:
+def qualified(spec: ProcessSpec, node_name: str) -> str:
+    """Return the name of a node with the namespace of its process: "/robot/camera"."""
     namespace = spec.namespace.strip("/")
     return f"/{namespace}/{node_name}" if namespace else f"/{node_name}"
 
@@ -116,7 +117,9 @@ def _note(state: MasterState, run: Run, event: happened.HandoffReported, now: fl
         return
     heard = run.heard.setdefault(event.instance, Heard())
     if event.phase not in heard.phases:
-        said = f": {event.message}" if event.message else ""
+        # What a destination waits for is over when it receives the state; a time-out names it.
+        is_news = event.message and event.phase is not ReportPhase.SHADOWING
+        said = f": {event.message}" if is_news else ""
         message = f"{run.process}#{event.instance} {_REPORTS[event.phase]}{said}"
         state.record(
             now, "handoff_reported", message,

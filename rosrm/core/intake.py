@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from rosrm.core import events as happened
@@ -16,7 +18,7 @@ from rosrm.core.lost_tail import note_seen
 from rosrm.core.migration import Execute
 from rosrm.core.model import InstanceStatus
 from rosrm.core.readings import take_readings
-from rosrm.core.state import MasterState, Wanted
+from rosrm.core.state import MasterState, ProcessPhase, Wanted
 from rosrm.ports import Intent
 from rosrm.spelling import counted
 
@@ -44,9 +46,8 @@ def host_registered(state: MasterState, event: happened.HostRegistered, now: flo
     host.failing.clear()  # the slave reports what fails in this run
     if is_new:
         save_host(state, host)
-    held = counted(len(event.instances), "process", "processes")
     state.record(
-        now, "host_registered", f"{host.name} registered with {held}",
+        now, "host_registered", f"{host.name} registered with {_live(event.instances)}",
         host=host.name,
         facts={
             "host_id": host.host_id, "labels": dict(description.labels),
@@ -71,6 +72,11 @@ def _stop_again(state: MasterState, stopping: list[int], now: float) -> None:
     for number in stopping:
         if number in state.instances:
             lifecycle.stop_instance(state, state.instances[number], now)
+
+
+def _live(held: Iterable[InstanceStatus]) -> str:
+    """Return how many of the instances that a slave reports have not ended: "2 processes"."""
+    return counted(sum(not one.state.ended for one in held), "process", "processes")
 
 
 def _execute_again(state: MasterState, host: Host) -> None:
@@ -111,7 +117,14 @@ def _registered_again(
 
 
 def _forgive(state: MasterState, host: Host) -> None:
-    """A slave that was started anew may find what it lacked before."""
+    """Forget what was held against a host before its slave was started again.
+
+    It may find what it lacked, and the master stops there what may have run on while it was away.
+    """
+    for name in state.over:
+        process = state.processes[name]
+        if process.phase is ProcessPhase.CANCELLED and process.ended_on == host.name:
+            process.reason = ""
     for process in state.processes.values():
         if host.name in process.excluded and not process.phase.over:
             del process.excluded[host.name]
@@ -167,10 +180,10 @@ def host_left(state: MasterState, event: happened.HostLeft, now: float) -> None:
 def _detach(state: MasterState, host: Host, kept: tuple[InstanceStatus, ...], now: float) -> None:
     """Take in what a slave that was stopped left running; what it does not hold has not begun."""
     state.hosts.set_condition(host, HostCondition.DETACHED)
-    held = counted(sum(not one.state.ended for one in kept), "process", "processes")
     state.record(
-        now, "host_detached", f"{host.name} is detached: its slave was stopped and left {held} "
-        f"running", host=host.name,
+        now, "host_detached",
+        f"{host.name} is detached: its slave was stopped and left {_live(kept)} running",
+        host=host.name,
     )  # fmt: skip
     lifecycle.reconcile(state, host, kept, now, registering=True)
     host_loss.detach(state, host, lease_end(state, host), now)

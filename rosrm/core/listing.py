@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Final
 
-from rosrm.core import periodic
+from rosrm.core import handoffs, periodic
 from rosrm.core.assigning import decide_now
 from rosrm.core.hosts import Host, HostCondition
 from rosrm.core.images import reason_of
-from rosrm.core.model import StopPolicy
+from rosrm.core.model import InstanceState, StopPolicy
 from rosrm.core.state import Instance, MasterState, Process, ProcessPhase, Wanted
 from rosrm.core.views import HostRow, ProcessRow, ResourceRow
 
@@ -23,6 +23,7 @@ _CONDITION: Final = {
 }
 #: Of hosts that report: one that leaves reports until all that it held has ended.
 _HEARD: Final = (HostCondition.UP, HostCondition.LEFT)
+_OUT_OF_REACH: Final = (HostCondition.LOST, HostCondition.DETACHED)
 #: Phases that a slave observes: of a silent host they are not known.
 _OBSERVED: Final = (ProcessPhase.STARTING, ProcessPhase.RUNNING, ProcessPhase.BACKOFF)
 
@@ -64,7 +65,8 @@ def process_row(state: MasterState, process: Process, now: float) -> ProcessRow:
     owner = state.instances.get(process.owner)
     seen = owner.seen if owner else {}
     silence = _silence(state, owner, now)
-    phase, reason = process.phase.value, reason_of(state, process) or _of_standby(process)
+    phase = process.phase.value
+    reason = reason_of(state, process) or _of_standby(process) or _awaited_node(process, owner)
     if silence and process.phase in _OBSERVED:
         phase, reason = "unknown", f"{silence}; last known: {phase}"
     if owner is not None and process.wanted is Wanted.CANCEL and process.name not in state.runs:
@@ -119,6 +121,17 @@ def _of_standby(process: Process) -> str:
     return process.standby_reason if process.phase is ProcessPhase.RUNNING else ""
 
 
+def _awaited_node(process: Process, owner: Instance | None) -> str:
+    """Return which node a process that runs must show to be ready; "" for none."""
+    if owner is None or process.phase is not ProcessPhase.STARTING:
+        return ""
+    spec = process.spec
+    if owner.state is not InstanceState.RUNNING or not spec.ros or spec.readiness.kind == "running":
+        return ""
+    node = handoffs.qualified(spec, owner.node_name or spec.name)
+    return f"waits for its node {node} in the ROS graph, for at most {spec.readiness.timeout:g} s"
+
+
 def explanation(state: MasterState, name: str, now: float) -> Mapping[str, Any] | None:
     """Why a process is where it is, or why it waits; None: there is no such process."""
     process = state.processes.get(name)
@@ -132,7 +145,9 @@ def explanation(state: MasterState, name: str, now: float) -> Mapping[str, Any] 
         decision, age = now_decided, 0.0
     return {
         "process": name, "state": row.state, "host": row.host,
-        "reason": _reason(state, process, row.queue_position),
+        "reason": "; ".join(
+            filter(None, (_reason(state, process, row), _advice(state, process)))
+        ),
         "decision": None if decision is None else {**decision, "elapsed": age},
         "kept": _kept(state, process, now),
         "checkpoint": periodic.of_process(state, process, now),
@@ -156,8 +171,24 @@ def _kept(state: MasterState, process: Process, now: float) -> list[Mapping[str,
     ]  # fmt: skip
 
 
-def _reason(state: MasterState, process: Process, position: int) -> str:
+def _reason(state: MasterState, process: Process, row: ProcessRow) -> str:
+    position = row.queue_position
     if process.phase is not ProcessPhase.QUEUED or position <= 1:
-        return reason_of(state, process)
+        awaited = _awaited_node(process, state.instances.get(process.owner))
+        return reason_of(state, process) or awaited
     ahead = f"{position - 1} before it in the queue, {state.queue.head()} first"
     return ahead if state.settings.backfill else f"{ahead}, and those behind wait with it"
+
+
+def _advice(state: MasterState, process: Process) -> str:
+    """Return the commands that help a process on; "" for none."""
+    owner = state.instances.get(process.owner)
+    if owner is not None and state.hosts.condition_of(owner.host) in _OUT_OF_REACH:
+        return f"start the slave of {owner.host.name} again"
+    logs = f"`rosrm logs {process.name}` shows its output"
+    if process.phase is ProcessPhase.BACKOFF:
+        return logs
+    if process.phase is ProcessPhase.FAILED:
+        again = f"`rosrm restart {process.name}` starts it again"
+        return f"{logs}, {again}" if process.ended_on else again
+    return ""

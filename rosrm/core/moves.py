@@ -44,9 +44,9 @@ from rosrm.core.steps import (
 
 #: What a commit means.
 _COMMITTED: Final = {
-    Aim.MOVE: "the destination owns the name; the move is not undone any more",
-    Aim.CHECKPOINT: "the image owns the name; the checkpoint is not undone any more",
-    Aim.RESTORE: "the restored instance owns the name; the restore is not undone any more",
+    Aim.MOVE: "the process is now the one at the destination: the move cannot be undone any more",
+    Aim.CHECKPOINT: "the process is now in its image: the checkpoint cannot be undone any more",
+    Aim.RESTORE: "the process is now the restored one: the restore cannot be undone any more",
 }
 
 # --- go on ------------------------------------------------------------------------------------
@@ -142,7 +142,7 @@ def _outcome(state: MasterState, run: Run, step: Step, now: float) -> str | None
 
 
 def _next(state: MasterState, run: Run, step: Step, now: float) -> None:
-    what = _COMMITTED[run.aim] if isinstance(step, Commit) else f"{title(step)} is done"
+    what = _COMMITTED[run.aim] if isinstance(step, Commit) else f"{title(step)}: done"
     state.record(
         now, "migration_step", f"{run.process}: {what}", process=run.process,
         facts={"step": title(step), "back": run.undo is not None},

@@ -10,7 +10,7 @@ from rosrm.core.commands import Reply
 from rosrm.core.hosts import Host, HostCondition
 from rosrm.core.liveness import lease_of
 from rosrm.core.requests import count, known_host, known_processes, refuse
-from rosrm.core.state import MasterState, Process, Wanted
+from rosrm.core.state import MasterState, Process, ProcessPhase, Wanted
 from rosrm.ports import Intent
 from rosrm.spelling import counted, listed
 
@@ -35,14 +35,13 @@ def prune_requested(state: MasterState, event: happened.PruneRequested, now: flo
         hosts = [host for host in left if not _why_held(state, host, now)]
     for process in processes:
         state.remove_process(process.name)
-    for host in hosts:
-        _prune_host(state, host, event.by, now)
+    left_running = [_prune_host(state, host, event.by, now) for host in hosts]
     if processes:
         state.record(now, "pruned", f"{count(len(processes))} removed", by=event.by)
     removed = [count(len(processes))] if processes else []
     removed += [counted(len(hosts), "host")] if hosts else []
     message = f"{listed(removed)} removed" if removed else "nothing to remove"
-    state.emit(Reply(event.request, message=message))
+    state.emit(Reply(event.request, message="; ".join([message, *filter(None, left_running)])))
 
 
 def _named(
@@ -89,13 +88,16 @@ def _why_held(state: MasterState, host: Host, now: float) -> str:
             f"again. Stop its slave if it runs; a host can be pruned once it has left or is lost, "
             f"which is after {lease_of(state, host):g} s of silence"
         )
-    for number in sorted(host.instances):
-        instance = state.instances[number]
-        process = state.owned_by(instance)
-        if process is not None and process.wanted is not Wanted.CANCEL:
-            if condition is HostCondition.LEFT:
-                return f"{host.name} is still stopping {process.name}; wait until it has ended"
-            return f"{host.name} may still run {process.name}; cancel it first"
+    held = [state.instances[number] for number in sorted(host.instances)]
+    owned = [one.id.process for one in held if (process := state.owned_by(one)) is not None
+             and process.wanted is not Wanted.CANCEL]  # fmt: skip
+    if owned and condition is HostCondition.LEFT:
+        end = "it has ended" if len(owned) == 1 else "they have ended"
+        return f"{host.name} is still stopping {listed(owned)}; wait until {end}"
+    if owned:
+        them = "it" if len(owned) == 1 else "them"
+        return f"{host.name} may still run {listed(owned)}; cancel {them} first"
+    for instance in held:
         if instance.id.process in state.runs:
             return f"{instance.id.process} is moving from or to {host.name}"
     for name in state.images.of:
@@ -105,10 +107,28 @@ def _why_held(state: MasterState, host: Host, now: float) -> str:
     return ""
 
 
-def _prune_host(state: MasterState, host: Host, by: str, now: float) -> None:
-    """Give up what may still run on a host; if the host returns, that is stopped there."""
+def _prune_host(state: MasterState, host: Host, by: str, now: float) -> str:
+    """Give up what may still run on a host; if the host returns, that is stopped there.
+
+    Returns:
+        which processes may still run there, and what stops them; "" if none may.
+    """
+    ends_all = state.hosts.condition_of(host) is HostCondition.LEFT
+    held = [] if ends_all else [state.instances[number] for number in sorted(host.instances)]
     state.hosts.prune(host)
     for number in sorted(host.instances):
         lifecycle.gone(state, state.instances[number], now, f"{host.name} was pruned")
+    names = list(dict.fromkeys(instance.id.process for instance in held))
+    for process in [state.processes[name] for name in names if name in state.processes]:
+        if process.phase is ProcessPhase.CANCELLED:
+            process.reason = f"it may still run on {host.name}, which was removed"
+            state.save(process)
     state.emit(Intent("host", host.name, None))
     state.record(now, "host_pruned", f"{host.name} was removed", host=host.name, by=by)
+    if not names:
+        return ""
+    them = "it" if len(names) == 1 else "them"
+    return (
+        f"{listed(names)} may still run on {host.name}: `rosrm slave --stop-all` on that host "
+        f"stops {them}"
+    )

@@ -6,6 +6,8 @@ those the one with the largest relief goes. When no host has room nothing moves.
 
 from __future__ import annotations
 
+from collections import defaultdict
+from collections.abc import Iterable
 from typing import Final
 
 from rosrm.core import abilities
@@ -30,6 +32,7 @@ from rosrm.spelling import counted, few, listed
 _TOLD_EVERY = 10.0
 #: Reasons against hosts that one answer names.
 _MOST_SAID: Final = 3
+_ALONE: Final = "there is no other host"
 
 
 def relieve_hosts(state: MasterState, now: float) -> None:
@@ -104,7 +107,7 @@ def _relieve_resource(state: MasterState, host: Host, resource: str, now: float)
         )  # fmt: skip
         if not reason:
             return
-        reasons.append(reason)
+        reasons.append((process.name, reason))
     _tell_nothing_moves(state, host, resource, reasons, now)
 
 
@@ -180,6 +183,8 @@ def _destination(
     if host is None:
         column = ranking.best()
         if column < 0:
+            if _is_alone(state, source):
+                return _ALONE
             return f"no host has room for {process.name}{_and_why(state, process, source)}"
         return state.hosts.hosts[column]
     if host is source:
@@ -188,6 +193,10 @@ def _destination(
         why = verdict_of(ranking, host.column).reason
         return f"{process.name} does not fit on {host.name}: {why or 'no room'}"
     return host
+
+
+def _is_alone(state: MasterState, source: Host) -> bool:
+    return all(host is source for host in state.hosts.listed())
 
 
 def _and_why(state: MasterState, process: Process, source: Host) -> str:
@@ -202,8 +211,10 @@ def _and_why(state: MasterState, process: Process, source: Host) -> str:
 def departures(state: MasterState, host: Host) -> str:
     """Return which processes leave a draining host, and which cannot and why."""
     leaving, staying = _leaving(state, host), _staying(state, host)
+    if not leaving:
+        return f"nothing can leave: {'; '.join(few(staying))}" if staying else "no process is left"
     count = counted(len(leaving), "process leaves", "processes leave")
-    said = f"{count} ({listed(leaving)})" if leaving else "no process is left that can leave"
+    said = f"{count} ({listed(leaving)})"
     return f"{said}; cannot leave: {'; '.join(few(staying))}" if staying else said
 
 
@@ -214,10 +225,26 @@ def _leaving(state: MasterState, host: Host) -> list[str]:
 
 
 def _staying(state: MasterState, host: Host) -> list[str]:
-    """Return the reason of each process that cannot leave a host."""
+    """Return the reasons of the processes that cannot leave a host, an equal one once."""
     held = [state.instances[number] for number in sorted(host.instances)]
-    reasons = [reason for one in held if (reason := _why_it_stays(state, one))]
-    return reasons + _images_on(state, host)
+    reasons = [(one.id.process, reason) for one in held if (reason := _why_it_stays(state, one))]
+    return _grouped(reasons + _images_on(state, host))
+
+
+def _grouped(reasons: Iterable[tuple[str, str]]) -> list[str]:
+    """Return the reasons of processes, equal ones once: "each of a and b is not ready".
+
+    Args:
+        reasons: name of the process, and its reason as a whole sentence.
+    """
+    names = defaultdict[tuple[str, bool], list[str]](list)
+    for name, reason in dict.fromkeys(reasons):
+        predicate = reason.removeprefix(f"{name} ")
+        names[predicate, predicate != reason].append(name)
+    return [
+        f"{alike[0] if len(alike) == 1 else f'each of {listed(alike)}'} {said}" if of_it else said
+        for (said, of_it), alike in names.items()
+    ]
 
 
 def _why_it_stays(state: MasterState, instance: Instance) -> str:
@@ -234,7 +261,9 @@ def _why_it_stays(state: MasterState, instance: Instance) -> str:
     possible = may_ever_take(state.hosts, Demand(process.spec, amounts, estimated, lasting))
     if any(possible[host.column] for host in state.hosts.listed() if host is not source):
         return ""
-    return f"no other host may take {process.name} (`rosrm explain {process.name}` says why)"
+    if _is_alone(state, source):
+        return _ALONE
+    return f"{process.name} may run on no other host (`rosrm explain NAME` says why)"
 
 
 def _note_drained(state: MasterState, host: Host, now: float) -> None:
@@ -260,27 +289,27 @@ def _drain(state: MasterState, host: Host, now: float) -> None:
             continue
         reason = try_move(state, process, f"{host.name} is being drained", now)
         if reason:
-            reasons.append(reason)
+            reasons.append((process.name, reason))
     reasons += _images_on(state, host)
     if reasons:
         _tell_nothing_moves(state, host, "drain", reasons, now)
 
 
-def _images_on(state: MasterState, host: Host) -> list[str]:
+def _images_on(state: MasterState, host: Host) -> list[tuple[str, str]]:
     """An image is restored where it lies: what is checkpointed leaves with nobody."""
     names = sorted(state.images.of)
     of_host = ((name, state.processes[name].image) for name in names)
     return [
-        f"{name} is checkpointed: its image stays on {host.name}"
+        (name, f"{name} is checkpointed: its image stays on {host.name}")
         for name, image in of_host
         if image is not None and image.host == host.name
     ]
 
 
 def _tell_nothing_moves(
-    state: MasterState, host: Host, what: str, reasons: list[str], now: float
+    state: MasterState, host: Host, what: str, reasons: list[tuple[str, str]], now: float
 ) -> None:
-    why = "; ".join(reasons[:8]) or "it holds no process of this cluster"
+    why = "; ".join(_grouped(reasons)[:8]) or "it holds no process of this cluster"
     key = f"nothing_moves {what}"
     soon = now - host.told.get(key, float("-inf")) < _TOLD_EVERY
     if soon or host.blocked.get(what) == why:

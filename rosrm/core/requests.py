@@ -69,21 +69,34 @@ def _taken(state: MasterState, event: happened.SubmissionReceived) -> str:
         spec.name for spec in event.specs
         if spec.name in state.processes and not state.processes[spec.name].phase.over
     ]  # fmt: skip
-    for name in taken:
-        if state.processes[name].wanted is Wanted.CANCEL:
-            reason = state.processes[name].reason
-            return f"the name {name} is still in use: {reason}. Nothing was queued"
     if taken:
-        return (
-            f"in use already by a live process: {listed(taken)}. Cancel it first or choose another "
-            f"name. Nothing was queued"
-        )
+        return f"{'; '.join(_in_use(state, taken))}. Nothing was queued"
     for spec in event.specs:
         if spec.name in state.processes or spec.name in state.orphans:
             left = _still_stopping(state, spec.name)
             if left:
                 return f"{left}. Nothing was queued"
     return ""
+
+
+def _in_use(state: MasterState, taken: list[str]) -> list[str]:
+    """Say that names belong to processes that are not over, and what frees them."""
+    live = [name for name in taken if state.processes[name].wanted is not Wanted.CANCEL]
+    ending: dict[str, list[str]] = {}
+    for name in taken:
+        if name not in live:
+            ending.setdefault(state.processes[name].reason, []).append(name)
+    said = [f"{_names(alike)} still in use: {reason}" for reason, alike in ending.items()]
+    if live:
+        said.append(
+            f"{_names(live)} in use already; `rosrm cancel` with the name or the file cancels "
+            f"{'it' if len(live) == 1 else 'them'}"
+        )
+    return said
+
+
+def _names(names: list[str]) -> str:
+    return f"the name {names[0]} is" if len(names) == 1 else f"the names {listed(names)} are"
 
 
 def _still_stopping(state: MasterState, name: str) -> str:

@@ -41,10 +41,9 @@ _TITLES: Final[Mapping[type[Step], str]] = {
     Commit: "the commit",
     Start: "starting {0.instance} on {0.host}",
     AwaitReady: "waiting until {0.instance} is ready on {0.host}",
-    AwaitReleased: "waiting until {0.instance} has nothing more to do on {0.host}",
+    AwaitReleased: "waiting until {0.instance} on {0.host} has handed everything over",
     Stop: "stopping {0.instance} on {0.host}",
     Execute: "the step {0.executor!r} of the migration strategy on {0.host}",
-    SetRestart: "setting the restart policy of {0.instance} on {0.host} to {0.restart.when!r}",
 }
 #: Of a host that answers nothing, and may never do so again.
 _AWAY: Final = (HostCondition.LOST, HostCondition.LEFT, HostCondition.DETACHED)
@@ -251,4 +250,7 @@ def title(step: Step) -> str:
     """Return a step as the subject of a sentence."""
     if isinstance(step, Configure):
         return handoffs.TITLES[step.phase]
+    if isinstance(step, SetRestart):
+        what = "turning off the restarts" if step.restart.when == "never" else "allowing restarts"
+        return f"{what} of {step.instance} on {step.host}"
     return _TITLES[type(step)].format(step)

@@ -14,7 +14,7 @@ import numpy as np
 
 from rosrm.core.columns import BUSY, CAPACITY, LIMIT, LOAD, USAGE, BoolArray, FloatArray, IntArray
 from rosrm.core.declared import declared_spec
-from rosrm.core.hosts import HostCondition, HostTable
+from rosrm.core.hosts import Host, HostCondition, HostTable
 from rosrm.core.lazy import Lazy
 from rosrm.core.model import EMPTY
 from rosrm.core.placement import CLOSE, TIE, Demand, Labels, NamedPolicy, Names, Ranking, eligible
@@ -247,10 +247,22 @@ def _full_reason(moment: Moment, at: int) -> str:
     if not (over > CLOSE).any():
         return ""
     row = int(np.nanargmax(over))
-    return (
-        f"{moment.resources[row]}: reading {moment.cells[USAGE, row, at]:.1%} + in flight "
-        f"{moment.cells[LOAD, row, at]:.1%} + need {moment.need[row, at]:.1%} > {limit[row]:.1%}"
-    )
+    host, name = moment.table.hosts[moment.columns[at]], moment.resources[row]
+    capacity = float(moment.cells[CAPACITY, row, at])
+    used, reserved, need, most = (
+        amount(float(part) * capacity, _unit_of(host, name))
+        for part in (
+            moment.cells[USAGE, row, at], moment.cells[LOAD, row, at], moment.need[row, at],
+            limit[row],
+        )
+    )  # fmt: skip
+    taken = f"{used} in use" + (f", {reserved} reserved" if moment.cells[LOAD, row, at] else "")
+    return f"{name}: needs {need}; at most {most} ({limit[row]:.0%}) may be used: {taken}"
+
+
+def _unit_of(host: Host, resource: str) -> str:
+    units = (one.unit for one in host.description.resources if one.name == resource)
+    return next(units, "")
 
 
 # --- none may ever ----------------------------------------------------------------------------
@@ -342,7 +354,6 @@ def _never_reason(table: HostTable, demand: Demand, column: int) -> str:
     need = table.fractions_of(table.hosts[column], demand.amounts, demand.estimated)
     row = int(np.argmax(need - table.limit[:, column]))
     name, limit = table.resources[row], float(table.limit[row, column])
-    unit = next(one.unit for one in table.hosts[column].description.resources if one.name == name)
-    capacity = float(table.capacity[row, column])
+    unit, capacity = _unit_of(table.hosts[column], name), float(table.capacity[row, column])
     needed, has, most = (amount(part * capacity, unit) for part in (float(need[row]), 1.0, limit))
     return f"it has {has} of {name}, of which {most} ({limit:.0%}) may be used; needed: {needed}"

@@ -10,11 +10,14 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Final
 
 from rosrm.errors import LaunchError
-from rosrm.spelling import get_close_matches
+from rosrm.spelling import get_close_matches, listed
 
 _PACKAGES = "share/ament_index/resource_index/packages"
+#: As many names are listed where none is similar.
+_FEW: Final = 8
 
 
 def search_path(environment: Mapping[str, str], python: str) -> list[Path]:
@@ -48,7 +51,8 @@ def _find_package(package: str, prefixes: Sequence[Path]) -> Path:
         if (prefix / _PACKAGES / package).is_file():
             return prefix
     where = ", ".join(str(prefix) for prefix in prefixes)
-    near = _near(package, [name for prefix in prefixes for name in _listed(prefix / _PACKAGES)])
+    known = {name for prefix in prefixes for name in _listed(prefix / _PACKAGES)}
+    near = _near(package, sorted(known))
     raise LaunchError(
         f"the ROS package {package!r} was not found{near or '; no package was found at all'}\n"
         f"searched: {where} (AMENT_PREFIX_PATH and the prefix of this Python)"
@@ -68,4 +72,9 @@ def _near(name: str, known: Sequence[str]) -> str:
     if not known:
         return ""
     close = get_close_matches(name, known, n=3, cutoff=0.5)
-    return f"; did you mean {', '.join(close)}?" if close else f"; it has {', '.join(known[:5])}"
+    close = close or [other for other in known if name in other][:3]
+    if close:
+        return f"; did you mean {listed(close, 'or')}?"
+    if len(known) > _FEW:
+        return f"; none of the {len(known)} that are there has a similar name"
+    return f"; there: {listed(known)}"

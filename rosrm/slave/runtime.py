@@ -21,6 +21,7 @@ from rosrm.core.model import (
     RESOURCE_SLOTS,
     HostDescription,
     InstanceId,
+    InstanceState,
     InstanceStatus,
     KeptState,
     RestartPolicy,
@@ -172,9 +173,19 @@ class SlaveRuntime:
         held = self._supervisor.take_over()
         self._work(time.monotonic())
         if held:
-            live = self._state.live()
-            ended = f"; {held - live} had ended" if held > live else ""
-            self.say(f"{counted(live, 'process', 'processes')} re-adopted{ended}")
+            self.say(self._found(held))
+
+    def _found(self, held: int) -> str:
+        """Return what became of the processes that a former run of the slave had started."""
+        live, states = self._state.live(), [one.state for one in self._state.statuses()]
+        waiting = states.count(InstanceState.BACKOFF) + states.count(InstanceState.STARTING)
+        running, ended = live - waiting, held - live
+        said = [f"{counted(running, 'process', 'processes')} still run{'s' * (running == 1)}"]
+        if waiting:
+            said.append(f"{waiting} {'is' if waiting == 1 else 'are'} started again")
+        if ended > 0:
+            said.append(f"{ended} {'has' if ended == 1 else 'have'} ended")
+        return ", ".join(said)
 
     # --- the loop ------------------------------------------------------------------------
 

@@ -165,7 +165,7 @@ def test_keep_leaves_the_processes_running(make_cluster) -> None:
     assert after.pid == before.pid
     row = cluster.ended("short")
     assert (row.state, row.exit_code) == ("failed", 3)
-    assert "1 process re-adopted; 1 had ended" in cluster.log_of("h0")
+    assert "1 process still runs, 1 has ended" in cluster.log_of("h0")
 
 
 def test_a_slave_that_keeps_nothing_leaves(make_cluster) -> None:

@@ -155,7 +155,7 @@ def ending(instance: Instance) -> str:
     if instance.exit_signal:
         return f"killed by {signal_name(instance.exit_signal)}"
     if instance.exit_code == UNKNOWN_EXIT:
-        return "ended while no supervisor ran: its exit code is not known"
+        return "ended while its host or its supervisor was down: its exit code is not known"
     return f"exit code {instance.exit_code}"
 
 

@@ -311,7 +311,7 @@ def test_a_restore_needs_the_room_that_the_process_used() -> None:
     cluster.wait(0.3)
     reply = cluster.restore("p")
     assert not reply.accepted
-    assert "does not fit there now: memory: reading 60.0%" in reply.message
+    assert "does not fit there now: memory: needs 6.4 GB; at most" in reply.message
     shelf.machine.busy["memory"] = 0.1
     cluster.wait(0.3)
     assert cluster.restore("p").accepted

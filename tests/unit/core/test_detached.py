@@ -170,3 +170,14 @@ def test_a_detached_host_is_pruned_once_nothing_is_left_there() -> None:
     cluster.cancel("p")
     assert cluster.ask(happened.PruneRequested, (), ("a",)).accepted
     assert cluster.phase("p") == "cancelled"
+
+
+def test_a_registration_counts_the_processes_that_have_not_ended() -> None:
+    """A slave that is started again also reports what ended while it was stopped."""
+    cluster = Cluster("a")
+    cluster.submit(process("p"), job("q"))
+    machine = cluster.machines["a"]
+    cluster.detach(machine)
+    machine.finish("q", cluster.now)
+    cluster.attach(machine)
+    assert cluster.told("host_registered")[-1] == "a registered with 1 process"

@@ -105,6 +105,14 @@ def test_the_good_course() -> None:
     assert cluster["p"].migrations == 1
 
 
+def test_what_a_destination_waited_for_is_no_part_of_its_report() -> None:
+    """It is over when the report arrives; a wait that lasts too long is named by the time-out."""
+    cluster = two_hosts()
+    assert cluster.migrate("p").accepted
+    cluster.wait(3.0)
+    assert "p#2 receives the state of the source" in cluster.told("handoff_reported")
+
+
 def test_names_on_the_wire_are_fully_qualified() -> None:
     """With the namespace; the destination under its alias."""
     cluster = two_hosts(spec=stateful(namespace="/robot"))

@@ -84,7 +84,7 @@ def test_what_was_seen_of_the_source_is_counted_at_the_destination() -> None:
     reply = cluster.migrate("p")
     assert reply.message == "no host has room for p"
     reply = cluster.migrate("p", "b")
-    assert "p does not fit on b: memory: reading 50.0%" in reply.message
+    assert "p does not fit on b: memory: needs 6.4 GB; at most 13.7 GB" in reply.message
 
 
 def test_a_move_is_refused_with_its_reason() -> None:

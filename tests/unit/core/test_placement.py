@@ -277,7 +277,7 @@ def test_every_placement_explains_itself() -> None:
     assert found["good"] == ("chosen", "0.200 by Eq. 1")
     assert found["fair"] == ("fits", "0.300 by Eq. 1")
     assert found["full"] == (
-        "full", "memory: reading 79.0% + in flight 0.0% + need 6.2% > 80.0%",
+        "full", "memory: needs 1.1 GB; at most 13.7 GB (80%) may be used: 13.6 GB in use",
     )  # fmt: skip
     assert found["closed"] == ("excluded", "it is cordoned")
     assert found["other"] == ("excluded", "it is over its limit of memory")

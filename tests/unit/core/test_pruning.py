@@ -171,12 +171,30 @@ def test_a_lost_host_is_pruned_once_all_that_it_may_run_was_cancelled() -> None:
     refused = prune(cluster, hosts=("a",))
     assert refused.message == "a may still run p; cancel it first. Nothing was removed"
     cluster.cancel("p")
-    assert prune(cluster, hosts=("a",)).accepted
+    assert prune(cluster, hosts=("a",)).message == (
+        "1 host removed; p may still run on a: `rosrm slave --stop-all` on that host stops it"
+    )
     assert (cluster.phase("p"), seen(cluster)[1]) == ("cancelled", [])
+    assert cluster["p"].reason == "it may still run on a, which was removed"
     assert cluster.told("host_pruned") == ["a was removed (by anna@desk)"]
     cluster.machines["a"].connected = True
     cluster.wait(1.0)
     assert seen(cluster)[1] == []
     cluster.register(cluster.machines["a"])
     cluster.wait(1.0)
-    assert (cluster.where("p"), seen(cluster)[1]) == ([], ["a"])
+    assert (cluster.where("p"), seen(cluster)[1], cluster["p"].reason) == ([], ["a"], "")
+
+
+def test_every_process_that_a_host_may_still_run_is_named() -> None:
+    """Both in the refusal and in the answer; a detached host goes on running what was cancelled."""
+    cluster = Cluster("a")
+    cluster.submit(process("p"), process("q"))
+    cluster.detach(cluster.machines["a"])
+    refused = prune(cluster, hosts=("a",))
+    assert refused.message == "a may still run p and q; cancel them first. Nothing was removed"
+    cluster.cancel("p", "q")
+    assert prune(cluster, hosts=("a",)).message == (
+        "1 host removed; p and q may still run on a: `rosrm slave --stop-all` on that host stops "
+        "them"
+    )
+    assert cluster["q"].reason == "it may still run on a, which was removed"

@@ -197,16 +197,17 @@ def test_a_drained_host_is_emptied_of_what_can_move() -> None:
     """What cannot stays, and why is said."""
     cluster = cluster_of(machine("a"))
     on_a(cluster, p=50, q=50)
-    cluster.submit(process("fixed"))
+    cluster.submit(process("fixed"), process("rooted"))
     cluster.add(machine("b"))
-    stays = "cannot leave: fixed has no migration strategy; give it `migration:` in its file"
+    stays = (
+        "leave: each of fixed and rooted has no migration strategy; give it `migration:` in its "
+        "file"
+    )
     said = cluster.set_host("a", "drain").message
-    assert said == f"a is draining: 2 processes leave (p and q); {stays}"
+    assert said == f"a is draining: 2 processes leave (p and q); cannot {stays}"
     cluster.wait(3.0)
-    assert cluster.counts() == {"a": 1, "b": 2}
-    assert cluster.told("host_drained") == [
-        f"a is drained: no process is left that can leave; {stays}"
-    ]
+    assert cluster.counts() == {"a": 2, "b": 2}
+    assert cluster.told("host_drained") == [f"a is drained: nothing can {stays}"]
     assert listing.host_rows(cluster.state, cluster.now)[0].drained
     cluster.submit(process("new"))
     assert cluster.where("new") == ["b"]
@@ -237,7 +238,9 @@ def test_a_process_that_no_other_host_may_take_stays_on_a_draining_host() -> Non
     cluster = cluster_of(Machine("a", labels={"camera": "front"}), machine("b"))
     cluster.submit(movable("p", required_labels={"camera": "front"}))
     said = cluster.set_host("a", "drain").message
-    assert said.endswith("cannot leave: no other host may take p (`rosrm explain p` says why)")
+    assert said.endswith(
+        "nothing can leave: p may run on no other host (`rosrm explain NAME` says why)"
+    )
     cluster.wait(3.0)
     assert len(cluster.told("host_drained")) == 1
     cluster.add(Machine("c", labels={"camera": "front"}))
@@ -250,9 +253,18 @@ def test_a_process_too_large_for_every_other_host_stays_on_a_draining_host() -> 
     cluster = cluster_of(machine("a"), Machine("small", memory=100 * MIB))
     cluster.submit(movable("p", needs={"memory": 400 * MIB}))
     assert cluster.where("p") == ["a"]
-    assert "cannot leave: no other host may take p" in cluster.set_host("a", "drain").message
+    assert "nothing can leave: p may run on no other" in cluster.set_host("a", "drain").message
     cluster.wait(3.0)
     assert len(cluster.told("host_drained")) == 1
+
+
+def test_that_there_is_no_other_host_is_said_once() -> None:
+    """To a command as well as to a drain; it is not the room that is lacking."""
+    cluster = cluster_of(machine("a"))
+    on_a(cluster, p=50, q=50)
+    assert cluster.migrate("p").message == "there is no other host"
+    said = cluster.set_host("a", "drain").message
+    assert said == "a is draining: nothing can leave: there is no other host"
 
 
 def test_with_automatic_off_nothing_moves_by_itself() -> None:

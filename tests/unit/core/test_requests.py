@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from rosrm.core import events as happened
-from rosrm.core import slave
+from rosrm.core import listing, slave
 from rosrm.core.migration import Move, Plan
 from rosrm.core.model import (
     InstanceId,
@@ -13,6 +13,7 @@ from rosrm.core.model import (
     InstanceStatus,
     MigrationPolicy,
     ProcessSpec,
+    RestartPolicy,
 )
 from tests.unit.core.cluster import Cluster, Machine, job, movable, node, process
 
@@ -41,8 +42,24 @@ def test_the_name_of_a_live_process_refuses_all() -> None:
     cluster.submit(process("p"))
     reply = cluster.submit(process("q"), process("p"))
     assert (reply.accepted, reply.code) == (False, "name_taken")
-    assert "in use already by a live process: p" in reply.message
+    assert reply.message == (
+        "the name p is in use already; `rosrm cancel` with the name or the file cancels it. "
+        "Nothing was queued"
+    )
     assert list(cluster.state.processes) == ["p"]
+
+
+def test_every_name_that_is_in_use_is_named() -> None:
+    """Those of live processes, and those whose processes are being cancelled, with the reason."""
+    cluster = Cluster("a")
+    cluster.submit(*(process(name) for name in "pqrs"))
+    cluster.detach(cluster.machines["a"])
+    cluster.cancel("p", "q")
+    assert cluster.submit(*(process(name) for name in "pqrst")).message == (
+        "the names p and q are still in use: being cancelled: waits for a, whose slave was "
+        "stopped; the names r and s are in use already; `rosrm cancel` with the name or the file "
+        "cancels them. Nothing was queued"
+    )
 
 
 def test_the_name_of_a_process_that_is_over_can_be_used_again() -> None:
@@ -392,6 +409,9 @@ def test_one_that_every_host_refuses_has_failed() -> None:
     cluster.submit(process("p", required_labels={"x": "y"}), process("q"))
     assert cluster.phase("p") == "failed"
     assert "no host can start it: a: not on a; b: not on b" in cluster["p"].reason
+    decision = cluster.explain("p")["decision"]
+    found = {one["name"]: (one["verdict"], one["reason"]) for one in decision["hosts"]}
+    assert (decision["chosen"], found["a"]) == (None, ("excluded", "not on a"))
     assert cluster.phase("q") == "running"
 
 
@@ -521,3 +541,29 @@ def test_a_job_that_has_begun_runs() -> None:
     cluster.submit(process("p"), job("q"))
     assert cluster.told("ready") == ["p is ready on a"]
     assert cluster.told("running") == ["q is running on a"]
+
+
+def test_a_process_that_is_not_in_the_graph_yet_says_what_it_waits_for() -> None:
+    """With the node's full name and the longest time; then it has nothing to say."""
+    cluster = Cluster("a")
+    cluster.submit(node("p", namespace="/robot"))
+    waits = "waits for its node /robot/p in the ROS graph, for at most 20 s"
+    row = listing.process_row(cluster.state, cluster["p"], cluster.now)
+    assert (row.state, row.reason, cluster.explain("p")["reason"]) == ("starting", waits, waits)
+    cluster.machines["a"].seen_in_graph("p", cluster.now)
+    cluster.settle()
+    row = listing.process_row(cluster.state, cluster["p"], cluster.now)
+    assert (row.state, row.reason) == ("running", "")
+
+
+def test_an_explanation_says_what_to_do_next() -> None:
+    """Of a failed process its logs and a restart, of one out of reach the start of its slave."""
+    cluster = Cluster("a")
+    cluster.submit(process("p", restart=RestartPolicy("never")), process("q"))
+    cluster.machines["a"].finish("p", cluster.now, code=2)
+    cluster.settle()
+    assert cluster.explain("p")["reason"] == (
+        "exit code 2; `rosrm logs p` shows its output, `rosrm restart p` starts it again"
+    )
+    cluster.detach(cluster.machines["a"])
+    assert cluster.explain("q")["reason"].endswith("; start the slave of a again")

@@ -21,6 +21,7 @@ from rosrm.core.model import (
     StopPolicy,
 )
 from rosrm.errors import LaunchError
+from rosrm.slave.ament_index import find_executable
 from rosrm.slave.environment import Whereabouts, process_environment, without_bootstrapper
 from rosrm.slave.launch import launch_order
 from rosrm.slave.ros_arguments import join_arguments, parameters_text
@@ -197,7 +198,8 @@ def test_packages_lie_in_the_prefix_of_python_too(tmp_path, prefix):
     ("package", "executable", "said"),
     [
         ("demo_node", "talker", ["'demo_node' was not found; did", "did you mean demo_nodes?"]),
-        ("nothing", "talker", ["'nothing' was not found; it has", "it has demo_nodes"]),
+        ("nothing", "talker", ["'nothing' was not found; "]),
+        ("demo", "talker", ["did you mean demo_nodes?"]),
         ("demo_nodes", "talk", ["has no executable 'talk'", "did you mean talker"]),
         ("demo_nodes", "notes", ["notes", "is not executable"]),
     ],
@@ -209,6 +211,17 @@ def test_what_is_missing_is_named(tmp_path, prefix, package, executable, said):
         order(tmp_path, environment, package=package, executable=executable)
     for part in [*said, str(prefix)]:
         assert part in str(caught.value)
+
+
+def test_a_few_packages_are_listed_and_many_counted(prefix):
+    """The first ones by alphabet help nobody; their number says that the path is not empty."""
+    with pytest.raises(LaunchError, match="'quux' was not found; there: demo_nodes"):
+        find_executable("quux", "x", [prefix])
+    index = prefix / "share" / "ament_index" / "resource_index" / "packages"
+    for number in range(9):
+        (index / f"a{number}_msgs").write_text("")
+    with pytest.raises(LaunchError, match="none of the 10 that are there has a similar name"):
+        find_executable("quux", "x", [prefix])
 
 
 # --- parameters -------------------------------------------------------------------------------
