@@ -114,7 +114,9 @@ def _without_this_folder() -> list[str]:
 
 def _with_domain(settings: RosSettings, ctx: typer.Context, domain: int | None) -> RosSettings:
     chosen = ctx.ensure_object(Common).domain if domain is None else domain
-    return settings if chosen is None else replace(settings, domain=chosen)
+    settings = settings if chosen is None else replace(settings, domain=chosen)
+    settings.check_domain()
+    return settings
 
 
 def _recover(state: Path) -> str:
