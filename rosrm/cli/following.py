@@ -12,13 +12,11 @@ import typer
 
 from rosrm.cli import connection
 from rosrm.cli.options import AsJson, Domain, Names
+from rosrm.cli.patience import PERIOD, ask_until_answered
 
 if TYPE_CHECKING:
     from rosrm.core.views import Snapshot
     from rosrm.ros.client import MasterClient
-
-#: Seconds between two looks.
-PERIOD: Final = 0.5
 
 Follow = Annotated[
     bool, typer.Option("--follow", "-f", help="Keep printing what is new until Ctrl-C.")
@@ -83,7 +81,10 @@ def _say_left_out(shown: int, newest: int) -> None:
 
 
 def _later(client: MasterClient, before: Snapshot, process: str, host: str) -> Snapshot:
-    return client.list(events=True, process=process, host=host, after=before.last_sequence)
+    def look() -> Snapshot:
+        return client.list(events=True, process=process, host=host, after=before.last_sequence)
+
+    return ask_until_answered(look)
 
 
 def logs(  # noqa: PLR0917 - an argument for each option

@@ -187,6 +187,24 @@ def test_events_are_shown_oldest_first(rosrm, client):
     assert client.asked == [("list", {"process": "talker", "host": "", "after": 0, "newest": 10})]
 
 
+def test_events_follow_outlives_a_master_that_is_away_for_a_while(rosrm, client, monkeypatch):
+    """And continues with what was recorded after the newest event that was shown."""
+
+    def later(seconds):
+        if client.fails is not None:
+            client.fails, client.events = None, [*EVENTS, event(3)]
+        elif len(client.events) == len(EVENTS):
+            client.fails = NoMaster("the master did not answer")
+        else:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr("time.sleep", later)
+    result = rosrm("events", "-f")
+    assert (result.code, len(result.out.splitlines())) == (130, 3)
+    assert result.err.count("\n") == 2
+    assert "rosrm: the master answers again\n" in result.err
+
+
 def test_events_json_is_one_list(rosrm, client):
     rows = json.loads(rosrm("events", "--json").out)
     assert [row["sequence"] for row in rows] == [1, 2]
