@@ -43,6 +43,7 @@ def master(
     """
     from rosrm.config.cluster import default_cluster, load_cluster
     from rosrm.registry import Registry
+    from rosrm.state_directory import only_one
 
     registry = Registry.discover()
     file = config or ctx.ensure_object(Common).cluster
@@ -50,7 +51,8 @@ def master(
     settings = replace(settings, ros=_with_domain(settings.ros, ctx, domain))
     if recover:
         typer.echo(_recover(settings.state), err=True)
-    typer.echo(_says(settings), err=True)
+    with only_one(settings.state, "master", code="second_master", remedy="another `state:`"):
+        typer.echo(_says(settings), err=True)
     become("rosrm.master.run", settings.to_json())
 
 
@@ -76,6 +78,7 @@ def slave(
     """
     from rosrm.config import HostConfig, load_host
     from rosrm.registry import Registry
+    from rosrm.state_directory import only_one
 
     registry = Registry.discover()
     settings = load_host(config, registry) if config else HostConfig()
@@ -86,11 +89,15 @@ def slave(
                 f"nothing to stop: no slave was started with the state directory {settings.state}"
             )
             return
+        with only_one(settings.state, "slave", code="name_taken", remedy=""):
+            pass  # a running slave stops its processes itself
         become("rosrm.slave.stop_all", settings.to_json())
         return
     if settings.probes is None:
         registry.default_probes()  # raises where there is none
-    typer.echo(_says_of_host(settings), err=True)
+    remedy = "another `host:` and `state:`"
+    with only_one(settings.state, "slave", code="name_taken", remedy=remedy):
+        typer.echo(_says_of_host(settings), err=True)
     become("rosrm.slave.run", settings.to_json())
 
 
