@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from itertools import islice
 from typing import Final
 
 _SIZES: Final = ("B", "kB", "MB", "GB", "TB", "PB")
 _BINARY_SIZES: Final = ("B", "KiB", "MiB", "GiB", "TiB", "PiB")
+#: Most names that a misspelt one is compared with: the master does so between two cycles.
+_MOST_COMPARED: Final = 1000
+#: Commands that list the names of a kind.
+_LISTED_BY: Final = {"process": "rosrm ps --all", "host": "rosrm hosts"}
 _STANDING: Final = {
     "backoff": "is in back-off",
     "failed": "has failed",
@@ -23,6 +28,25 @@ def get_close_matches(
     import difflib  # noqa: PLC0415 - the runtimes, whose memory is budgeted, seldom need it
 
     return difflib.get_close_matches(word, list(possibilities), n=n, cutoff=cutoff)
+
+
+def no_such(kind: str, names: Sequence[str], known: Iterable[str]) -> str:
+    """Return the refusal of names that do not exist: the nearest ones, or those that there are.
+
+    Args:
+        kind: "process" or "host".
+        names: that do not exist.
+        known: names of that kind, the likeliest first.
+    """
+    there = list(islice(known, _MOST_COMPARED))
+    most = 3 if len(names) == 1 else 1
+    near = [repr(one) for name in names[:3] for one in get_close_matches(name, there, most)]
+    if near:
+        hint = f"did you mean {listed(dict.fromkeys(near), 'or')}?"
+    else:
+        hint = f"there are: {', '.join(few(there)) or 'none'}"
+    unknown = listed(map(repr, names))
+    return f"no such {kind}: {unknown}; {hint} (`{_LISTED_BY[kind]}` lists them)"
 
 
 def counted(number: int, singular: str, plural: str = "") -> str:

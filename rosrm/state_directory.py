@@ -19,7 +19,7 @@ def only_one(directory: Path, role: str, *, code: str, remedy: str) -> Iterator[
         directory: made where it is missing.
         role: "master" or "slave".
         code: of the refusal.
-        remedy: what the second one can do, for people.
+        remedy: settings with which a second one can run beside it; "": it cannot.
 
     Raises:
         Refused: another one holds it; the message names its pid.
@@ -40,7 +40,7 @@ def only_one(directory: Path, role: str, *, code: str, remedy: str) -> Iterator[
             lock.seek(0)
             raise Refused(
                 f"a {role} runs already on {directory}: pid {lock.read().strip() or 'unknown'}. "
-                f"Stop it first, or give this one {remedy}",
+                f"Stop it first{remedy and f', or give this one {remedy}'}",
                 code,
             ) from None
         with contextlib.suppress(OSError):  # a full disk: nobody will read who holds it

@@ -90,7 +90,7 @@ def cancel(
 
     limit, chosen = longest(timeout), words or []
     if everything == bool(chosen):
-        raise ConfigError("rosrm cancel: give names of processes or work files, or --all")
+        raise ConfigError("cancel: give names of processes or work files, or --all")
     named = [word for word in chosen if not _is_file(word)]
     filed = [spec.name for word in chosen if _is_file(word) for spec in _load(word)]
     with connection.master(ctx, domain) as client:

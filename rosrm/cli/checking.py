@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
@@ -15,8 +15,8 @@ import typer
 from rosrm.spelling import counted, get_close_matches, listed
 
 if TYPE_CHECKING:
+    from rosrm.config.documents import Node
     from rosrm.config.settings import ClusterConfig, HostConfig
-    from rosrm.core.model import ProcessSpec
     from rosrm.registry import Registry
 
 #: Least likeness of two words that are taken for one misspelt; gpu_memory and memory have less.
@@ -121,7 +121,8 @@ def _checked(file: Path, kind: KindOfFile | None, registry: Registry) -> str:
     from rosrm.config.kinds import kind_of
     from rosrm.core.graph_names import shared_nodes
 
-    match kind.value if kind else kind_of(read(file)):
+    root = read(file)
+    match kind.value if kind else kind_of(root):
         case "cluster":
             cluster = load_cluster(file, registry)
             _make(file, cluster, registry)
@@ -143,8 +144,10 @@ def _checked(file: Path, kind: KindOfFile | None, registry: Registry) -> str:
             held = counted(processes, "process", "processes")
             return f"a simulation: {counted(hosts, 'host')}, {held}"
         case _:
+            for warning in _misspelt_needs(root, registry):  # a wrong file has them too
+                typer.echo(warning, err=True)
             specs = load_work(file, registry)
-            for warning in (*shared_nodes(specs), *_misspelt_needs(specs, registry)):
+            for warning in shared_nodes(specs):
                 typer.echo(f"{file}: warning: {warning}", err=True)
             jobs = sum(spec.kind.value == "job" for spec in specs)
             numbers = ((jobs, "job"), (len(specs) - jobs, "service"))
@@ -152,14 +155,18 @@ def _checked(file: Path, kind: KindOfFile | None, registry: Registry) -> str:
             return f"work: {listed(parts) if parts else 'no processes'}"
 
 
-def _misspelt_needs(specs: Iterable[ProcessSpec], registry: Registry) -> Iterator[str]:
+def _misspelt_needs(root: Node, registry: Registry) -> Iterator[str]:
     """Warn of resources in `needs` that are nearly named as one that a probe installed here reads.
 
     Only a warning: another host may have a probe that this machine lacks.
     """
     read = registry.resources()
-    for spec in specs:
-        for name in spec.needs:
+    listed_there = root.get("processes")
+    entries = listed_there.value if listed_there and isinstance(listed_there.value, tuple) else ()
+    for needs in [one.get("needs") for one in (root.child("defaults"), *entries) if one]:
+        for name, amount in needs.items.items() if needs else ():
             near = get_close_matches(name, read, n=1, cutoff=_NEAR)
             if near and name not in read:
-                yield f"{spec.name}: needs: no probe reads {name!r}; did you mean {near[0]!r}?"
+                place = amount.key_place or amount.place
+                hint = f"no probe reads {name!r}; did you mean {near[0]!r}?"
+                yield f"{place}: warning: needs: {hint}"

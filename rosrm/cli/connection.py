@@ -18,7 +18,7 @@ from rosrm.cli.app import BEGUN
 from rosrm.cli.options import Common
 from rosrm.errors import Refused, RosrmError
 from rosrm.ros.settings import RosSettings
-from rosrm.spelling import get_close_matches, listed
+from rosrm.spelling import no_such
 
 if TYPE_CHECKING:
     from rosrm.core.views import Snapshot
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 SAID_WITHIN: Final = 2.6
 #: However long the imports took, a master on this machine is found in this time.
 LEAST: Final = 1.5
-_LISTED_BY: Final = {"process": "ps --all", "host": "hosts"}
 
 
 def ros_settings(ctx: typer.Context, domain: int | None) -> RosSettings:
@@ -58,7 +57,7 @@ def say_trouble(snapshot: Snapshot) -> None:
 
 
 def check_name(kind: str, name: str, known: Iterable[str]) -> None:
-    """Refuse a name that is not among the known ones, with the nearest; "" is no name.
+    """Refuse a name that is not among the known ones, with those meant; "" is no name.
 
     Args:
         kind: "process" or "host".
@@ -68,9 +67,7 @@ def check_name(kind: str, name: str, known: Iterable[str]) -> None:
     names = list(known)
     if not name or name in names:
         return
-    near = [repr(one) for one in get_close_matches(name, names)]
-    hint = f"did you mean {listed(near, 'or')}?" if near else f"see `rosrm {_LISTED_BY[kind]}`"
-    raise Refused(f"no such {kind}: {name!r}; {hint}", "unknown")
+    raise Refused(no_such(kind, [name], names), "unknown")
 
 
 def connect(settings: RosSettings) -> MasterClient:

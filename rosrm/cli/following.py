@@ -12,22 +12,18 @@ import typer
 
 from rosrm.cli import connection
 from rosrm.cli.options import AsJson, Domain, Names
+from rosrm.cli.patience import PERIOD, ask_until_answered
 
 if TYPE_CHECKING:
     from rosrm.core.views import Snapshot
     from rosrm.ros.client import MasterClient
 
-#: Seconds between two looks.
-PERIOD: Final = 0.5
-
-Follow = Annotated[
-    bool, typer.Option("--follow", "-f", help="Keep printing what is new until Ctrl-C.")
-]
-
 
 def events(  # noqa: PLR0917 - an argument for each option
     ctx: typer.Context,
-    follow: Follow = False,
+    follow: Annotated[
+        bool, typer.Option("--follow", "-f", help="Keep printing what is new until Ctrl-C.")
+    ] = False,
     process: Annotated[
         str, typer.Option("--process", metavar="NAME", help="Show only events of this process.")
     ] = "",
@@ -83,13 +79,21 @@ def _say_left_out(shown: int, newest: int) -> None:
 
 
 def _later(client: MasterClient, before: Snapshot, process: str, host: str) -> Snapshot:
-    return client.list(events=True, process=process, host=host, after=before.last_sequence)
+    def look() -> Snapshot:
+        return client.list(events=True, process=process, host=host, after=before.last_sequence)
+
+    return ask_until_answered(look)
 
 
 def logs(  # noqa: PLR0917 - an argument for each option
     ctx: typer.Context,
     names: Names,
-    follow: Follow = False,
+    follow: Annotated[
+        bool,
+        typer.Option(
+            "--follow", "-f", help="Keep printing what is new until the processes have ended."
+        ),
+    ] = False,
     tail: Annotated[
         int | None,
         typer.Option("--tail", metavar="N", min=1, help="Only the last N lines of each."),
@@ -110,7 +114,7 @@ def logs(  # noqa: PLR0917 - an argument for each option
     """Print what processes wrote, from their hosts.
 
     The output is complete, over restarts and moves; a line tells where the bound on logs dropped
-    something, and how much. With -f it continues until the processes have ended.
+    something, and how much.
     """
     from rosrm.cli.log_following import Wanted, copy_logs, since_of
     from rosrm.cli.log_writing import Stream

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any, Final
 
+from typer import BadParameter
 from typer.core import TyperCommand, TyperGroup
 
 from rosrm.spelling import listed
@@ -31,16 +33,26 @@ _ELSEWHERE: Final = {
 }
 #: Wide enough that no summary of a command is cut.
 _UNCUT: Final = 1000
+#: "WORK......" and "[NAME...]..." say twice that a word may be repeated.
+_DOTS_TWICE: Final = re.compile(r"(\.\.\.\]?)\.\.\.")
 _BRACES: Final = str.maketrans("", "", "{}")
 
 
 class PlainCommand(TyperCommand):
-    """A command whose usage line shows a required argument as `WORK`, not as `{WORK}`."""
+    """A command with plain usage lines (`WORK...`, `[NAME...]`) and plain errors."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse the command line; raise errors without the words of the library that found them."""
+        try:
+            return super().parse_args(ctx, args)
+        except BadParameter as error:
+            error.message = error.message.removeprefix("Value error, ")
+            raise
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
         """Return the parts of the usage line."""
         pieces = super().collect_usage_pieces(ctx)
-        return [piece.translate(_BRACES).replace("......", "...") for piece in pieces]
+        return [_DOTS_TWICE.sub(r"\1", piece.translate(_BRACES)) for piece in pieces]
 
 
 class PlainGroup(TyperGroup):

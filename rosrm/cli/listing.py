@@ -11,6 +11,7 @@ import typer
 
 from rosrm.cli import connection
 from rosrm.cli.options import AsJson, Domain, Name
+from rosrm.errors import Refused
 
 
 def status(ctx: typer.Context, as_json: AsJson = False, domain: Domain = None) -> None:
@@ -115,7 +116,13 @@ def explain(ctx: typer.Context, name: Name, as_json: AsJson = False, domain: Dom
     from rosrm.cli import explaining, json_forms, tables
 
     with connection.master(ctx, domain) as client:
-        story = client.explain(name)
+        try:
+            story = client.explain(name)
+        except Refused as refusal:
+            if refusal.code == "unknown":
+                known = client.list(processes=True).processes
+                connection.check_name("process", name, [row.name for row in known])
+            raise
     if as_json:
         json_forms.show(dict(story))
     else:

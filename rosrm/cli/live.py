@@ -77,7 +77,7 @@ class Picture:
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """Draw the parts below one another."""
         width, snapshot = options.max_width, self.snapshot
-        yield _title(snapshot, self.note)
+        yield from _title(snapshot, self.note, width)
         yield Text()
         yield from _hosts(snapshot.hosts, width)
         yield Text()
@@ -108,16 +108,24 @@ def render(
     return Picture(snapshot, rows, events, note, sort, foot)
 
 
-def _title(snapshot: Snapshot, note: str) -> Text:
+def _title(snapshot: Snapshot, note: str, width: int) -> Iterator[Text]:
+    """Yield the title; where it exceeds the width, a number and its state stay together."""
     counts = Counter(row.state for row in snapshot.processes)
     states = sorted(counts, key=_rank)
-    text = Text(f"{snapshot.master}  {formats.duration(snapshot.uptime)}", "bold")
-    for word in states:
-        text.append("   ")
-        text.append(f"{counts[word]} {formats.words(word)}", tables.STYLES.get(word, ""))
+    parts = [
+        Text(f"{counts[word]} {formats.words(word)}", tables.STYLES.get(word, ""))
+        for word in states
+    ]
     if note:
-        text.append(f"   {note}", "bold yellow")
-    return text
+        parts.append(Text(note, "bold yellow"))
+    line = Text(f"{snapshot.master}  {formats.duration(snapshot.uptime)}", "bold")
+    for part in parts:
+        if line.cell_len + 3 + part.cell_len > width:
+            yield line
+            line = Text("  ").append_text(part)
+        else:
+            line.append("   ").append_text(part)
+    yield line
 
 
 # --- hosts ------------------------------------------------------------------------------------

@@ -27,8 +27,8 @@ LEAST_PERIOD: Final = 0.1
 KEYS: Final = {"s": "state", "c": "cpu", "m": "memory", "n": "name"}
 _QUIT: Final = "q"
 _HINT: Final = "q quits; sort: s state, c CPU, m memory, n name"
-#: Lines beside those of hosts and processes: title, heads, events, hint and gaps.
-_OTHER_LINES: Final = 12
+#: Lines beside those of hosts and processes: title (two), heads, events, hint and gaps.
+_OTHER_LINES: Final = 13
 _LEAST_ROWS: Final = 5
 
 

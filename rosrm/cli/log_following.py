@@ -5,9 +5,10 @@ The numbers of instances ascend over all hosts, so that they order what a proces
 
 from __future__ import annotations
 
+import sys
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from heapq import merge
 from operator import itemgetter
 from typing import TYPE_CHECKING, Final
@@ -15,10 +16,11 @@ from typing import TYPE_CHECKING, Final
 import typer
 
 from rosrm.cli import formats
+from rosrm.cli.connection import check_name
 from rosrm.cli.log_writing import Piece, Stream, show
 from rosrm.config.units import Quantity
 from rosrm.errors import ConfigError, NoMaster, Refused, RosrmError
-from rosrm.spelling import standing, standing_for
+from rosrm.spelling import listed, no_such, standing, standing_for
 
 if TYPE_CHECKING:
     from rosrm.core.views import HostRow, ProcessRow, Snapshot
@@ -29,6 +31,8 @@ _CHUNK: Final = 256 * 1024
 PERIOD: Final = 0.3
 #: States in which nothing more will be written anywhere.
 _OVER: Final = frozenset({"finished", "failed", "cancelled"})
+#: Offset behind all that is written while the log is read.
+_NO_END: Final = sys.maxsize
 #: Newest events by which the hosts of a process are found.
 _EVENTS: Final = 200
 
@@ -129,6 +133,7 @@ class _Copy:
     _number: int = 0
     _offset: int = 0
     _started: bool = False
+    _hosts: Sequence[str] = ()
     _away: dict[str, str] = field(default_factory=dict)
 
     def fail(self, error: RosrmError) -> None:
@@ -139,13 +144,15 @@ class _Copy:
     def begin(self) -> Iterator[None]:
         """Copy what there is, one part at each step; raises `RosrmError`."""
         found = self._find()
-        for host, number, tail in self._chosen(found):
-            part = self._read(host, number, 0, tail=tail, since=self.wanted.since)
-            self._started = self._started or any(pid for _, _, pid in part.marks)
-            self._take(host, part)
+        for host, first, end in self._chosen(found):
+            self._started = self._started or any(pid for _, _, pid in first.marks)
+            self._take(host, _up_to(end, first))
             yield
-            while (part := self._read(host, number, self._offset)).content:
-                self._take(host, part)
+            while self._offset < end:
+                part = self._read(host, first.number, self._offset)
+                if not part.content:
+                    break
+                self._take(host, _up_to(end, part))
                 yield
         if not self.stream.wrote:
             self._explain_nothing(found)
@@ -160,27 +167,39 @@ class _Copy:
 
     # --- one instance ------------------------------------------------------------------------
 
-    def _chosen(self, found: Sequence[tuple[str, int]]) -> list[tuple[str, int, int]]:
-        """Return the instances to be shown, the oldest first, and how many of their last lines."""
+    def _chosen(self, found: Sequence[tuple[str, int]]) -> Iterable[tuple[str, LogPart, int]]:
+        """Yield host and first part of each instance to be shown, the oldest first.
+
+        The offset behind what is to be shown stands beside them.
+        """
         left = self.wanted.tail
         if not left:
-            return [(host, number, 0) for host, number in found]
-        chosen: list[tuple[str, int, int]] = []
+            for host, number in found:
+                yield host, self._read(host, number, 0, since=self.wanted.since), _NO_END
+            return
+        chosen: list[tuple[str, LogPart, int]] = []
         for host, number in reversed(found):
             if left <= 0:
                 break
-            chosen.insert(0, (host, number, left))
-            left -= self._count(host, number, left)
-        return chosen
+            first, end, lines = self._last_lines(host, number, left)
+            chosen.insert(0, (host, first, _NO_END if self.wanted.follow else end))
+            left -= lines
+        yield from chosen
 
-    def _count(self, host: str, number: int, tail: int) -> int:
-        """Return how many of the last lines that are asked for an instance has."""
-        lines, last = 0, b"\n"
-        part = self._read(host, number, 0, tail=tail)
+    def _last_lines(self, host: str, number: int, most: int) -> tuple[LogPart, int, int]:
+        """Return the part in which the last lines begin, the offset behind them, and their count.
+
+        The log may grow between two reads: what is added after the last line is not counted.
+        """
+        first = part = self._read(host, number, 0, tail=most)
+        lines, end, last = 0, first.offset, b"\n"
         while part.content:
-            lines, last = lines + part.content.count(b"\n"), part.content[-1:]
-            part = self._read(host, number, part.next_offset)
-        return lines + (last != b"\n")
+            *ended, rest = part.content.split(b"\n", most - lines)
+            lines, last, end = lines + len(ended), part.content[-1:], part.next_offset
+            if lines == most:
+                return first, end - len(rest), lines
+            part = self._read(host, number, end)
+        return first, end, lines + (last != b"\n")
 
     def _read(
         self, host: str, number: int, offset: int, most: int = 0, *, tail: int = 0,
@@ -210,14 +229,17 @@ class _Copy:
     def _find(self) -> list[tuple[str, int]]:
         """Return host and number of every instance within reach, the oldest first."""
         name, row, hosts, events = self._ask()
+        check_name("host", self.wanted.host, hosts)
         if self.wanted.host:
             names = [self.wanted.host]
         else:
             here = [row.host] if row is not None and row.host else []
             names = list(dict.fromkeys([*here, *(host for host in events if host)]))
         if not names and row is None:
-            raise Refused(f"there is no process {name!r}; `rosrm ps --all` lists them")
+            known = self.client.list(processes=True).processes
+            raise Refused(no_such("process", [name], [row.name for row in known]), "unknown")
         owner = row.host if row is not None and not self.wanted.host else self.wanted.host
+        self._hosts = names
         self._away = {host: away for host in names if (away := _why_away(hosts.get(host), host))}
         if owner in self._away:
             self._refuse(row, owner)
@@ -255,14 +277,18 @@ class _Copy:
 
     def _refuse(self, row: ProcessRow | None, host: str) -> None:
         """Say at once that the newest part is out of reach, with what the master knows."""
-        name = self.stream.name
+        name, why = self.stream.name, f", and {self._away[host]}"
         known = ""
         if row is not None:
-            reason = f": {row.reason}" if row.reason else ""
-            known = f". {name} {standing_for(row.state, formats.duration(row.since))}{reason}"
+            known = f". {name} {standing_for(row.state, formats.duration(row.since))}"
+        if row is not None and row.reason:
+            known += f": {row.reason}"
+            why = "" if row.reason.startswith(f"{host} is ") else why  # the reason says the same
+        others = [f"`--host {other}`" for other in self._hosts if other not in self._away]
+        older = f"; an older part may be read with {listed(others, 'or')}" if others else ""
         raise Refused(
-            f"the log of {name} is on {host}, and {self._away[host]}{known}. `rosrm events "
-            f"--process {name}` shows what happened; `--host HOST` reads an older part elsewhere"
+            f"the log of {name} is on {host}{why}{known}. To read it, start the slave of {host} "
+            f"again (`rosrm slave`){older}. `rosrm events --process {name}` shows what happened"
         )
 
     def _explain_nothing(self, found: Sequence[tuple[str, int]]) -> None:
@@ -295,6 +321,13 @@ class _Copy:
                 raise
             return False
         return True
+
+
+def _up_to(end: int, part: LogPart) -> LogPart:
+    """Return a part without what lies behind an offset."""
+    if part.next_offset <= end:
+        return part
+    return replace(part, content=part.content[: end - part.offset], next_offset=end)
 
 
 def _hosts_of(listed: Snapshot) -> list[str]:

@@ -8,6 +8,8 @@ from typing import Annotated
 
 import typer
 
+from rosrm.ros.settings import HIGHEST_DOMAIN
+
 
 @dataclass(frozen=True)
 class Common:
@@ -23,7 +25,7 @@ Domain = Annotated[
         "--domain",
         metavar="N",
         min=0,
-        max=232,
+        max=HIGHEST_DOMAIN,
         help="The ROS domain, instead of ROS_DOMAIN_ID.",
     ),
 ]

@@ -43,6 +43,7 @@ def master(
     """
     from rosrm.config.cluster import default_cluster, load_cluster
     from rosrm.registry import Registry
+    from rosrm.state_directory import only_one
 
     registry = Registry.discover()
     file = config or ctx.ensure_object(Common).cluster
@@ -50,7 +51,8 @@ def master(
     settings = replace(settings, ros=_with_domain(settings.ros, ctx, domain))
     if recover:
         typer.echo(_recover(settings.state), err=True)
-    typer.echo(_says(settings), err=True)
+    with only_one(settings.state, "master", code="second_master", remedy="another `state:`"):
+        typer.echo(_says(settings), err=True)
     become("rosrm.master.run", settings.to_json())
 
 
@@ -76,6 +78,7 @@ def slave(
     """
     from rosrm.config import HostConfig, load_host
     from rosrm.registry import Registry
+    from rosrm.state_directory import only_one
 
     registry = Registry.discover()
     settings = load_host(config, registry) if config else HostConfig()
@@ -86,11 +89,15 @@ def slave(
                 f"nothing to stop: no slave was started with the state directory {settings.state}"
             )
             return
+        with only_one(settings.state, "slave", code="name_taken", remedy=""):
+            pass  # a running slave stops its processes itself
         become("rosrm.slave.stop_all", settings.to_json())
         return
     if settings.probes is None:
         registry.default_probes()  # raises where there is none
-    typer.echo(_says_of_host(settings), err=True)
+    remedy = "another `host:` and `state:`"
+    with only_one(settings.state, "slave", code="name_taken", remedy=remedy):
+        typer.echo(_says_of_host(settings), err=True)
     become("rosrm.slave.run", settings.to_json())
 
 
@@ -114,7 +121,9 @@ def _without_this_folder() -> list[str]:
 
 def _with_domain(settings: RosSettings, ctx: typer.Context, domain: int | None) -> RosSettings:
     chosen = ctx.ensure_object(Common).domain if domain is None else domain
-    return settings if chosen is None else replace(settings, domain=chosen)
+    settings = settings if chosen is None else replace(settings, domain=chosen)
+    settings.check_domain()
+    return settings
 
 
 def _recover(state: Path) -> str:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 import typer
 
+from rosrm.cli.patience import PERIOD, ask_until_answered
 from rosrm.config.units import Quantity
 from rosrm.core.views import ProcessRow
 from rosrm.errors import ConfigError
@@ -19,8 +20,6 @@ from rosrm.spelling import listed, standing
 if TYPE_CHECKING:
     from rosrm.ros.client import MasterClient
 
-#: Seconds between two looks.
-PERIOD: Final = 0.5
 #: Seconds for which a process is set aside before it counts as waiting for a host that may never
 #: come: just after the start of a cluster its hosts are still registering.
 SETTLED: Final = 5.0
@@ -115,7 +114,8 @@ def wait_for(
     said: dict[str, str] = {}
     verdicts: dict[str, str] = {}
     while True:
-        rows = {row.name: row for row in client.list(processes=True).processes}
+        listed_now = ask_until_answered(lambda: client.list(processes=True), deadline)
+        rows = {row.name: row for row in listed_now.processes}
         ours = [rows[name] for name in names if name in rows]
         verdicts.update((row.name, judge(row)) for row in ours)
         _say_news((row for row in ours if verdicts[row.name] != "done"), said)
@@ -196,7 +196,7 @@ def wait_until_drained(client: MasterClient, host: str, since: int, longest: flo
 def _look_until(longest: float, look: Callable[[], bool | Sequence[str]]) -> bool:
     """Return the outcome that `look` comes to; until then it returns the names still awaited."""
     deadline = time.monotonic() + longest
-    while not isinstance(seen := look(), bool):
+    while not isinstance(seen := ask_until_answered(look, deadline), bool):
         if time.monotonic() >= deadline:
             _say_time_is_up(seen)
             return False

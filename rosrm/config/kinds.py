@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from collections.abc import Set as AbstractSet
 from dataclasses import fields
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Final
 from rosrm.config.documents import Node
 from rosrm.config.settings import ClusterConfig, HostConfig
 from rosrm.errors import ConfigError
+from rosrm.spelling import get_close_matches
 
 #: Keys of each kind of file.
 _KEYS: Final = {
@@ -46,10 +48,18 @@ def kind_of(root: Node) -> str:
     named = _NAMES.get(stem.rsplit(".", 1)[-1])
     if named is not None and (named in best or not best):
         return named
+    if not isinstance(root.value, Mapping):
+        said = "it is no mapping; in a work file the list stands under `processes:`"
+        raise ConfigError(f"{root.place}: {said}")
     if best:
         said = f"its keys fit a {' and a '.join(best)} file alike"
     else:
         said = "it has no key of a cluster, host, work or simulation file"
+        known = [key for keys in _KEYS.values() for key in keys]
+        for key in root.items:
+            if close := get_close_matches(key, known, 1):
+                hint = f"{key!r}: did you mean {close[0]!r}? Say which with --kind"
+                raise ConfigError(f"{root.place}: {said}, and {hint}")
     raise ConfigError(f"{root.place}: {said}; say which with --kind")
 
 

@@ -95,11 +95,18 @@ def load_variants(
         check_keys(change, _OF_A_VARIANT, "a variant", problems)
     problems.raise_any()
     variants = [Variant(title, None, checked_cluster(base, path, registry))]
+    wrong = []
     for change in changes:
-        made = _variant(base, change, path, registry)
+        try:
+            made = _variant(base, change, path, registry)
+        except ConfigError as error:
+            wrong.append(str(error))
+            continue
         if made.name in [one.name for one in variants]:
-            raise ConfigError(f"{change.place}: two variants are called {made.name!r}; name them")
+            wrong.append(f"{change.place}: two variants are called {made.name!r}; name them")
         variants.append(made)
+    if wrong:
+        raise ConfigError("\n".join(wrong))
     return tuple(variants)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from rosrm.config.checking import near, salvaged
 from rosrm.config.documents import Node, Problems, read
@@ -18,6 +18,7 @@ from rosrm.config.process import ProcessInFile, complaints
 from rosrm.config.rules import check_amounts, check_name, settled_on_host
 from rosrm.core.model import ProcessSpec
 from rosrm.registry import Registry
+from rosrm.spelling import get_close_matches
 
 _SECTIONS: Final = ("processes", "defaults")
 #: Of one entry alone: neither makes sense for all.
@@ -49,11 +50,18 @@ def load_work(path: str | Path, registry: Registry | None = None) -> tuple[Proce
 
 
 def _entries(root: Node, problems: Problems) -> Sequence[Node]:
+    if not isinstance(root.value, Mapping):
+        given = "a list" if isinstance(root.value, tuple) else "text"
+        remedy = "put the list under `processes:`" if given == "a list" else "it has `processes:`"
+        problems.add(root.place, f"a work file is a mapping, not {given}; {remedy}")
+        return ()
     for name, node in root.items.items():
         if name not in _SECTIONS:
             place = node.key_place or node.place
             problems.add(place, f"unknown key {name!r}{near(name, _SECTIONS)}")
     processes = root.get("processes")
+    if processes is None and any(get_close_matches(name, ["processes"]) for name in root.items):
+        return ()  # misspelt, as was noted
     if processes is None or not isinstance(processes.value, tuple) or not processes.value:
         place = (processes or root).place
         problems.add(place, "processes: a list of at least one process is required")
@@ -95,22 +103,31 @@ def _process(
 ) -> ProcessSpec | None:
     check_name(node.get("name"), "process", problems)
     check_amounts(node.get("needs"), "needs", problems)
+    options = _options_of_strategy(node, plugins)
     process, wrong = salvaged(ProcessInFile, node, problems)
     if process is None:
         return None
     for complaint in complaints(process, wrong):
         problems.add(node.deepest(complaint.path).place, complaint.text)
     process = _on_host(process, path)
-    strategy = process.migration.strategy
-    if strategy is None:
+    if options is None:
         return process.spec()
-    named = node.deepest(("migration", "strategy"))
-    given = node.get("migration", "options")
-    checked = plugins.choice("migration", strategy, named, given, own=True)
-    # Only what this process says: for the rest the cluster's options hold.
-    said = given.items if given is not None else {}
-    options = {name: value for name, value in checked.items() if name in said}
     return replace(process, migration=replace(process.migration, options=options)).spec()
+
+
+def _options_of_strategy(node: Node, plugins: PluginCheck) -> Mapping[str, Any] | None:
+    """Return the checked options that a process gives; for the rest the cluster's hold.
+
+    The name and the options are checked whatever else is wrong in `migration`. None: the process
+    names no strategy.
+    """
+    strategy, given = node.get("migration", "strategy"), node.get("migration", "options")
+    if strategy is None or not isinstance(strategy.value, str):
+        return None
+    said = given.items if given is not None else {}
+    options = given if said else None
+    checked = plugins.choice("migration", strategy.value, strategy, options, own=True)
+    return {name: value for name, value in checked.items() if name in said}
 
 
 def _on_host(process: ProcessInFile, path: str | Path) -> ProcessInFile:

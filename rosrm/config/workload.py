@@ -34,6 +34,7 @@ from rosrm.core.model import (
     ProcessSpec,
     ResourceDescription,
 )
+from rosrm.errors import ConfigError
 from rosrm.registry import Registry
 from rosrm.simulation.workload import Curve, HostPlan, Model, ProcessPlan, Workload
 
@@ -160,15 +161,25 @@ def load_workload(
     model = validated(ModelInFile, root.get("model") or Node({}, root.place), problems, "model")
     until = _until(root, problems)
     _refuse_endless(nodes, plans, until, problems)
-    problems.raise_any()
+    base = root.get("cluster") or Node({}, root.place)
+    variants: tuple[Variant, ...] = ()
+    wrong = []
+    try:
+        problems.raise_any()
+    except ConfigError as error:
+        wrong.append(str(error))
+    try:
+        variants = load_variants(base, [*variants_of(root), *changes], path, registry)
+    except ConfigError as error:
+        wrong.append(str(error))
+    if wrong:
+        raise ConfigError("\n".join(wrong))
     workload = Workload(
         text_of(root, "name") or Path(path).name, tuple(known),
         tuple(plan for plan in plans if plan is not None),
         Model(**_values(model)), until=until,
     )  # fmt: skip
-    base = root.get("cluster") or Node({}, root.place)
-    changes = [*variants_of(root), *changes]
-    return Comparison(workload, load_variants(base, changes, path, registry))
+    return Comparison(workload, variants)
 
 
 def _values(model: Any) -> dict[str, Any]:

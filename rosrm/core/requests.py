@@ -19,7 +19,7 @@ from rosrm.core.relief import departures, try_move
 from rosrm.core.state import WAITING, MasterState, Process, ProcessPhase, Wanted
 from rosrm.errors import PluginError
 from rosrm.ports import SpecChecking
-from rosrm.spelling import counted, listed
+from rosrm.spelling import counted, listed, no_such
 
 
 def refuse(state: MasterState, request: int, message: str, code: str = "invalid") -> None:
@@ -158,7 +158,7 @@ def known_processes(state: MasterState, request: int, names: Iterable[str]) -> l
     """The processes of these names; a name that nobody has refuses the whole request."""
     unknown = [name for name in names if name not in state.processes]
     if unknown:
-        refuse(state, request, f"no such process: {listed(unknown)}; see `rosrm ps`", "unknown")
+        refuse(state, request, no_such("process", unknown, reversed(state.processes)), "unknown")
         return None
     return [state.processes[name] for name in dict.fromkeys(names)]
 
@@ -347,8 +347,8 @@ def known_host(state: MasterState, request: int, name: str) -> Host | None:
     host = state.hosts.by_name.get(name)
     if host is not None and not host.pruned:
         return host
-    there = listed(sorted(host.name for host in state.hosts.listed()))
-    refuse(state, request, f"no such host: {name!r}; there are: {there}", "unknown")
+    there = sorted(host.name for host in state.hosts.listed())
+    refuse(state, request, no_such("host", [name], there), "unknown")
     return None
 
 

@@ -34,6 +34,8 @@ _AGAIN: Final = 2.0
 _GREET_AGAIN: Final = 0.5
 #: In an answer that does not say which run of the master gave it.
 _UNKNOWN_EPOCH: Final = 0
+#: In messages.
+_MASTER: Final = "the master"
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,7 +242,7 @@ class MasterClient:
         """
         request = srv.Submit.Request(processes=[convert.spec_to_msg(spec) for spec in specs])
         request.envelope = self._envelope()
-        client = self._client(srv.Submit, names.SUBMIT)
+        client = self._client(srv.Submit, names.SUBMIT, _MASTER)
 
         def finish(response: Any) -> None:
             refused = response is None or not response.answer.accepted
@@ -304,7 +306,7 @@ class MasterClient:
             plugins=bool(plugins), failing=plugins == "failing", events=events, process=process,
             host=host, after_sequence=after, max_events=newest,
         )  # fmt: skip
-        answer = self._call(srv.List, self._names(names.LIST), request, "the master")
+        answer = self._call(srv.List, self._names(names.LIST), request, _MASTER)
         return Snapshot(
             master=answer.master, uptime=answer.uptime, last_sequence=answer.last_sequence,
             trouble=answer.trouble,
@@ -317,7 +319,7 @@ class MasterClient:
     def explain(self, name: str) -> Mapping[str, Any]:
         """Why a process is where it is, or why it waits."""
         request = srv.Explain.Request(protocol_version=PROTOCOL_VERSION, process=name)
-        answer = self._call(srv.Explain, self._names(names.EXPLAIN), request, "the master")
+        answer = self._call(srv.Explain, self._names(names.EXPLAIN), request, _MASTER)
         story: Mapping[str, Any] = json.loads(answer.explanation)
         return story
 
@@ -355,7 +357,7 @@ class MasterClient:
         if time.monotonic() - self._heard > 1.0:
             hello = find_master(self._participant, self._control.sender, self._timeout)
             if hello is None:
-                raise NoMaster(f"the master is gone ({self._participant.settings.describe()})")
+                raise self._silent(_MASTER)
             self._master, self._heard = hello, time.monotonic()
         return self._control.envelope(self._master.beat, self._master.epoch)
 
@@ -363,21 +365,36 @@ class MasterClient:
         for greeted_anew in (False, True):
             request.envelope = self._envelope()
             try:
-                return self._call(kind, self._names(name), request, "the master")
+                return self._call(kind, self._names(name), request, _MASTER)
             except Refused as refusal:
                 if greeted_anew or refusal.code != "stale":
                     raise
                 self._heard = -math.inf  # another run of the master than the one that greeted us
         raise AssertionError("the second time it is answered or raised")
 
-    def _client(self, kind: Any, name: str) -> Any:
+    def _silent(self, who: str, trouble: str = "", unknown: str = "") -> NoMaster:
+        """Return the error for a part that does not answer.
+
+        Args:
+            who: the master, or the slave of a host.
+            trouble: why, if that is known.
+            unknown: what became of the request.
+        """
+        settings = self._participant.settings
+        check = _to_check(settings) if who == _MASTER else "Is `rosrm slave` running there?"
+        return NoMaster(
+            f"{who} did not answer within {self._timeout:g} s ({settings.describe()})"
+            f"{trouble}{unknown}{'' if trouble else f'. {check}'}"
+        )
+
+    def _client(self, kind: Any, name: str, who: str) -> Any:
         path = name if name.startswith("/") else self._names(name)
         client = self._clients.get(path)
         if client is None:
             client = self._participant.node.create_client(kind, path, qos_profile=qos.SERVICE)
             self._clients[path] = client
             if not wait_for_service(self._participant, client, time.monotonic() + self._timeout):
-                raise NoMaster(f"{path} does not answer ({self._participant.settings.describe()})")
+                raise self._silent(who)
         return client
 
     def _call(self, kind: Any, path: str, request: Any, who: str) -> Any:
@@ -385,7 +402,7 @@ class MasterClient:
 
         Every request may be repeated: it reads only, or carries an id by which it is known.
         """
-        client = self._client(kind, path)
+        client = self._client(kind, path, who)
         deadline = time.monotonic() + self._timeout
         answers = _ask_until_answered(self._participant, client, request, deadline, _AGAIN)
         response = answers.answer
@@ -393,10 +410,7 @@ class MasterClient:
             # What only reads has no envelope.
             acts = hasattr(request, "envelope")
             unknown = ". It is not known whether it was done" if acts else ""
-            raise NoMaster(
-                f"{who} did not answer {path} within {self._timeout:g} s "
-                f"({self._participant.settings.describe()}){self._trouble(kind)}{unknown}"
-            )
+            raise self._silent(who, self._trouble(kind), unknown)
         if answers.sent > 1 and is_unsure(response.answer, self._master.epoch):
             raise Refused(
                 f"{who} was silent when it was asked first, and has forgotten it since: it is not "
@@ -411,7 +425,7 @@ class MasterClient:
         if kind is srv.List:
             return ""
         request = srv.List.Request(protocol_version=PROTOCOL_VERSION)
-        client, deadline = self._client(srv.List, names.LIST), time.monotonic() + _AGAIN
+        client, deadline = self._client(srv.List, names.LIST, _MASTER), time.monotonic() + _AGAIN
         answers = _ask_until_answered(self._participant, client, request, deadline, _GREET_AGAIN)
         answer = answers.answer
         trouble = answer.trouble if answer is not None else ""

@@ -5,6 +5,12 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Final
+
+from rosrm.errors import ConfigError
+
+#: The ports of a domain above are higher than UDP has.
+HIGHEST_DOMAIN: Final = 232
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +42,20 @@ class RosSettings:
             "FASTDDS_BUILTIN_TRANSPORTS": self.transports,
         }
         return {name: value for name, value in variables.items() if value}
+
+    def check_domain(self) -> None:
+        """Raise `ConfigError` if the ROS_DOMAIN_ID that is in force is none.
+
+        DDS would print a fault of its own, or rclpy would raise a traceback.
+        """
+        word = os.environ.get("ROS_DOMAIN_ID", "")
+        if self.domain is not None or not word:
+            return
+        if not (word.isascii() and word.isdigit() and int(word) <= HIGHEST_DOMAIN):
+            raise ConfigError(
+                f"ROS_DOMAIN_ID={word!r} is not a whole number from 0 to {HIGHEST_DOMAIN}; set "
+                f"the variable to one, or give --domain N"
+            )
 
     def describe(self) -> str:
         """Domain, RMW and discovery in force, for messages."""

@@ -217,7 +217,7 @@ def test_logs(rosrm) -> None:
     written = [datetime.fromisoformat(line.split()[2]).timestamp() for line in lines]
     assert written == sorted(written)
     assert all(0.0 < time.time() - when < PATIENCE * 10 for when in written)
-    assert "no process" in rosrm.run("logs", "nobody", code=1)
+    assert "no such process" in rosrm.run("logs", "nobody", code=1)
 
 
 def test_top(rosrm) -> None:

@@ -336,3 +336,37 @@ def test_every_command_ends_clean_with_its_code(rosrm, client, work, words, erro
     assert result.err == (f"rosrm: {error}\n" if str(error) else "")
     assert "Traceback" not in result.out
     assert client.closed
+
+
+def test_a_wait_outlives_a_master_that_is_away_for_a_while(rosrm, client, work, monkeypatch):
+    """The user reads once that the master does not answer, and once that it answers again."""
+    silences = iter([True, True, True])
+    client.processes = [process("a", "finished", kind="job"), process("b")]
+    real = client.list
+
+    def list_(**what):
+        if next(silences, False):
+            raise NoMaster("the master did not answer within 10 s.")
+        return real(**what)
+
+    client.list = list_
+    monkeypatch.setattr("time.sleep", lambda seconds: None)
+    result = rosrm("submit", work, "--wait")
+    assert (result.code, result.err.splitlines()) == (
+        0,
+        [
+            "rosrm: the master did not answer within 10 s. Asking again until the master answers",
+            "rosrm: the master answers again",
+        ],
+    )
+
+
+def test_a_wait_for_a_silent_master_ends_after_its_time(rosrm, client, work, monkeypatch):
+    def list_(**what):
+        raise NoMaster("the master did not answer")
+
+    client.list = list_
+    monkeypatch.setattr("rosrm.cli.patience.PERIOD", 0.01)
+    result = rosrm("submit", work, "--wait", "--timeout", "50ms")
+    assert result.code == 3
+    assert "rosrm: --timeout has passed: the master did not answer\n" in result.err

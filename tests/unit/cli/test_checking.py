@@ -53,7 +53,11 @@ def test_a_file_that_may_be_either_wants_the_kind(rosrm, file):
     assert "its keys fit a cluster and a host file alike; say which with --kind" in result.err
     assert rosrm("config", "check", "--kind", "cluster", file("ros: {domain: 1}")).code == 0
     result = rosrm("config", "check", file(""))
-    assert "it has no key of a cluster, host, work or simulation file" in result.err
+    assert "it has no key of a cluster, host, work or simulation file; say" in result.err
+    result = rosrm("config", "check", file("proceses: []"))
+    assert "simulation file, and 'proceses': did you mean 'processes'? Say which" in result.err
+    result = rosrm("config", "check", file("- {name: a}"))
+    assert "it is no mapping; in a work file the list stands under `processes:`" in result.err
 
 
 SIMULATION = "hosts: [{name: a, memory: 1GiB, cpu: 1}]\nprocesses: [{name: p, duration: 1s}]"
@@ -152,14 +156,14 @@ def test_plugins_that_cannot_be_made_are_found(rosrm, file, monkeypatch):
     [
         (
             "processes: [{name: a, command: x, needs: {cpus: 1}}]",
-            "a: needs: no probe reads 'cpus'; did you mean 'cpu'?",
+            ":1:43: warning: needs: no probe reads 'cpus'; did you mean 'cpu'?",
         ),
         (
             """
             defaults: {package: p, executable: e}
             processes: [{name: a}, {name: b, arguments: [--ros-args, -r, '__node:=a']}]
             """,
-            "a and b put the node /a into the ROS graph; give each node a name of its own",
+            ": warning: a and b put the node /a into the ROS graph; give each node a name of",
         ),
     ],
 )
@@ -168,7 +172,23 @@ def test_what_may_be_a_mistake_is_a_warning(rosrm, tmp_path, text, warning):
     file.write_text(text, encoding="utf-8")
     result = rosrm("config", "check", file)
     assert result.code == 0
-    assert result.err == f"{file}: warning: {warning}\n"
+    assert result.err.startswith(f"{file}{warning}")
+    assert result.err.count("\n") == 1
+
+
+def test_warnings_are_given_along_with_errors(rosrm, file):
+    """All that is wrong at once."""
+    text = "defaults: {needs: {cpus: 1}}\nprocesses: [{name: a, comand: x}]"
+    result = rosrm("config", "check", file(text))
+    assert result.code == 2
+    assert "f.yaml:1:20: warning: needs: no probe reads 'cpus'; did you mean" in result.err
+    assert "f.yaml:2:23: unknown key 'comand'" in result.err
+
+
+def test_an_unknown_kind_is_refused_with_those_there_are(rosrm, file):
+    result = rosrm("config", "check", "--kind", "robot", file("name: a"))
+    assert result.code == 2
+    assert "Invalid value for '--kind': 'robot' is not one of 'cluster', 'host'," in result.err
 
 
 def test_a_resource_in_needs_is_compared_with_all_that_probes_read(rosrm, file, monkeypatch):
@@ -177,7 +197,7 @@ def test_a_resource_in_needs_is_compared_with_all_that_probes_read(rosrm, file, 
     text = "processes: [{name: a, command: x, needs: {temprature: 1}}]"
     result = rosrm("config", "check", file(text))
     assert result.code == 0
-    assert "a: needs: no probe reads 'temprature'; did you mean 'temperature'?" in result.err
+    assert "needs: no probe reads 'temprature'; did you mean 'temperature'?" in result.err
 
 
 def fails(options, context):

@@ -205,3 +205,15 @@ def test_no_file_takes_the_number_of_a_closed_standard_stream():
     words = ["sh", "-c", 'exec "$0" "$@" <&- >&-', sys.executable, "-c", code]
     done = subprocess.run(words, stderr=subprocess.PIPE, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize(
+    ("command", "usage"),
+    [
+        ("submit", "Usage: rosrm submit [OPTIONS] WORK...\n"),
+        ("cancel", "Usage: rosrm cancel [OPTIONS] [NAME|WORK...]\n"),
+        ("prune", "Usage: rosrm prune [OPTIONS] [NAME...]\n"),
+    ],
+)
+def test_a_usage_line_says_once_that_a_word_may_be_repeated(rosrm, command, usage):
+    assert rosrm(command, "--help").out.startswith(usage)

@@ -10,7 +10,7 @@ import pytest
 
 from rosrm.cli import explaining, tables
 from rosrm.core.views import PluginRow
-from rosrm.errors import NoMaster
+from rosrm.errors import NoMaster, Refused
 
 from .conftest import EVENTS, NAN, PLUGINS, STORY, event, host, process, resource
 
@@ -187,6 +187,24 @@ def test_events_are_shown_oldest_first(rosrm, client):
     assert client.asked == [("list", {"process": "talker", "host": "", "after": 0, "newest": 10})]
 
 
+def test_events_follow_outlives_a_master_that_is_away_for_a_while(rosrm, client, monkeypatch):
+    """And continues with what was recorded after the newest event that was shown."""
+
+    def later(seconds):
+        if client.fails is not None:
+            client.fails, client.events = None, [*EVENTS, event(3)]
+        elif len(client.events) == len(EVENTS):
+            client.fails = NoMaster("the master did not answer")
+        else:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr("time.sleep", later)
+    result = rosrm("events", "-f")
+    assert (result.code, len(result.out.splitlines())) == (130, 3)
+    assert result.err.count("\n") == 2
+    assert "rosrm: the master answers again\n" in result.err
+
+
 def test_events_json_is_one_list(rosrm, client):
     rows = json.loads(rosrm("events", "--json").out)
     assert [row["sequence"] for row in rows] == [1, 2]
@@ -289,14 +307,18 @@ def test_restarts_that_the_reason_counts_are_not_said_twice(rosrm, client):
 def test_a_host_that_is_not_there_is_refused(rosrm, client, command):
     result = rosrm(command, "--host", "alpa")
     assert (result.code, result.out) == (1, "")
-    assert result.err == "rosrm: no such host: 'alpa'; did you mean 'alpha'?\n"
+    assert result.err == (
+        "rosrm: no such host: 'alpa'; did you mean 'alpha'? (`rosrm hosts` lists them)\n"
+    )
 
 
 def test_events_of_a_process_that_is_not_there_are_refused(rosrm, client):
     result = rosrm("events", "--process", "talkr")
     assert (result.code, result.out) == (1, "")
-    assert result.err == "rosrm: no such process: 'talkr'; did you mean 'talker'?\n"
-    assert "see `rosrm ps --all`" in rosrm("events", "--process", "zzz").err
+    assert result.err == (
+        "rosrm: no such process: 'talkr'; did you mean 'talker'? (`rosrm ps --all` lists them)\n"
+    )
+    assert "; there are: talker, next, crashed, done (" in rosrm("events", "--process", "zzz").err
 
 
 def test_events_of_a_process_without_any_are_none(rosrm, client):
@@ -410,3 +432,13 @@ def test_top_refuses_what_it_does_not_know(rosrm, client, option, says):
     result = rosrm("top", *option)
     assert (result.code, says in result.err) == (2, True), result.err
     assert not client.asked
+
+
+def test_explain_of_a_process_that_is_not_there_names_the_nearest(rosrm, client):
+    def explain(name):
+        raise Refused(f"no such process: {name}", "unknown")
+
+    client.explain = explain
+    result = rosrm("explain", "talkr")
+    assert (result.code, result.out) == (1, "")
+    assert "no such process: 'talkr'; did you mean 'talker'?" in result.err

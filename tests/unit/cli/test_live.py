@@ -40,6 +40,15 @@ def test_it_keeps_to_the_width_of_the_terminal(width):
     assert "and 22 more" in text
 
 
+def test_a_title_is_broken_between_states():
+    """At 80 columns a number stands beside its state."""
+    states = ("running", "starting", "set_aside", "queued", "failed", "cancelled", "finished")
+    rows = [process(f"{state}{i}", state) for state in states for i in range(4)]
+    first, second, *_ = drawn(Snapshot("laboratory", 650.0, 1, HOSTS, rows)).splitlines()
+    assert first.endswith("4 failed")
+    assert second == "  4 cancelled   4 finished"
+
+
 LONG = "no host may take it: shelf: it lacks the label camera=front; desk: it lacks it too; " * 3
 
 

@@ -150,6 +150,28 @@ def test_tail_counts_lines_over_rotations_and_instances(rosrm, client, slaves):
     assert (result.code, "--tail" in result.err) == (2, True)
 
 
+@pytest.mark.parametrize("lines", [1, 2, 5])
+def test_tail_counts_no_line_that_is_written_while_the_log_is_read(rosrm, client, slaves, lines):
+    """A process may write more lines between two reads than are asked for."""
+    slaves.write("alpha", 1, b"".join(b"%d\n" % number for number in range(10)))
+    there = client.read_log
+
+    def read(*query, **more):
+        part = there(*query, **more)
+        slaves.write("alpha", 1, b"late\n" * 20)
+        return part
+
+    client.read_log = read
+    out = rosrm("logs", "talker", "--tail", lines).out
+    assert len(out.splitlines()) == lines
+
+
+def test_a_host_to_read_from_has_to_exist(rosrm, client, slaves):
+    result = rosrm("logs", "talker", "--host", "nix")
+    assert result.code == 1
+    assert "rosrm: no such host: 'nix'; there are: alpha, beta (" in result.err
+
+
 def test_since_begins_at_a_time(rosrm, client, slaves):
     """Within an instance, and without the instances before."""
     now = time.time()
@@ -238,7 +260,7 @@ def test_a_process_that_waits_or_is_unknown_is_said(rosrm, client, slaves):
     assert "next is queued: no host has room" in result.err
     result = rosrm("logs", "nobody")
     assert result.code == 1
-    assert "there is no process 'nobody'" in result.err
+    assert "no such process: 'nobody'; there are: talker, " in result.err
 
 
 @pytest.mark.parametrize("state", ["lost", "suspect", "left", "detached"])
@@ -249,10 +271,15 @@ def test_a_host_that_is_away_is_not_asked(rosrm, client, slaves, state):
     result = rosrm("logs", "talker")
     assert result.code == 1
     assert (
-        f"the log of talker is on alpha, and alpha {'has' if state == 'left' else 'is'}"
-        in result.err
+        "the log of talker is on alpha. talker has been unreachable for 12 s: alpha is lost. "
+        "To read it, start the slave of alpha again (`rosrm slave`). `rosrm events" in result.err
     )
-    assert "talker has been unreachable for 12 s: alpha is lost. `rosrm events" in result.err
+    client.processes = [process("talker", "unreachable")]
+    verb = "has" if state == "left" else "is"
+    assert f"the log of talker is on alpha, and alpha {verb}" in rosrm("logs", "talker").err
+    client.hosts.append(host("beta"))
+    client.events = [event(1, host="beta"), event(2)]
+    assert "an older part may be read with `--host beta`." in rosrm("logs", "talker").err
     assert ("read_log", "alpha") not in client.asked
 
 
@@ -270,7 +297,7 @@ def test_one_name_that_fails_does_not_keep_the_others(rosrm, client, slaves):
     result = rosrm("logs", "nobody", "talker")
     assert result.code == 1
     assert result.out.endswith("\ntalker | one\n")
-    assert "there is no process 'nobody'" in result.err
+    assert "no such process: 'nobody'; there are: talker, " in result.err
 
 
 def test_a_host_that_does_not_answer_is_asked_once(rosrm, client, slaves):

@@ -174,3 +174,18 @@ def test_without_ros_a_command_says_how_to_get_it(monkeypatch):
     monkeypatch.setattr(builtins, "__import__", no_ros)
     with pytest.raises(RosrmError, match=r"ROS 2 cannot be imported.*pip install 'rosrm\[ros\]'"):
         connection.connect(RosSettings())
+
+
+@pytest.mark.parametrize("word", ["abc", "300", "-1", "1.5"])
+def test_a_domain_of_the_environment_is_checked_before_ros_is_joined(monkeypatch, rosrm, word):
+    """For all commands, with the same bounds as --domain, which displaces the variable."""
+    monkeypatch.setenv("ROS_DOMAIN_ID", word)
+    for command in ("ps", "master", "slave"):
+        early.join([command], {})
+        result = rosrm(command)
+        assert (result.code, result.out) == (2, "")
+        assert result.err == (
+            f"rosrm: ROS_DOMAIN_ID={word!r} is not a whole number from 0 to 232; set the variable "
+            f"to one, or give --domain N\n"
+        )
+    RosSettings(domain=3).check_domain()

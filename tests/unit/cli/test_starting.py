@@ -15,6 +15,7 @@ from rosrm.installed import installed_plugins
 from rosrm.journal import SqliteJournal
 from rosrm.ports import Intent, MigrationOffer, ProbeOffer, ScoringOffer
 from rosrm.registry import Registry
+from rosrm.state_directory import only_one
 from rosrm.testing import FakeProbe
 
 
@@ -45,8 +46,9 @@ OURS = SimpleNamespace(
 
 
 @pytest.fixture
-def becomes(monkeypatch):
+def becomes(monkeypatch, tmp_path):
     """What this process would have become, instead of becoming it."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     seen = []
     monkeypatch.setattr(Registry, "discover", lambda: Registry.of(ours=OURS))
     monkeypatch.setattr(
@@ -135,3 +137,23 @@ def test_a_damaged_journal_is_recovered_before_the_master_starts(rosrm, becomes,
     assert "the journal was recovered" in result.err
     assert [module for module, _ in becomes] == ["rosrm.master.run"]
     SqliteJournal(path).close()
+
+
+@pytest.mark.parametrize(
+    ("words", "remedy"),
+    [
+        (["master"], "Stop it first, or give this one another `state:`"),
+        (["slave"], "Stop it first, or give this one another `host:` and `state:`"),
+        (["slave", "--stop-all"], "Stop it first"),
+    ],
+)
+def test_beside_a_running_one_nothing_starts(rosrm, becomes, words, remedy):
+    """The refusal is all that is printed."""
+    settings = ClusterConfig() if words == ["master"] else HostConfig()
+    (settings.state / "supervisor").mkdir(parents=True)
+    with only_one(settings.state, words[0], code="", remedy=""):
+        result = rosrm(*words)
+    assert (result.code, becomes) == (1, [])
+    assert result.err == (
+        f"rosrm: a {words[0]} runs already on {settings.state}: pid {os.getpid()}. {remedy}\n"
+    )

@@ -230,6 +230,10 @@ def test_a_wrong_entry_is_refused_with_its_place(refusal, entry, said):
         ("command: x, health: {topic: /scan}, prioritty: 1", "health.topic and health.rate"),
         ("command: x, isolation: {after: 1s}, priority: high", "isolation.after goes with"),
         ("command: x, migration: relunch, prioritty: 1", "unknown migration strategy 'relunch'"),
+        (
+            "command: x, migration: {strategy: relunch, overlapp: true}, prioritty: 1",
+            "unknown migration strategy 'relunch'",
+        ),
     ],
 )
 def test_what_several_keys_break_is_said_along_with_a_wrong_key(refusal, entry, said):
@@ -338,6 +342,8 @@ def test_quoted_words_and_lists_are_passed_as_they_are(file, given, words):
         ("", "f.yaml:1:1: processes: a list of at least one process is required"),
         ("processes: []", "f.yaml:1:12: processes: a list of at least one"),
         ("processes: [a]", "f.yaml:1:13: processes: each of the list is a mapping"),
+        ("- {name: a}", "f.yaml:1:1: a work file is a mapping, not a list; put the list under `pr"),
+        ("exec python3 robot", "f.yaml:1:1: a work file is a mapping, not text; it has `proces"),
         ("proceses: []", "f.yaml:1:1: unknown key 'proceses'; did you mean 'processes'?"),
         ("defaults: {name: x}\nprocesses: []", "f.yaml:1:12: defaults: name belongs to one"),
         ("defaults: 5\nprocesses: []", "f.yaml:1:11: defaults: a mapping is required"),
@@ -345,6 +351,13 @@ def test_quoted_words_and_lists_are_passed_as_they_are(file, given, words):
 )
 def test_a_wrong_file_is_refused_with_its_place(refusal, text, said):
     assert said in refusal(load_work, text)
+
+
+def test_a_misspelt_section_is_one_error(refusal):
+    said = refusal(load_work, "proceses: [{name: a, command: x}]")
+    assert said == (
+        "f.yaml:1:1: unknown key 'proceses'; did you mean 'processes'? Allowed: processes, defaults"
+    )
 
 
 def test_a_fault_in_defaults_is_said_once_at_its_place(refusal):

@@ -203,7 +203,7 @@ def test_what_cannot_be_checkpointed_is_refused_with_its_reason() -> None:
     shelf.machine.seen_in_graph("stateful", cluster.now)
     cluster.settle()
     cases = [
-        ("x", "no such process: x"),
+        ("x", "no such process: 'x'"),
         ("waits", "only a running process is checkpointed"),
         ("watched", "watched has a standby, which would take over"),
         ("stateful", "takes part under the number of its instance"),

@@ -361,7 +361,8 @@ def test_a_cordoned_host_gets_no_work_and_keeps_what_it_has() -> None:
 def test_an_unknown_host_or_action_is_refused_with_what_there_is() -> None:
     """The answer names the hosts, or the actions."""
     cluster = Cluster("a", "b")
-    assert cluster.set_host("c", "cordon").message == "no such host: 'c'; there are: a and b"
+    said = cluster.set_host("c", "cordon").message
+    assert said == "no such host: 'c'; there are: a, b (`rosrm hosts` lists them)"
     assert "cordon, uncordon, drain" in cluster.set_host("a", "explode").message
 
 

@@ -92,8 +92,8 @@ def test_a_move_is_refused_with_its_reason() -> None:
     cluster = two_hosts()
     cluster.submit(process("fixed"), process("waits", memory=1e6))
     cases = [
-        (("x",), "no such process: x"),
-        (("p", "z"), "no such host: 'z'; there are: a and b"),
+        (("x",), "no such process: 'x'; there are: waits, fixed, p "),
+        (("p", "z"), "no such host: 'z'; there are: a, b"),
         (("p", "a"), "p runs on a already"),
         (("fixed",), "has no migration strategy"),
         (("waits",), "only a running process can be moved"),

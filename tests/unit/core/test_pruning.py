@@ -131,7 +131,7 @@ def test_what_has_not_ended_or_left_is_refused_and_nothing_is_removed() -> None:
     cluster = of_two_hosts()
     refused = prune(cluster, "done", "live")
     assert refused.message == "live is running; cancel it first. Nothing was removed"
-    assert "no such process: ghost" in prune(cluster, "ghost").message
+    assert "no such process: 'ghost'" in prune(cluster, "ghost").message
     assert "a is up; stop its slave first" in prune(cluster, hosts=("a",)).message
     assert "no such host: 'c'" in prune(cluster, hosts=("c",)).message
     assert seen(cluster) == (["done", "gone", "live"], ["a", "b"])

@@ -206,11 +206,14 @@ def test_cancel_of_one_that_is_over_says_so() -> None:
 def test_an_unknown_name_refuses_the_whole_request() -> None:
     """Nothing is cancelled or restarted."""
     cluster = Cluster("a")
-    cluster.submit(process("p"))
+    cluster.submit(process("talker"))
     for ask in (cluster.cancel, cluster.restart):
-        reply = ask("p", "x")
-        assert (reply.code, reply.message) == ("unknown", "no such process: x; see `rosrm ps`")
-    assert cluster.phase("p") == "running"
+        reply = ask("talker", "talkre")
+        assert (reply.code, reply.message) == (
+            "unknown",
+            "no such process: 'talkre'; did you mean 'talker'? (`rosrm ps --all` lists them)",
+        )
+    assert cluster.phase("talker") == "running"
 
 
 @pytest.mark.parametrize("overlap", [True, False])

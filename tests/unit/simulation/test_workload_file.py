@@ -180,3 +180,16 @@ def test_every_key_is_documented_and_nothing_else(heading, names):
     section = re.split(r"^#{2,3} ", behind, maxsplit=1, flags=re.MULTILINE)[0]
     first = re.findall(r"^\| (`[^|]*`) \|", section, re.MULTILINE)
     assert {word for cell in first for word in re.findall(r"`(\w+)`", cell)} == set(names)
+
+
+def test_variants_are_judged_beside_a_wrong_workload(load):
+    """All that is wrong at once: the file, and each variant."""
+    with pytest.raises(ConfigError) as raised:
+        load(
+            BOTH + "seed: x",
+            "scoring: {policy: wieghted}",
+            "queue: {backfil: true}",
+            "scoring: {policy: treshold}",
+        )
+    for said in ("seed: 'x'", "policy 'wieghted'", "key 'backfil'", "policy 'treshold'"):
+        assert said in str(raised.value)
