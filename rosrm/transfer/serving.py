@@ -190,6 +190,7 @@ async def serve(
         )
         over = [asyncio.create_task(one.wait()) for one in (desk.taken, withdrawn)]
         await asyncio.wait(over, timeout=seconds, return_when=asyncio.FIRST_COMPLETED)
+        is_withdrawn = withdrawn.is_set()  # not later: an offer that has expired stays expired
         for task in over:
             task.cancel()
     finally:
@@ -197,4 +198,4 @@ async def serve(
         await runner.cleanup()
     if desk.taken.is_set():
         return Sent("taken", desk.sent)
-    return Sent("withdrawn" if withdrawn.is_set() else "expired", desk.sent)
+    return Sent("withdrawn" if is_withdrawn else "expired", desk.sent)

@@ -84,7 +84,7 @@ def test_a_migration_strategy_is_installed_and_chosen_by_name(environment):
         "plan = strategy.propose(move)\n"
         "print([type(step).__name__ for step in plan.steps], plan.steps[0].timeout)\n"
         "print(repr(plan_fault(plan, move)))\n"
-        "print(registry.executors()['teleport.announce']({'who': 'a'}))\n"
+        "print(registry.executors()['teleport.announce'].call({'who': 'a'}))\n"
     )
     assert environment.python(code).splitlines() == [
         "['Execute', 'Stop', 'Start', 'AwaitReady', 'Commit'] 5.0",
