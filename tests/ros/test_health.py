@@ -95,7 +95,7 @@ def test_a_topic_that_falls_silent(cluster) -> None:
     reason = failed(cluster, "quiet")
     assert reason.startswith("unhealthy: ~/scan: 0.0 Hz for 2.")
     assert reason.endswith("at least 5 Hz are required")
-    assert cluster.client.explain("quiet")["reason"] == reason
+    assert cluster.client.explain("quiet")["reason"].startswith(reason)
 
 
 def test_a_topic_that_nobody_publishes(cluster) -> None:
