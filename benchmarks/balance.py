@@ -11,8 +11,8 @@ from pathlib import Path
 from benchmarks.hosts import three_hosts
 from benchmarks.machine import print_report
 from benchmarks.stopping import run
-from rosrm.core.model import ProcessSpec
-from rosrm.local_cluster import LocalCluster
+from rosrm.model.values import ProcessSpec
+from rosrm.testing.local_cluster import LocalCluster
 
 _PROCESSES = 60
 

@@ -16,7 +16,7 @@ import numpy as np
 from benchmarks.hosts import three_hosts
 from benchmarks.machine import print_report
 from benchmarks.stopping import run
-from rosrm.local_cluster import LocalCluster
+from rosrm.testing.local_cluster import LocalCluster
 
 _COMMANDS = (("ps",), ("hosts",), ("status",), ("events",))
 _TIMEOUT = 10.0

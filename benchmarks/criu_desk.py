@@ -24,10 +24,10 @@ from rclpy.node import Node
 from std_msgs.msg import Int64MultiArray
 
 from benchmarks.handoff_nodes import OUTPUT, QOS
-from rosrm.core.model import MigrationPolicy, ProcessSpec, RestartPolicy
 from rosrm.errors import Refused
+from rosrm.model.ros_settings import RosSettings
+from rosrm.model.values import MigrationPolicy, ProcessSpec, RestartPolicy
 from rosrm.ros.client import MasterClient
-from rosrm.ros.settings import RosSettings
 
 _ROOT: Final = Path(__file__).resolve().parents[1]
 #: Hz, of the counters.

@@ -1,7 +1,7 @@
 """The master's whole decision in the core: filter, score, veto, pick, account.
 
-Two figures, both through `rosrm.core.master.step` with the policy `weighted`, as the master's
-runtime does it, without the wires and the journal:
+Two figures, both through `rosrm.core.master.reducer.step` with the policy `weighted`, as the
+master's runtime does it, without the wires and the journal:
 
 - `us_per_host`: one process is submitted right after fresh readings of all hosts, so that every
   host is judged anew: microseconds from SubmissionReceived to the commands, by host. The paper's
@@ -25,12 +25,12 @@ import numpy as np
 
 from benchmarks.machine import median, print_report, say
 from benchmarks.stopping import run
-from rosrm.core import events as happened
-from rosrm.core.commands import Assign
-from rosrm.core.master import step
-from rosrm.core.model import RESOURCE_SLOTS, HostDescription, ProcessSpec, ResourceDescription
-from rosrm.core.settings import CoreSettings
-from rosrm.core.state import MasterState
+from rosrm.core.master import events as happened
+from rosrm.core.master.commands import Assign
+from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.reducer import step
+from rosrm.core.master.settings import CoreSettings
+from rosrm.model.values import RESOURCE_SLOTS, HostDescription, ProcessSpec, ResourceDescription
 from rosrm_scoring.weighted import Weighted, WeightedOptions
 
 _HOSTS = (10, 100, 1_000, 10_000)

@@ -38,12 +38,18 @@ from benchmarks.handoff import Observer, Output
 from benchmarks.handoff_nodes import QOS
 from benchmarks.machine import percentile, print_report, say
 from benchmarks.stopping import run
-from rosrm import kept
+from rosrm import snapshots
 from rosrm.config.settings import ClusterConfig, ControlSettings, HostConfig, LivenessSettings
-from rosrm.core.model import HostLossPolicy, MigrationPolicy, ProcessSpec, StandbyPolicy, StopPolicy
-from rosrm.local_cluster import LocalCluster
-from rosrm.loopback import enter_private_network
+from rosrm.model.values import (
+    HostLossPolicy,
+    MigrationPolicy,
+    ProcessSpec,
+    StandbyPolicy,
+    StopPolicy,
+)
 from rosrm.ros.names import token
+from rosrm.testing.local_cluster import LocalCluster
+from rosrm.testing.loopback import enter_private_network
 
 _ROOT = Path(__file__).resolve().parents[1]
 _HOSTS = ("h0", "h1", "h2", "h3")
@@ -234,7 +240,7 @@ def _wait_until_calm(cluster: LocalCluster) -> None:
 def _copies(cluster: LocalCluster, own: str, number: int) -> dict[str, int]:
     """Hosts other than its own that keep a state of an instance on their disks, and the cycle."""
     heads = {
-        name: kept.newest_head(cluster.directory / "hosts" / name / "kept" / token(_KEPT))
+        name: snapshots.newest_head(cluster.directory / "hosts" / name / "kept" / token(_KEPT))
         for name in _HOSTS
         if name != own
     }

@@ -36,9 +36,9 @@ from benchmarks.hosts import three_hosts
 from benchmarks.machine import percentile, print_report, say
 from benchmarks.stopping import run
 from rosrm.config.settings import ClusterConfig, MigrationSettings
-from rosrm.core.model import MigrationPolicy, ProcessSpec
-from rosrm.local_cluster import LocalCluster
-from rosrm.loopback import enter_private_network
+from rosrm.model.values import MigrationPolicy, ProcessSpec
+from rosrm.testing.local_cluster import LocalCluster
+from rosrm.testing.loopback import enter_private_network
 
 _ROOT = Path(__file__).resolve().parents[1]
 _NS = 1e9

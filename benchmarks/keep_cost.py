@@ -25,8 +25,8 @@ from std_msgs.msg import UInt8MultiArray
 
 from benchmarks.machine import print_report, say
 from benchmarks.stopping import run
-from rosrm.loopback import enter_private_network
 from rosrm.node import Node
+from rosrm.testing.loopback import enter_private_network
 
 SIZES = (100, 100_000, 1_000_000, 5_000_000)
 

@@ -19,11 +19,11 @@ import numpy as np
 from benchmarks.hosts import three_hosts
 from benchmarks.machine import print_report
 from benchmarks.stopping import run
-from rosrm.core.model import Kind, ProcessSpec
 from rosrm.errors import Refused
-from rosrm.local_cluster import LocalCluster
-from rosrm.slave.log_reading import newest_instance
+from rosrm.model.values import Kind, ProcessSpec
+from rosrm.slave.logs import newest_instance
 from rosrm.supervisor.client import log_path
+from rosrm.testing.local_cluster import LocalCluster
 
 _STAMP = ("date", "+%s%N")
 _NS_PER_MS = 1e6

@@ -35,13 +35,13 @@ from typing import Any
 from benchmarks.machine import percentile, print_report, say
 from benchmarks.simulated_slaves import STEP
 from benchmarks.stopping import run
-from rosrm.core.model import Kind, ProcessSpec
 from rosrm.errors import RosrmError
-from rosrm.local_cluster import LocalCluster
-from rosrm.loopback import enter_private_network
+from rosrm.model.ros_settings import RosSettings
+from rosrm.model.values import Kind, ProcessSpec
 from rosrm.ros import names, qos
 from rosrm.ros.participant import Participant
-from rosrm.ros.settings import RosSettings
+from rosrm.testing.local_cluster import LocalCluster
+from rosrm.testing.loopback import enter_private_network
 from rosrm_msgs import msg
 
 _ROOT = Path(__file__).resolve().parents[1]

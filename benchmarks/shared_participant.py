@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
+from rosrm.model.ros_settings import RosSettings
 from rosrm.ros.participant import OpenRequest, Participant
-from rosrm.ros.settings import RosSettings
 from rosrm_msgs import msg, srv
 
 

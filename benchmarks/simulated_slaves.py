@@ -33,8 +33,10 @@ import numpy.typing as npt
 
 from benchmarks.machine import say
 from benchmarks.shared_participant import Berth, SharedParticipant, Tally
-from rosrm.core import slave as core
-from rosrm.core.model import (
+from rosrm.core.slave import reducer as core
+from rosrm.errors import Refused, RosrmError
+from rosrm.model.ros_settings import RosSettings
+from rosrm.model.values import (
     RESOURCE_SLOTS,
     HostDescription,
     InstanceId,
@@ -44,10 +46,8 @@ from rosrm.core.model import (
     ResourceDescription,
     RestartPolicy,
 )
-from rosrm.errors import Refused, RosrmError
-from rosrm.loopback import settings_on_this_machine
-from rosrm.ros.settings import RosSettings
-from rosrm.ros.slave_endpoint import Link, LogQuery, LogSlice, SlaveEndpoint
+from rosrm.ros.slave.endpoint import Link, LogQuery, LogSlice, SlaveEndpoint
+from rosrm.testing.loopback import settings_on_this_machine
 
 #: Most seconds between two looks at standard input.
 _LOOK = 0.05

@@ -19,11 +19,11 @@ import numpy as np
 
 from benchmarks.machine import median, print_report, say
 from benchmarks.stopping import run
-from rosrm.core.events import ReadingsReceived
-from rosrm.core.model import RESOURCE_SLOTS, Kind, ProcessSpec, ResourceDescription
-from rosrm.core.settings import CoreSettings
+from rosrm.core.master.events import ReadingsReceived
+from rosrm.core.master.settings import CoreSettings
 from rosrm.master.recorder import Recorder
-from rosrm.recording.reading import Header
+from rosrm.model.values import RESOURCE_SLOTS, Kind, ProcessSpec, ResourceDescription
+from rosrm.recording.reader import Header
 from rosrm.simulation.engine import Simulation
 from rosrm.simulation.workload import Curve, HostPlan, ProcessPlan, Workload
 from rosrm_scoring.weighted import Weighted, WeightedOptions

@@ -20,7 +20,7 @@ import psutil
 from benchmarks.machine import print_report
 from benchmarks.stopping import run
 from rosrm.config.settings import HostConfig
-from rosrm.local_cluster import LocalCluster
+from rosrm.testing.local_cluster import LocalCluster
 
 _BARE = """
 import rclpy

@@ -19,8 +19,8 @@ from benchmarks.hosts import three_hosts
 from benchmarks.machine import print_report
 from benchmarks.stopping import run
 from rosrm.config.settings import HostConfig
-from rosrm.core.model import Kind, ProcessSpec
-from rosrm.local_cluster import LocalCluster
+from rosrm.model.values import Kind, ProcessSpec
+from rosrm.testing.local_cluster import LocalCluster
 
 _TRUE = 300
 _SLEEPS, _SLEEP_S = 150, 0.1

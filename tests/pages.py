@@ -27,7 +27,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from rosrm.bootstrapper import without_bootstrapper
+from rosrm.runtime.ros_wheels import without_bootstrapper
 
 ROOT: Final = Path(__file__).resolve().parents[1]
 #: Seconds for what a page promises, on a busy machine; for what `until` waits for.

@@ -12,8 +12,8 @@ from typing import Any
 
 from rosrm.config.work import load_work
 from rosrm.errors import NoMaster, RosrmError
+from rosrm.model.ros_settings import RosSettings
 from rosrm.ros.client import MasterClient
-from rosrm.ros.settings import RosSettings
 
 #: Seconds for finding a master; a request is given 10.
 _PATIENCE = 3.0

@@ -15,10 +15,10 @@ import sys
 from typing import Any
 
 from rosrm.config.work import load_work
-from rosrm.core.views import HostRow
 from rosrm.errors import RosrmError
+from rosrm.model.ros_settings import RosSettings
+from rosrm.model.rows import HostRow
 from rosrm.ros.client import MasterClient
-from rosrm.ros.settings import RosSettings
 
 #: Seconds for a master that is coming up on a busy machine.
 _PATIENCE = 60.0

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from benchmarks.paper.trace import HostLook, Look, Move, Trace
-from rosrm.core.columns import FloatArray
+from rosrm.core.master.state.host_arrays import FloatArray
 
 #: Fraction of a host's memory by which readings of different hosts and moments may disagree.
 NOISE: Final = 0.01

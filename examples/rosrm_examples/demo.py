@@ -27,8 +27,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from rosrm.core.views import ProcessRow
-from rosrm.local_cluster import LocalCluster
+from rosrm.model.rows import ProcessRow
+from rosrm.testing.local_cluster import LocalCluster
 from rosrm_examples.demo_frame import (
     CLUSTER,
     Stage,

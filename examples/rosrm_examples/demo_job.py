@@ -18,7 +18,7 @@ from rosrm.config.settings import (
     MigrationSettings,
     ScoringChoice,
 )
-from rosrm.core.model import Kind, MigrationPolicy, ProcessSpec
+from rosrm.model.values import Kind, MigrationPolicy, ProcessSpec
 
 HOSTS: Final = ("host1", "host2", "host3")
 MEMORY_LIMIT: Final = 0.8

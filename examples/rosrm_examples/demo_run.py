@@ -11,12 +11,12 @@ from pathlib import Path
 from types import FrameType
 from typing import Final, Protocol
 
-from rosrm.core.model import InstanceId
-from rosrm.core.views import ProcessRow, Snapshot
 from rosrm.errors import RosrmError
-from rosrm.local_cluster import LocalCluster, Part
+from rosrm.model.rows import ProcessRow, Snapshot
+from rosrm.model.values import InstanceId
 from rosrm.ros.client import MasterClient
 from rosrm.supervisor.client import log_path
+from rosrm.testing.local_cluster import LocalCluster, Part
 from rosrm_examples.demo_job import Arrival
 from rosrm_examples.demo_record import Record
 from rosrm_examples.demo_screen import Screen

@@ -14,8 +14,8 @@ from typing import Final
 import numpy as np
 
 from rosrm.config.settings import ClusterConfig, HostConfig, MigrationSettings, ScoringChoice
-from rosrm.core.model import Kind, MigrationPolicy, ProcessSpec
-from rosrm.core.views import ProcessRow, Snapshot
+from rosrm.model.rows import ProcessRow, Snapshot
+from rosrm.model.values import Kind, MigrationPolicy, ProcessSpec
 from rosrm.ros.client import MasterClient
 from rosrm_examples.demo_job import MEMORY_LIMIT
 from rosrm_examples.drives import Drive

@@ -1,1 +1,1 @@
-"""The `rosrm` command. Only `rosrm.cli.live` is of use to other programs."""
+"""The `rosrm` command. Only `rosrm.cli.output.top` is of use to other programs."""

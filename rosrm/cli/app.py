@@ -10,15 +10,10 @@ from __future__ import annotations
 import errno
 import os
 import sys
-import time
 from contextlib import suppress
 from typing import TextIO
 
-#: When this process began, by the monotonic clock: what is promised to be quick counts from here.
-BEGUN = time.monotonic()
-
-#: What a shell gives for a program that Ctrl-C ended.
-INTERRUPTED = 130
+from rosrm.cli.process import INTERRUPTED
 
 
 def main() -> None:

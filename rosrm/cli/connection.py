@@ -14,14 +14,14 @@ from typing import TYPE_CHECKING, Final
 import typer
 
 from rosrm.cli import early
-from rosrm.cli.app import BEGUN
 from rosrm.cli.options import Common
+from rosrm.cli.process import BEGUN
 from rosrm.errors import Refused, RosrmError
-from rosrm.ros.settings import RosSettings
-from rosrm.spelling import no_such
+from rosrm.model.ros_settings import RosSettings
+from rosrm.wording import no_such
 
 if TYPE_CHECKING:
-    from rosrm.core.views import Snapshot
+    from rosrm.model.rows import Snapshot
     from rosrm.ros.client import MasterClient
 
 #: Seconds from the start of the command within which it says that there is no master: less than 3,

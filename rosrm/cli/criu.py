@@ -91,7 +91,7 @@ def check(prefix: Prefix = None, as_json: AsJson = False) -> None:
 
     The exit code is 0 only if it works, and images can be sent.
     """
-    from rosrm.cli import json_forms
+    from rosrm.cli.output import json_forms
     from rosrm.criu.program import default_prefix
     from rosrm.transfer import missing
 

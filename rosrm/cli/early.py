@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Final
 
+from rosrm.model.ros_settings import RosSettings
 from rosrm.ros import names
-from rosrm.ros.settings import RosSettings
 
 if TYPE_CHECKING:
     from rosrm.ros.participant import Participant

@@ -8,7 +8,7 @@ from typing import Any, Final
 from typer import BadParameter
 from typer.core import TyperCommand, TyperGroup
 
-from rosrm.spelling import listed
+from rosrm.wording import listed
 
 #: Verbs of other tools, and the commands of rosrm that do as much.
 _ELSEWHERE: Final = {

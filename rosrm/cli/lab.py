@@ -218,7 +218,7 @@ def status(
     ] = "",
 ) -> None:
     """List the labs and their hosts."""
-    from rosrm.cli import json_forms, tables
+    from rosrm.cli.output import json_forms, tables
     from rosrm.errors import LabError
     from rosrm.lab import all_labs
 
@@ -328,7 +328,7 @@ def _host(name: str, limits: dict[str, str]) -> HostPlan:
 
 #: A limit that is a whole number of these was given in powers of 1024, and is shown so.
 _MIB = 2**20
-#: As `rosrm.config.units` calls what is measured.
+#: As `rosrm.extensions.units` calls what is measured.
 _MEASURES = {"memory": "size", "cpu": "cores", "disk": "size"}
 
 
@@ -340,7 +340,7 @@ def _limit(host: str, what: str, text: str) -> float | None:
 
 def _quantity(measures: str, text: str, where: str) -> float:
     """A number with or without a unit; what a shell hands over is always text."""
-    from rosrm.config.units import Quantity
+    from rosrm.extensions.units import Quantity
 
     try:
         return Quantity(measures).parse(_number(text))
@@ -381,7 +381,7 @@ def _network(name: str, host: str) -> str:
 def _table(rows: Iterable[HostStatus]) -> Any:
     from rich.text import Text
 
-    from rosrm.cli import tables
+    from rosrm.cli.output import tables
 
     numbers = ("MEMORY", "CPU", "DISK", "PROCESSES")
     made = tables.table("LAB", "HOST", "STATE", "ADDRESS", *numbers, "NETWORK", right=numbers)
@@ -401,7 +401,7 @@ def _table(rows: Iterable[HostStatus]) -> Any:
 
 
 def _used(used: int | None, limit: int | None) -> str:
-    from rosrm.cli import formats
+    from rosrm.cli.output import formats
 
     binary = limit is not None and limit % _MIB == 0
     said = "?" if used is None else formats.size(used, binary=binary)

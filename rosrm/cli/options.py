@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from rosrm.ros.settings import HIGHEST_DOMAIN
+from rosrm.model.ros_settings import HIGHEST_DOMAIN
 
 
 @dataclass(frozen=True)

@@ -75,7 +75,7 @@ def simulate(  # noqa: PLR0913, PLR0917 - an argument for each option
     if plot is not None:
         simulation_picture.draw(report, plot)
     if as_json:
-        from rosrm.cli.json_forms import show
+        from rosrm.cli.output.json_forms import show
 
         show(simulation_tables.report_form(report))
         return

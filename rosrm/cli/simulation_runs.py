@@ -14,7 +14,6 @@ from typing import Final
 
 from rosrm.config.documents import Node
 from rosrm.config.settings import ClusterConfig
-from rosrm.config.units import Quantity
 from rosrm.config.variants import (
     Variant,
     load_variants,
@@ -24,13 +23,14 @@ from rosrm.config.variants import (
     variant_of_option,
 )
 from rosrm.config.workload import load_workload
-from rosrm.core.declared import Declared
-from rosrm.core.placement import NamedPolicy
+from rosrm.core.master.scheduling.ranking import NamedPolicy
 from rosrm.errors import ConfigError, RecordError
-from rosrm.ports import MigrationStrategy
+from rosrm.extensions.contracts import MigrationStrategy
+from rosrm.extensions.declared_fields import Declared
+from rosrm.extensions.registry import Registry
+from rosrm.extensions.units import Quantity
 from rosrm.recording.frames import is_record
-from rosrm.recording.reading import Recording, read_record
-from rosrm.registry import Registry
+from rosrm.recording.reader import Recording, read_record
 from rosrm.simulation.agreement import Agreement, compare
 from rosrm.simulation.engine import Progress, Simulation
 from rosrm.simulation.extraction import Extraction

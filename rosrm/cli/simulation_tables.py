@@ -8,12 +8,12 @@ from typing import Any, Final
 import typer
 from rich.text import Text
 
-from rosrm.cli import tables
+from rosrm.cli.output import tables
 from rosrm.cli.simulation_runs import Report, Run
-from rosrm.config.plain import to_plain
+from rosrm.model.codec import to_plain
 from rosrm.simulation.agreement import Agreement
 from rosrm.simulation.replay import Replay
-from rosrm.spelling import counted, few
+from rosrm.wording import counted, few
 
 #: Processes that were never placed, of which the reason is told.
 _TOLD: Final = 3

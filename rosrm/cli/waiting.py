@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Final
 import typer
 
 from rosrm.cli.patience import PERIOD, ask_until_answered
-from rosrm.config.units import Quantity
-from rosrm.core.views import ProcessRow
 from rosrm.errors import ConfigError
-from rosrm.spelling import listed, standing
+from rosrm.extensions.units import Quantity
+from rosrm.model.rows import ProcessRow
+from rosrm.wording import listed, standing
 
 if TYPE_CHECKING:
     from rosrm.ros.client import MasterClient

@@ -22,8 +22,8 @@ from typing import (
 from pydantic import BaseModel, ConfigDict, ValidationError, create_model
 
 from rosrm.config.documents import Node, Place, Problems
-from rosrm.config.units import UnfitAmount
-from rosrm.spelling import get_close_matches
+from rosrm.extensions.units import UnfitAmount
+from rosrm.wording import get_close_matches
 
 T = TypeVar("T")
 

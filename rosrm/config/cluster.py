@@ -13,7 +13,7 @@ from rosrm.config.kinds import check_kind
 from rosrm.config.options import PluginCheck
 from rosrm.config.rules import check_amounts, check_name, settled
 from rosrm.config.settings import ClusterConfig
-from rosrm.registry import Registry
+from rosrm.extensions.registry import Registry
 
 #: Sections that the rules about times read.
 _OF_TIME: Final = ("liveness", "control")

@@ -11,7 +11,7 @@ from rosrm.config.kinds import check_kind
 from rosrm.config.options import PluginCheck
 from rosrm.config.rules import check_amounts, check_name, settled
 from rosrm.config.settings import HostConfig
-from rosrm.registry import Registry
+from rosrm.extensions.registry import Registry
 
 #: What a slice is measured against, and so must be given for it.
 _OF_A_SLICE = ("memory", "cpu")

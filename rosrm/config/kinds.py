@@ -11,7 +11,7 @@ from typing import Final
 from rosrm.config.documents import Node
 from rosrm.config.settings import ClusterConfig, HostConfig
 from rosrm.errors import ConfigError
-from rosrm.spelling import get_close_matches
+from rosrm.wording import get_close_matches
 
 #: Keys of each kind of file.
 _KEYS: Final = {

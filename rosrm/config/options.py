@@ -7,11 +7,11 @@ from typing import Any, Final, get_args, get_type_hints
 
 from rosrm.config.checking import near, validated
 from rosrm.config.documents import Node, Problems
-from rosrm.config.plain import to_plain
-from rosrm.config.units import IsResource
-from rosrm.core.plugin_calls import TITLES
 from rosrm.errors import ConfigError
-from rosrm.registry import Registry
+from rosrm.extensions.plugin_calls import TITLES
+from rosrm.extensions.registry import Registry
+from rosrm.extensions.units import IsResource
+from rosrm.model.codec import to_plain
 
 #: Stands among `probes` for all that are read where the file names none.
 DEFAULT_PROBES: Final = "default"

@@ -10,8 +10,8 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Annotated, Any, Final, Literal
 
 from rosrm.config.markers import NullIsEmpty, PlainWord, Words
-from rosrm.config.units import Amount, Count, PositiveSeconds, Quantity, Seconds
-from rosrm.core.model import (
+from rosrm.extensions.units import Amount, Count, PositiveSeconds, Quantity, Seconds
+from rosrm.model.values import (
     EMPTY,
     Health,
     HostLossPolicy,
@@ -24,7 +24,7 @@ from rosrm.core.model import (
     StandbyPolicy,
     StopPolicy,
 )
-from rosrm.spelling import listed
+from rosrm.wording import listed
 
 _RESTART: Final = RestartPolicy()
 _READINESS: Final = Readiness()

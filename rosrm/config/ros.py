@@ -8,8 +8,8 @@ from typing import Annotated, Final, Literal
 
 from pydantic import AfterValidator
 
-from rosrm.config.units import Quantity
-from rosrm.ros.settings import RosSettings
+from rosrm.extensions.units import Quantity
+from rosrm.model.ros_settings import RosSettings
 
 _DEFAULT: Final = RosSettings()
 _SERVER: Final = re.compile(r"[^\s:;]+:\d{1,5}(;[^\s:;]*(:\d{1,5})?)*|[^\s:;]+")

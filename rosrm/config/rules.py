@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from rosrm.config.documents import Node, Problems
-from rosrm.config.units import ANY_AMOUNT, amount_of
+from rosrm.extensions.units import ANY_AMOUNT, amount_of
 
 _NAME: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,199}")
 

@@ -16,8 +16,9 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 from rosrm.config.markers import NullIsEmpty, OptionsByName, PlainWord, RosSection
-from rosrm.config.plain import from_plain, to_plain
-from rosrm.config.units import (
+from rosrm.core.master.settings import CoreSettings
+from rosrm.errors import ConfigError
+from rosrm.extensions.units import (
     Amount,
     Count,
     Fraction,
@@ -26,10 +27,9 @@ from rosrm.config.units import (
     Quantity,
     Seconds,
 )
-from rosrm.core.model import EMPTY
-from rosrm.core.settings import CoreSettings
-from rosrm.errors import ConfigError
-from rosrm.ros.settings import RosSettings
+from rosrm.model.codec import from_plain, to_plain
+from rosrm.model.ros_settings import RosSettings
+from rosrm.model.values import EMPTY
 
 #: Upper limits where the file sets none: memory as in the paper, CPU and disk with a reserve.
 DEFAULT_LIMITS: Final[Mapping[str, float]] = {"memory": 0.8, "cpu": 0.9, "disk": 0.9}

@@ -13,9 +13,9 @@ from rosrm.config.cluster import checked_cluster
 from rosrm.config.documents import Node, Place, Problems, parse, read
 from rosrm.config.merging import in_depth
 from rosrm.config.settings import ClusterConfig
-from rosrm.config.units import Quantity
 from rosrm.errors import ConfigError
-from rosrm.registry import Registry
+from rosrm.extensions.registry import Registry
+from rosrm.extensions.units import Quantity
 
 #: What of a cluster's settings a simulation can try out.
 SECTIONS: Final = ("scoring", "migration", "queue", "defaults", "liveness", "delivery_timeout")

@@ -16,9 +16,9 @@ from rosrm.config.namesakes import refuse_namesakes
 from rosrm.config.options import PluginCheck
 from rosrm.config.process import ProcessInFile, complaints
 from rosrm.config.rules import check_amounts, check_name, settled_on_host
-from rosrm.core.model import ProcessSpec
-from rosrm.registry import Registry
-from rosrm.spelling import get_close_matches
+from rosrm.extensions.registry import Registry
+from rosrm.model.values import ProcessSpec
+from rosrm.wording import get_close_matches
 
 _SECTIONS: Final = ("processes", "defaults")
 #: Of one entry alone: neither makes sense for all.

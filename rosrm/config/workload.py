@@ -19,23 +19,11 @@ from rosrm.config.namesakes import refuse_namesakes
 from rosrm.config.options import PluginCheck
 from rosrm.config.process import Labels, LabelsInFile, MigrationInFile
 from rosrm.config.rules import check_amounts, check_name
-from rosrm.config.units import (
-    Amount,
-    Count,
-    Fraction,
-    PositiveSeconds,
-    Quantity,
-    Seconds,
-)
 from rosrm.config.variants import Variant, check_keys, load_variants, text_of, variants_of
-from rosrm.core.model import (
-    Kind,
-    MigrationPolicy,
-    ProcessSpec,
-    ResourceDescription,
-)
 from rosrm.errors import ConfigError
-from rosrm.registry import Registry
+from rosrm.extensions.registry import Registry
+from rosrm.extensions.units import Amount, Count, Fraction, PositiveSeconds, Quantity, Seconds
+from rosrm.model.values import Kind, MigrationPolicy, ProcessSpec, ResourceDescription
 from rosrm.simulation.workload import Curve, HostPlan, Model, ProcessPlan, Workload
 
 _PARTS: Final = ("name", "seed", "until", "hosts", "processes", "model", "cluster", "variants")

@@ -20,7 +20,7 @@ from rosrm.criu import held_files, image, ties, tree, troubles
 from rosrm.criu.image import Manifest
 from rosrm.criu.program import Criu
 from rosrm.errors import CriuError
-from rosrm.supervisor import members, paths
+from rosrm.supervisor import paths, procfs
 
 #: What both CRIU's dump and its restore are told.
 COMMON: Final = ("--tcp-close", "--file-locks", "--manage-cgroups=ignore")
@@ -161,7 +161,7 @@ def _describe(root: int, directory: Path, manifest: Manifest) -> Manifest:
 
 def _shelter(leader: int) -> str:
     """The directory of its supervisor for those that name none; "" where it has no supervisor."""
-    _, state = members.read_marks(leader)
+    _, state = procfs.read_marks(leader)
     return paths.work_directory(state) if state else ""
 
 

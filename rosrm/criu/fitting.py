@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 
-from rosrm.spelling import listed
+from rosrm.wording import listed
 
 #: The facts that are compared, each with its meaning.
 FACTS = {

@@ -36,7 +36,7 @@ from rosrm.criu.image import Manifest
 from rosrm.criu.outcome import Outcome
 from rosrm.criu.program import Criu, opened
 from rosrm.errors import CriuError
-from rosrm.supervisor.members import INSTANCE_MARK, SUPERVISOR_MARK
+from rosrm.supervisor.procfs import INSTANCE_MARK, SUPERVISOR_MARK
 
 #: Exit code of a restore that failed.
 FAILED: Final = 125

@@ -25,8 +25,8 @@ from typing import Final
 from rosrm.criu import packages as debian
 from rosrm.criu.packages import Say
 from rosrm.criu.program import OLDEST, PROGRAM, Criu, opened
-from rosrm.disk_space import room_for
 from rosrm.errors import CriuError
+from rosrm.runtime.disk_space import room_for
 
 #: The second one changes the first one's idea of where its libraries are.
 _WANTED: Final = ("criu", "patchelf")

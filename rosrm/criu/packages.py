@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from rosrm.disk_space import room_for
 from rosrm.errors import CriuError
+from rosrm.runtime.disk_space import room_for
 
 #: Takes a line that tells a person how far it is.
 Say = Callable[[str], None]

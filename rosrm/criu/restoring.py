@@ -21,7 +21,7 @@ from rosrm.criu.image import HeldFile, Manifest, MappedFile
 from rosrm.criu.program import Criu
 from rosrm.errors import CriuError
 from rosrm.supervisor import paths
-from rosrm.supervisor.members import SUPERVISOR_MARK
+from rosrm.supervisor.procfs import SUPERVISOR_MARK
 
 #: CRIU writes the pid of the restored root here.
 _PID_FILE: Final = "restored.pid"

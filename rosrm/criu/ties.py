@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from rosrm.criu.held_files import Descriptor, descriptors
-from rosrm.supervisor.members import everyone
+from rosrm.supervisor.procfs import everyone
 
 #: Of linux/netlink.h, linux/sock_diag.h and linux/unix_diag.h.
 _NETLINK_SOCK_DIAG: Final = 4

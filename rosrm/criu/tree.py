@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
-from rosrm.supervisor.members import read_stat
+from rosrm.supervisor.procfs import read_stat
 
 #: Namespaces that CRIU has to share with what it dumps, with the option of nsenter for each.
 _NAMESPACES: Final = {

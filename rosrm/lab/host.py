@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from rosrm.bootstrapper import without_bootstrapper
 from rosrm.errors import ConfigError, LabError
 from rosrm.lab import groups, store
 from rosrm.lab import plan as names
@@ -23,6 +22,7 @@ from rosrm.lab.groups import Hierarchy, Leaf
 from rosrm.lab.needs import find_command
 from rosrm.lab.plan import HostPlan
 from rosrm.lab.store import Birth
+from rosrm.runtime.ros_wheels import without_bootstrapper
 
 #: Where a host has its disk, as its processes see it.
 DATA: Final = Path("/run/data")

@@ -20,7 +20,7 @@ from rosrm.errors import LabError
 from rosrm.lab import wires
 from rosrm.lab.plan import PREFIX, LabPlan
 from rosrm.lab.wires import Link
-from rosrm.supervisor.members import read_stat
+from rosrm.supervisor.procfs import read_stat
 
 RUN: Final = Path("/run") / PREFIX
 #: Disks go where there is room, not into the memory that /run is made of.

@@ -15,12 +15,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple
 
-from rosrm.core.commands import Command
-from rosrm.core.events import Event, ReadingsReceived, StatusesReceived, UsagesReceived
+from rosrm.core.master.commands import Command
+from rosrm.core.master.events import Event, ReadingsReceived, StatusesReceived, UsagesReceived
 from rosrm.errors import ConfigError
 from rosrm.recording.encoding import decisions, encode, encode_decisions
 from rosrm.recording.frames import FrameKind, frame, opening
-from rosrm.recording.reading import Header
+from rosrm.recording.reader import Header
 
 _log = logging.getLogger("rosrm.master")
 

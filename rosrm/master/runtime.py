@@ -15,9 +15,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from rosrm.config.settings import ClusterConfig
-from rosrm.core import events as happened
-from rosrm.core import lost_tail, restore
-from rosrm.core.commands import (
+from rosrm.core.master import events as happened
+from rosrm.core.master.commands import (
     Assign,
     Command,
     Order,
@@ -26,21 +25,13 @@ from rosrm.core.commands import (
     Reply,
     Withdraw,
 )
-from rosrm.core.declared import Declared
-from rosrm.core.hosts import HostCondition
-from rosrm.core.master import step
-from rosrm.core.processes import Instance
-from rosrm.core.state import MasterState
-from rosrm.core.views import PluginRow
-from rosrm.entry import handle_stop_signals
+from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.recovery import journal_gap, restore
+from rosrm.core.master.reducer import step
+from rosrm.core.master.state.hosts import HostCondition
+from rosrm.core.master.state.process import Instance
 from rosrm.errors import JournalBlocked, Refused
-from rosrm.journal import SqliteJournal
-from rosrm.journal_faults import unreadable
-from rosrm.master.policy_guard import Deadlines
-from rosrm.master.reading import Reading
-from rosrm.master.recorder import Recorder
-from rosrm.master.standstill import Standstill
-from rosrm.ports import (
+from rosrm.extensions.contracts import (
     CheckpointPolicy,
     Intent,
     MigrationStrategy,
@@ -48,13 +39,22 @@ from rosrm.ports import (
     ScoringPolicy,
     StoredRecord,
 )
-from rosrm.recording.reading import TABLES, Header
+from rosrm.extensions.declared_fields import Declared
+from rosrm.journal.errors import unreadable
+from rosrm.journal.sqlite import SqliteJournal
+from rosrm.master.journal_stall import Standstill
+from rosrm.master.plugin_deadline import Deadlines
+from rosrm.master.queries import Reading
+from rosrm.master.recorder import Recorder
+from rosrm.model.rows import PluginRow
+from rosrm.recording.reader import TABLES, Header
 from rosrm.ros.client import find_master
-from rosrm.ros.master_endpoint import Identity, MasterEndpoint
+from rosrm.ros.master.endpoint import Identity, MasterEndpoint
 from rosrm.ros.participant import Participant
-from rosrm.spelling import counted, listed
-from rosrm.state_directory import only_one
+from rosrm.runtime.bootstrap import handle_stop_signals
+from rosrm.runtime.state_lock import only_one
 from rosrm.version import __version__
+from rosrm.wording import counted, listed
 
 _log = logging.getLogger("rosrm.master")
 
@@ -166,14 +166,14 @@ class MasterRuntime:
             restore.restore(state, self._journal.intents, now)
         except (AttributeError, KeyError, TypeError, ValueError) as fault:
             raise unreadable(self._config.state / "journal.sqlite", fault) from fault
-        lost_tail.begin(state, newest, now, fell=fell)
+        journal_gap.begin(state, newest, now, fell=fell)
         started = f"master {self._config.name} started, epoch {epoch}"
         self._journal.write(
             [Record("master_started", message=started)],
             # As one: from the boot the next master cannot tell what this one had to wait for.
             [
                 Intent("cluster", "epoch", {"epoch": epoch, "boot": _boot()}),
-                lost_tail.intent(state),
+                journal_gap.intent(state),
             ],
             0.0,
         )

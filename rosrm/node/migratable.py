@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 import rclpy.node
 
 from rosrm.node.entities import ServiceOf
-from rosrm.node.handoff import Handoff
+from rosrm.node.handoff.session import Handoff
 from rosrm.node.identity import Identity, identity_from
 from rosrm.ros.fast_dds import announcing
 

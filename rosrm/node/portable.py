@@ -16,7 +16,7 @@ from rclpy.event_handler import EventHandler
 from rosrm.node.absence import Absence, absence_of, await_peers, await_readers
 from rosrm.portable import VARIABLE
 from rosrm.ros.fast_dds import announcing
-from rosrm.ros.leftovers import close_leaked, open_sockets
+from rosrm.ros.graph_remains import close_leaked, open_sockets
 
 #: Seconds in which what was published arrives at its readers, before the node leaves.
 _READERS: Final = 0.5

@@ -23,8 +23,8 @@ from rosrm.node.absence import Absence, sees_again
 from rosrm.node.portable import PortableNode
 from rosrm.portable import SIGNAL, VARIABLE, Request, State, Status, Want
 from rosrm.portable.listening import Listener
-from rosrm.ros import fast_dds_place
-from rosrm.ros.leftovers import what_is_left
+from rosrm.ros import fast_dds_relocation
+from rosrm.ros.graph_remains import what_is_left
 
 #: Seconds between two looks at what is asked: while it runs, and while it is away. An idle node is
 #: woken as often; one that works notices the signal after its callback.
@@ -187,7 +187,7 @@ class _Run:
         listener = self._its_listener()
         listener.say(Status(State.LEAVING, request.id))
         try:
-            fast_dds_place.check()
+            fast_dds_relocation.check()
             self._come_to_rest()
         except PortableError as error:
             return None, str(error)
@@ -267,7 +267,7 @@ class _Run:
         listener = self._its_listener()
         began = time.monotonic()
         listener.enter(State.JOINING, request.id)
-        guids_are_new = fast_dds_place.look_again()
+        guids_are_new = fast_dds_relocation.look_again()
         entries = self._enter(absence)
         seen = time.monotonic()
         node = self._node

@@ -25,7 +25,7 @@ from rosrm.portable.form import (
     remove_status,
     write_request,
 )
-from rosrm.supervisor.members import read_environment
+from rosrm.supervisor.procfs import read_environment
 
 #: Seconds between two looks at a status: the standard library cannot await the change of a file.
 _LOOK: Final = 0.005

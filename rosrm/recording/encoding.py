@@ -16,10 +16,17 @@ from typing import Any, Final, get_args
 
 import numpy as np
 
-from rosrm.config.plain import from_plain, to_plain
-from rosrm.core import events as happened
-from rosrm.core.commands import Assign, Command, Order, PublishStateConfig, Redeliver, Withdraw
-from rosrm.core.model import RESOURCE_SLOTS
+from rosrm.core.master import events as happened
+from rosrm.core.master.commands import (
+    Assign,
+    Command,
+    Order,
+    PublishStateConfig,
+    Redeliver,
+    Withdraw,
+)
+from rosrm.model.codec import from_plain, to_plain
+from rosrm.model.values import RESOURCE_SLOTS
 from rosrm.recording.frames import FrameKind
 
 #: Seconds by the master's monotonic clock, and unix time.

@@ -11,13 +11,13 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final, Literal
 
-from rosrm.core.model import ProcessSpec
-from rosrm.core.views import Snapshot
 from rosrm.errors import NoMaster, Refused, RosrmError
+from rosrm.model.ros_settings import RosSettings
+from rosrm.model.rows import Snapshot
+from rosrm.model.values import ProcessSpec
 from rosrm.ros import convert, names, qos
 from rosrm.ros.control import ControlClient, check_answer
 from rosrm.ros.participant import Participant
-from rosrm.ros.settings import RosSettings
 from rosrm.version import PROTOCOL_VERSION, __version__
 from rosrm_msgs import srv
 

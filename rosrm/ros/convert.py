@@ -6,9 +6,9 @@ import json
 from collections.abc import Iterable, Mapping
 from typing import Any, Final
 
-from rosrm.core import model
-from rosrm.core.views import EventRow, HostRow, PluginRow, ProcessRow, ResourceRow
 from rosrm.errors import Refused
+from rosrm.model import values
+from rosrm.model.rows import EventRow, HostRow, PluginRow, ProcessRow, ResourceRow
 from rosrm_msgs import msg
 
 _INFINITE: Final = float("inf")
@@ -26,14 +26,14 @@ def mapping(values: Iterable[msg.KeyValue]) -> dict[str, str]:
     return {pair.key: pair.value for pair in values}
 
 
-def instance_to_msg(instance: model.InstanceId) -> msg.InstanceId:
+def instance_to_msg(instance: values.InstanceId) -> msg.InstanceId:
     """One run of a process."""
     return msg.InstanceId(process=instance.process, number=instance.number)
 
 
-def instance_from_msg(message: msg.InstanceId) -> model.InstanceId:
+def instance_from_msg(message: msg.InstanceId) -> values.InstanceId:
     """The inverse of `instance_to_msg`."""
-    return model.InstanceId(message.process, message.number)
+    return values.InstanceId(message.process, message.number)
 
 
 def json_object(text: str, what: str) -> dict[str, Any]:
@@ -49,7 +49,7 @@ def json_object(text: str, what: str) -> dict[str, Any]:
 # --- specs and assignments --------------------------------------------------------------------
 
 
-def spec_to_msg(spec: model.ProcessSpec) -> msg.ProcessSpec:
+def spec_to_msg(spec: values.ProcessSpec) -> msg.ProcessSpec:
     """A process spec."""
     restart, readiness, stop = spec.restart, spec.readiness, spec.stop
     return msg.ProcessSpec(
@@ -92,13 +92,13 @@ def spec_to_msg(spec: model.ProcessSpec) -> msg.ProcessSpec:
     )  # fmt: skip
 
 
-def spec_from_msg(message: msg.ProcessSpec) -> model.ProcessSpec:
+def spec_from_msg(message: msg.ProcessSpec) -> values.ProcessSpec:
     """The inverse of `spec_to_msg`; raises `Refused` for what makes no process."""
     fault = _spec_fault(message)
     if fault:
         raise Refused(f"process {message.name!r}: {fault}")
     migration = message.migration
-    return model.ProcessSpec(
+    return values.ProcessSpec(
         name=message.name, namespace=message.ros_namespace, package=message.package or None,
         executable=message.executable or None, module=message.module or None,
         command=tuple(message.command), arguments=tuple(message.arguments),
@@ -108,22 +108,22 @@ def spec_from_msg(message: msg.ProcessSpec) -> model.ProcessSpec:
         },
         remappings=mapping(message.remappings), environment=mapping(message.environment),
         working_directory=message.working_directory or None, ros=message.ros,
-        kind=model.Kind(message.kind),
+        kind=values.Kind(message.kind),
         restart=_restart_from_msg(message.restart),
         needs={need.resource: need.amount for need in message.needs},
         required_labels=mapping(message.required_labels),
         preferred_labels=mapping(message.preferred_labels),
         avoided_labels=mapping(message.avoided_labels), priority=message.priority,
-        migration=model.MigrationPolicy(
+        migration=values.MigrationPolicy(
             migration.strategy or None, migration.overlap,
             json_object(migration.options, "migration options"),
         ),
-        readiness=model.Readiness(message.readiness.kind, message.readiness.timeout),
-        stop=model.StopPolicy(message.stop.interrupt_grace, message.stop.terminate_grace),
-        host_loss=model.HostLossPolicy(message.host_loss.then, message.host_loss.delay),
-        isolation=model.IsolationPolicy(message.isolation.then, message.isolation.after),
-        standby=model.StandbyPolicy(message.standby.wanted, tuple(message.standby.apart_by)),
-        health=model.Health(
+        readiness=values.Readiness(message.readiness.kind, message.readiness.timeout),
+        stop=values.StopPolicy(message.stop.interrupt_grace, message.stop.terminate_grace),
+        host_loss=values.HostLossPolicy(message.host_loss.then, message.host_loss.delay),
+        isolation=values.IsolationPolicy(message.isolation.then, message.isolation.after),
+        standby=values.StandbyPolicy(message.standby.wanted, tuple(message.standby.apart_by)),
+        health=values.Health(
             message.health.topic, message.health.rate, message.health.lifecycle,
             message.health.timeout,
         ),
@@ -150,7 +150,7 @@ def _spec_fault(message: msg.ProcessSpec) -> str:
 
 def _word_fault(message: msg.ProcessSpec) -> str:
     words = (
-        ("kind", message.kind, tuple(kind.value for kind in model.Kind)),
+        ("kind", message.kind, tuple(kind.value for kind in values.Kind)),
         ("readiness", message.readiness.kind, ("auto", "graph", "running")),
         ("host_loss", message.host_loss.then, ("wait", "elsewhere", "stop")),
         ("isolation", message.isolation.then, ("keep", "stop")),
@@ -181,7 +181,7 @@ def _times_fault(message: msg.ProcessSpec) -> str:
     return ""
 
 
-def restart_to_msg(restart: model.RestartPolicy) -> msg.RestartPolicy:
+def restart_to_msg(restart: values.RestartPolicy) -> msg.RestartPolicy:
     """A restart policy."""
     return msg.RestartPolicy(
         when=restart.when, delay=float(restart.delay), max_delay=float(restart.max_delay),
@@ -189,7 +189,7 @@ def restart_to_msg(restart: model.RestartPolicy) -> msg.RestartPolicy:
     )  # fmt: skip
 
 
-def restart_from_msg(message: msg.RestartPolicy) -> model.RestartPolicy:
+def restart_from_msg(message: msg.RestartPolicy) -> values.RestartPolicy:
     """The inverse of `restart_to_msg`; raises `Refused` for what makes no policy."""
     fault = _restart_fault(message)
     if fault:
@@ -197,8 +197,8 @@ def restart_from_msg(message: msg.RestartPolicy) -> model.RestartPolicy:
     return _restart_from_msg(message)
 
 
-def _restart_from_msg(message: msg.RestartPolicy) -> model.RestartPolicy:
-    return model.RestartPolicy(
+def _restart_from_msg(message: msg.RestartPolicy) -> values.RestartPolicy:
+    return values.RestartPolicy(
         message.when, message.delay, message.max_delay, message.factor, message.attempts,
         message.window,
     )  # fmt: skip
@@ -222,9 +222,9 @@ def _json_value(text: str, what: str) -> Any:
         raise Refused(f"{what} is no JSON: {error}") from error
 
 
-def assignment_to_msg(assignment: model.Assignment) -> msg.Assignment:
+def assignment_to_msg(assignment: values.Assignment) -> msg.Assignment:
     """An order to run an instance."""
-    fence = assignment.fence or model.Fence(0.0, 0.0)
+    fence = assignment.fence or values.Fence(0.0, 0.0)
     return msg.Assignment(
         instance=instance_to_msg(assignment.instance), epoch=assignment.epoch,
         node_name=assignment.node_name, shadow=assignment.shadow,
@@ -236,15 +236,15 @@ def assignment_to_msg(assignment: model.Assignment) -> msg.Assignment:
     )  # fmt: skip
 
 
-def assignment_from_msg(message: msg.Assignment) -> model.Assignment:
+def assignment_from_msg(message: msg.Assignment) -> values.Assignment:
     """The inverse of `assignment_to_msg`; raises `Refused`."""
     for name in ("fence_after", "fence_grace"):
         if not 0.0 <= getattr(message, name) < _INFINITE:
             raise Refused(f"{message.instance.process}: {name} is {getattr(message, name)}")
     fence = None
     if message.fence_after:
-        fence = model.Fence(message.fence_after, message.fence_grace, message.fence_alive)
-    return model.Assignment(
+        fence = values.Fence(message.fence_after, message.fence_grace, message.fence_alive)
+    return values.Assignment(
         instance_from_msg(message.instance), spec_from_msg(message.spec), message.epoch,
         message.node_name, message.shadow, fence, tuple(message.kept_on), message.kept_from,
         message.restored,
@@ -254,7 +254,7 @@ def assignment_from_msg(message: msg.Assignment) -> model.Assignment:
 # --- hosts and statuses -----------------------------------------------------------------------
 
 
-def host_to_msg(host: model.HostDescription) -> msg.HostDescription:
+def host_to_msg(host: values.HostDescription) -> msg.HostDescription:
     """A host."""
     return msg.HostDescription(
         name=host.name, hostname=host.hostname, incarnation=host.incarnation, pid=host.pid,
@@ -271,12 +271,12 @@ def host_to_msg(host: model.HostDescription) -> msg.HostDescription:
     )  # fmt: skip
 
 
-def host_from_msg(message: msg.HostDescription) -> model.HostDescription:
+def host_from_msg(message: msg.HostDescription) -> values.HostDescription:
     """The inverse of `host_to_msg`; raises `Refused` for what makes no host."""
     resources = sorted(message.resources, key=lambda resource: int(resource.slot))
     if [resource.slot for resource in resources] != list(range(len(resources))):
         raise Refused(f"host {message.name!r}: its resources do not fill the slots 0, 1, 2, …")
-    if len(resources) > model.RESOURCE_SLOTS or not message.name or not message.incarnation:
+    if len(resources) > values.RESOURCE_SLOTS or not message.name or not message.incarnation:
         raise Refused(f"host {message.name!r}: no name, no incarnation or too many resources")
     for resource in resources:
         if not 0.0 < resource.capacity < _INFINITE:
@@ -285,18 +285,18 @@ def host_from_msg(message: msg.HostDescription) -> model.HostDescription:
             )
     if not 0.0 < message.period < _INFINITE:
         raise Refused(f"host {message.name!r}: it reports every {message.period} s")
-    return model.HostDescription(
+    return values.HostDescription(
         name=message.name, incarnation=message.incarnation, hostname=message.hostname,
         pid=message.pid, software_version=message.software_version, labels=mapping(message.labels),
         resources=tuple(
-            model.ResourceDescription(r.name, r.unit, r.capacity, r.scope) for r in resources
+            values.ResourceDescription(r.name, r.unit, r.capacity, r.scope) for r in resources
         ),
         max_processes=message.max_processes, period=message.period,
         executors=tuple(message.executors), absent=mapping(message.absent),
     )  # fmt: skip
 
 
-def status_to_msg(status: model.InstanceStatus) -> msg.ProcessStatus:
+def status_to_msg(status: values.InstanceStatus) -> msg.ProcessStatus:
     """What became of an instance."""
     return msg.ProcessStatus(
         instance=instance_to_msg(status.instance), state=status.state.value, pid=status.pid,
@@ -306,23 +306,23 @@ def status_to_msg(status: model.InstanceStatus) -> msg.ProcessStatus:
     )  # fmt: skip
 
 
-def status_from_msg(message: msg.ProcessStatus) -> model.InstanceStatus:
+def status_from_msg(message: msg.ProcessStatus) -> values.InstanceStatus:
     """The inverse of `status_to_msg`; raises `Refused` for what makes no sense."""
     try:
-        state = model.InstanceState(message.state)
+        state = values.InstanceState(message.state)
     except ValueError as error:
         raise Refused(f"unknown state {message.state!r} of {message.instance.process}") from error
     for name in ("peak_memory", "cpu_time", "run_time"):
         if not 0.0 <= getattr(message, name) < _INFINITE:
             raise Refused(f"{message.instance.process}: {name} is {getattr(message, name)}")
-    return model.InstanceStatus(
+    return values.InstanceStatus(
         instance_from_msg(message.instance), state, message.pid, message.exit_code,
         message.exit_signal, message.restarts, message.peak_memory, message.cpu_time,
         message.run_time, message.message,
     )  # fmt: skip
 
 
-def kept_to_msg(kept: model.KeptState) -> msg.KeptState:
+def kept_to_msg(kept: values.KeptState) -> msg.KeptState:
     """A state that a host keeps."""
     return msg.KeptState(
         process=kept.instance.process, number=kept.instance.number, sequence=kept.sequence,
@@ -330,10 +330,10 @@ def kept_to_msg(kept: model.KeptState) -> msg.KeptState:
     )  # fmt: skip
 
 
-def kept_from_msg(message: msg.KeptState) -> model.KeptState:
+def kept_from_msg(message: msg.KeptState) -> values.KeptState:
     """The inverse of `kept_to_msg`."""
-    instance = model.InstanceId(message.process, message.number)
-    return model.KeptState(instance, message.sequence, message.size)
+    instance = values.InstanceId(message.process, message.number)
+    return values.KeptState(instance, message.sequence, message.size)
 
 
 # --- rows -------------------------------------------------------------------------------------
@@ -369,10 +369,10 @@ def host_row_from_msg(message: msg.HostState) -> HostRow:
     )  # fmt: skip
     description = message.description
     return HostRow(
-        model.HostDescription(
+        values.HostDescription(
             description.name, description.incarnation, description.hostname, description.pid,
             description.software_version, mapping(description.labels),
-            tuple(model.ResourceDescription(r.name, r.unit, r.capacity, r.scope)
+            tuple(values.ResourceDescription(r.name, r.unit, r.capacity, r.scope)
                   for r in description.resources),
             description.max_processes, description.period, tuple(description.executors),
             mapping(description.absent),

@@ -20,10 +20,10 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 
+from rosrm.model.ros_settings import RosSettings
 from rosrm.ros import qos
 from rosrm.ros.callback_guard import CallbackGuard
 from rosrm.ros.fast_dds import Pace, announcing
-from rosrm.ros.settings import RosSettings
 from rosrm.version import PROTOCOL_VERSION
 
 if TYPE_CHECKING:

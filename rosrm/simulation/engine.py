@@ -14,9 +14,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from rosrm.core import events as happened
-from rosrm.core import slave
-from rosrm.core.commands import (
+from rosrm.core.master import events as happened
+from rosrm.core.master.commands import (
     Assign,
     Command,
     Order,
@@ -25,13 +24,14 @@ from rosrm.core.commands import (
     Reply,
     Withdraw,
 )
-from rosrm.core.declared import Declared
-from rosrm.core.master import step
-from rosrm.core.model import EMPTY, InstanceId
-from rosrm.core.placement import NamedPolicy
-from rosrm.core.settings import CoreSettings
-from rosrm.core.state import MasterState
-from rosrm.ports import Intent, MigrationStrategy, Record
+from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.reducer import step
+from rosrm.core.master.scheduling.ranking import NamedPolicy
+from rosrm.core.master.settings import CoreSettings
+from rosrm.core.slave import reducer
+from rosrm.extensions.contracts import Intent, MigrationStrategy, Record
+from rosrm.extensions.declared_fields import Declared
+from rosrm.model.values import EMPTY, InstanceId
 from rosrm.simulation.agenda import Agenda
 from rosrm.simulation.hosting import Hosting
 from rosrm.simulation.machine import Machine
@@ -164,8 +164,8 @@ class Simulation:
         assert reply is not None  # _tell has set it
         machine.host_id = reply.host_id
         self._by_id[machine.host_id] = machine
-        self._hosting.hear(machine, slave.Registered(self.state.epoch))
-        self._hosting.hear(machine, slave.MasterHears(inf))  # no simulated host is cut off
+        self._hosting.hear(machine, reducer.Registered(self.state.epoch))
+        self._hosting.hear(machine, reducer.MasterHears(inf))  # no simulated host is cut off
         self._read([machine])
 
     def _leave(self, plan: HostPlan) -> None:
@@ -191,7 +191,7 @@ class Simulation:
             self._usage_told = turn
             for machine in there:
                 self._tell_usages(machine)
-                self._hosting.hear(machine, slave.TimePassed())
+                self._hosting.hear(machine, reducer.TimePassed())
         self._tell(happened.TimePassed())
 
     def _read(self, machines: list[Machine]) -> None:
@@ -268,7 +268,7 @@ class Simulation:
         def arrive() -> None:
             if machine.up and not machine.stopping and assignment.instance in self._undelivered:
                 self._undelivered.discard(assignment.instance)
-                self._hosting.hear(machine, slave.AssignmentsReceived((assignment,)))
+                self._hosting.hear(machine, reducer.AssignmentsReceived((assignment,)))
 
         self.agenda.after(self.workload.model.wire, arrive)
 

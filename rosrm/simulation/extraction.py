@@ -14,17 +14,17 @@ from typing import Final
 
 import numpy as np
 
-from rosrm.core import events as happened
-from rosrm.core.commands import Assign, Command, PublishStateConfig
-from rosrm.core.hosts import HostCondition
-from rosrm.core.model import HostDescription, InstanceState, InstanceStatus, ProcessSpec
-from rosrm.core.processes import ProcessPhase
-from rosrm.core.slave import awaits_graph
-from rosrm.core.specs import spec_from_dict
-from rosrm.core.state import MasterState
-from rosrm.ports import Record
+from rosrm.core.master import events as happened
+from rosrm.core.master.commands import Assign, Command, PublishStateConfig
+from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.state.hosts import HostCondition
+from rosrm.core.master.state.process import ProcessPhase
+from rosrm.core.slave.reducer import awaits_graph
+from rosrm.extensions.contracts import Record
+from rosrm.model.spec_json import spec_from_dict
+from rosrm.model.values import HostDescription, InstanceState, InstanceStatus, ProcessSpec
 from rosrm.recording.encoding import Happened
-from rosrm.recording.reading import Recording
+from rosrm.recording.reader import Recording
 from rosrm.simulation.workload import Curve, HostPlan, Model, ProcessPlan, Workload
 
 #: Points of a memory curve that are kept.

@@ -5,16 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from functools import partial
 
-from rosrm.core import events as happened
-from rosrm.core import slave
-from rosrm.core.commands import Order
-from rosrm.core.model import (
-    Assignment,
-    InstanceId,
-    InstanceState,
-    InstanceStatus,
-    RestartPolicy,
-)
+from rosrm.core.master import events as happened
+from rosrm.core.master.commands import Order
+from rosrm.core.slave import reducer
+from rosrm.model.values import Assignment, InstanceId, InstanceState, InstanceStatus, RestartPolicy
 from rosrm.simulation.agenda import Agenda, Entry
 from rosrm.simulation.machine import Machine, Program
 from rosrm.simulation.workload import Model, ProcessPlan
@@ -50,30 +44,30 @@ class Hosting:
 
     # --- the slave hears -----------------------------------------------------------------
 
-    def hear(self, machine: Machine, event: slave.Event) -> None:
+    def hear(self, machine: Machine, event: reducer.Event) -> None:
         """Something happens to a slave."""
-        for command in slave.step(machine.slave, event, self._agenda.now):
+        for command in reducer.step(machine.slave, event, self._agenda.now):
             self._carry_out(machine, command)
 
-    def _carry_out(self, machine: Machine, command: slave.Command) -> None:
-        if isinstance(command, slave.Report):
+    def _carry_out(self, machine: Machine, command: reducer.Command) -> None:
+        if isinstance(command, reducer.Report):
             machine.batches += 1
             report = happened.StatusesReceived(
                 machine.host_id, machine.incarnation, machine.batches, command.complete,
                 command.statuses,
             )  # fmt: skip
             self._say(machine, report)
-        elif isinstance(command, slave.Launch):
+        elif isinstance(command, reducer.Launch):
             for assignment in command.assignments:
                 self._launch(machine, assignment)
-        elif isinstance(command, slave.Stop | slave.Fence):
+        elif isinstance(command, reducer.Stop | reducer.Fence):
             self._stop(machine, command.instance)
-        elif isinstance(command, slave.Restart):
+        elif isinstance(command, reducer.Restart):
             self._restart(machine, command.instance)
-        elif isinstance(command, slave.Amend):
+        elif isinstance(command, reducer.Amend):
             machine.programs[command.instance].restart = command.restart
-            self.hear(machine, slave.RestartPolicyRecorded(command.instance, command.restart))
-        elif isinstance(command, slave.Settle):
+            self.hear(machine, reducer.RestartPolicyRecorded(command.instance, command.restart))
+        elif isinstance(command, reducer.Settle):
             self._settle(machine, command)
 
     def _say(self, machine: Machine, event: happened.Event) -> None:
@@ -86,7 +80,7 @@ class Hosting:
         self._agenda.after(self._model.wire, arrive)
 
     def _supervisor_says(self, machine: Machine, status: InstanceStatus) -> None:
-        self.hear(machine, slave.SupervisorReported((status,)))
+        self.hear(machine, reducer.SupervisorReported((status,)))
 
     # --- what runs -----------------------------------------------------------------------
 
@@ -106,13 +100,13 @@ class Hosting:
         self._plan_end(machine)
         status = InstanceStatus(instance, InstanceState.RUNNING, pid=instance.number)
         self._supervisor_says(machine, status)
-        if slave.awaits_graph(program.assignment.spec):
+        if reducer.awaits_graph(program.assignment.spec):
             self._agenda.after(self._model.ready, partial(self._seen, machine, instance, run))
 
     def _seen(self, machine: Machine, instance: InstanceId, run: int) -> None:
         program = machine.programs.get(instance)
         if program is not None and program.run == run and machine.up:
-            self.hear(machine, slave.SeenInGraph(instance))
+            self.hear(machine, reducer.SeenInGraph(instance))
 
     def _stop(self, machine: Machine, instance: InstanceId) -> None:
         program = machine.programs.get(instance)
@@ -171,7 +165,7 @@ class Hosting:
         machine.stopping = True
         for instance in list(machine.slave.held):
             if not machine.slave.held[instance].status.state.ended:
-                self.hear(machine, slave.StopOrdered(instance))
+                self.hear(machine, reducer.StopOrdered(instance))
         self._close(machine)
 
     def _close(self, machine: Machine) -> None:
@@ -198,27 +192,27 @@ class Hosting:
             assert order.instance is not None
             assert order.restart is not None
             self._settling[order.instance, order.restart] = order
-            self.hear(machine, slave.RestartPolicySet(order.instance, order.restart))
+            self.hear(machine, reducer.RestartPolicySet(order.instance, order.restart))
         else:
             self.hear(machine, _as_event(order))
             self._say(machine, happened.OrderAnswered(order.order, accepted=True))
 
-    def _settle(self, machine: Machine, command: slave.Settle) -> None:
+    def _settle(self, machine: Machine, command: reducer.Settle) -> None:
         order = self._settling.pop((command.instance, command.restart), None)
         if order is not None:
             code = "refused" if command.refusal else ""
             self._say(machine, happened.OrderAnswered(order.order, not code, code, command.refusal))
 
 
-def _as_event(order: Order) -> slave.Event:
+def _as_event(order: Order) -> reducer.Event:
     if order.action == "report":
-        return slave.ReportRequested()
+        return reducer.ReportRequested()
     if order.action == "start":
         assert order.assignment is not None
-        return slave.AssignmentsReceived((order.assignment,))
+        return reducer.AssignmentsReceived((order.assignment,))
     assert order.instance is not None
     if order.action == "restart":
-        return slave.RestartOrdered(order.instance)
+        return reducer.RestartOrdered(order.instance)
     if order.action == "fence":
-        return slave.FenceOrdered(order.instance)
-    return slave.StopOrdered(order.instance)
+        return reducer.FenceOrdered(order.instance)
+    return reducer.StopOrdered(order.instance)

@@ -14,9 +14,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rosrm.core import slave
-from rosrm.core.columns import FloatArray
-from rosrm.core.model import (
+from rosrm.core.master.state.host_arrays import FloatArray
+from rosrm.core.slave import reducer
+from rosrm.model.values import (
     RESOURCE_SLOTS,
     Assignment,
     HostDescription,
@@ -76,7 +76,7 @@ class Machine:
     plan: HostPlan
     incarnation: int
     period: float
-    slave: slave.SlaveState = field(default_factory=slave.SlaveState)
+    slave: reducer.SlaveState = field(default_factory=reducer.SlaveState)
     programs: dict[InstanceId, Program] = field(default_factory=dict)
     host_id: int = 0
     up: bool = True
@@ -186,7 +186,7 @@ class Machine:
             usage = np.zeros(RESOURCE_SLOTS)
             usage[: len(used)] = [used[one.name] for one in self.plan.resources]
             present = (1 << len(used)) - 1
-            accepts = slave.under_limits(
+            accepts = reducer.under_limits(
                 usage.astype(np.float32), self.limit.astype(np.float32), present, 0
             )
             self._reading = Reading(now, usage, accepts)

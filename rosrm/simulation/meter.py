@@ -9,15 +9,15 @@ from typing import Final
 
 import numpy as np
 
-from rosrm.core import events as happened
-from rosrm.core.columns import FloatArray
-from rosrm.core.commands import Command
-from rosrm.core.hosts import HostCondition
-from rosrm.core.model import Kind
-from rosrm.core.processes import Process, ProcessPhase
-from rosrm.core.state import MasterState
-from rosrm.ports import Record
-from rosrm.spelling import standing
+from rosrm.core.master import events as happened
+from rosrm.core.master.commands import Command
+from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.state.host_arrays import FloatArray
+from rosrm.core.master.state.hosts import HostCondition
+from rosrm.core.master.state.process import Process, ProcessPhase
+from rosrm.extensions.contracts import Record
+from rosrm.model.values import Kind
+from rosrm.wording import standing
 
 #: Resources of which the balance is measured and drawn.
 MEASURED: Final = ("memory", "cpu")

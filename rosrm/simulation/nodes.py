@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 
-from rosrm.core.commands import PublishStateConfig
-from rosrm.core.events import Event, HandoffReported
-from rosrm.core.migration import HandoffPhase, ReportPhase
-from rosrm.core.model import InstanceId
+from rosrm.core.master.commands import PublishStateConfig
+from rosrm.core.master.events import Event, HandoffReported
+from rosrm.model.plan import HandoffPhase, ReportPhase
+from rosrm.model.values import InstanceId
 from rosrm.simulation.agenda import Agenda
 from rosrm.simulation.hosting import Hosting
 from rosrm.simulation.workload import Model

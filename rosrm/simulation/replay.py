@@ -7,17 +7,17 @@ from dataclasses import dataclass
 from math import inf
 from typing import Final
 
-from rosrm.core import lost_tail
-from rosrm.core.commands import Command
-from rosrm.core.declared import Declared
-from rosrm.core.master import step
-from rosrm.core.placement import NamedPolicy
-from rosrm.core.restore import restore
-from rosrm.core.settings import CoreSettings
-from rosrm.core.state import MasterState
-from rosrm.ports import MigrationStrategy
+from rosrm.core.master.commands import Command
+from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.recovery import journal_gap
+from rosrm.core.master.recovery.restore import restore
+from rosrm.core.master.reducer import step
+from rosrm.core.master.scheduling.ranking import NamedPolicy
+from rosrm.core.master.settings import CoreSettings
+from rosrm.extensions.contracts import MigrationStrategy
+from rosrm.extensions.declared_fields import Declared
 from rosrm.recording.encoding import Happened, decisions
-from rosrm.recording.reading import Recording
+from rosrm.recording.reader import Recording
 from rosrm.simulation.meter import Meter, Outcome
 
 #: Differences that are told in full.
@@ -86,7 +86,7 @@ def replay(
     restore(state, lambda table: header.intents.get(table, {}), header.started)
     tail = header.intents.get("cluster", {}).get("tail")
     if tail is not None:
-        lost_tail.begin(state, int(tail["newest"]), header.started, fell=bool(tail["fell"]))
+        journal_gap.begin(state, int(tail["newest"]), header.started, fell=bool(tail["fell"]))
     end = header.started + min(until, recording.length)
     meter = Meter(end)
     meter.begin(state, header.started)

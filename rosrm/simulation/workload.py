@@ -10,8 +10,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from math import inf
 
-from rosrm.core.events import Event
-from rosrm.core.model import EMPTY, ProcessSpec, ResourceDescription
+from rosrm.core.master.events import Event
+from rosrm.model.values import EMPTY, ProcessSpec, ResourceDescription
 
 
 @dataclass(frozen=True, slots=True)

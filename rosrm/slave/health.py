@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
-from rosrm.core.model import InstanceId
-from rosrm.core.slave import Held, Look, LookedAt, Watch
+from rosrm.core.slave.reducer import Held, Look, LookedAt, Watch
 from rosrm.criu import tree
 from rosrm.errors import PortableError
+from rosrm.model.values import InstanceId
 from rosrm.portable import State, directory_of, status_of
-from rosrm.ros.graph import GraphWatch
-from rosrm.ros.health import HealthEar
 from rosrm.ros.participant import Participant
+from rosrm.ros.slave.graph import GraphWatch
+from rosrm.ros.slave.health import HealthEar
 from rosrm.slave.sessions import SessionTable
-from rosrm.supervisor.members import read_stat
+from rosrm.supervisor.procfs import read_stat
 
 #: State in /proc of what a signal has stopped; "t" is what a debugger holds.
 _STOPPED: Final = "T"

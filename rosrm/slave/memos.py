@@ -6,8 +6,8 @@ import json
 from dataclasses import astuple
 from typing import Any
 
-from rosrm.core.model import Health
-from rosrm.core.slave import Awaited, Memo, Watch
+from rosrm.core.slave.reducer import Awaited, Memo, Watch
+from rosrm.model.values import Health
 
 
 def to_memo(memo: Memo) -> str:

@@ -16,8 +16,11 @@ from typing import Any, Final
 import numpy as np
 
 from rosrm.config.settings import HostConfig
-from rosrm.core import slave as core
-from rosrm.core.model import (
+from rosrm.core.slave import reducer as core
+from rosrm.errors import Refused
+from rosrm.extensions.contracts import ProbeContext
+from rosrm.extensions.registry import Registry
+from rosrm.model.values import (
     RESOURCE_SLOTS,
     HostDescription,
     InstanceId,
@@ -26,29 +29,26 @@ from rosrm.core.model import (
     KeptState,
     RestartPolicy,
 )
-from rosrm.entry import handle_stop_signals
-from rosrm.errors import Refused
-from rosrm.ports import ProbeContext
-from rosrm.registry import Registry
-from rosrm.ros.graph import GraphWatch
-from rosrm.ros.journal_seen import JournalSeen
-from rosrm.ros.kept_endpoint import KeptEndpoint
 from rosrm.ros.names import token
 from rosrm.ros.participant import Participant
-from rosrm.ros.slave_endpoint import Link, LogQuery, LogSlice, SlaveEndpoint
-from rosrm.slave.ending import STOP_ALL, Ending
-from rosrm.slave.executing import Done, Executors, Here
+from rosrm.ros.slave.endpoint import Link, LogQuery, LogSlice, SlaveEndpoint
+from rosrm.ros.slave.graph import GraphWatch
+from rosrm.ros.slave.journal_watermark import JournalSeen
+from rosrm.ros.slave.replication import KeptEndpoint
+from rosrm.runtime.bootstrap import handle_stop_signals
+from rosrm.runtime.state_lock import only_one
+from rosrm.slave.executors import Done, Executors, Here
 from rosrm.slave.health import HealthWatch
-from rosrm.slave.keeping import Keeping
-from rosrm.slave.log_reading import newest_instance, nothing_yet, read_log
-from rosrm.slave.sampling import ProbeReport, Sampler
+from rosrm.slave.launch.starter import Starter
+from rosrm.slave.logs import newest_instance, nothing_yet, read_log
+from rosrm.slave.replication.service import Keeping
+from rosrm.slave.sampler import ProbeReport, Sampler
 from rosrm.slave.sessions import SessionTable
-from rosrm.slave.starting import Starter
-from rosrm.slave.supervisor_link import SupervisorLink
+from rosrm.slave.shutdown import STOP_ALL, Ending
+from rosrm.slave.supervisor_client import SupervisorLink
 from rosrm.slave.usage import UsageWatch
-from rosrm.spelling import counted
-from rosrm.state_directory import only_one
 from rosrm.version import __version__
+from rosrm.wording import counted
 
 _log = logging.getLogger("rosrm.slave")
 

@@ -35,7 +35,7 @@ class SessionUsage:
 
 
 class SessionTable:
-    """Implements `rosrm.ports.Sessions`; the loop calls all but `pids` and `ended_cpu_time`.
+    """Implements `Sessions` of the contracts; the loop calls all but `pids` and `ended_cpu_time`.
 
     Those two may be called from any thread at any time: they return what was assigned in one step.
 

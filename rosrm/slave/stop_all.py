@@ -1,7 +1,7 @@
 """Ends what a slave that is gone left running on its host: `rosrm slave --stop-all` executes this.
 
 It is the slave once more, which registers, accepts no work and ends. So the master learns what has
-ended, as at the end of any slave. As `rosrm.slave.run`, it imports little.
+ended, as at the end of any slave. As `rosrm.slave`, it imports little.
 """
 
 # ruff: noqa: E402 - Ctrl-C must end us without a traceback also while the rest is being imported
@@ -15,9 +15,8 @@ import sys
 from dataclasses import replace
 
 from rosrm.config.settings import HostConfig
-from rosrm.entry import run
-from rosrm.handover import Handover
-from rosrm.registry import Registry
+from rosrm.extensions.registry import Registry
+from rosrm.runtime.bootstrap import Handover, run
 from rosrm.slave.runtime import SlaveRuntime
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Final
 
-from rosrm.core.model import InstanceId, InstanceState, InstanceStatus
+from rosrm.model.values import InstanceId, InstanceState, InstanceStatus
 from rosrm.slave.sessions import SessionTable, SessionUsage
 
 #: Readings that go out between looking at what each instance uses and saying it: so the master

@@ -2,7 +2,7 @@
 
     __main__.py   starts it: subreaper, daemon, then the bare interpreter
     bare.py       where that interpreter begins
-    server.py     its event loop: the imperative shell around `rosrm.core.supervision`
+    server.py     its event loop: the imperative shell around `rosrm.core.supervisor.reducer`
     children.py   spawns, signals and reaps
     members.py    reads in /proc who belongs to an instance
     record.py     what survives its own death: instances.jsonl

@@ -10,12 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from rosrm.core.model import (
-    InstanceId,
-    InstanceStatus,
-    RestartPolicy,
-)
-from rosrm.core.supervision import (
+from rosrm.core.supervisor.reducer import (
     AmendOrdered,
     FailOrdered,
     FenceOrdered,
@@ -26,11 +21,9 @@ from rosrm.core.supervision import (
     StopOrdered,
 )
 from rosrm.errors import SupervisorError
-from rosrm.supervisor import lines, paths, protocol
-from rosrm.supervisor.logs import LogLimits
-from rosrm.supervisor.outgoing import MOST_UNSENT, Outgoing, Overfull
-from rosrm.supervisor.starting import connect_or_start, readable
-from rosrm.supervisor.values import (
+from rosrm.model.values import InstanceId, InstanceStatus, RestartPolicy
+from rosrm.supervisor import json_lines, messages, paths
+from rosrm.supervisor.client_values import (
     Amended,
     LaunchOrder,
     Told,
@@ -40,6 +33,9 @@ from rosrm.supervisor.values import (
     status_from,
     stop_rule,
 )
+from rosrm.supervisor.discovery import connect_or_start, readable
+from rosrm.supervisor.logs import LogLimits
+from rosrm.supervisor.send_buffer import MOST_UNSENT, Outgoing, Overfull
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -115,7 +111,7 @@ class SupervisorClient:
         self._peer = peer
         self._outgoing = Outgoing(peer)
         self._state = state_directory
-        self._lines = lines.Lines()
+        self._lines = json_lines.Lines()
         self._received: list[Told] = []
         self._failure: SupervisorError | None = None
         self._ending = False
@@ -167,7 +163,7 @@ class SupervisorClient:
         with self._sending:
             if orders and self._base is None:
                 self._choose_base(orders[0].environment)
-            self._send(b"".join(protocol.encode_order(self._launch(order)) for order in orders))
+            self._send(b"".join(messages.encode_order(self._launch(order)) for order in orders))
 
     def stop(self, instance: InstanceId) -> None:
         """SIGINT, SIGTERM, SIGKILL to all of it; never heard of: it will never be started."""
@@ -211,17 +207,17 @@ class SupervisorClient:
             changes: of its environment when it starts again; None: without this variable.
         """
         order = AmendOrdered(key_of(instance), restart_rule(restart))
-        self._order(protocol.Amend(order, changes))
+        self._order(messages.Amend(order, changes))
 
     def remember(self, instance: InstanceId, memo: str) -> None:
         """Keep another text for a later run of the client."""
-        self._order(protocol.Remember(key_of(instance), memo))
+        self._order(messages.Remember(key_of(instance), memo))
 
     def forget(self, instances: Iterable[InstanceId]) -> None:
         """Their final statuses are kept elsewhere now: the supervisor need not."""
         forgotten = tuple(Forgotten(key_of(instance)) for instance in instances)
         if forgotten:
-            self._order(protocol.Forget(forgotten))
+            self._order(messages.Forget(forgotten))
 
     def shutdown(self) -> None:
         """Stop everything, then end the supervisor; `receive` tells all of it."""
@@ -271,13 +267,13 @@ class SupervisorClient:
 
     # --- sending ------------------------------------------------------------------------------
 
-    def _launch(self, order: LaunchOrder) -> protocol.Launch:
+    def _launch(self, order: LaunchOrder) -> messages.Launch:
         base = self._base or {}
         changes: dict[str, str | None] = {
             name: value for name, value in order.environment.items() if base.get(name) != value
         }
         changes.update((name, None) for name in base if name not in order.environment)
-        return protocol.Launch(
+        return messages.Launch(
             key_of(order.instance),
             order.argv,
             self._base_id,
@@ -294,11 +290,11 @@ class SupervisorClient:
         """Environments differ little: send one whole, and of the others what differs from it."""
         self._base = dict(environment)
         self._base_id = os.urandom(8).hex()
-        self._send(protocol.encode_order(protocol.Environment(self._base_id, self._base)))
+        self._send(messages.encode_order(messages.Environment(self._base_id, self._base)))
 
-    def _order(self, order: protocol.Order) -> None:
+    def _order(self, order: messages.Order) -> None:
         with self._sending:
-            self._send(protocol.encode_order(order))
+            self._send(messages.encode_order(order))
 
     def _send(self, data: bytes) -> None:
         try:
@@ -315,7 +311,7 @@ class SupervisorClient:
     # --- receiving ----------------------------------------------------------------------------
 
     def _introduce(self, log: LogLimits, deadline: float) -> None:
-        self._order(protocol.Hello(protocol.PROTOCOL, os.getpid(), log))
+        self._order(messages.Hello(messages.PROTOCOL, os.getpid(), log))
         while not self.pid:
             if self._failure is not None:
                 raise self._failure
@@ -335,8 +331,8 @@ class SupervisorClient:
             self._lose(f"{self._name()} is gone; its processes go on")
         try:
             for line in self._lines.feed(data):
-                self._take(lines.parse(line))
-        except (lines.ProtocolError, KeyError, TypeError, ValueError) as error:
+                self._take(json_lines.parse(line))
+        except (json_lines.ProtocolError, KeyError, TypeError, ValueError) as error:
             self._fail(SupervisorError(f"{self._name()} cannot be understood: {error}"))
 
     def _lose(self, reason: str) -> None:
@@ -351,8 +347,8 @@ class SupervisorClient:
         if told == "status":
             self._received.append(status_from(fields["status"]))
         elif told == "amended":
-            instance = InstanceId(*protocol.read_key(fields["instance"]))
-            rule = protocol.read_restart(fields["restart"])  # type: ignore[arg-type]
+            instance = InstanceId(*messages.read_key(fields["instance"]))
+            rule = messages.read_restart(fields["restart"])  # type: ignore[arg-type]
             self._received.append(Amended(instance, RestartPolicy(*rule)))
         elif told == "welcome":
             self._take_welcome(fields)
@@ -365,8 +361,8 @@ class SupervisorClient:
 
     def _take_welcome(self, fields: Mapping[str, object]) -> None:
         number, pid = fields["protocol"], fields["pid"]
-        if number != protocol.PROTOCOL:
-            raise ValueError(f"it speaks protocol {number!r}, this is {protocol.PROTOCOL}")
+        if number != messages.PROTOCOL:
+            raise ValueError(f"it speaks protocol {number!r}, this is {messages.PROTOCOL}")
         notes, instances, memos = fields["notes"], fields["instances"], fields["memos"]
         fenced = fields["fenced"]
         assert isinstance(pid, int)
@@ -377,8 +373,8 @@ class SupervisorClient:
         self.pid = pid
         self.notes = tuple(str(note) for note in notes)
         self.instances = tuple(status_from(value) for value in instances)
-        self.fenced = frozenset(InstanceId(*protocol.read_key(key)) for key in fenced)
-        self.memos = {InstanceId(*protocol.read_key(key)): str(memo) for key, memo in memos}
+        self.fenced = frozenset(InstanceId(*messages.read_key(key)) for key in fenced)
+        self.memos = {InstanceId(*messages.read_key(key)): str(memo) for key, memo in memos}
 
     def _fail(self, failure: SupervisorError) -> None:
         """Remember what ends the connection; what came before it is delivered first."""

@@ -7,7 +7,7 @@ import struct
 from typing import Final
 
 from rosrm.supervisor import own_log
-from rosrm.supervisor.lines import Lines
+from rosrm.supervisor.json_lines import Lines
 
 #: A client that leaves so many bytes unread is cut off; it hears everything anew when it returns.
 MOST_UNREAD: Final = 8 << 20

@@ -1,4 +1,4 @@
-"""The event loop of the supervisor: carries out what `rosrm.core.supervision` decides.
+"""The event loop of the supervisor: carries out what `rosrm.core.supervisor.reducer` decides.
 
 One thread. Each round: take what came in, let the core decide, record, spawn a few, tell. What is
 told was recorded before; what is spawned was recorded as about to be.
@@ -15,15 +15,15 @@ from collections import deque
 from collections.abc import Callable
 from typing import Final
 
-from rosrm.core import supervision
-from rosrm.core.supervision import Event, Key, Spawned, SpawnFailed
-from rosrm.supervisor import children, heard, members, own_log, paths, protocol, takeover
+from rosrm.core.supervisor import reducer
+from rosrm.core.supervisor.reducer import Event, Key, Spawned, SpawnFailed
+from rosrm.supervisor import lease_file, messages, own_log, paths, procfs, spawn, takeover
 from rosrm.supervisor.connection import Connection
-from rosrm.supervisor.family import Family, mark
-from rosrm.supervisor.lines import ProtocolError
+from rosrm.supervisor.instance_record import Record
+from rosrm.supervisor.json_lines import ProtocolError
 from rosrm.supervisor.logs import LogKeeper, LogLimits
-from rosrm.supervisor.members import INSTANCE_MARK, SUPERVISOR_MARK
-from rosrm.supervisor.record import Record
+from rosrm.supervisor.process_tree import Family, mark
+from rosrm.supervisor.procfs import INSTANCE_MARK, SUPERVISOR_MARK
 
 #: Spawns between two looks at everything else.
 SPAWNS_A_ROUND: Final = 8
@@ -46,13 +46,13 @@ class Server:
         self._state = state
         self._listener = listener
         self._selector = selectors.DefaultSelector()
-        self._core = supervision.Supervision()
+        self._core = reducer.Supervision()
         self._family = Family(state, self._selector, self._happened)
         self._record = Record(state)
-        self._heard_at = heard.LastHeard(state)
+        self._heard_at = lease_file.LastHeard(state)
         self._logs = LogKeeper(state, limits)
         self._null = os.open(os.devnull, os.O_RDWR | os.O_CLOEXEC)
-        self._launches: dict[Key, protocol.Launch] = {}
+        self._launches: dict[Key, messages.Launch] = {}
         self._environments: dict[str, dict[str, str]] = {}
         self._notes: list[str] = []
         self._spawns: deque[Key] = deque()
@@ -88,7 +88,7 @@ class Server:
             # This process may have been stopped meanwhile: what was said in time counts first.
             self._take_in(0.0)
         if self._is_due():
-            self._happened(supervision.TimePassed())
+            self._happened(reducer.TimePassed())
         now = time.monotonic()
         self._logs.look(now)
         self._spawn_some()
@@ -115,7 +115,7 @@ class Server:
     def _leave(self) -> None:
         os.unlink(os.path.join(self._state, paths.SOCKET))
         if self._client is not None:
-            self._client.finish(protocol.encode_ended(), LAST_WORDS)
+            self._client.finish(messages.encode_ended(), LAST_WORDS)
 
     # --- the core's commands ------------------------------------------------------------------
 
@@ -123,16 +123,16 @@ class Server:
         for command in self._core.handle(event, time.monotonic()):
             self._execute(command)
 
-    def _execute(self, command: supervision.Command) -> None:
-        if isinstance(command, supervision.Tell):
+    def _execute(self, command: reducer.Command) -> None:
+        if isinstance(command, reducer.Tell):
             self._note_status(command.instance)
-        elif isinstance(command, supervision.Spawn):
+        elif isinstance(command, reducer.Spawn):
             self._spawns.append(command.instance)
-        elif isinstance(command, supervision.Signal):
+        elif isinstance(command, reducer.Signal):
             self._family.signal(command.instance, command.number)
-        elif isinstance(command, supervision.Unspawn):
+        elif isinstance(command, reducer.Unspawn):
             self._unspawn(command.instance)
-        elif isinstance(command, supervision.Drop):
+        elif isinstance(command, reducer.Drop):
             self._record.dead(command.instance, self._core.dead[command.instance[0]])
         else:
             self._leaving = True
@@ -142,10 +142,10 @@ class Server:
         if instance.ended:
             self._launches.pop(key, None)
             self._logs.release(key)
-        if not instance.pid and instance.phase != supervision.STOPPING:
+        if not instance.pid and instance.phase != reducer.STOPPING:
             self._family.release(key)
         self._record.state(instance, self._family.birth(key))
-        self._telling.append(protocol.encode_status(protocol.Status.of(instance)))
+        self._telling.append(messages.encode_status(messages.Status.of(instance)))
 
     def _unspawn(self, key: Key) -> None:
         if key in self._spawns:
@@ -174,10 +174,10 @@ class Server:
                 self._happened(SpawnFailed(key, failed, transient=True))
 
     def _spawn(self, key: Key) -> None:
-        birth = members.ticks_now()
+        birth = procfs.ticks_now()
         try:
             pid = self._spawn_process(key)
-        except children.SpawnError as error:
+        except spawn.SpawnError as error:
             self._happened(SpawnFailed(key, str(error), error.transient))
             return
         self._family.add_child(key, pid, birth)
@@ -187,24 +187,22 @@ class Server:
     def _spawn_process(self, key: Key) -> int:
         launch = self._launches.get(key)
         if launch is None:
-            raise children.SpawnError("its order was lost with a part of the record")
+            raise spawn.SpawnError("its order was lost with a part of the record")
         try:
             log = self._logs.open(key, self._core.instances)
         except OSError as error:
             message = f"its log {error.filename} cannot be opened: {error.strerror}"
-            raise children.SpawnError(message, transient=True) from None
+            raise spawn.SpawnError(message, transient=True) from None
         try:
             directory = launch.directory or paths.work_directory(self._state)
-            return children.spawn(
-                launch.argv, self._environment(launch), directory, self._null, log
-            )
+            return spawn.spawn(launch.argv, self._environment(launch), directory, self._null, log)
         finally:
             os.close(log)
 
-    def _environment(self, launch: protocol.Launch) -> dict[str, str]:
+    def _environment(self, launch: messages.Launch) -> dict[str, str]:
         base = self._environments.get(launch.environment)
         if base is None:
-            raise children.SpawnError(
+            raise spawn.SpawnError(
                 "its environment was lost with a damaged part of the record: it cannot be started "
                 "again by this order, only by a new one"
             )
@@ -256,38 +254,38 @@ class Server:
         try:
             for line in connection.read():
                 if not connection.closing:
-                    self._obey(connection, protocol.decode_order(line))
+                    self._obey(connection, messages.decode_order(line))
         except ProtocolError as error:
             self._refuse(connection, str(error))
         self._send(connection, b"")
 
-    def _obey(self, connection: Connection, order: protocol.Order) -> None:
-        if isinstance(order, protocol.Hello):
+    def _obey(self, connection: Connection, order: messages.Order) -> None:
+        if isinstance(order, messages.Hello):
             self._welcome(connection, order)
         elif connection is not self._client:
             raise ProtocolError("say hello first")
-        elif isinstance(order, protocol.Environment):
+        elif isinstance(order, messages.Environment):
             self._learn_environment(connection, order)
-        elif isinstance(order, protocol.Launch):
+        elif isinstance(order, messages.Launch):
             self._start(order)
-        elif isinstance(order, protocol.Amend):
+        elif isinstance(order, messages.Amend):
             self._amend(order)
-        elif isinstance(order, protocol.Remember):
+        elif isinstance(order, messages.Remember):
             self._remember(order)
-        elif isinstance(order, protocol.Forget):
+        elif isinstance(order, messages.Forget):
             for forgotten in order.instances:
                 self._happened(forgotten)
-        elif isinstance(order, supervision.Heard):
+        elif isinstance(order, reducer.Heard):
             self._renew(order)
         else:
             self._happened(order)
 
-    def _welcome(self, connection: Connection, hello: protocol.Hello) -> None:
+    def _welcome(self, connection: Connection, hello: messages.Hello) -> None:
         if connection is self._client:
             raise ProtocolError("hello was said already")
-        if hello.protocol != protocol.PROTOCOL:
+        if hello.protocol != messages.PROTOCOL:
             raise ProtocolError(
-                f"this supervisor (pid {os.getpid()}) speaks protocol {protocol.PROTOCOL}, "
+                f"this supervisor (pid {os.getpid()}) speaks protocol {messages.PROTOCOL}, "
                 f"you speak {hello.protocol}"
             )
         if self._client is not None and not self._client_is_gone(self._client):
@@ -299,61 +297,61 @@ class Server:
         self._served = True
         self._logs.limits = hello.log
         self._telling.clear()  # all that it would say is in the statuses
-        statuses = [protocol.Status.of(instance) for instance in self._core.instances.values()]
+        statuses = [messages.Status.of(instance) for instance in self._core.instances.values()]
         memos = {key: launch.memo for key, launch in self._launches.items() if launch.memo}
         fenced = [one.key for one in self._core.instances.values() if one.fence is not None]
         self._record.flush()
-        connection.send(protocol.encode_welcome(os.getpid(), self._notes, statuses, memos, fenced))
+        connection.send(messages.encode_welcome(os.getpid(), self._notes, statuses, memos, fenced))
 
     def _client_is_gone(self, client: Connection) -> bool:
         """Its end may have come in the same round as its successor."""
         self._heard(client)
         return client.gone
 
-    def _learn_environment(self, client: Connection, order: protocol.Environment) -> None:
+    def _learn_environment(self, client: Connection, order: messages.Environment) -> None:
         client.environment = order.id
         if order.id not in self._environments:
             self._environments[order.id] = dict(order.variables)
             self._record.environment(order.id, order.variables)
 
-    def _start(self, launch: protocol.Launch) -> None:
+    def _start(self, launch: messages.Launch) -> None:
         if launch.environment not in self._environments:
             raise ProtocolError(f"unknown environment {launch.environment!r}")
         if launch.instance not in self._core.instances:
             self._launches[launch.instance] = launch
             self._record.launch(launch)
         self._happened(
-            supervision.StartOrdered(
+            reducer.StartOrdered(
                 launch.instance, launch.restart, launch.stop, launch.fence, launch.heard or None
             )
         )
 
-    def _renew(self, order: supervision.Heard) -> None:
+    def _renew(self, order: reducer.Heard) -> None:
         now = time.monotonic()
-        newest = supervision.Heard(min(order.at, now), min(order.alive, now))
+        newest = reducer.Heard(min(order.at, now), min(order.alive, now))
         self._heard_at.keep(newest)
         self._happened(newest)
 
-    def _amend(self, amendment: protocol.Amend) -> None:
+    def _amend(self, amendment: messages.Amend) -> None:
         launch = self._launches.get(amendment.order.instance)
         if launch is not None:
             self._keep_launch(launch.amended(amendment))
         self._happened(amendment.order)
-        self._telling.append(protocol.encode_amended(amendment.order))
+        self._telling.append(messages.encode_amended(amendment.order))
 
-    def _remember(self, order: protocol.Remember) -> None:
+    def _remember(self, order: messages.Remember) -> None:
         launch = self._launches.get(order.instance)
         if launch is not None:  # of what has ended there is nothing to keep
             self._keep_launch(launch._replace(memo=order.memo))
 
-    def _keep_launch(self, launch: protocol.Launch) -> None:
+    def _keep_launch(self, launch: messages.Launch) -> None:
         if launch != self._launches[launch.instance]:
             self._launches[launch.instance] = launch
             self._record.launch(launch)
 
     def _refuse(self, connection: Connection, message: str) -> None:
         connection.closing = True
-        connection.send(protocol.encode_refusal(message))
+        connection.send(messages.encode_refusal(message))
 
     def _send(self, connection: Connection, data: bytes) -> None:
         """Send, and wait for the peer to read or drop it as need be."""
@@ -373,7 +371,7 @@ class Server:
         connection.close()
         if connection is self._client:
             self._client = None
-            self._happened(supervision.ClientLost())
+            self._happened(reducer.ClientLost())
 
     # --- signals ------------------------------------------------------------------------------
 
@@ -393,7 +391,7 @@ class Server:
         if signal.SIGCHLD in numbers:
             self._family.reap()
         if signal.SIGTERM in numbers:
-            self._happened(supervision.ShutdownOrdered())
+            self._happened(reducer.ShutdownOrdered())
 
     def _watch(self, file: socket.socket | Connection, call: Callable[[], None]) -> None:
         self._selector.register(file, selectors.EVENT_READ, call)

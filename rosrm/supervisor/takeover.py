@@ -14,8 +14,8 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 
-from rosrm.core import supervision
-from rosrm.core.supervision import (
+from rosrm.core.supervisor import reducer
+from rosrm.core.supervisor.reducer import (
     UNKNOWN_EXIT,
     Cleared,
     Event,
@@ -26,26 +26,26 @@ from rosrm.core.supervision import (
     SpawnFailed,
     Supervision,
 )
-from rosrm.supervisor import heard, members, record
-from rosrm.supervisor.family import Family, mark
-from rosrm.supervisor.members import Stat
-from rosrm.supervisor.record import Recorded
+from rosrm.supervisor import instance_record, lease_file, procfs
+from rosrm.supervisor.instance_record import Recorded
+from rosrm.supervisor.process_tree import Family, mark
+from rosrm.supervisor.procfs import Stat
 
 
 def restore(state: str, core: Supervision, family: Family) -> Recorded:
     """Read the record into the core, and find the leaders that live on."""
-    recorded = record.read(state)
+    recorded = instance_record.read(state)
     core.dead.update(recorded.dead)
-    newest = heard.read(state)
+    newest = lease_file.read(state)
     for instance in recorded.instances.values():
         if not recorded.same_boot:
             _begin_clock_anew(instance, time.monotonic())
         alive = instance.fence is not None and instance.fence.alive
         instance.heard = max(instance.heard, newest.at, newest.alive if alive else 0.0)
         core.restore(instance)
-        leader = members.read_stat(instance.pid) if instance.pid and recorded.same_boot else None
+        leader = procfs.read_stat(instance.pid) if instance.pid and recorded.same_boot else None
         birth = recorded.births[instance.key]
-        if leader is not None and leader.alive and members.was_born(leader, birth):
+        if leader is not None and leader.alive and procfs.was_born(leader, birth):
             family.take_over(instance.key, leader)
     return recorded
 
@@ -72,12 +72,12 @@ def what_happened(
         for instance in core.instances.values()
         if not instance.ended and not family.birth(instance.key)
     ]
-    marked = members.find_marked(state) if waiting else {}
+    marked = procfs.find_marked(state) if waiting else {}
     for instance in waiting:
         left = marked.get(mark(instance.key), [])
-        if instance.phase == supervision.STARTING:
+        if instance.phase == reducer.STARTING:
             yield _start_of(instance, left, recorded, family)
-        elif instance.phase in (supervision.RUNNING, supervision.STOPPING):
+        elif instance.phase in (reducer.RUNNING, reducer.STOPPING):
             yield from _end_of(instance, left, family)
 
 

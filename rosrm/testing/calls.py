@@ -10,12 +10,12 @@ from unittest import SkipTest
 
 from rosrm.config.checking import validated
 from rosrm.config.documents import Problems, parse
-from rosrm.config.plain import to_plain
 from rosrm.errors import ConfigError, PluginError
-from rosrm.hookspecs import hookimpl
-from rosrm.loading import HOOKS, Offer
-from rosrm.registry import FailedProbe, Registry
-from rosrm.time_limit import limited
+from rosrm.extensions.discovery import HOOKS, Offer
+from rosrm.extensions.hookspecs import hookimpl
+from rosrm.extensions.registry import FailedProbe, Registry
+from rosrm.extensions.time_limit import limited
+from rosrm.model.codec import to_plain
 
 T = TypeVar("T")
 

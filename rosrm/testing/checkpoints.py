@@ -7,11 +7,9 @@ from dataclasses import replace
 from itertools import islice, permutations
 from typing import Any, ClassVar, Final
 
-from rosrm.core.keeping import sound_choice
-from rosrm.core.model import EMPTY, MigrationPolicy, ProcessSpec
-from rosrm.core.periodic import sound_pace
-from rosrm.core.plugin_calls import implements
-from rosrm.ports import (
+from rosrm.core.master.checkpoint.periodic import sound_pace
+from rosrm.core.master.checkpoint.replication import sound_choice
+from rosrm.extensions.contracts import (
     CheckpointChoice,
     CheckpointOffer,
     CheckpointPolicy,
@@ -19,8 +17,10 @@ from rosrm.ports import (
     MemoryPacing,
     MemoryView,
 )
+from rosrm.extensions.plugin_calls import implements
+from rosrm.extensions.time_limit import CALL_LIMIT
+from rosrm.model.values import EMPTY, MigrationPolicy, ProcessSpec
 from rosrm.testing.calls import call, made
-from rosrm.time_limit import CALL_LIMIT
 
 #: Orders of the hosts that keep a state, of those that are tried.
 _ORDERS: Final = 24

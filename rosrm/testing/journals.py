@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any, ClassVar
 from unittest import SkipTest
 
-from rosrm.ports import Intent, Journal, Record, StoredRecord
+from rosrm.extensions.contracts import Intent, Journal, Record, StoredRecord
 
 
 @dataclass
 class MemoryJournal:
-    """A journal that forgets; implements `rosrm.ports.Journal`.
+    """A journal that forgets; implements `rosrm.extensions.contracts.Journal`.
 
     Attributes:
         stored: every record, oldest first.

@@ -12,8 +12,11 @@ from math import inf
 from pathlib import Path
 from typing import Any, ClassVar, Final, get_type_hints
 
-from rosrm.config.own_options import merged_options
-from rosrm.core.migration import (
+from rosrm.extensions.contracts import Imaging, MigrationOffer, MigrationStrategy, PeriodicImaging
+from rosrm.extensions.options import merged_options
+from rosrm.extensions.plugin_calls import implements, required
+from rosrm.extensions.time_limit import CALL_LIMIT
+from rosrm.model.plan import (
     Aim,
     Commit,
     Configure,
@@ -26,13 +29,10 @@ from rosrm.core.migration import (
     Step,
     Stop,
 )
-from rosrm.core.migration import plan_fault as fault_of
-from rosrm.core.model import EMPTY, InstanceId, ProcessSpec
-from rosrm.core.plans import checked_plan
-from rosrm.core.plugin_calls import implements, required
-from rosrm.ports import Imaging, MigrationOffer, MigrationStrategy, PeriodicImaging
+from rosrm.model.plan import plan_fault as fault_of
+from rosrm.model.plan_json import checked_plan
+from rosrm.model.values import EMPTY, InstanceId, ProcessSpec
 from rosrm.testing.calls import ContractBroken, as_json, call, checked_options, made
-from rosrm.time_limit import CALL_LIMIT
 
 #: A unit of each quantity that an option may have.
 _UNITS: Final = {"duration": "s", "size": "B", "cores": "cores"}

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-from rosrm.core.descriptions import resource_fault
-from rosrm.core.model import EMPTY, Reading, ResourceDescription
-from rosrm.ports import Probe, ProbeContext, ProbeOffer
-from rosrm.registry import MadeProbe
-from rosrm.slave.sampling import read_values
+from rosrm.extensions.contracts import Probe, ProbeContext, ProbeOffer
+from rosrm.extensions.registry import MadeProbe
+from rosrm.model.description_checks import resource_fault
+from rosrm.model.values import EMPTY, Reading, ResourceDescription
+from rosrm.slave.sampler import read_values
 from rosrm.testing.calls import call, made
 
 
@@ -39,7 +39,7 @@ class FakeClock:
 
 @dataclass
 class FakeSessions:
-    """Process trees as the test says; implements `rosrm.ports.Sessions`."""
+    """Process trees as the test says; implements `rosrm.extensions.contracts.Sessions`."""
 
     members: tuple[int, ...] = ()
     ended: float = 0.0

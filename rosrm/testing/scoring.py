@@ -10,11 +10,8 @@ from typing import Any, ClassVar, Final
 import numpy as np
 import numpy.typing as npt
 
-from rosrm.core.declared import SPEC_FIELDS, declared_spec
-from rosrm.core.model import EMPTY, Kind, MigrationPolicy, ProcessSpec
-from rosrm.core.placement import sound
-from rosrm.core.plugin_calls import required
-from rosrm.ports import (
+from rosrm.core.master.scheduling.ranking import sound
+from rosrm.extensions.contracts import (
     BoolArray,
     FloatArray,
     HostView,
@@ -23,8 +20,11 @@ from rosrm.ports import (
     ScoringOffer,
     ScoringPolicy,
 )
+from rosrm.extensions.declared_fields import SPEC_FIELDS, declared_spec
+from rosrm.extensions.plugin_calls import required
+from rosrm.extensions.time_limit import CALL_LIMIT
+from rosrm.model.values import EMPTY, Kind, MigrationPolicy, ProcessSpec
 from rosrm.testing.calls import call, made
-from rosrm.time_limit import CALL_LIMIT
 
 
 def host_view(

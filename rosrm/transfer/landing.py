@@ -15,8 +15,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
-from rosrm.disk_space import room_for
 from rosrm.errors import TransferError
+from rosrm.runtime.disk_space import room_for
 
 _PREFIX: Final = ".rosrm-fetch-"
 

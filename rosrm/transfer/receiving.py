@@ -8,8 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from rosrm.disk_space import room_for
 from rosrm.errors import TransferError
+from rosrm.runtime.disk_space import room_for
 from rosrm.transfer.form import Fetched, Offer
 from rosrm.transfer.landing import Landing
 from rosrm.transfer.stream import Stream

@@ -5,8 +5,8 @@ from typing import ClassVar
 
 import pytest
 
-from rosrm.core.model import ProcessSpec
-from rosrm.ports import CheckpointChoice, CheckpointOffer, CheckpointView, MemoryView
+from rosrm.extensions.contracts import CheckpointChoice, CheckpointOffer, CheckpointView, MemoryView
+from rosrm.model.values import ProcessSpec
 from rosrm.testing import CheckpointContract
 from rosrm_checkpoint import plugin
 from rosrm_checkpoint.other_host import OtherHost, OtherHostOptions

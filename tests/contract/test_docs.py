@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 from types import ModuleType
 
-from rosrm.registry import Registry
+from rosrm.extensions.registry import Registry
 from rosrm.testing import CheckpointContract, ProbeContract
 
 PAGE = Path(__file__).resolve().parents[2] / "docs/reference/plugins.md"

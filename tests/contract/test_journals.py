@@ -1,6 +1,6 @@
 """Every journal holds one contract."""
 
-from rosrm.journal import SqliteJournal
+from rosrm.journal.sqlite import SqliteJournal
 from rosrm.testing import JournalContract, MemoryJournal
 
 

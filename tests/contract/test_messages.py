@@ -10,11 +10,8 @@ from unittest import SkipTest
 
 import pytest
 
-from rosrm.config.units import Bytes, PositiveSeconds
-from rosrm.core.migration import Execute
 from rosrm.errors import SkipPlugin
-from rosrm.plans import Plan, Start
-from rosrm.ports import (
+from rosrm.extensions.contracts import (
     CheckpointChoice,
     CheckpointOffer,
     MigrationOffer,
@@ -22,6 +19,9 @@ from rosrm.ports import (
     Scores,
     ScoringOffer,
 )
+from rosrm.extensions.plans import Plan, Start
+from rosrm.extensions.units import Bytes, PositiveSeconds
+from rosrm.model.plan import Execute
 from rosrm.testing import (
     CheckpointContract,
     FakeProbe,

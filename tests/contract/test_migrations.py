@@ -5,8 +5,9 @@ from typing import ClassVar
 
 import pytest
 
-from rosrm.config.units import PositiveSeconds
-from rosrm.core.migration import (
+from rosrm.extensions.contracts import MigrationOffer
+from rosrm.extensions.units import PositiveSeconds
+from rosrm.model.plan import (
     AwaitReady,
     Commit,
     Configure,
@@ -17,8 +18,7 @@ from rosrm.core.migration import (
     Start,
     Stop,
 )
-from rosrm.core.model import ProcessSpec, RestartPolicy
-from rosrm.ports import MigrationOffer
+from rosrm.model.values import ProcessSpec, RestartPolicy
 from rosrm.testing import MigrationContract
 from rosrm_migration import plugin
 

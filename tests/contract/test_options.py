@@ -6,7 +6,7 @@ from types import MappingProxyType
 import pytest
 from pydantic import TypeAdapter, ValidationError
 
-from rosrm.config.plain import from_plain, to_plain
+from rosrm.model.codec import from_plain, to_plain
 from rosrm_checkpoint.plugin import register_checkpoint_policies
 from rosrm_migration.plugin import register_migration_strategies
 from rosrm_resources.plugin import register_probes

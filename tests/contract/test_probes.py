@@ -5,8 +5,8 @@ from typing import ClassVar
 
 import pytest
 
-from rosrm.core.model import Reading, ResourceDescription
-from rosrm.ports import ProbeOffer
+from rosrm.extensions.contracts import ProbeOffer
+from rosrm.model.values import Reading, ResourceDescription
 from rosrm.slave.sessions import SessionTable
 from rosrm.testing import FakeProbe, ProbeContract, probe_context
 from rosrm_resources.plugin import register_probes

@@ -5,7 +5,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from rosrm.ports import Scores, ScoringOffer
+from rosrm.extensions.contracts import Scores, ScoringOffer
 from rosrm.testing import ScoringContract
 from rosrm_scoring.plugin import register_scoring_policies
 

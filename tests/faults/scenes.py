@@ -7,8 +7,8 @@ import signal
 from pathlib import Path
 
 from rosrm.config.settings import LivenessSettings
-from rosrm.core.model import MigrationPolicy, ProcessSpec, RestartPolicy
-from rosrm.core.views import ProcessRow
+from rosrm.model.rows import ProcessRow
+from rosrm.model.values import MigrationPolicy, ProcessSpec, RestartPolicy
 from tests.faults.watching import Blow, Watcher, blocks, instances, is_gapless
 from tests.ros.clusters import PATIENCE, QUICK, Cluster, host
 

@@ -16,8 +16,8 @@ from pathlib import Path
 import pytest
 
 from rosrm.config.settings import LivenessSettings
-from rosrm.core.model import HostLossPolicy
 from rosrm.criu import outcome
+from rosrm.model.values import HostLossPolicy
 from tests.faults.watching import instances
 from tests.ros.clusters import PATIENCE
 from tests.ros.portable_kit import NAME, Ear, ask, counter, nothing_left, two_hosts

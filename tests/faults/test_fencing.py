@@ -7,7 +7,7 @@ import signal
 import time
 
 from rosrm.config.settings import ControlSettings, LivenessSettings
-from rosrm.core.model import HostLossPolicy, IsolationPolicy
+from rosrm.model.values import HostLossPolicy, IsolationPolicy
 from tests.faults.test_host_loss import held
 from tests.ros.clusters import PATIENCE, alive, host, service, wait_gone, wait_until
 

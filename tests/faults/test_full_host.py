@@ -7,7 +7,7 @@ import signal
 import pytest
 
 from rosrm.config.settings import LivenessSettings
-from rosrm.core.model import RestartPolicy
+from rosrm.model.values import RestartPolicy
 from tests.faults.disks import small_disk
 from tests.ros.clusters import PATIENCE, alive, clusters, host, job, service
 

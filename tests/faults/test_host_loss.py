@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from rosrm.config.settings import ControlSettings, LivenessSettings
-from rosrm.core.model import (
+from rosrm.model.values import (
     HostLossPolicy,
     MigrationPolicy,
     ProcessSpec,

@@ -13,9 +13,9 @@ import pytest
 
 from rosrm.config.settings import LivenessSettings
 from rosrm.errors import JournalError, NoMaster, Refused
-from rosrm.journal import SqliteJournal
-from rosrm.journal_recovery import recover
-from rosrm.ports import Intent
+from rosrm.extensions.contracts import Intent
+from rosrm.journal.recovery import recover
+from rosrm.journal.sqlite import SqliteJournal
 from tests.faults.disks import small_disk
 from tests.ros.clusters import PATIENCE, alive, clusters, host, job, service, wait_gone, wait_until
 

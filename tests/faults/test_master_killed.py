@@ -16,8 +16,8 @@ from pathlib import Path
 import pytest
 
 from rosrm.config.settings import LivenessSettings, MigrationSettings
-from rosrm.core.model import MigrationPolicy, RestartPolicy
 from rosrm.errors import NoMaster, Refused
+from rosrm.model.values import MigrationPolicy, RestartPolicy
 from tests.ros.clusters import PATIENCE, Cluster, alive, host, job, pids_of, python
 
 KILLS = int(os.environ.get("ROSRM_KILLS", "6"))

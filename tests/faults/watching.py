@@ -14,9 +14,9 @@ from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import Int64, Int64MultiArray
 
 from benchmarks.handoff_nodes import INPUT, OUTPUT, QOS
-from rosrm.node.channel import CHANNEL, STATE_CONFIG
+from rosrm.node.handoff.channel import CHANNEL, STATE_CONFIG
 from rosrm.ros import qos
-from rosrm.supervisor.members import read_environment
+from rosrm.supervisor.procfs import read_environment
 from rosrm_msgs.msg import HandoffReport, ProcessStatus, ProcessStatusBatch, StateConfig
 from tests.ros.clusters import Cluster, pids_of, zombie
 

@@ -13,10 +13,10 @@ from pathlib import Path
 
 import pytest
 
-from rosrm.core.model import RestartPolicy
 from rosrm.criu import dumping, image, restoring, tree
 from rosrm.criu.image import MappedFile
 from rosrm.errors import CriuError
+from rosrm.model.values import RestartPolicy
 from tests.criu_kit import TIMEOUT, eventually
 from tests.integration.supervisor.conftest import Host
 

@@ -8,7 +8,7 @@ import sys
 import pytest
 
 _ENTER = """
-from rosrm.loopback import enter_private_network, settings_on_this_machine
+from rosrm.testing.loopback import enter_private_network, settings_on_this_machine
 before = settings_on_this_machine(7)
 print(enter_private_network(), before.discovery_range, before.transports)
 after = settings_on_this_machine(7)
@@ -16,7 +16,7 @@ print(after.domain, after.discovery_range, after.transports)
 """
 _REACH = """
 import os, socket
-from rosrm.loopback import enter_private_network
+from rosrm.testing.loopback import enter_private_network
 entered = enter_private_network()
 with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as here, \\
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as there:
@@ -42,7 +42,7 @@ def _run(code: str, *before: str) -> list[str]:
 
 
 def _may_enter() -> bool:
-    return _run("from rosrm.loopback import *; print(enter_private_network())") == ["True"]
+    return _run("from rosrm.testing.loopback import *; print(enter_private_network())") == ["True"]
 
 
 @pytest.fixture

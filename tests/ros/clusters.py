@@ -13,11 +13,11 @@ from pathlib import Path
 import pytest
 
 from rosrm.config.settings import ClusterConfig, HostConfig, LivenessSettings
-from rosrm.core.model import Kind, ProcessSpec, Readiness, StopPolicy
-from rosrm.core.views import ProcessRow, Snapshot
 from rosrm.errors import Refused
-from rosrm.local_cluster import LocalCluster, Part
-from rosrm.supervisor.members import read_environment
+from rosrm.model.rows import ProcessRow, Snapshot
+from rosrm.model.values import Kind, ProcessSpec, Readiness, StopPolicy
+from rosrm.supervisor.procfs import read_environment
+from rosrm.testing.local_cluster import LocalCluster, Part
 
 MIB = 2**20
 QUICK = StopPolicy(interrupt_grace=0.5, terminate_grace=0.5)

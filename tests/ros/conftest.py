@@ -6,7 +6,7 @@ from contextlib import closing
 
 import pytest
 
-from rosrm.loopback import enter_private_network
+from rosrm.testing.loopback import enter_private_network
 from tests.ros.clusters import STEADY, clusters
 from tests.ros.nodes import Stage
 from tests.ros.portable_kit import Ear

@@ -17,9 +17,9 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import Int64
 
-from rosrm.local_cluster import claim_domain
 from rosrm.node import Node
-from rosrm.node.channel import CHANNEL, STATE_CONFIG
+from rosrm.node.handoff.channel import CHANNEL, STATE_CONFIG
+from rosrm.testing.local_cluster import claim_domain
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs.msg import HandoffReport, StateConfig
 

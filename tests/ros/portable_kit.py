@@ -16,9 +16,9 @@ from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import Int64MultiArray
 
 from rosrm.config.settings import MigrationSettings, ProcessDefaults
-from rosrm.core.model import MigrationPolicy, ProcessSpec, RestartPolicy
 from rosrm.criu import outcome, tree
 from rosrm.errors import Refused
+from rosrm.model.values import MigrationPolicy, ProcessSpec, RestartPolicy
 from tests.ros.clusters import MIB, PATIENCE, QUICK, Cluster, Make, host, wait_until
 
 NAME = "portable_counter"

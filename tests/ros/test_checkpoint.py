@@ -18,9 +18,9 @@ from rclpy.qos import QoSProfile
 from std_msgs.msg import Int64, Int64MultiArray
 
 from rosrm.config.settings import MigrationSettings, ProcessDefaults
-from rosrm.core.model import MigrationPolicy, ProcessSpec, RestartPolicy
-from rosrm.core.views import ProcessRow
 from rosrm.errors import Refused
+from rosrm.model.rows import ProcessRow
+from rosrm.model.values import MigrationPolicy, ProcessSpec, RestartPolicy
 from tests.ros.clusters import (
     MIB,
     PATIENCE,

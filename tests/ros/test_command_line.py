@@ -18,7 +18,7 @@ from pathlib import Path
 
 import pytest
 
-from rosrm.local_cluster import claim_domain
+from rosrm.testing.local_cluster import claim_domain
 from tests.ros.clusters import PATIENCE, alive, host, wait_gone, wait_until_none
 
 WORK = """

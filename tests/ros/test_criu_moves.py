@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rosrm.core.model import Health
+from rosrm.model.values import Health
 from tests.ros.portable_kit import NAME, ask, counter, nothing_left, two_hosts
 
 

@@ -6,7 +6,7 @@ from contextlib import closing
 
 import pytest
 
-from rosrm.local_cluster import claim_domain
+from rosrm.testing.local_cluster import claim_domain
 from tests.pages import RUN, Reader
 
 

@@ -12,16 +12,16 @@ import numpy as np
 import pytest
 
 from rosrm.config.settings import ControlSettings
-from rosrm.core.model import HostDescription, ResourceDescription
 from rosrm.errors import NoMaster, Refused
-from rosrm.local_cluster import claim_domain
-from rosrm.loopback import settings_on_this_machine
+from rosrm.model.ros_settings import RosSettings
+from rosrm.model.values import HostDescription, ResourceDescription
 from rosrm.ros import convert, names, qos
 from rosrm.ros.client import MasterClient, find_master, wait_for_service
 from rosrm.ros.control import ControlClient
 from rosrm.ros.participant import Participant
-from rosrm.ros.readings import LAYOUT, encode
-from rosrm.ros.settings import RosSettings
+from rosrm.ros.reading_codec import LAYOUT, encode
+from rosrm.testing.local_cluster import claim_domain
+from rosrm.testing.loopback import settings_on_this_machine
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs import msg, srv
 from tests.ros.asking import wait_for

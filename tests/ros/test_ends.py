@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from rosrm.config.settings import LivenessSettings
-from rosrm.core.model import RestartPolicy, StopPolicy
+from rosrm.model.values import RestartPolicy, StopPolicy
 from tests.ros.clusters import (
     PATIENCE,
     STEADY,
@@ -211,7 +211,7 @@ def test_a_second_master_is_refused_naming_the_first(make_cluster) -> None:
     assert f"pid {first.process.pid}" in said
 
     other = replace(cluster.cluster, name="rival", ros=cluster.ros, state=cluster.directory / "m2")
-    second = cluster._start("master2", "rosrm.master.run", other.to_json())
+    second = cluster._start("master2", "rosrm.master", other.to_json())
     assert second.process.wait(PATIENCE) == 1
     said = cluster.log_of("master2")
     assert "a master runs already" in said
@@ -230,7 +230,7 @@ def test_of_two_masters_at_once_one_stays(make_cluster) -> None:
         )
         for n in range(2)
     ]
-    parts = [cluster._start(one.name, "rosrm.master.run", one.to_json()) for one in domain_settings]
+    parts = [cluster._start(one.name, "rosrm.master", one.to_json()) for one in domain_settings]
     try:
         wait_until(lambda: any(p.process.poll() is not None for p in parts), "one has given way")
         ended = next(part for part in parts if part.process.poll() is not None)
@@ -263,7 +263,7 @@ def test_a_second_slave_of_a_name_is_refused(make_cluster) -> None:
 
     state = cluster.directory / "hosts" / "impostor"
     settings = replace(host("h0"), ros=cluster.ros, state=state)
-    second = cluster._start("impostor", "rosrm.slave.run", settings.to_json())
+    second = cluster._start("impostor", "rosrm.slave", settings.to_json())
     assert second.process.wait(PATIENCE) == 1
     said = cluster.log_of("impostor")
     assert "a live slave has the name 'h0' already" in said
@@ -280,8 +280,8 @@ def test_a_state_directory_that_cannot_be_used_is_said(make_cluster, tmp_path) -
     (tmp_path / "file").write_text("")
     state = tmp_path / "file" / "state"
     for module, settings in (
-        ("rosrm.master.run", replace(cluster.cluster, ros=cluster.ros, state=state)),
-        ("rosrm.slave.run", replace(host("h9"), ros=cluster.ros, state=state)),
+        ("rosrm.master", replace(cluster.cluster, ros=cluster.ros, state=state)),
+        ("rosrm.slave", replace(host("h9"), ros=cluster.ros, state=state)),
     ):
         part = cluster._start("unusable", module, settings.to_json())
         assert part.process.wait(PATIENCE) == 2

@@ -6,14 +6,14 @@ import time
 
 import pytest
 
-from rosrm.core.commands import PublishStateConfig
-from rosrm.core.events import HandoffReported
-from rosrm.core.migration import HandoffPhase, ReportPhase
-from rosrm.local_cluster import claim_domain
+from rosrm.core.master.commands import PublishStateConfig
+from rosrm.core.master.events import HandoffReported
+from rosrm.model.plan import HandoffPhase, ReportPhase
+from rosrm.model.ros_settings import RosSettings
 from rosrm.ros import qos
-from rosrm.ros.handoff_endpoint import HandoffEndpoint
+from rosrm.ros.master.handoff import HandoffEndpoint
 from rosrm.ros.participant import Participant
-from rosrm.ros.settings import RosSettings
+from rosrm.testing.local_cluster import claim_domain
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs.msg import HandoffReport, StateConfig
 

@@ -9,9 +9,9 @@ from dataclasses import replace
 import pytest
 from std_msgs.msg import Int64
 
-from rosrm.core.model import MigrationPolicy, ProcessSpec, Readiness, RestartPolicy
 from rosrm.errors import Refused
-from rosrm.node.channel import STATE_CONFIG
+from rosrm.model.values import MigrationPolicy, ProcessSpec, Readiness, RestartPolicy
+from rosrm.node.handoff.channel import STATE_CONFIG
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs.msg import StateConfig
 from tests.ros.clusters import CALM, NODE, PATIENCE, alive, host

@@ -10,10 +10,10 @@ import time
 import pytest
 from std_msgs.msg import Int64, String
 
-from rosrm.core.model import Health, MigrationPolicy, RestartPolicy
-from rosrm.core.slave import Watch
-from rosrm.ros.graph import GraphWatch
-from rosrm.ros.health import HealthEar
+from rosrm.core.slave.reducer import Watch
+from rosrm.model.values import Health, MigrationPolicy, RestartPolicy
+from rosrm.ros.slave.graph import GraphWatch
+from rosrm.ros.slave.health import HealthEar
 from tests.ros.clusters import PATIENCE, STEADY, alive, host, node, service, wait_gone
 
 #: Seconds: far more than a busy machine takes between two messages.

@@ -10,9 +10,15 @@ from pathlib import Path
 
 import pytest
 
-from rosrm import kept
+from rosrm import snapshots
 from rosrm.config.settings import CheckpointChoice, KeepSettings, LivenessSettings
-from rosrm.core.model import HostLossPolicy, MigrationPolicy, ProcessSpec, Readiness, RestartPolicy
+from rosrm.model.values import (
+    HostLossPolicy,
+    MigrationPolicy,
+    ProcessSpec,
+    Readiness,
+    RestartPolicy,
+)
 from tests.ros.clusters import CALM, PATIENCE, STEADY, Cluster, host, pids_of, wait_gone, wait_until
 
 pytestmark = pytest.mark.timeout(120)
@@ -119,7 +125,7 @@ def test_a_large_state_is_kept_too(make_cluster):
     runs = wait_for_count(cluster, 1, 1)
     # By default a state may be a second behind; a busy machine needs its time to write it.
     assert runs[1][0] >= 20, runs
-    found = kept.newest_head(kept_directory(cluster, "h0"))
+    found = snapshots.newest_head(kept_directory(cluster, "h0"))
     assert found is not None
     assert found.size > 5_000_000
 
@@ -146,7 +152,7 @@ def test_a_state_that_cannot_be_restored_stays_as_it_is(make_cluster):
     cluster.wait("counter", "failed")
     log = cluster.wait_for_log("counter", "cannot be restored")
     assert "another version of the program" in log
-    assert kept.newest_content(directory)[1] == strange
+    assert snapshots.newest_content(directory)[1] == strange
 
 
 def rewritten(directory: Path) -> bytes:
@@ -155,16 +161,16 @@ def rewritten(directory: Path) -> bytes:
 
     from rosrm_msgs.msg import StateMark
 
-    found, _ = kept.newest(directory, 99)
+    found, _ = snapshots.newest(directory, 99)
     mark = deserialize_message(found.blocks[0], StateMark)
     mark.parts = []
     data = bytes(serialize_message(mark))
-    writer = kept.SlotWriter(directory, "counter", found.head.instance)
+    writer = snapshots.SlotWriter(directory, "counter", found.head.instance)
     import zlib
 
-    writer.write(found.head.sequence + 1, [kept.Block(data, zlib.crc32(data))])
+    writer.write(found.head.sequence + 1, [snapshots.Block(data, zlib.crc32(data))])
     writer.close()
-    return kept.newest_content(directory)[1]
+    return snapshots.newest_content(directory)[1]
 
 
 # --- on other hosts ---------------------------------------------------------------------------
@@ -191,7 +197,7 @@ def copies(cluster: Cluster) -> dict[str, int]:
     """By host, the cycle up to which it keeps a copy."""
     found = {}
     for name in cluster.slaves:
-        head = kept.peek(kept_directory(cluster, name) / kept.COPY)
+        head = snapshots.peek(kept_directory(cluster, name) / snapshots.COPY)
         if head is not None:
             found[name] = head.sequence
     return found

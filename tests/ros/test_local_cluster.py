@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from rosrm.local_cluster import LocalCluster
+from rosrm.testing.local_cluster import LocalCluster
 from tests.ros.clusters import PATIENCE, host, node, wait_until
 
 

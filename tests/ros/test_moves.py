@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from rosrm.config.settings import MigrationSettings, ProcessDefaults
-from rosrm.core.model import MigrationPolicy, Readiness
 from rosrm.errors import Refused
+from rosrm.model.values import MigrationPolicy, Readiness
 from tests.ros.clusters import (
     CALM,
     MIB,

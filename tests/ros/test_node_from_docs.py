@@ -20,7 +20,7 @@ from std_msgs.msg import Float64, Float64MultiArray, Int64MultiArray
 from std_srvs.srv import Trigger
 
 from rosrm.config.settings import MigrationSettings
-from rosrm.core.model import MigrationPolicy, ProcessSpec, Readiness
+from rosrm.model.values import MigrationPolicy, ProcessSpec, Readiness
 from tests.ros.clusters import PATIENCE, host, wait_until
 
 PROGRAM = Path(__file__).parent / "programs" / "dock.py"

@@ -15,7 +15,8 @@ from rclpy.parameter import Parameter
 from std_msgs.msg import Int64, String
 from std_srvs.srv import Trigger
 
-from rosrm.node import Migratable, source
+from rosrm.node import Migratable
+from rosrm.node.handoff import source
 from rosrm_msgs.msg import HandoffReport, StateConfig
 from tests.ros.nodes import EPOCH, PATIENCE, RELIABLE, Conductor, Counter, Stage
 

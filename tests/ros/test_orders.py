@@ -9,7 +9,7 @@ import time
 
 import pytest
 
-from rosrm.core.model import InstanceId, Kind, RestartPolicy
+from rosrm.model.values import InstanceId, Kind, RestartPolicy
 from rosrm.ros import convert, names, qos
 from rosrm.ros.client import wait_for_service
 from rosrm.ros.control import ControlClient

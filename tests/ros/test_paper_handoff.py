@@ -7,8 +7,8 @@ import sys
 import pytest
 
 from rosrm.config.settings import MigrationSettings
-from rosrm.core.model import MigrationPolicy, ProcessSpec, Readiness, RestartPolicy
 from rosrm.errors import Refused
+from rosrm.model.values import MigrationPolicy, ProcessSpec, Readiness, RestartPolicy
 from tests.ros.clusters import PATIENCE, QUICK, host
 
 #: Plain rclpy: publishes its state in every cycle; a shadow begins with what it hears there.

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from rosrm.config.settings import CheckpointChoice
-from rosrm.core.model import Health, InstanceState
+from rosrm.model.values import Health, InstanceState
 from tests.ros.clusters import PATIENCE, wait_until
 from tests.ros.portable_kit import (
     NAME,

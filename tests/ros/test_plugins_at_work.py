@@ -11,19 +11,19 @@ from pathlib import Path
 import pytest
 
 from rosrm.config.settings import MigrationSettings, ScoringChoice
-from rosrm.core.model import MigrationPolicy
 from rosrm.errors import Refused
+from rosrm.model.values import MigrationPolicy
 from tests.ros.clusters import PATIENCE, host, job, service, wait_until
 
 PLUGIN = """
 import os, sys, time
 import numpy as np
 from pathlib import Path
-from rosrm.core.migration import AwaitReady, Commit, Execute, Plan, Start, Stop
-from rosrm.core.model import Reading, ResourceDescription
-from rosrm.hookspecs import hookimpl
+from rosrm.model.plan import AwaitReady, Commit, Execute, Plan, Start, Stop
+from rosrm.model.values import Reading, ResourceDescription
+from rosrm.extensions.hookspecs import hookimpl
 from rosrm.errors import SkipPlugin
-from rosrm.ports import MigrationOffer, ProbeOffer, ScoringOffer, Scores
+from rosrm.extensions.contracts import MigrationOffer, ProbeOffer, ScoringOffer, Scores
 
 class Policy:
     def __init__(self, act): self.act = act

@@ -13,7 +13,8 @@ import time
 import pytest
 
 from rosrm.config.settings import LogSettings
-from rosrm.core.model import (
+from rosrm.errors import Refused
+from rosrm.model.values import (
     Kind,
     MigrationPolicy,
     ProcessSpec,
@@ -21,7 +22,6 @@ from rosrm.core.model import (
     RestartPolicy,
     StopPolicy,
 )
-from rosrm.errors import Refused
 from tests.ros.clusters import CALM, NODE, QUICK, alive, host, job, node, python, service, wait_gone
 
 

@@ -16,9 +16,9 @@ from rosrm.cli.simulation_runs import (
     replay_record,
 )
 from rosrm.config.settings import MigrationSettings, ProcessDefaults, RecordSettings
-from rosrm.core.model import MigrationPolicy
 from rosrm.errors import RecordError
-from rosrm.registry import Registry
+from rosrm.extensions.registry import Registry
+from rosrm.model.values import MigrationPolicy
 from tests.ros.clusters import MIB, PATIENCE, STEADY, host, job, python, service
 
 HOLD = """

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from rosrm.config.settings import MigrationSettings
-from rosrm.core.model import Kind, MigrationPolicy, ProcessSpec
 from rosrm.errors import Refused
+from rosrm.model.values import Kind, MigrationPolicy, ProcessSpec
 from rosrm_examples.drives import Drive, default_drive
 from rosrm_examples.map_part import load_parts
 from rosrm_examples.migration_results import LiveRun, differences, summarise, unmigrated_poses

@@ -14,7 +14,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import Int64, String
 
-from rosrm.local_cluster import claim_domain
+from rosrm.testing.local_cluster import claim_domain
 from rosrm_migration.handoff import watch
 
 LATCHED = QoSProfile(

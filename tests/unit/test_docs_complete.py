@@ -13,14 +13,15 @@ from typing import Annotated, get_args, get_origin, get_type_hints
 import pytest
 import typer.main
 
-from rosrm import hookspecs, plans, ports
 from rosrm.cli.commands import app
 from rosrm.config import ClusterConfig, HostConfig, load_cluster, load_host, load_work
 from rosrm.config.process import ProcessInFile
-from rosrm.core import migration, views
-from rosrm.core.declared import SPEC_FIELDS
-from rosrm.core.model import HostDescription
-from rosrm.loading import HOOKS
+from rosrm.extensions import contracts, hookspecs, installed, plans
+from rosrm.extensions.declared_fields import SPEC_FIELDS
+from rosrm.extensions.discovery import HOOKS
+from rosrm.model import plan
+from rosrm.model import rows as listing_rows
+from rosrm.model.values import HostDescription
 from rosrm_checkpoint.other_host import OtherHostOptions
 from rosrm_migration.criu import CriuOptions
 from rosrm_migration.handoff import HandoffOptions
@@ -137,7 +138,7 @@ def hook_names() -> list[str]:
     return [
         name
         for name, function in vars(hookspecs).items()
-        if callable(function) and hasattr(function, f"{hookspecs.GROUP}_spec")
+        if callable(function) and hasattr(function, f"{installed.GROUP}_spec")
     ]
 
 
@@ -155,7 +156,12 @@ def test_every_hook_and_its_parameters_are_documented(hook):
 
 @pytest.mark.parametrize(
     "offer",
-    [ports.ProbeOffer, ports.ScoringOffer, ports.MigrationOffer, ports.CheckpointOffer],
+    [
+        contracts.ProbeOffer,
+        contracts.ScoringOffer,
+        contracts.MigrationOffer,
+        contracts.CheckpointOffer,
+    ],
     ids=lambda offer: offer.__name__,
 )
 def test_every_field_of_an_offer_is_documented(offer):
@@ -169,22 +175,22 @@ def test_every_field_of_an_offer_is_documented(offer):
 @pytest.mark.parametrize(
     ("heading", "kinds"),
     [
-        ("`ProbeOffer`", [ports.Probe, ports.ProbeContext, ports.Sessions]),
+        ("`ProbeOffer`", [contracts.Probe, contracts.ProbeContext, contracts.Sessions]),
         (
             "`ScoringOffer`",
-            [ports.ScoringPolicy, ports.HostView, ports.ProcessView, ports.Scores],
+            [contracts.ScoringPolicy, contracts.HostView, contracts.ProcessView, contracts.Scores],
         ),
-        ("`MigrationOffer`", [ports.MigrationStrategy, migration.Move, migration.Plan]),
+        ("`MigrationOffer`", [contracts.MigrationStrategy, plan.Move, plan.Plan]),
         (
             "`CheckpointOffer`",
-            [ports.CheckpointPolicy, ports.CheckpointView, ports.CheckpointChoice],
+            [contracts.CheckpointPolicy, contracts.CheckpointView, contracts.CheckpointChoice],
         ),
     ],
 )
 def test_all_that_a_plugin_meets_is_documented(heading, kinds):
     text = section(page("plugins.md"), heading)
     for kind in kinds:
-        assert kind.__name__ in text or kind is ports.Sessions
+        assert kind.__name__ in text or kind is contracts.Sessions
         for name in set(vars(kind)) | set(getattr(kind, "__annotations__", ())):
             if not name.startswith("_"):
                 assert re.search(rf"`{name}[`(]", text), f"{kind.__name__}.{name}"
@@ -192,13 +198,13 @@ def test_all_that_a_plugin_meets_is_documented(heading, kinds):
 
 def test_every_step_of_a_plan_is_documented():
     text = section(page("plugins.md"), "`MigrationOffer`")
-    for step in get_args(migration.Step):
+    for step in get_args(plan.Step):
         assert f"`{step.__name__}`" in text
 
 
 def test_every_step_of_a_plan_is_public_and_its_arguments_are_documented():
     text = " ".join(section(page("plugins.md"), "`MigrationOffer`").split())
-    for step in get_args(migration.Step):
+    for step in get_args(plan.Step):
         assert getattr(plans, step.__name__) is step
         assert step.__name__ in plans.__all__
         shown = re.search(rf"`{step.__name__}\(([^`]*)\)`", text)
@@ -212,7 +218,7 @@ def test_every_field_of_a_spec_that_a_policy_may_read_is_documented():
 
 
 #: A commit is done at once and stays: it takes no time and has no way back.
-_OF_NO_USE = {(migration.Commit, "timeout"), (migration.Commit, "undo")}
+_OF_NO_USE = {(plan.Commit, "timeout"), (plan.Commit, "undo")}
 
 
 def commands(group, before: str = "rosrm") -> Iterator[tuple[str, object]]:
@@ -251,10 +257,10 @@ def test_the_common_options_are_documented():
 @pytest.mark.parametrize(
     ("title", "kinds"),
     [
-        ("A process", [views.ProcessRow]),
-        ("A host", [views.HostRow, HostDescription, views.ResourceRow]),
-        ("An event", [views.EventRow]),
-        ("A plugin", [views.PluginRow]),
+        ("A process", [listing_rows.ProcessRow]),
+        ("A host", [listing_rows.HostRow, HostDescription, listing_rows.ResourceRow]),
+        ("An event", [listing_rows.EventRow]),
+        ("A plugin", [listing_rows.PluginRow]),
     ],
 )
 def test_every_field_of_the_json_is_documented(title, kinds):

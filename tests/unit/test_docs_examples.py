@@ -14,7 +14,7 @@ import yaml
 from typer.testing import CliRunner
 
 from rosrm.cli.commands import app
-from rosrm.registry import Registry
+from rosrm.extensions.registry import Registry
 from rosrm.ros import names
 from tests import pages
 

@@ -14,8 +14,8 @@ import textwrap
 import pytest
 
 from rosrm.errors import JournalBlocked, JournalError
-from rosrm.journal import SqliteJournal
-from rosrm.ports import Intent, Record
+from rosrm.extensions.contracts import Intent, Record
+from rosrm.journal.sqlite import SqliteJournal
 
 
 @pytest.fixture
@@ -41,8 +41,8 @@ def run(code: str, path, **options) -> subprocess.Popen:
 WRITER = """
     import sys
     from pathlib import Path
-    from rosrm.journal import SqliteJournal
-    from rosrm.ports import Intent, Record
+    from rosrm.journal.sqlite import SqliteJournal
+    from rosrm.extensions.contracts import Intent, Record
 
     journal = SqliteJournal(Path(sys.argv[1]))
     number = 0
@@ -220,8 +220,8 @@ def test_a_full_disk_is_said(path) -> None:
         import json, resource, sys
         from pathlib import Path
         from rosrm.errors import JournalError
-        from rosrm.journal import SqliteJournal
-        from rosrm.ports import Intent, Record
+        from rosrm.journal.sqlite import SqliteJournal
+        from rosrm.extensions.contracts import Intent, Record
 
         journal = SqliteJournal(Path(sys.argv[1]))
         resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))

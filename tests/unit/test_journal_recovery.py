@@ -9,9 +9,9 @@ import sqlite3
 import pytest
 
 from rosrm.errors import JournalError
-from rosrm.journal import SqliteJournal
-from rosrm.journal_recovery import recover
-from rosrm.ports import Intent, Record
+from rosrm.extensions.contracts import Intent, Record
+from rosrm.journal.recovery import recover
+from rosrm.journal.sqlite import SqliteJournal
 
 PAGE = 4096
 COUNT = 300

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rosrm.spelling import counted, standing_for
+from rosrm.wording import counted, standing_for
 
 
 @pytest.mark.parametrize(("number", "text"), [(0, "no hosts"), (1, "1 host"), (2, "2 hosts")])

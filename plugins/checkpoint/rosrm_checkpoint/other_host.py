@@ -5,8 +5,8 @@ from __future__ import annotations
 import zlib
 from dataclasses import dataclass
 
-from rosrm.config.units import Fraction, PositiveCount, PositiveSeconds
-from rosrm.ports import CheckpointChoice, CheckpointView, MemoryView
+from rosrm.extensions.contracts import CheckpointChoice, CheckpointView, MemoryView
+from rosrm.extensions.units import Fraction, PositiveCount, PositiveSeconds
 
 
 @dataclass(frozen=True)

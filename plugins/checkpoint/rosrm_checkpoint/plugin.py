@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from rosrm.hookspecs import hookimpl
-from rosrm.ports import CheckpointOffer
+from rosrm.extensions.contracts import CheckpointOffer
+from rosrm.extensions.hookspecs import hookimpl
 from rosrm_checkpoint.other_host import OtherHost, OtherHostOptions
 
 

@@ -12,9 +12,8 @@ from dataclasses import dataclass
 from math import inf
 from typing import Any, Final
 
-from rosrm.config.units import Bytes, PositiveSeconds, Seconds
 from rosrm.criu.fitting import mismatch
-from rosrm.plans import (
+from rosrm.extensions.plans import (
     Commit,
     Execute,
     InstanceId,
@@ -26,6 +25,7 @@ from rosrm.plans import (
     Stop,
     options_of,
 )
+from rosrm.extensions.units import Bytes, PositiveSeconds, Seconds
 from rosrm_migration.criu_building import execute, suspend
 from rosrm_migration.criu_kept import checkpoint_plan, restore_plan
 from rosrm_migration.criu_periodic import SWEEP, periodic_step

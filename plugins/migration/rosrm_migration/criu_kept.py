@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from rosrm.core.migration import Commit, Move, Plan, SetRestart, Start, Stop
+from rosrm.model.plan import Commit, Move, Plan, SetRestart, Start, Stop
 from rosrm_migration.criu_building import execute, suspend
 
 if TYPE_CHECKING:

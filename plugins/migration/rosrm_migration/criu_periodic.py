@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from rosrm.core.migration import Execute
+from rosrm.model.plan import Execute
 from rosrm_migration.criu_building import LONGER
 
 if TYPE_CHECKING:
-    from rosrm.core.model import InstanceId, ProcessSpec
+    from rosrm.model.values import InstanceId, ProcessSpec
     from rosrm_migration.criu import CriuOptions
 
 #: The executors; `criu_periodic_steps` has what they do.

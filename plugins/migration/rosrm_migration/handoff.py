@@ -13,8 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
-from rosrm.config.units import PositiveSeconds
-from rosrm.plans import (
+from rosrm.extensions.plans import (
     AwaitReleased,
     Commit,
     Configure,
@@ -29,6 +28,7 @@ from rosrm.plans import (
     Stop,
     options_of,
 )
+from rosrm.extensions.units import PositiveSeconds
 
 #: Name of the executor that hears when a destination of the paper's protocol speaks.
 WATCH: Final = "handoff_watch"
@@ -206,7 +206,7 @@ def _suffixed(name: str, at: int) -> str:
 
 def watch(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
     """Wait on the slave of the destination until a second publisher of the state is heard."""
-    from rosrm.ros.watching import await_second_publisher  # noqa: PLC0415 - the master has no use
+    from rosrm.ros.slave.publisher_watch import await_second_publisher  # noqa: PLC0415 - the master has no use
 
     return await_second_publisher(
         str(arguments["state"]), str(arguments["type"]), str(arguments["source"]),

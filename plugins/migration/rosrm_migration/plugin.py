@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from typing import Any, Final
 
-from rosrm.hookspecs import hookimpl
-from rosrm.ports import MigrationOffer
+from rosrm.extensions.contracts import MigrationOffer
+from rosrm.extensions.hookspecs import hookimpl
 from rosrm_migration import criu, criu_kept, criu_periodic
 from rosrm_migration.criu import Criu, CriuOptions, OwnCriuOptions
 from rosrm_migration.handoff import WATCH, Handoff, HandoffOptions, watch

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from rosrm.config.units import PositiveSeconds
-from rosrm.plans import AwaitReady, Commit, Move, Plan, Start, Stop
+from rosrm.extensions.plans import AwaitReady, Commit, Move, Plan, Start, Stop
+from rosrm.extensions.units import PositiveSeconds
 
 
 @dataclass(frozen=True)

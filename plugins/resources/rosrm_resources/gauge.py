@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final, Literal, Protocol
 
-from rosrm.core.model import Reading, ResourceDescription
 from rosrm.errors import ConfigError
-from rosrm.ports import ProbeContext
+from rosrm.extensions.contracts import ProbeContext
+from rosrm.model.values import Reading, ResourceDescription
 
 #: What is measured: the whole machine; the control group the slave runs in (what a container
 #: needs); or the slave's own process tree against a budget.

@@ -10,9 +10,9 @@ from typing import Annotated, Any, Final, Literal
 
 from annotated_types import Ge
 
-from rosrm.core.model import Reading, ResourceDescription
 from rosrm.errors import ConfigError, SkipPlugin
-from rosrm.ports import ProbeContext
+from rosrm.extensions.contracts import ProbeContext
+from rosrm.model.values import Reading, ResourceDescription
 
 _LIBRARY: Final = "libnvidia-ml.so.1"
 

@@ -10,9 +10,9 @@ from typing import Annotated, Any, Final
 
 from annotated_types import Gt, Le
 
-from rosrm.core.model import Reading, ResourceDescription
 from rosrm.errors import ConfigError, SkipPlugin
-from rosrm.ports import ProbeContext
+from rosrm.extensions.contracts import ProbeContext
+from rosrm.model.values import Reading, ResourceDescription
 from rosrm_resources.rate import Rate
 
 _BYTES_PER_MEGABIT: Final = 1e6 / 8

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from rosrm.hookspecs import hookimpl
-from rosrm.ports import ProbeOffer
+from rosrm.extensions.contracts import ProbeOffer
+from rosrm.extensions.hookspecs import hookimpl
 from rosrm_resources import cpu, disk, gpu, memory, network
 
 

@@ -22,8 +22,8 @@ from typing import Annotated, Final
 import numpy as np
 from annotated_types import Ge, Gt, Le
 
-from rosrm.config.units import ResourceName
-from rosrm.ports import FloatArray, HostView, ProcessView, Scores
+from rosrm.extensions.contracts import FloatArray, HostView, ProcessView, Scores
+from rosrm.extensions.units import ResourceName
 from rosrm_scoring.weighted import DEFAULT_WEIGHTS, Missing, Weight, WeightedSum
 
 #: Stands for a limit of 0, which nothing can be divided by.
@@ -57,7 +57,7 @@ class ThresholdOptions:
 
 
 class Threshold:
-    """Implements `rosrm.ports.ScoringPolicy`.
+    """Implements `rosrm.extensions.contracts.ScoringPolicy`.
 
     Args:
         options: weights and band.

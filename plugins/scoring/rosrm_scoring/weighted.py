@@ -20,8 +20,8 @@ from typing import Annotated, Final, Literal
 import numpy as np
 from annotated_types import Ge, Le
 
-from rosrm.config.units import ResourceName
-from rosrm.ports import FloatArray, HostView, ProcessView, Scores
+from rosrm.extensions.contracts import FloatArray, HostView, ProcessView, Scores
+from rosrm.extensions.units import ResourceName
 
 Weight = Annotated[float, Ge(0), Le(1)]
 Missing = Literal["worst", "ignore"]
@@ -50,7 +50,7 @@ class WeightedOptions:
 
 
 class Weighted:
-    """Implements `rosrm.ports.ScoringPolicy` by Eq. 1.
+    """Implements `rosrm.extensions.contracts.ScoringPolicy` by Eq. 1.
 
     Args:
         options: the weights.

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from typing import Final
 
-from rosrm.core.model import Assignment, InstanceId
+from rosrm.core.slave.events_and_commands import Command, MasterHears, Renew
 from rosrm.core.slave.state import SlaveState
-from rosrm.core.slave.words import Command, MasterHears, Renew
+from rosrm.model.values import Assignment, InstanceId
 
 #: Least seconds between two words to the supervisor.
 RENEW_PERIOD: Final = 0.1

@@ -7,11 +7,8 @@ from dataclasses import replace
 from types import MappingProxyType
 from typing import Any, Final
 
-from rosrm.core.model import Assignment, InstanceId, InstanceState, InstanceStatus
 from rosrm.core.slave import fencing
-from rosrm.core.slave.health import Judgement, watch_of
-from rosrm.core.slave.state import Held, SlaveState, awaits_graph, qualified_name
-from rosrm.core.slave.words import (
+from rosrm.core.slave.events_and_commands import (
     Amend,
     AssignmentsReceived,
     Awaited,
@@ -42,6 +39,9 @@ from rosrm.core.slave.words import (
     SupervisorReported,
     TimePassed,
 )
+from rosrm.core.slave.health import Judgement, watch_of
+from rosrm.core.slave.state import Held, SlaveState, awaits_graph, qualified_name
+from rosrm.model.values import Assignment, InstanceId, InstanceState, InstanceStatus
 
 #: Seconds for which the end of an instance is kept for a master that did not hear of it.
 REMEMBER_END: Final = 60.0

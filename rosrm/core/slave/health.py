@@ -10,8 +10,8 @@ from collections import deque
 from collections.abc import Iterator, Mapping
 from typing import Final
 
-from rosrm.core.model import Assignment, Health
-from rosrm.core.slave.words import Look, Watch
+from rosrm.core.slave.events_and_commands import Look, Watch
+from rosrm.model.values import Assignment, Health
 
 #: Seconds between two looks.
 LOOK_PERIOD: Final = 0.2

@@ -10,7 +10,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from rosrm.core.model import (
+from rosrm.core.slave.events_and_commands import Awaited, Memo, Watch
+from rosrm.core.slave.health import Judgement
+from rosrm.model.values import (
     RESOURCE_SLOTS,
     Assignment,
     InstanceId,
@@ -19,8 +21,6 @@ from rosrm.core.model import (
     ProcessSpec,
     RestartPolicy,
 )
-from rosrm.core.slave.health import Judgement
-from rosrm.core.slave.words import Awaited, Memo, Watch
 
 _SLOTS: Final = np.left_shift(np.uint32(1), np.arange(RESOURCE_SLOTS, dtype=np.uint32))
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from rosrm.local_cluster import claim_domain
+from rosrm.testing.local_cluster import claim_domain
 from rosrm_examples.pieces import load_piece
 
 Start = Callable[..., subprocess.Popen[str]]

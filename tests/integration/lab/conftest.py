@@ -44,7 +44,6 @@ def lab_is_possible():
 
 def remains(lab: str) -> dict[str, set[str]]:
     """All of this machine that a lab could leave behind; other labs may be made meanwhile."""
-    tops = [top for top in Path("/sys/fs/cgroup").rglob("rosrm-lab") if top.is_dir()]
     losetup = ["losetup", "-n", "-O", "BACK-FILE"]
     loops = subprocess.run(losetup, capture_output=True, text=True, check=True).stdout.splitlines()
     mounts = Path("/proc/self/mounts").read_text().splitlines()
@@ -55,12 +54,21 @@ def remains(lab: str) -> dict[str, set[str]]:
         "mounts": {
             line for line in mounts if lab in line or not {"rosrm-lab", "/run/netns"} & _words(line)
         },
-        "groups": {str(path) for top in tops for path in top.rglob(f"{lab}*")},
+        "groups": _below(Path("/sys/fs/cgroup"), lab),
         "processes": {line for line in commands if lab in line and "rosrm/lab/inside" in line},
         "loops": {line for line in loops if lab in line},
-        "files": {
-            str(path) for root in (store.RUN, store.IMAGES) for path in root.rglob(f"{lab}*")
-        },
+        "files": _below(store.RUN, lab) | _below(store.IMAGES, lab),
+    }
+
+
+def _below(root: Path, start: str) -> set[str]:
+    """Return the paths below a folder whose name starts so."""
+    # `os.walk` skips a folder of another lab that is removed meanwhile; `rglob` raises.
+    return {
+        f"{folder}/{name}"
+        for folder, folders, files in os.walk(root)
+        for name in (*folders, *files)
+        if name.startswith(start)
     }
 
 

@@ -164,7 +164,7 @@ def test_a_slave_beside_the_quota_of_its_jobs(cluster):
     )
     limits = cluster.ask("logs", "group")
     assert f"{lab.group('host1')}\n" in limits
-    inner = [pid for pid in lab.pids("host1") if "rosrm.slave.run" in _command(pid)]
+    inner = [pid for pid in lab.pids("host1") if "rosrm.slave" in _command(pid)]
     assert inner
     assert lab.group("host1") not in Path(f"/proc/{inner[0]}/cgroup").read_text()
     assert slave.poll() is None

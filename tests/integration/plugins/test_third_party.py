@@ -33,7 +33,7 @@ def test_a_probe_is_installed_and_chosen_by_name(environment):
     code = (
         "from pathlib import Path\n"
         "from rosrm.config import HostConfig, load_host\n"
-        "from rosrm.registry import Registry\n"
+        "from rosrm.extensions.registry import Registry\n"
         "from rosrm.testing import probe_context\n"
         "registry = Registry.discover()\n"
         "config = HostConfig.from_json(load_host('host.yaml', registry).to_json())\n"
@@ -71,8 +71,8 @@ def test_a_migration_strategy_is_installed_and_chosen_by_name(environment):
 
     code = (
         "from rosrm.config import ClusterConfig, load_cluster\n"
-        "from rosrm.core.migration import plan_fault\n"
-        "from rosrm.registry import Registry\n"
+        "from rosrm.model.plan import plan_fault\n"
+        "from rosrm.extensions.registry import Registry\n"
         "from rosrm.testing import MigrationContract\n"
         "registry = Registry.discover()\n"
         "config = ClusterConfig.from_json(load_cluster('cluster.yaml', registry).to_json())\n"

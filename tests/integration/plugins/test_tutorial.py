@@ -82,7 +82,7 @@ def test_the_tutorial_does_what_it_says(environment):
     assert len(done) == 6
 
     code = (
-        "from rosrm.registry import Registry\n"
+        "from rosrm.extensions.registry import Registry\n"
         "from rosrm.config import ClusterConfig, load_cluster\n"
         "registry = Registry.discover()\n"
         "config = load_cluster('rosrm-fewest/cluster.yaml', registry)\n"

@@ -12,8 +12,8 @@ import psutil
 import pytest
 
 import rosrm_resources.plugin
-from rosrm.registry import Registry
-from rosrm.slave.sampling import Sampler
+from rosrm.extensions.registry import Registry
+from rosrm.slave.sampler import Sampler
 from rosrm.slave.sessions import SessionTable
 from rosrm.testing import probe_context
 from rosrm_resources.cgroups import find_group
@@ -160,8 +160,8 @@ def test_default_probes_are_lean():
     """The slave's memory is budgeted: what only some hosts need is not imported on all of them."""
     code = (
         "import sys; import rosrm_resources.plugin as plugin\n"
-        "from pathlib import Path; from rosrm.ports import ProbeContext\n"
-        "from rosrm.registry import Registry\n"
+        "from pathlib import Path; from rosrm.extensions.contracts import ProbeContext\n"
+        "from rosrm.extensions.registry import Registry\n"
         "Registry.of(resources=plugin).probes(None, ProbeContext('machine', {}, Path('/'), None))\n"
         "print(*sorted({'psutil', 'pydantic'} & set(sys.modules)))"
     )

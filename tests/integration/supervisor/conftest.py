@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from rosrm.core.model import InstanceId, InstanceState, RestartPolicy, StopPolicy
-from rosrm.supervisor import members, record
+from rosrm.model.values import InstanceId, InstanceState, RestartPolicy, StopPolicy
+from rosrm.supervisor import instance_record, procfs
 from rosrm.supervisor.client import Amended, LaunchOrder, SupervisorClient, log_path
 
 QUICK = StopPolicy(interrupt_grace=0.3, terminate_grace=0.3)
@@ -85,7 +85,7 @@ class Host:
 
     def alive(self) -> list[int]:
         """Every process that the supervisor started, and what came of it."""
-        found = members.find_marked(str(self.state))
+        found = procfs.find_marked(str(self.state))
         return [stat.pid for stats in found.values() for stat in stats]
 
     def clean_up(self) -> None:
@@ -103,11 +103,11 @@ class Host:
 
     def recorded(self) -> list[int]:
         """Leaders that live, by the record: one that is just being executed shows no marks yet."""
-        recorded = record.read(str(self.state))
+        recorded = instance_record.read(str(self.state))
         leaders = []
         for key, instance in recorded.instances.items():
-            stat = members.read_stat(instance.pid) if instance.pid else None
-            if stat is not None and members.was_born(stat, recorded.births[key]):
+            stat = procfs.read_stat(instance.pid) if instance.pid else None
+            if stat is not None and procfs.was_born(stat, recorded.births[key]):
                 leaders.append(instance.pid)
         return leaders
 

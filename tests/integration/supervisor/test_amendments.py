@@ -8,7 +8,7 @@ import signal
 
 import pytest
 
-from rosrm.core.model import InstanceId, InstanceState, RestartPolicy
+from rosrm.model.values import InstanceId, InstanceState, RestartPolicy
 
 from .conftest import wait_gone, wait_until
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 import rosrm
-from rosrm.core.model import Fence, InstanceId, InstanceState, RestartPolicy, StopPolicy
+from rosrm.model.values import Fence, InstanceId, InstanceState, RestartPolicy, StopPolicy
 
 from .conftest import TIMEOUT, wait_gone, wait_until
 
@@ -27,7 +27,7 @@ ALWAYS = RestartPolicy("always", delay=0.05)
 SLAVE = """
     import os, sys, time
     from pathlib import Path
-    from rosrm.core.model import Fence, InstanceId
+    from rosrm.model.values import Fence, InstanceId
     from rosrm.supervisor.client import LaunchOrder, SupervisorClient
     client = SupervisorClient.connect(Path(sys.argv[1]))
     fences = {"one": Fence(3.0, 0.5), "driver": None}

@@ -15,19 +15,19 @@ from pathlib import Path
 import pytest
 
 import rosrm
-from rosrm.core.model import InstanceId, InstanceState, RestartPolicy
 from rosrm.errors import SupervisorError
-from rosrm.supervisor import members, protocol, record
+from rosrm.model.values import InstanceId, InstanceState, RestartPolicy
+from rosrm.supervisor import instance_record, messages, procfs
 from rosrm.supervisor.client import SupervisorClient, SupervisorEnded
 
 from .conftest import Host, command_line, wait_gone, wait_until
 
-OURS = protocol.PROTOCOL
+OURS = messages.PROTOCOL
 
 SLAVE = """
     import os, sys
     from pathlib import Path
-    from rosrm.core.model import InstanceId
+    from rosrm.model.values import InstanceId
     from rosrm.supervisor.client import LaunchOrder, SupervisorClient
     client = SupervisorClient.connect(Path(sys.argv[1]))
     order = LaunchOrder(InstanceId("kept", 1), ("sleep", "1000"), dict(os.environ))
@@ -76,7 +76,7 @@ def test_nothing_of_a_slaves_terminal_reaches_it(host, slave):
     (process,) = wait_until(host.alive, "the process is executed")
     sessions = {os.getsid(slave.pid), os.getsid(supervisor), os.getsid(process)}
     assert len(sessions) == 3
-    stat = members.read_stat(supervisor)
+    stat = procfs.read_stat(supervisor)
     assert stat.parent != slave.pid
 
 
@@ -93,7 +93,7 @@ def test_a_slave_of_another_version_is_refused(host, client, monkeypatch, number
     pid = host.running(client, "kept").pid
     client.close()
     with monkeypatch.context() as patched:
-        patched.setattr(protocol, "PROTOCOL", number)
+        patched.setattr(messages, "PROTOCOL", number)
         with pytest.raises(SupervisorError, match=f"speaks protocol {OURS}, you speak {number}"):
             host.connect()
     assert [status.pid for status in host.connect().instances] == [pid]
@@ -259,13 +259,13 @@ def test_a_damaged_line_is_left_out_and_said(host):
 def test_what_starts_after_the_record_was_compacted_is_taken_over(host):
     """Compacted while nothing ran: the environment that the client sent once is still there."""
     client = host.connect()
-    large = "x" * (record.COMPACT_BYTES + 1)
+    large = "x" * (instance_record.COMPACT_BYTES + 1)
     host.run(client, host.order("large", "/no/such/program", memo=large))
     always = RestartPolicy(when="always", delay=0.01)
     code = "import os, time; print(os.environ.get('PATH'), flush=True); time.sleep(1000)"
     client.start([host.python("later", code, restart=always)])
     pid = host.running(client, "later").pid
-    assert (host.state / "instances.jsonl").stat().st_size < record.COMPACT_BYTES
+    assert (host.state / "instances.jsonl").stat().st_size < instance_record.COMPACT_BYTES
     host.kill_supervisor(client)
     client = host.connect()
     assert client.notes == ()
@@ -448,7 +448,7 @@ def test_it_imports_nothing_heavy():
     assert roots - {"rosrm"} <= set(sys.stdlib_module_names) | {"__main__"}
     heavy = {"asyncio", "ctypes", "dataclasses", "inspect", "logging", "pathlib", "subprocess"}
     assert roots & heavy == set()
-    assert "rosrm.core.model" not in loaded
+    assert "rosrm.model.values" not in loaded
 
 
 def test_it_is_small(client):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rosrm.core.model import InstanceId
+from rosrm.model.values import InstanceId
 from rosrm.supervisor import log_index
 from rosrm.supervisor.client import LogLimits, newest_log
 from rosrm.supervisor.logs import PROCESSES_AT_ONCE

@@ -11,7 +11,7 @@ from functools import partial
 
 import pytest
 
-from rosrm.core.model import InstanceId, InstanceState, RestartPolicy
+from rosrm.model.values import InstanceId, InstanceState, RestartPolicy
 
 from .conftest import wait_gone, wait_until
 

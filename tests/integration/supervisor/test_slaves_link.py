@@ -11,10 +11,10 @@ import time
 import pytest
 
 from rosrm.config.settings import LogSettings
-from rosrm.core import slave as core
-from rosrm.core.model import InstanceId, InstanceState, InstanceStatus
-from rosrm.slave.supervisor_link import SupervisorLink
-from rosrm.supervisor import outgoing
+from rosrm.core.slave import reducer as core
+from rosrm.model.values import InstanceId, InstanceState, InstanceStatus
+from rosrm.slave.supervisor_client import SupervisorLink
+from rosrm.supervisor import send_buffer
 from rosrm.supervisor.client import SupervisorClient
 
 from .conftest import TIMEOUT, wait_gone
@@ -130,7 +130,7 @@ def test_orders_to_a_stopped_supervisor_wait_for_it(loop) -> None:
 
 def test_a_supervisor_that_takes_nothing_any_more_is_connected_to_anew(loop, monkeypatch) -> None:
     """What it had taken runs and is told; what it had not is given to it again: all of it runs."""
-    monkeypatch.setattr(outgoing, "MOST_UNSENT", 300_000)
+    monkeypatch.setattr(send_buffer, "MOST_UNSENT", 300_000)
     os.kill(loop.pid, signal.SIGSTOP)
     loop.start_many()
     loop.wait(lambda: any("takes no orders" in one for one in loop.said), "it is said")

@@ -10,15 +10,8 @@ from typer.testing import CliRunner
 
 from rosrm.cli import connection
 from rosrm.cli.commands import app
-from rosrm.core.model import HostDescription
-from rosrm.core.views import (
-    EventRow,
-    HostRow,
-    PluginRow,
-    ProcessRow,
-    ResourceRow,
-    Snapshot,
-)
+from rosrm.model.rows import EventRow, HostRow, PluginRow, ProcessRow, ResourceRow, Snapshot
+from rosrm.model.values import HostDescription
 
 NAN = float("nan")
 

@@ -7,9 +7,9 @@ from types import SimpleNamespace
 import pytest
 
 from rosrm.errors import SkipPlugin
-from rosrm.hookspecs import hookimpl
-from rosrm.ports import CheckpointOffer, MigrationOffer, ProbeOffer, ScoringOffer
-from rosrm.registry import Registry
+from rosrm.extensions.contracts import CheckpointOffer, MigrationOffer, ProbeOffer, ScoringOffer
+from rosrm.extensions.hookspecs import hookimpl
+from rosrm.extensions.registry import Registry
 from rosrm.testing import FakeProbe
 
 from .test_starting import OURS

@@ -130,7 +130,8 @@ def test_output_that_cannot_be_written_gives_no_traceback(command, output, ros):
     """Exit with 1, in silence for a closed pipe; `write` leaves its output to the exit."""
     code = (
         "import sys, types\n"
-        "from rosrm.cli import commands, tables\n"
+        "from rosrm.cli import commands\n"
+        "from rosrm.cli.output import tables\n"
         "@commands.app.command()\n"
         "def show(): tables.show('some')\n"
         "@commands.app.command()\n"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rosrm.cli import formats
+from rosrm.cli.output import formats
 
 
 @pytest.mark.parametrize(

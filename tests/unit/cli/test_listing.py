@@ -8,9 +8,9 @@ from dataclasses import replace
 
 import pytest
 
-from rosrm.cli import explaining, tables
-from rosrm.core.views import PluginRow
+from rosrm.cli.output import explain, tables
 from rosrm.errors import NoMaster, Refused
+from rosrm.model.rows import PluginRow
 
 from .conftest import EVENTS, NAN, PLUGINS, STORY, event, host, process, resource
 
@@ -256,7 +256,7 @@ def drawn(made, width=60):
 
 def test_the_history_of_explain_wraps_below_the_message():
     entry = {"elapsed": 9.0, "kind": "waits", "message": "a host " * 9}
-    lines = drawn(explaining.render({**STORY, "history": [entry]}))
+    lines = drawn(explain.render({**STORY, "history": [entry]}))
     first = next(i for i, line in enumerate(lines) if "waits" in line)
     indent = lines[first].index("a host")
     assert [len(line) - len(line.lstrip()) for line in lines[first + 1 :]] == [indent, indent]

@@ -7,8 +7,8 @@ from io import StringIO
 import pytest
 from rich.console import Console
 
-from rosrm.cli import live
-from rosrm.core.views import Snapshot
+from rosrm.cli.output import top
+from rosrm.model.rows import Snapshot
 from tests.unit.core.cluster import Cluster
 from tests.unit.core.cluster import process as core_process
 
@@ -17,7 +17,7 @@ from .conftest import HOSTS, NAN, PROCESSES, event, host, process, resource
 
 def drawn(snapshot, width=80, **more):
     output = StringIO()
-    Console(file=output, width=width, color_system=None).print(live.render(snapshot, **more))
+    Console(file=output, width=width, color_system=None).print(top.render(snapshot, **more))
     return output.getvalue()
 
 
@@ -95,7 +95,7 @@ def test_a_reason_gets_the_room_of_empty_columns():
 def test_the_master_begins_reasons_as_the_table_knows():
     cluster = Cluster("a")
     cluster.submit(core_process("p", required_labels={"gpu": "new"}))
-    assert cluster["p"].reason.startswith(live._BEGINNINGS[cluster.phase("p")])
+    assert cluster["p"].reason.startswith(top._BEGINNINGS[cluster.phase("p")])
 
 
 @pytest.mark.parametrize("width", [50, 60, 80, 120])
@@ -154,7 +154,7 @@ def test_an_empty_cluster_is_a_picture_too():
     ],
 )
 def test_a_bar_shows_used_promised_and_limit(row, picture):
-    assert live.bar(row, 10).plain == picture
+    assert top.bar(row, 10).plain == picture
 
 
 def test_what_matters_comes_first_and_the_queue_keeps_its_order():

@@ -15,8 +15,8 @@ from typer.main import get_command
 from rosrm.cli import connection, early
 from rosrm.cli.commands import app
 from rosrm.errors import NoMaster, RosrmError
+from rosrm.model.ros_settings import RosSettings
 from rosrm.ros import client as client_module
-from rosrm.ros.settings import RosSettings
 
 
 def test_the_domain_comes_from_before_or_after_the_command(rosrm, client):

@@ -8,7 +8,8 @@ import sys
 import pytest
 from rich.console import Console
 
-from rosrm.cli import simulation_picture, tables
+from rosrm.cli import simulation_picture
+from rosrm.cli.output import tables
 from rosrm.cli.simulation_runs import agreement_of
 from rosrm.errors import ConfigError
 from tests.unit.simulation.workloads import host, plan, recorded, simulation

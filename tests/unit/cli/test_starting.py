@@ -7,15 +7,15 @@ from types import SimpleNamespace
 
 import pytest
 
-from rosrm.cli import starting
+from rosrm.cli.commands import start
 from rosrm.config import ClusterConfig, HostConfig
-from rosrm.handover import take_over
-from rosrm.hookspecs import hookimpl
-from rosrm.installed import installed_plugins
-from rosrm.journal import SqliteJournal
-from rosrm.ports import Intent, MigrationOffer, ProbeOffer, ScoringOffer
-from rosrm.registry import Registry
-from rosrm.state_directory import only_one
+from rosrm.extensions.contracts import Intent, MigrationOffer, ProbeOffer, ScoringOffer
+from rosrm.extensions.hookspecs import hookimpl
+from rosrm.extensions.installed import installed_plugins
+from rosrm.extensions.registry import Registry
+from rosrm.journal.sqlite import SqliteJournal
+from rosrm.runtime.bootstrap import take_over
+from rosrm.runtime.state_lock import only_one
 from rosrm.testing import FakeProbe
 
 
@@ -51,9 +51,7 @@ def becomes(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     seen = []
     monkeypatch.setattr(Registry, "discover", lambda: Registry.of(ours=OURS))
-    monkeypatch.setattr(
-        starting, "become", lambda module, settings: seen.append((module, settings))
-    )
+    monkeypatch.setattr(start, "become", lambda module, settings: seen.append((module, settings)))
     return seen
 
 
@@ -64,7 +62,7 @@ def test_a_master_starts_with_the_settings_of_its_file(rosrm, becomes, tmp_path)
     assert result.err.startswith("master 'lab': domain 7, ")
     assert f"scoring weighted; migration relaunch; state in {tmp_path / 's'}" in result.err
     ((module, settings),) = becomes
-    assert module == "rosrm.master.run"
+    assert module == "rosrm.master"
     config = ClusterConfig.from_json(settings)
     assert (config.name, config.ros.domain) == ("lab", 7)
 
@@ -76,14 +74,14 @@ def test_a_slave_starts_with_the_settings_of_its_file(rosrm, becomes, tmp_path):
     assert "slave of 'h1': domain " in result.err
     assert "limits memory 80%, cpu 70%, disk 90%" in result.err
     ((module, settings),) = becomes
-    assert module == "rosrm.slave.run"
+    assert module == "rosrm.slave"
     assert HostConfig.from_json(settings).host == "h1"
 
 
 def test_both_start_with_the_defaults_too(rosrm, becomes):
     assert rosrm("master").code == 0
     assert rosrm("slave").code == 0
-    assert [module for module, _ in becomes] == ["rosrm.master.run", "rosrm.slave.run"]
+    assert [module for module, _ in becomes] == ["rosrm.master", "rosrm.slave"]
 
 
 def test_a_wrong_file_or_unknown_plugin_starts_nothing(rosrm, becomes, tmp_path):
@@ -107,8 +105,8 @@ def test_the_runtime_inherits_the_settings_and_where_the_plugins_are(monkeypatch
         seen["handover"] = take_over(words[-2:])
 
     monkeypatch.setattr(os, "execv", execv)
-    starting.become("rosrm.slave.run", '{"host": "h"}')
-    assert seen["words"][-4:-1] == ["-m", "rosrm.slave.run", "--settings-fd"]
+    start.become("rosrm.slave", '{"host": "h"}')
+    assert seen["words"][-4:-1] == ["-m", "rosrm.slave", "--settings-fd"]
     assert (seen["inherited"], seen["handover"].settings) == (True, '{"host": "h"}')
     assert list(seen["handover"].plugins) == installed_plugins()
 
@@ -135,7 +133,7 @@ def test_a_damaged_journal_is_recovered_before_the_master_starts(rosrm, becomes,
     result = rosrm(*command)
     assert result.code == 0
     assert "the journal was recovered" in result.err
-    assert [module for module, _ in becomes] == ["rosrm.master.run"]
+    assert [module for module, _ in becomes] == ["rosrm.master"]
     SqliteJournal(path).close()
 
 

@@ -11,11 +11,11 @@ import pytest
 from annotated_types import Le
 
 from rosrm.config import ClusterConfig, load_cluster
-from rosrm.config.units import Fraction, ResourceName, Seconds
-from rosrm.core.settings import CoreSettings
-from rosrm.hookspecs import hookimpl
-from rosrm.ports import MigrationOffer, ProbeOffer, ScoringOffer
-from rosrm.registry import Registry
+from rosrm.core.master.settings import CoreSettings
+from rosrm.extensions.contracts import MigrationOffer, ProbeOffer, ScoringOffer
+from rosrm.extensions.hookspecs import hookimpl
+from rosrm.extensions.registry import Registry
+from rosrm.extensions.units import Fraction, ResourceName, Seconds
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,9 @@ import pytest
 
 from rosrm.config import HostConfig, load_host
 from rosrm.errors import SkipPlugin
-from rosrm.hookspecs import hookimpl
-from rosrm.ports import ProbeOffer
-from rosrm.registry import Registry
+from rosrm.extensions.contracts import ProbeOffer
+from rosrm.extensions.hookspecs import hookimpl
+from rosrm.extensions.registry import Registry
 
 
 @dataclass(frozen=True)

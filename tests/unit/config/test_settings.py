@@ -10,14 +10,14 @@ from pathlib import Path
 
 import pytest
 
-from rosrm.config.plain import from_plain, to_plain
 from rosrm.config.settings import ClusterConfig, HostConfig
+from rosrm.model.codec import from_plain, to_plain
 
 
 def test_settings_and_registry_import_without_pydantic_yaml_or_typer():
     """A slave's memory budget has no room for what only files and terminals need."""
     code = (
-        "import sys, rosrm.config.settings, rosrm.registry, rosrm.core.specs;"
+        "import sys, rosrm.config.settings, rosrm.extensions.registry, rosrm.model.spec_json;"
         "print(*sorted({'pydantic', 'yaml', 'typer', 'rich', 'rclpy'} & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosrm.core.model import (
+from rosrm.model.spec_json import spec_from_dict, spec_to_dict
+from rosrm.model.values import (
     Kind,
     MigrationPolicy,
     ProcessSpec,
@@ -16,7 +17,6 @@ from rosrm.core.model import (
     RestartPolicy,
     StopPolicy,
 )
-from rosrm.core.specs import spec_from_dict, spec_to_dict
 
 text = st.text(max_size=8)
 numbers = st.floats(allow_nan=False, allow_infinity=False)

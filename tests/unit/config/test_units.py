@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from rosrm.config.units import Quantity, amount_of
+from rosrm.extensions.units import Quantity, amount_of
 
 SIZE, DURATION, NUMBER = Quantity("size", whole=True), Quantity("duration"), Quantity()
 

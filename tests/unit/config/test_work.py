@@ -8,11 +8,11 @@ from types import SimpleNamespace
 import pytest
 
 from rosrm.config import load_work
-from rosrm.config.units import PositiveSeconds
-from rosrm.core.model import Kind, MigrationPolicy, Readiness, RestartPolicy, StopPolicy
-from rosrm.hookspecs import hookimpl
-from rosrm.ports import MigrationOffer
-from rosrm.registry import Registry
+from rosrm.extensions.contracts import MigrationOffer
+from rosrm.extensions.hookspecs import hookimpl
+from rosrm.extensions.registry import Registry
+from rosrm.extensions.units import PositiveSeconds
+from rosrm.model.values import Kind, MigrationPolicy, Readiness, RestartPolicy, StopPolicy
 
 
 def one(path):

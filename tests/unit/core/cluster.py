@@ -16,11 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from rosrm.config.own_options import merged_options
-from rosrm.config.plain import to_plain
-from rosrm.core import events as happened
-from rosrm.core import listing, slave
-from rosrm.core.commands import (
+from rosrm.core.master import events as happened
+from rosrm.core.master import listing
+from rosrm.core.master.commands import (
     Assign,
     Command,
     Order,
@@ -29,9 +27,16 @@ from rosrm.core.commands import (
     Reply,
     Withdraw,
 )
-from rosrm.core.declared import Declared
-from rosrm.core.master import step
-from rosrm.core.migration import (
+from rosrm.core.master.master_state import MasterState, Process
+from rosrm.core.master.recovery.restore import restore
+from rosrm.core.master.reducer import step
+from rosrm.core.master.settings import CoreSettings
+from rosrm.core.slave import reducer
+from rosrm.extensions.contracts import HostView, Intent, ProcessView, Record, Scores
+from rosrm.extensions.declared_fields import Declared
+from rosrm.extensions.options import merged_options
+from rosrm.model.codec import to_plain
+from rosrm.model.plan import (
     AwaitReady,
     AwaitReleased,
     Commit,
@@ -43,7 +48,7 @@ from rosrm.core.migration import (
     Start,
     Stop,
 )
-from rosrm.core.model import (
+from rosrm.model.values import (
     EMPTY,
     RESOURCE_SLOTS,
     KeptState,
@@ -53,10 +58,6 @@ from rosrm.core.model import (
     Readiness,
     RestartPolicy,
 )
-from rosrm.core.restore import restore
-from rosrm.core.settings import CoreSettings
-from rosrm.core.state import MasterState, Process
-from rosrm.ports import HostView, Intent, ProcessView, Record, Scores
 from rosrm_migration.plugin import register_migration_strategies
 from tests.unit.core.machine import GIB, MIB, Machine
 from tests.unit.core.nodes import Air, Node
@@ -316,8 +317,8 @@ class Cluster:
         if reply.accepted:
             machine.host_id, machine.fresh = reply.host_id, False
             machine.polled.clear()
-            machine.tell(slave.Registered(self.state.epoch), self.now)
-            machine.tell(slave.MasterHears(self.now), self.now)
+            machine.tell(reducer.Registered(self.state.epoch), self.now)
+            machine.tell(reducer.MasterHears(self.now), self.now)
             self.read(machine)
             self.ask_for_work(machine)
         self.settle()
@@ -394,7 +395,7 @@ class Cluster:
         """A slave says that it stops, then ends all that it runs."""
         reply = self.ask(happened.HostLeft, machine.host_id, machine.incarnation, settle=False)
         for instance in list(machine.programs):
-            machine.tell(slave.StopOrdered(instance), self.now)
+            machine.tell(reducer.StopOrdered(instance), self.now)
         self.settle()
         return reply
 
@@ -451,9 +452,9 @@ class Cluster:
             self.read()
             for machine in self.machines.values():
                 if machine.connected and machine.host_id:
-                    machine.tell(slave.TimePassed(), self.now)
+                    machine.tell(reducer.TimePassed(), self.now)
                     if machine.host_id not in self.state.hosts.unheard():
-                        machine.tell(slave.MasterHears(self.now), self.now)
+                        machine.tell(reducer.MasterHears(self.now), self.now)
                     self.ask_for_work(machine)
                     self.tell(machine.usages())
             self.tell(happened.TimePassed())

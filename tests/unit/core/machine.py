@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from rosrm.core import events as happened
-from rosrm.core import slave
-from rosrm.core.commands import Order
-from rosrm.core.model import (
+from rosrm.core.master import events as happened
+from rosrm.core.master.commands import Order
+from rosrm.core.slave import reducer
+from rosrm.model.values import (
     EMPTY,
     Assignment,
     HostDescription,
@@ -77,13 +77,13 @@ class Machine:
 
     host_id: int = 0
     incarnation: int = 0
-    slave: slave.SlaveState = field(default_factory=slave.SlaveState)
+    slave: reducer.SlaveState = field(default_factory=reducer.SlaveState)
     programs: dict[InstanceId, Program] = field(default_factory=dict)
     ends: dict[InstanceId, InstanceStatus] = field(default_factory=dict)
     refuses: dict[str, str] = field(default_factory=dict)
     stubborn: set[str] = field(default_factory=set)
     quirks: dict[str, set[str]] = field(default_factory=lambda: defaultdict(set))
-    settled: list[slave.Settle] = field(default_factory=list)
+    settled: list[reducer.Settle] = field(default_factory=list)
     busy: dict[str, float] = field(default_factory=lambda: {"memory": 0.1, "cpu": 0.1})
     shown: dict[str, dict[str, float]] = field(default_factory=lambda: defaultdict(dict))
     polled: list[Assignment] = field(default_factory=list)
@@ -151,9 +151,9 @@ class Machine:
             np.array([one.get("memory", 0.0) for one in used]),
         )  # fmt: skip
 
-    def _report(self, commands: Iterable[slave.Command], now: float) -> None:
+    def _report(self, commands: Iterable[reducer.Command], now: float) -> None:
         for command in commands:
-            if isinstance(command, slave.Report):
+            if isinstance(command, reducer.Report):
                 self.batches += 1
                 self.said.append(
                     happened.StatusesReceived(
@@ -164,32 +164,32 @@ class Machine:
             else:
                 self._carry_out(command, now)
 
-    def _carry_out(self, command: slave.Command, now: float) -> None:
-        if isinstance(command, slave.Launch):
+    def _carry_out(self, command: reducer.Command, now: float) -> None:
+        if isinstance(command, reducer.Launch):
             for assignment in command.assignments:
                 self._launch(assignment, now)
-        elif isinstance(command, slave.Stop):
+        elif isinstance(command, reducer.Stop):
             self._stop(command.instance, now)
-        elif isinstance(command, slave.Fence):
+        elif isinstance(command, reducer.Fence):
             if command.instance in self.programs:
                 self._end(command.instance, InstanceState.FENCED, now, signal=9)
-        elif isinstance(command, slave.Restart):
+        elif isinstance(command, reducer.Restart):
             self._restart(command.instance, now)
-        elif isinstance(command, slave.Amend):
+        elif isinstance(command, reducer.Amend):
             self.programs[command.instance].restart = command.restart
-            self.tell(slave.RestartPolicyRecorded(command.instance, command.restart), now)
-        elif isinstance(command, slave.Settle):
+            self.tell(reducer.RestartPolicyRecorded(command.instance, command.restart), now)
+        elif isinstance(command, reducer.Settle):
             self.settled.append(command)
-        elif isinstance(command, slave.Forget):
+        elif isinstance(command, reducer.Forget):
             for instance in command.instances:
                 self.ends.pop(instance, None)
 
-    def tell(self, event: slave.Event, now: float) -> None:
+    def tell(self, event: reducer.Event, now: float) -> None:
         """Something happens to the slave."""
-        self._report(slave.step(self.slave, event, now), now)
+        self._report(reducer.step(self.slave, event, now), now)
 
     def _supervisor_says(self, status: InstanceStatus, now: float) -> None:
-        self.tell(slave.SupervisorReported((status,)), now)
+        self.tell(reducer.SupervisorReported((status,)), now)
 
     # --- what it does --------------------------------------------------------------------
 
@@ -197,7 +197,7 @@ class Machine:
         instance = assignment.instance
         reason = self.refuses.get(instance.process)
         if reason is not None:
-            self.tell(slave.LaunchRefused(instance, reason), now)
+            self.tell(reducer.LaunchRefused(instance, reason), now)
             return
         self.pids += 1
         silent = assignment.shadow or assignment.restored
@@ -260,7 +260,7 @@ class Machine:
 
     def seen_in_graph(self, name: str, now: float) -> None:
         """The node of the newest instance comes up."""
-        self.tell(slave.SeenInGraph(self.find(name)), now)
+        self.tell(reducer.SeenInGraph(self.find(name)), now)
 
     def obey(self, order: Order, now: float) -> happened.OrderAnswered:
         """The slave takes an order."""
@@ -278,17 +278,17 @@ class Machine:
             assert order.instance is not None
             self._keep_or_drop(order, order.instance)
             return happened.OrderAnswered(order.order, True)
-        event: slave.Event
+        event: reducer.Event
         if order.action == "report":
-            event = slave.ReportRequested()
+            event = reducer.ReportRequested()
         elif order.action == "start":
             assert order.assignment is not None
-            event = slave.AssignmentsReceived((order.assignment,))
+            event = reducer.AssignmentsReceived((order.assignment,))
         else:
             assert order.instance is not None
             kinds = {
-                "stop": slave.StopOrdered, "fence": slave.FenceOrdered,
-                "restart": slave.RestartOrdered,
+                "stop": reducer.StopOrdered, "fence": reducer.FenceOrdered,
+                "restart": reducer.RestartOrdered,
             }  # fmt: skip
             event = kinds[order.action](order.instance)
         self.tell(event, now)
@@ -319,7 +319,7 @@ class Machine:
         assert order.instance is not None
         assert order.restart is not None
         self.settled.clear()
-        self.tell(slave.RestartPolicySet(order.instance, order.restart), now)
+        self.tell(reducer.RestartPolicySet(order.instance, order.restart), now)
         (settled,) = self.settled
         code = "refused" if settled.refusal else ""
         return happened.OrderAnswered(order.order, not code, code, settled.refusal)
@@ -328,13 +328,13 @@ class Machine:
         """The slave's open request is answered with what waits for it."""
         batch, self.polled = self.polled, []
         if batch:
-            self.tell(slave.AssignmentsReceived(tuple(batch)), now)
+            self.tell(reducer.AssignmentsReceived(tuple(batch)), now)
 
     def replace_supervisor(self, now: float) -> None:
         """The supervisor is killed; the next one takes over what runs, and remembers what ended."""
         fenced = {one for one, it in self.programs.items() if it.assignment.fence is not None}
         statuses = (*self.ends.values(), *self._running())
-        self.tell(slave.SupervisorReplaced(statuses, {}, frozenset(fenced)), now)
+        self.tell(reducer.SupervisorReplaced(statuses, {}, frozenset(fenced)), now)
 
     def _running(self) -> list[InstanceStatus]:
         return [
@@ -360,6 +360,6 @@ class Machine:
         self.said.clear()
         self.ordered.clear()
         self.polled.clear()
-        self.slave = slave.SlaveState(max_processes=self.max_processes)
+        self.slave = reducer.SlaveState(max_processes=self.max_processes)
         found = (*self.ends.values(), *self._running())
-        slave.step(self.slave, slave.SupervisorReported(found), now)
+        reducer.step(self.slave, reducer.SupervisorReported(found), now)

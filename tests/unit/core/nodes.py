@@ -11,10 +11,10 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from rosrm.core.commands import PublishStateConfig
-from rosrm.core.events import HandoffReported
-from rosrm.core.migration import HandoffPhase, ReportPhase
-from rosrm.core.model import InstanceId
+from rosrm.core.master.commands import PublishStateConfig
+from rosrm.core.master.events import HandoffReported
+from rosrm.model.plan import HandoffPhase, ReportPhase
+from rosrm.model.values import InstanceId
 
 if TYPE_CHECKING:
     from tests.unit.core.machine import Machine

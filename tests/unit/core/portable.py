@@ -6,10 +6,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from rosrm.core import events as happened
-from rosrm.core.commands import Order
-from rosrm.core.model import InstanceId, InstanceState
+from rosrm.core.master import events as happened
+from rosrm.core.master.commands import Order
 from rosrm.criu.fitting import FACTS
+from rosrm.model.values import InstanceId, InstanceState
 from rosrm_migration.criu import (
     ABILITY,
     AWAIT_RESTORED,

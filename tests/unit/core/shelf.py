@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from rosrm.core.migration import Commit, Execute, Move, Plan, SetRestart, Start, Step, Stop
-from rosrm.core.model import Assignment, InstanceState, RestartPolicy
+from rosrm.model.plan import Commit, Execute, Move, Plan, SetRestart, Start, Step, Stop
+from rosrm.model.values import Assignment, InstanceState, RestartPolicy
 from tests.unit.core.cluster import Cluster, StartFirstOrStopFirst
 from tests.unit.core.machine import Machine
 

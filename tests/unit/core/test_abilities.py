@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from rosrm.core.commands import Order
-from rosrm.core.migration import Commit, Execute, Move, Plan, SetRestart, Start, Stop
-from rosrm.core.model import MigrationPolicy, RestartPolicy
+from rosrm.core.master.commands import Order
+from rosrm.model.plan import Commit, Execute, Move, Plan, SetRestart, Start, Stop
+from rosrm.model.values import MigrationPolicy, RestartPolicy
 from tests.unit.core.cluster import Cluster, process
 from tests.unit.core.machine import Machine
 

@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
-from rosrm.core import events as happened
-from rosrm.core.commands import Command, Order
-from rosrm.core.migration import Aim, Commit, Move, Plan, Start, Stop, plan_fault
-from rosrm.core.model import (
+from rosrm.core.master import events as happened
+from rosrm.core.master.commands import Command, Order
+from rosrm.model.plan import Aim, Commit, Move, Plan, Start, Stop, plan_fault
+from rosrm.model.values import (
     HostLossPolicy,
     InstanceId,
     MigrationPolicy,

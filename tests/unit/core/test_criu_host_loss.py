@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from rosrm.core.migration import Commit, Execute, Move, Plan, Start, Stop
-from rosrm.core.model import HostLossPolicy, MigrationPolicy
+from rosrm.model.plan import Commit, Execute, Move, Plan, Start, Stop
+from rosrm.model.values import HostLossPolicy, MigrationPolicy
 from rosrm_migration.criu import AWAIT_RESTORED, END, FETCH, GO_ON, JOIN
 from tests.unit.core.cluster import Cluster, Machine, node, process
 from tests.unit.core.portable import Portable, by_criu

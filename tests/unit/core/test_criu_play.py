@@ -11,8 +11,8 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from rosrm.core import events as happened
-from rosrm.core.hosts import HostCondition
+from rosrm.core.master import events as happened
+from rosrm.core.master.state.hosts import HostCondition
 from rosrm_migration.criu import AWAIT_RESTORED, CHECKPOINT, END, FETCH, GO_ON, INTRODUCE, JOIN
 from tests.unit.core.cluster import Cluster
 from tests.unit.core.portable import Portable

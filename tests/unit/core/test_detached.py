@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
-from rosrm.core import events as happened
-from rosrm.core import listing
-from rosrm.core.model import HostLossPolicy, ProcessSpec
+from rosrm.core.master import events as happened
+from rosrm.core.master import listing
+from rosrm.model.values import HostLossPolicy, ProcessSpec
 from tests.unit.core.cluster import Cluster, job, process
 
 REASON = "a is detached: its slave was stopped and left processes running"

@@ -10,11 +10,11 @@ from typing import Any
 
 import pytest
 
-from rosrm.core import events as happened
-from rosrm.core.commands import PublishStateConfig
-from rosrm.core.lifecycle import restarts_after
-from rosrm.core.migration import HandoffPhase, ReportPhase
-from rosrm.core.model import (
+from rosrm.core.master import events as happened
+from rosrm.core.master.commands import PublishStateConfig
+from rosrm.core.master.lifecycle import restarts_after
+from rosrm.model.plan import HandoffPhase, ReportPhase
+from rosrm.model.values import (
     InstanceId,
     InstanceState,
     InstanceStatus,

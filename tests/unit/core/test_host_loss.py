@@ -6,9 +6,11 @@ from typing import Any
 
 import pytest
 
-from rosrm.core import events as happened
-from rosrm.core import listing, slave
-from rosrm.core.model import (
+from rosrm.core.master import events as happened
+from rosrm.core.master import listing
+from rosrm.core.master.settings import CoreSettings
+from rosrm.core.slave import reducer
+from rosrm.model.values import (
     HostLossPolicy,
     InstanceState,
     IsolationPolicy,
@@ -17,7 +19,6 @@ from rosrm.core.model import (
     StandbyPolicy,
     StopPolicy,
 )
-from rosrm.core.settings import CoreSettings
 from tests.unit.core.cluster import Cluster, job, movable, process
 from tests.unit.core.machine import Machine
 
@@ -376,7 +377,7 @@ def test_what_is_taken_back_is_restarted_as_its_spec_says() -> None:
     cluster.add(Machine("b", busy={"memory": 0.9}))  # somebody is heard, who has no room
     cluster.wait(11.0)
     a = cluster.machines["a"]
-    a.tell(slave.RestartPolicySet(a.find("p"), RestartPolicy("never")), cluster.now)
+    a.tell(reducer.RestartPolicySet(a.find("p"), RestartPolicy("never")), cluster.now)
     lose(cluster, "a")
     assert cluster.phase("p") == "queued"
     back(cluster, "a")

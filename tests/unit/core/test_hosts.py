@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rosrm.core import events as happened
-from rosrm.core import listing, slave
-from rosrm.core.model import (
+from rosrm.core.master import events as happened
+from rosrm.core.master import listing
+from rosrm.core.slave import reducer
+from rosrm.model.values import (
     RESOURCE_SLOTS,
     Assignment,
     InstanceId,
@@ -434,7 +435,7 @@ def test_an_instance_that_nobody_intends_is_stopped_until_it_has_ended() -> None
     machine.stubborn.add("ghost")
     spec = process("ghost", memory=10 * MIB)
     ghost = Assignment(InstanceId("ghost", 999), spec, 1, "ghost")
-    machine.tell(slave.AssignmentsReceived((ghost,)), cluster.now)
+    machine.tell(reducer.AssignmentsReceived((ghost,)), cluster.now)
     cluster.settle()
     cluster.wait(5.0)
     assert len(cluster.orders("stop")) == 3

@@ -6,9 +6,10 @@ from typing import Any
 
 import pytest
 
-from rosrm.core import events as happened
-from rosrm.core.commands import Assign
-from rosrm.core.model import (
+from rosrm.core.master import events as happened
+from rosrm.core.master.commands import Assign
+from rosrm.extensions.contracts import CheckpointChoice, CheckpointView
+from rosrm.model.values import (
     HostLossPolicy,
     InstanceId,
     KeptState,
@@ -16,7 +17,6 @@ from rosrm.core.model import (
     ProcessSpec,
     Readiness,
 )
-from rosrm.ports import CheckpointChoice, CheckpointView
 from tests.unit.core.cluster import Cluster, job, process
 
 

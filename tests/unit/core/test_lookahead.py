@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rosrm.core.lookahead import PROVED_LONG
+from rosrm.core.master.assignment.prefetch import PROVED_LONG
 from tests.unit.core.cluster import Cluster, Machine, job
 
 

@@ -6,7 +6,7 @@ import copy
 
 import pytest
 
-from rosrm.core import lost_tail
+from rosrm.core.master.recovery import journal_gap
 from tests.unit.core.cluster import Cluster, process
 
 LEASE = 10.0
@@ -41,8 +41,8 @@ class Loss:
 
 def begin(cluster: Cluster, newest: int, *, fell: bool = False) -> None:
     """As a master does with its start: what it must remember becomes durable at once."""
-    lost_tail.begin(cluster.state, newest, cluster.now, fell=fell)
-    cluster.journal([lost_tail.intent(cluster.state)])
+    journal_gap.begin(cluster.state, newest, cluster.now, fell=fell)
+    cluster.journal([journal_gap.intent(cluster.state)])
 
 
 def kill_again(cluster: Cluster) -> None:

@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from rosrm.core.migration import Execute
-from rosrm.core.model import MigrationPolicy, ProcessSpec, Readiness, RestartPolicy
-from rosrm.ports import CheckpointChoice, CheckpointView, MemoryView
+from rosrm.extensions.contracts import CheckpointChoice, CheckpointView, MemoryView
+from rosrm.model.plan import Execute
+from rosrm.model.values import MigrationPolicy, ProcessSpec, Readiness, RestartPolicy
 from rosrm_migration.criu import Criu, CriuOptions
 from tests.criu_kit import HOST_FACTS
 from tests.unit.core.cluster import Cluster, process

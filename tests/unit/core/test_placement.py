@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from rosrm.core import events as happened
-from rosrm.core.model import ResourceDescription
+from rosrm.core.master import events as happened
+from rosrm.model.values import ResourceDescription
 from tests.unit.core.cluster import GIB, MIB, Cluster, Eq1, Machine, job, process
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from rosrm.core.migration import (
+from rosrm.model.plan import (
     AwaitReady,
     AwaitReleased,
     Commit,
@@ -19,8 +19,8 @@ from rosrm.core.migration import (
     Start,
     Stop,
 )
-from rosrm.core.model import InstanceId, RestartPolicy
-from rosrm.core.plans import plan_from_dict, plan_to_dict
+from rosrm.model.plan_json import plan_from_dict, plan_to_dict
+from rosrm.model.values import InstanceId, RestartPolicy
 
 ONE = InstanceId("p", 1)
 EVERYTHING = Plan(

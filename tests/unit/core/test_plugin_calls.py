@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
-from rosrm.core import events as happened
-from rosrm.core.model import MigrationPolicy, Readiness
-from rosrm.core.plugin_calls import TOLD_AGAIN, WORKS_AFTER, PluginCalls, required
+from rosrm.core.master import events as happened
 from rosrm.errors import PluginError
-from rosrm.ports import HostView, ProcessView, Scores
+from rosrm.extensions.contracts import HostView, ProcessView, Scores
+from rosrm.extensions.plugin_calls import TOLD_AGAIN, WORKS_AFTER, PluginCalls, required
+from rosrm.model.values import MigrationPolicy, Readiness
 from tests.unit.core.cluster import Cluster, Eq1, StartFirstOrStopFirst, process
 
 

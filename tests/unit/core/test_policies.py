@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rosrm.core.declared import STANDARD_FIELDS, Declared
-from rosrm.core.model import ResourceDescription
-from rosrm.ports import HostView, ProcessView, Scores
+from rosrm.extensions.contracts import HostView, ProcessView, Scores
+from rosrm.extensions.declared_fields import STANDARD_FIELDS, Declared
+from rosrm.model.values import ResourceDescription
 from tests.unit.core.cluster import Cluster, Eq1, Machine, node, process
 
 

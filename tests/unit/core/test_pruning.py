@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from rosrm.core import events as happened
-from rosrm.core import listing
-from rosrm.core.commands import Reply
+from rosrm.core.master import events as happened
+from rosrm.core.master import listing
+from rosrm.core.master.commands import Reply
 from tests.unit.core.cluster import Cluster, job, process
 
 

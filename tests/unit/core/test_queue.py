@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from rosrm.core import events as happened
-from rosrm.core.model import InstanceId, InstanceState, InstanceStatus
-from rosrm.ports import Record
+from rosrm.core.master import events as happened
+from rosrm.extensions.contracts import Record
+from rosrm.model.values import InstanceId, InstanceState, InstanceStatus
 from tests.unit.core.cluster import MIB, Cluster, Machine, job, process
 
 

@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from rosrm.core import listing
-from rosrm.core.model import ResourceDescription
+from rosrm.core.master import listing
+from rosrm.model.values import ResourceDescription
 from tests.unit.core.cluster import GIB, MIB, Cluster, Machine, movable, process
 
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from rosrm.core import events as happened
-from rosrm.core import listing, slave
-from rosrm.core.migration import Move, Plan
-from rosrm.core.model import (
+from rosrm.core.master import events as happened
+from rosrm.core.master import listing
+from rosrm.core.slave import reducer
+from rosrm.model.plan import Move, Plan
+from rosrm.model.values import (
     InstanceId,
     InstanceState,
     InstanceStatus,
@@ -311,7 +312,7 @@ def test_what_is_over_is_kept_while_something_of_it_is_being_stopped() -> None:
     machine = cluster.machines["a"]
     late = InstanceStatus(InstanceId("p", 77), InstanceState.RUNNING, pid=5)
     machine.stubborn.add("p")
-    machine.tell(slave.SupervisorReported((late,)), cluster.now)
+    machine.tell(reducer.SupervisorReported((late,)), cluster.now)
     cluster.settle()
     machine.finish("q", cluster.now)
     cluster.wait(0.5)

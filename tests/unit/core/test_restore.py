@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from rosrm.core import events as happened
-from rosrm.core import listing
-from rosrm.core.model import InstanceId, InstanceState, InstanceStatus, RestartPolicy
+from rosrm.core.master import events as happened
+from rosrm.core.master import listing
+from rosrm.model.values import InstanceId, InstanceState, InstanceStatus, RestartPolicy
 from tests.unit.core.cluster import MIB, Cluster, Machine, job, movable, process
 
 

@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
-from rosrm.core import events as happened
-from rosrm.core.migration import ReportPhase
-from rosrm.core.model import HostLossPolicy, InstanceState, RestartPolicy, StandbyPolicy
+from rosrm.core.master import events as happened
+from rosrm.model.plan import ReportPhase
+from rosrm.model.values import HostLossPolicy, InstanceState, RestartPolicy, StandbyPolicy
 from tests.unit.core.cluster import Cluster, Machine
 from tests.unit.core.test_handoffs import stateful
 

@@ -13,12 +13,14 @@ import numpy as np
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from rosrm.core import events as happened
-from rosrm.core import slave
-from rosrm.core.assigning import demand_of
-from rosrm.core.commands import Assign, Command
-from rosrm.core.keeping import awaits_states
-from rosrm.core.model import (
+from rosrm.core.master import events as happened
+from rosrm.core.master.assignment.assign import demand_of
+from rosrm.core.master.checkpoint.replication import awaits_states
+from rosrm.core.master.commands import Assign, Command
+from rosrm.core.master.master_state import ProcessPhase, Wanted
+from rosrm.core.slave import reducer
+from rosrm.extensions.contracts import CheckpointChoice, CheckpointView
+from rosrm.model.values import (
     HostLossPolicy,
     InstanceState,
     KeptState,
@@ -29,8 +31,6 @@ from rosrm.core.model import (
     RestartPolicy,
     StandbyPolicy,
 )
-from rosrm.core.state import ProcessPhase, Wanted
-from rosrm.ports import CheckpointChoice, CheckpointView
 from tests.unit.core.cluster import MIB, Cluster, HandOver, Machine, StartFirstOrStopFirst
 from tests.unit.core.nodes import QUIRKS, Node
 from tests.unit.core.portable import Everywhere, Portable
@@ -205,8 +205,8 @@ class Play(RuleBasedStateMachine):
             machine.host_id = self.cluster.replies[self.cluster._requests].host_id
             machine.fresh = False
             machine.polled.clear()
-            machine.tell(slave.Registered(self.cluster.state.epoch), self.cluster.now)
-            machine.tell(slave.MasterHears(self.cluster.now), self.cluster.now)
+            machine.tell(reducer.Registered(self.cluster.state.epoch), self.cluster.now)
+            machine.tell(reducer.MasterHears(self.cluster.now), self.cluster.now)
 
     def pick(self, things: list, which: int) -> object:
         return things[which % len(things)]
@@ -464,7 +464,7 @@ class Play(RuleBasedStateMachine):
         """A report that arrives now, and perhaps late once more."""
         machine = self.machine(host)
         if self.known(machine):
-            machine.tell(slave.ReportRequested(), self.cluster.now)
+            machine.tell(reducer.ReportRequested(), self.cluster.now)
             self.late.append(machine.said[-1])
 
     @rule(prompt=chance)
@@ -550,7 +550,7 @@ class Play(RuleBasedStateMachine):
         elif what == "leaves" and self.known(machine):
             self.ask(happened.HostLeft, machine.host_id, machine.incarnation)
             for instance in list(machine.programs):
-                machine.tell(slave.StopOrdered(instance), self.cluster.now)
+                machine.tell(reducer.StopOrdered(instance), self.cluster.now)
         elif what == "is detached" and self.known(machine):
             # Until it is killed, or all is well, no slave is there.
             self.ask(happened.HostLeft, machine.host_id, machine.incarnation, machine.begun())
@@ -608,7 +608,7 @@ class Play(RuleBasedStateMachine):
     def time_passes(self, seconds: float, quiet: bool) -> None:
         self.cluster.now += seconds
         for machine in self.cluster.machines.values():
-            machine.tell(slave.TimePassed(), self.cluster.now)
+            machine.tell(reducer.TimePassed(), self.cluster.now)
             if self.known(machine) and not quiet:
                 self.tell(self.cluster.readings([machine]))
                 self.tell(machine.usages())
@@ -913,7 +913,7 @@ class Play(RuleBasedStateMachine):
         for _ in range(times):
             for machine in self.cluster.machines.values():
                 for instance in list(machine.programs):
-                    machine.tell(slave.SeenInGraph(instance), self.cluster.now)
+                    machine.tell(reducer.SeenInGraph(instance), self.cluster.now)
             self.cluster.wait(1.0, tick=0.5)
             self.no_process_is_lost()
             self.the_books_balance()

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from rosrm.config import load_cluster, load_host, load_work
-from rosrm.registry import Registry
+from rosrm.extensions.registry import Registry
 from rosrm_examples import demo, demo_frame
 
 EXAMPLES = Path(__file__).parents[3] / "examples"

@@ -9,8 +9,8 @@ import math
 import pytest
 from rich.console import Console
 
-from rosrm.core.model import HostDescription
-from rosrm.core.views import EventRow, HostRow, ProcessRow, ResourceRow, Snapshot
+from rosrm.model.rows import EventRow, HostRow, ProcessRow, ResourceRow, Snapshot
+from rosrm.model.values import HostDescription
 from rosrm_examples import demo_plots
 from rosrm_examples.demo_plots import draw_usage, memory_of, stacked, title_of
 from rosrm_examples.demo_record import Record, Sample, sample_of, summarise

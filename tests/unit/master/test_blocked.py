@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from rosrm.core import events as happened
+from rosrm.core.master import events as happened
 from rosrm.master import runtime
 from rosrm.master.runtime import MasterRuntime
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
-from rosrm.hookspecs import hookimpl
-from rosrm.master.fallback import fallback_of
-from rosrm.ports import ScoringOffer
-from rosrm.registry import Registry
+from rosrm.extensions.contracts import ScoringOffer
+from rosrm.extensions.hookspecs import hookimpl
+from rosrm.extensions.registry import Registry
+from rosrm.master.fallback_policy import fallback_of
 
 
 def registry_of(**policies):

@@ -6,10 +6,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from rosrm.core import events as happened
-from rosrm.core.views import PluginRow
+from rosrm.core.master import events as happened
 from rosrm.errors import PluginError
-from rosrm.master.reading import Reading
+from rosrm.master.queries import Reading
+from rosrm.model.rows import PluginRow
 from tests.unit.core.cluster import Cluster
 
 SELECTED = PluginRow("scoring", "eq1", "mine 1.0", "selected", "the summary")

@@ -7,11 +7,11 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from rosrm.core import events as happened
-from rosrm.core.commands import Record
-from rosrm.core.model import InstanceId
-from rosrm.master import standstill
-from rosrm.master.standstill import Standstill
+from rosrm.core.master import events as happened
+from rosrm.core.master.commands import Record
+from rosrm.master import journal_stall
+from rosrm.master.journal_stall import Standstill
+from rosrm.model.values import InstanceId
 from tests.unit.core.cluster import Cluster, process
 
 REFUSED = {
@@ -70,7 +70,7 @@ def test_what_happened_is_kept_in_order_and_of_requests_for_work_the_newest() ->
 
 def test_what_is_kept_is_bounded(monkeypatch) -> None:
     """Slaves are asked again for statuses that were let go."""
-    monkeypatch.setattr(standstill, "_MOST_STATUSES", 3)
+    monkeypatch.setattr(journal_stall, "_MOST_STATUSES", 3)
     held = still()
     take(held, *(statuses(n) for n in range(10)))
     assert held.waiting() == [statuses(n) for n in range(3)]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rosrm.core import events as happened
+from rosrm.core.master import events as happened
 from rosrm.master.runtime import what_runs
 from tests.unit.core.cluster import Cluster, process
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosrm.node.buffer import InputBuffer, Sent
+from rosrm.node.handoff.buffer import InputBuffer, Sent
 
 A, B = "/a", "/b"
 ROOM = 1000

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosrm.node.cuts import CutAssembler, part_key
+from rosrm.node.handoff.snapshot_assembler import CutAssembler, part_key
 
 A, B = "/a", "/b"
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from std_msgs.msg import Int64, String
 
-from rosrm.node.parts import Part, StateError
+from rosrm.node.handoff.state_parts import Part, StateError
 
 
 def part(*answers):

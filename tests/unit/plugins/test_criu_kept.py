@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from rosrm.core.migration import Aim, Execute, Move, Plan, Start, plan_fault
-from rosrm.core.model import InstanceId, MigrationPolicy, ProcessSpec
-from rosrm.core.plugin_calls import implements
-from rosrm.ports import Imaging
+from rosrm.extensions.contracts import Imaging
+from rosrm.extensions.plugin_calls import implements
+from rosrm.model.plan import Aim, Execute, Move, Plan, Start, plan_fault
+from rosrm.model.values import InstanceId, MigrationPolicy, ProcessSpec
 from rosrm.testing import with_options
 from rosrm_migration.criu import Criu, CriuOptions
 from rosrm_migration.criu_kept import DROP, KEEP

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from rosrm.core.migration import AwaitReleased, Configure, Execute, Move, Plan, Start, Stop
-from rosrm.core.model import InstanceId, MigrationPolicy, ProcessSpec, StopPolicy
+from rosrm.model.plan import AwaitReleased, Configure, Execute, Move, Plan, Start, Stop
+from rosrm.model.values import InstanceId, MigrationPolicy, ProcessSpec, StopPolicy
 from rosrm.testing import with_options
 from rosrm_migration.handoff import Handoff, HandoffOptions, alias_of
 from rosrm_migration.plugin import register_migration_strategies

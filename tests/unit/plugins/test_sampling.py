@@ -5,9 +5,9 @@ import time
 
 import pytest
 
-from rosrm.core.model import RESOURCE_SLOTS, Reading, ResourceDescription
-from rosrm.registry import FailedProbe
-from rosrm.slave.sampling import ANOTHER_ERROR, REPORTS, TRUSTED_AFTER, Sampler
+from rosrm.extensions.registry import FailedProbe
+from rosrm.model.values import RESOURCE_SLOTS, Reading, ResourceDescription
+from rosrm.slave.sampler import ANOTHER_ERROR, REPORTS, TRUSTED_AFTER, Sampler
 from rosrm.testing import FakeClock, FakeProbe, made_probe
 
 TICK = 0.1

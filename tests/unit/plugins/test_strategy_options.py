@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from rosrm.core.model import MigrationPolicy, ProcessSpec
-from rosrm.plans import options_of
+from rosrm.extensions.plans import options_of
+from rosrm.model.values import MigrationPolicy, ProcessSpec
 from rosrm_migration.criu import CriuOptions, OwnCriuOptions
 
 

@@ -8,11 +8,11 @@ import sys
 import pytest
 
 from rosrm.errors import ConfigError
-from rosrm.registry import Registry
+from rosrm.extensions.registry import Registry
 
 GOOD = """
-from rosrm.hookspecs import hookimpl
-from rosrm.ports import ScoringOffer
+from rosrm.extensions.hookspecs import hookimpl
+from rosrm.extensions.contracts import ScoringOffer
 
 @hookimpl
 def register_scoring_policies():
@@ -85,7 +85,7 @@ def test_two_distributions_with_one_name_are_both_named(install):
 
 
 def test_a_plugin_that_takes_long_to_import_is_named_in_the_log(install, caplog, monkeypatch):
-    monkeypatch.setattr("rosrm.loading.SLOW_LOADING", 0.1)
+    monkeypatch.setattr("rosrm.extensions.discovery.SLOW_LOADING", 0.1)
     install("vx_slow", "import time; time.sleep(1.0)")
     with caplog.at_level(logging.WARNING, "rosrm.plugins"):
         Registry.discover()

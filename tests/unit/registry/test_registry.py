@@ -10,11 +10,17 @@ from types import SimpleNamespace
 
 import pytest
 
-from rosrm.core.model import Reading, ResourceDescription
 from rosrm.errors import ConfigError, PluginError, SkipPlugin
-from rosrm.hookspecs import hookimpl
-from rosrm.ports import CheckpointOffer, MigrationOffer, ProbeContext, ProbeOffer, ScoringOffer
-from rosrm.registry import FailedProbe, Probes, Registry
+from rosrm.extensions.contracts import (
+    CheckpointOffer,
+    MigrationOffer,
+    ProbeContext,
+    ProbeOffer,
+    ScoringOffer,
+)
+from rosrm.extensions.hookspecs import hookimpl
+from rosrm.extensions.registry import FailedProbe, Probes, Registry
+from rosrm.model.values import Reading, ResourceDescription
 
 
 @dataclass(frozen=True)
@@ -447,7 +453,7 @@ def test_an_ability_that_cannot_be_read_is_the_plugins_fault():
 
 def test_a_create_that_hangs_is_ended_and_named(monkeypatch, context):
     """A probe fails, and what the master cannot do without is an error; nothing hangs."""
-    monkeypatch.setattr("rosrm.registry.CREATE_LIMIT", 0.05)
+    monkeypatch.setattr("rosrm.extensions.registry.CREATE_LIMIT", 0.05)
 
     def hangs(*_):
         threading.Event().wait()
@@ -468,8 +474,8 @@ def test_a_create_that_hangs_is_ended_and_named(monkeypatch, context):
 
 def test_a_hook_that_hangs_is_named_while_it_does_and_ended(monkeypatch, caplog):
     """With the hook, its place, and the line in which it hangs; the others go on."""
-    monkeypatch.setattr("rosrm.loading.LOADING_LIMIT", 0.3)
-    monkeypatch.setattr("rosrm.loading.SLOW_LOADING", 0.1)
+    monkeypatch.setattr("rosrm.extensions.discovery.LOADING_LIMIT", 0.3)
+    monkeypatch.setattr("rosrm.extensions.discovery.SLOW_LOADING", 0.1)
 
     @hookimpl
     def register_probes():

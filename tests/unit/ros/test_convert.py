@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rclpy.serialization import deserialize_message, serialize_message
 
-from rosrm.core import model
-from rosrm.core.views import EventRow, HostRow, PluginRow, ProcessRow, ResourceRow
 from rosrm.errors import Refused
+from rosrm.model import values
+from rosrm.model.rows import EventRow, HostRow, PluginRow, ProcessRow, ResourceRow
 from rosrm.ros import convert
 from rosrm_msgs import msg
 
@@ -27,7 +27,7 @@ TEXTS = st.dictionaries(NAMES, WORDS, max_size=3)
 UINT32 = st.integers(0, 2**32 - 1)
 UINT64 = st.integers(0, 2**64 - 1)
 INT32 = st.integers(-(2**31), 2**31 - 1)
-INSTANCES = st.builds(model.InstanceId, NAMES, UINT64)
+INSTANCES = st.builds(values.InstanceId, NAMES, UINT64)
 
 FORMS = st.one_of(
     st.fixed_dictionaries({"package": NAMES, "executable": NAMES}),
@@ -37,8 +37,8 @@ FORMS = st.one_of(
 
 
 @st.composite
-def specs(draw) -> model.ProcessSpec:
-    return model.ProcessSpec(
+def specs(draw) -> values.ProcessSpec:
+    return values.ProcessSpec(
         **draw(FORMS),
         name=draw(NAMES),
         namespace=draw(WORDS),
@@ -48,8 +48,8 @@ def specs(draw) -> model.ProcessSpec:
         environment=draw(TEXTS),
         working_directory=draw(st.none() | NAMES),
         ros=draw(st.booleans()),
-        kind=draw(st.sampled_from(model.Kind)),
-        restart=model.RestartPolicy(
+        kind=draw(st.sampled_from(values.Kind)),
+        restart=values.RestartPolicy(
             draw(st.sampled_from(["never", "on-failure", "always"])),
             draw(SECONDS),
             draw(SECONDS),
@@ -62,15 +62,15 @@ def specs(draw) -> model.ProcessSpec:
         preferred_labels=draw(TEXTS),
         avoided_labels=draw(TEXTS),
         priority=draw(INT32),
-        migration=model.MigrationPolicy(
+        migration=values.MigrationPolicy(
             draw(st.none() | NAMES),
             draw(st.booleans()),
             draw(st.dictionaries(WORDS, PLAIN, max_size=2)),
         ),
-        readiness=model.Readiness(
+        readiness=values.Readiness(
             draw(st.sampled_from(["auto", "graph", "running"])), draw(SECONDS)
         ),
-        stop=model.StopPolicy(draw(SECONDS), draw(SECONDS)),
+        stop=values.StopPolicy(draw(SECONDS), draw(SECONDS)),
     )
 
 
@@ -90,7 +90,7 @@ def test_spec_survives(spec) -> None:
 @settings(max_examples=30, deadline=None)
 def test_assignment_survives(spec, instance, epoch, node_name, shadow) -> None:
     """An order to run an instance arrives as it was given."""
-    assignment = model.Assignment(instance, spec, epoch, node_name, shadow)
+    assignment = values.Assignment(instance, spec, epoch, node_name, shadow)
     assert (
         convert.assignment_from_msg(over_the_wire(convert.assignment_to_msg(assignment)))
         == assignment
@@ -110,7 +110,7 @@ def test_restart_policy_survives(spec) -> None:
 )
 def test_restart_policy_that_makes_no_sense_is_refused(name, value) -> None:
     """Nothing of it is used."""
-    message = convert.restart_to_msg(model.RestartPolicy())
+    message = convert.restart_to_msg(values.RestartPolicy())
     setattr(message, name, value)
     with pytest.raises(Refused, match="a restart policy: "):
         convert.restart_from_msg(message)
@@ -118,9 +118,9 @@ def test_restart_policy_that_makes_no_sense_is_refused(name, value) -> None:
 
 @given(
     st.builds(
-        model.InstanceStatus,
+        values.InstanceStatus,
         instance=INSTANCES,
-        state=st.sampled_from(model.InstanceState),
+        state=st.sampled_from(values.InstanceState),
         pid=UINT32,
         exit_code=INT32,
         exit_signal=INT32,
@@ -138,10 +138,10 @@ def test_status_survives(status) -> None:
 
 
 RESOURCES = st.lists(
-    st.builds(model.ResourceDescription, NAMES, WORDS, st.floats(1e-3, 1e18), WORDS), max_size=16
+    st.builds(values.ResourceDescription, NAMES, WORDS, st.floats(1e-3, 1e18), WORDS), max_size=16
 ).map(tuple)
 HOSTS = st.builds(
-    model.HostDescription,
+    values.HostDescription,
     name=NAMES,
     incarnation=st.integers(1, 2**64 - 1),
     hostname=WORDS,
@@ -194,7 +194,7 @@ def test_rows_survive() -> None:
 
 
 def good_spec() -> msg.ProcessSpec:
-    return convert.spec_to_msg(model.ProcessSpec("p", command=("true",)))
+    return convert.spec_to_msg(values.ProcessSpec("p", command=("true",)))
 
 
 NAN, INF = float("nan"), float("inf")
@@ -256,8 +256,8 @@ NONSENSE_IN_HOSTS = {
 @pytest.mark.parametrize("what", NONSENSE_IN_HOSTS)
 def test_host_that_makes_no_sense_is_refused(what) -> None:
     """A slave that describes itself badly is not taken in."""
-    resources = tuple(model.ResourceDescription(name, "B", 1.0) for name in ("memory", "disk"))
-    message = convert.host_to_msg(model.HostDescription("h", 1, resources=resources))
+    resources = tuple(values.ResourceDescription(name, "B", 1.0) for name in ("memory", "disk"))
+    message = convert.host_to_msg(values.HostDescription("h", 1, resources=resources))
     convert.host_from_msg(message)
 
     NONSENSE_IN_HOSTS[what](message)

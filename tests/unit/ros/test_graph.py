@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 
-from rosrm.ros.graph import GraphWatch
+from rosrm.ros.slave.graph import GraphWatch
 
 HERE, ELSEWHERE = b"\x11\x11", b"\x22\x22"
 

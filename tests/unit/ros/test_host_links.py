@@ -7,12 +7,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from rosrm.core.commands import Order
-from rosrm.core.events import BAD_RESULT
-from rosrm.core.model import HostDescription
+from rosrm.core.master.commands import Order
+from rosrm.core.master.events import BAD_RESULT
+from rosrm.model.values import HostDescription
 from rosrm.ros.control import accepted
-from rosrm.ros.host_links import HostLinks, _order_answered
-from rosrm.ros.readings import Runs
+from rosrm.ros.master.slave_links import HostLinks, _order_answered
+from rosrm.ros.reading_codec import Runs
 from rosrm_msgs import srv
 
 HOST, RUN = 1, 500
@@ -64,7 +64,8 @@ def links(monkeypatch, control) -> HostLinks:
     links = HostLinks(participant, "master test", 1, 5.0, lambda event: None)
     links._client = FakeClient()
     monkeypatch.setattr(
-        "rosrm.ros.host_links._order_request", lambda command: SimpleNamespace(envelope=None)
+        "rosrm.ros.master.slave_links._order_request",
+        lambda command: SimpleNamespace(envelope=None),
     )
     return links
 

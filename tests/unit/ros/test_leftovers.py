@@ -8,8 +8,8 @@ import socket
 import pytest
 
 from rosrm.errors import PortableError
-from rosrm.ros import fast_dds_place
-from rosrm.ros.leftovers import close_leaked, open_sockets, what_is_left
+from rosrm.ros import fast_dds_relocation
+from rosrm.ros.graph_remains import close_leaked, open_sockets, what_is_left
 
 
 @pytest.fixture
@@ -66,29 +66,29 @@ def test_a_number_that_is_another_socket_by_now_stays(make) -> None:
 def test_a_fast_dds_that_cannot_look_again_is_said(monkeypatch) -> None:
     """Before the node leaves, and not by silence after its move."""
     libc = ctypes.CDLL(None)
-    monkeypatch.setattr(fast_dds_place, "_library", lambda: libc)
-    for function in (fast_dds_place.check, fast_dds_place.look_again):
+    monkeypatch.setattr(fast_dds_relocation, "_library", lambda: libc)
+    for function in (fast_dds_relocation.check, fast_dds_relocation.look_again):
         with pytest.raises(PortableError, match=r"update_interfaces.*loopback alone"):
             function()
 
 
 def test_interfaces_that_cannot_be_read_are_said(monkeypatch) -> None:
     """The node would be heard by nobody."""
-    monkeypatch.setattr(fast_dds_place, "_library", lambda: ctypes.CDLL(None))
-    monkeypatch.setattr(fast_dds_place, "_interfaces_of", lambda _: lambda: False)
+    monkeypatch.setattr(fast_dds_relocation, "_library", lambda: ctypes.CDLL(None))
+    monkeypatch.setattr(fast_dds_relocation, "_interfaces_of", lambda _: lambda: False)
     with pytest.raises(PortableError, match="cannot read the network interfaces"):
-        fast_dds_place.look_again()
+        fast_dds_relocation.look_again()
 
 
 def test_guids_that_cannot_be_renewed_are_told_of(monkeypatch) -> None:
     """Less is lost by that: an image can be restored only once."""
-    monkeypatch.setattr(fast_dds_place, "_library", lambda: ctypes.CDLL(None))
-    monkeypatch.setattr(fast_dds_place, "_interfaces_of", lambda _: lambda: True)
-    assert fast_dds_place.look_again() is False
+    monkeypatch.setattr(fast_dds_relocation, "_library", lambda: ctypes.CDLL(None))
+    monkeypatch.setattr(fast_dds_relocation, "_interfaces_of", lambda _: lambda: True)
+    assert fast_dds_relocation.look_again() is False
 
 
 def test_without_fast_dds_there_is_nothing_to_renew(monkeypatch) -> None:
     """Another vendor's library looks by itself."""
-    monkeypatch.setattr(fast_dds_place, "_library", lambda: None)
-    fast_dds_place.check()
-    assert fast_dds_place.look_again() is True
+    monkeypatch.setattr(fast_dds_relocation, "_library", lambda: None)
+    fast_dds_relocation.check()
+    assert fast_dds_relocation.look_again() is True

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from rclpy.serialization import deserialize_message, serialize_message
 
-from rosrm.core.model import RESOURCE_SLOTS
-from rosrm.ros.readings import ACCEPTING, LAYOUT, MOST_QUIET, decode, encode, flags
+from rosrm.model.values import RESOURCE_SLOTS
+from rosrm.ros.reading_codec import ACCEPTING, LAYOUT, MOST_QUIET, decode, encode, flags
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs import msg
 

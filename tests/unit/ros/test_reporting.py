@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosrm.core.model import RESOURCE_SLOTS
-from rosrm.ros.ledger import Ledger
-from rosrm.ros.readings import decode
-from rosrm.ros.reporting import RESOLUTION, Reporter
+from rosrm.model.values import RESOURCE_SLOTS
+from rosrm.ros.master.reading_stats import Ledger
+from rosrm.ros.reading_codec import decode
+from rosrm.ros.slave.reporter import RESOLUTION, Reporter
 
 RUN = 77
 HOST = 3

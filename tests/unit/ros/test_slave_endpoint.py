@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from rosrm.core import slave as core
-from rosrm.core.model import HostDescription
-from rosrm.ros import slave_endpoint
+from rosrm.core.slave import reducer as core
+from rosrm.model.values import HostDescription
 from rosrm.ros.callback_guard import CallbackGuard
-from rosrm.ros.journal_seen import JournalSeen, Seen
-from rosrm.ros.slave_endpoint import Link, SlaveEndpoint
+from rosrm.ros.slave import endpoint
+from rosrm.ros.slave.endpoint import Link, SlaveEndpoint
+from rosrm.ros.slave.journal_watermark import JournalSeen, Seen
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs import msg, srv
 
@@ -191,7 +191,7 @@ class Slave:
 @pytest.fixture
 def slave(monkeypatch) -> Slave:
     clock = Clock()
-    monkeypatch.setattr(slave_endpoint, "time", clock)
+    monkeypatch.setattr(endpoint, "time", clock)
     return Slave(clock)
 
 
@@ -383,7 +383,7 @@ def test_a_name_that_is_taken_is_said_at_once(slave) -> None:
 def test_what_a_former_run_said_of_its_journal_is_given_back(monkeypatch, tmp_path) -> None:
     """Also by a later run of the slave; to the run that said it, there is nothing to tell."""
     clock = Clock()
-    monkeypatch.setattr(slave_endpoint, "time", clock)
+    monkeypatch.setattr(endpoint, "time", clock)
     path = tmp_path / "journal_seen"
     slave = Slave(clock, JournalSeen(path))
     old = Master(slave, 11, epoch=2)

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rosrm.core import events as happened
-from rosrm.core.processes import ProcessPhase
+from rosrm.core.master import events as happened
+from rosrm.core.master.state.process import ProcessPhase
 from rosrm.simulation.workload import Curve
 
 from .workloads import MIB, host, plan, run, simulation

@@ -13,9 +13,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from rosrm.core import events as happened
-from rosrm.core.migration import ReportPhase
-from rosrm.core.model import (
+from rosrm.core.master import events as happened
+from rosrm.errors import RecordError
+from rosrm.model.plan import ReportPhase
+from rosrm.model.values import (
     RESOURCE_SLOTS,
     HostDescription,
     InstanceId,
@@ -28,7 +29,6 @@ from rosrm.core.model import (
     ResourceDescription,
     RestartPolicy,
 )
-from rosrm.errors import RecordError
 from rosrm.recording.encoding import decode, encode
 
 from .workloads import host, plan, read, recorded, simulation

@@ -10,12 +10,12 @@ import time
 import numpy as np
 import pytest
 
-from rosrm.core import events as happened
-from rosrm.core.model import RESOURCE_SLOTS
+from rosrm.core.master import events as happened
 from rosrm.errors import ConfigError
 from rosrm.master import recorder
 from rosrm.master.recorder import Recorder
-from rosrm.recording.reading import Header
+from rosrm.model.values import RESOURCE_SLOTS
+from rosrm.recording.reader import Header
 
 from .workloads import read
 

@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rosrm.core import events as happened
-from rosrm.core.settings import CoreSettings
-from rosrm.ports import Intent
+from rosrm.core.master import events as happened
+from rosrm.core.master.settings import CoreSettings
+from rosrm.extensions.contracts import Intent
 from rosrm.recording.encoding import Happened
-from rosrm.recording.reading import Header, Recording
+from rosrm.recording.reader import Header, Recording
 from rosrm.simulation.agreement import compare
 from rosrm.simulation.engine import Simulation
 from rosrm.simulation.extraction import Extraction

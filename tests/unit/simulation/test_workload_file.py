@@ -13,9 +13,9 @@ from rosrm.cli.simulation_runs import run
 from rosrm.config import workload as in_file
 from rosrm.config.variants import variant_in_text
 from rosrm.config.workload import load_workload
-from rosrm.core.model import Kind
 from rosrm.errors import ConfigError
-from rosrm.registry import Registry
+from rosrm.extensions.registry import Registry
+from rosrm.model.values import Kind
 
 ROOT = Path(__file__).resolve().parents[3]
 HOST = "hosts: [{name: a, memory: 1GiB, cpu: 2}]\n"

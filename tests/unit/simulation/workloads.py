@@ -5,13 +5,13 @@ from __future__ import annotations
 from io import BytesIO
 from math import inf
 
-from rosrm.config.plain import to_plain
 from rosrm.config.settings import ClusterConfig
-from rosrm.core.model import Kind, MigrationPolicy, ProcessSpec, ResourceDescription
-from rosrm.core.settings import CoreSettings
+from rosrm.core.master.settings import CoreSettings
+from rosrm.model.codec import to_plain
+from rosrm.model.values import Kind, MigrationPolicy, ProcessSpec, ResourceDescription
 from rosrm.recording.encoding import decisions, encode, encode_decisions
 from rosrm.recording.frames import FrameKind, frame, opening
-from rosrm.recording.reading import Header, read_record
+from rosrm.recording.reader import Header, read_record
 from rosrm.simulation.engine import Simulation
 from rosrm.simulation.workload import Curve, HostPlan, ProcessPlan, Workload
 from rosrm_migration.handoff import Handoff, HandoffOptions

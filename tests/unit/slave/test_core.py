@@ -10,8 +10,8 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from rosrm.core import slave
-from rosrm.core.model import (
+from rosrm.core.slave import reducer
+from rosrm.model.values import (
     Assignment,
     Fence,
     Health,
@@ -29,27 +29,27 @@ NODE = ProcessSpec("n", module="m", ros=True, namespace="/robot", readiness=Read
 STATE = InstanceState
 
 
-def assigned(spec=PLAIN, number=1, epoch=1, fence=None) -> slave.AssignmentsReceived:
+def assigned(spec=PLAIN, number=1, epoch=1, fence=None) -> reducer.AssignmentsReceived:
     assignment = Assignment(InstanceId(spec.name, number), spec, epoch, spec.name, fence=fence)
-    return slave.AssignmentsReceived((assignment,))
+    return reducer.AssignmentsReceived((assignment,))
 
 
-def told(state, name="p", number=1, **more) -> slave.SupervisorReported:
-    return slave.SupervisorReported((InstanceStatus(InstanceId(name, number), state, **more),))
+def told(state, name="p", number=1, **more) -> reducer.SupervisorReported:
+    return reducer.SupervisorReported((InstanceStatus(InstanceId(name, number), state, **more),))
 
 
 class Slave:
     """A state and its clock."""
 
     def __init__(self) -> None:
-        self.state = slave.SlaveState(registered=True)
+        self.state = reducer.SlaveState(registered=True)
         self.now = 100.0
 
     def step(self, event, after=0.0):
         self.now += after
-        return list(slave.step(self.state, event, self.now))
+        return list(reducer.step(self.state, event, self.now))
 
-    def of(self, name="p", number=1) -> slave.Held:
+    def of(self, name="p", number=1) -> reducer.Held:
         return self.state.held[InstanceId(name, number)]
 
 
@@ -61,8 +61,8 @@ def one() -> Slave:
 def test_what_went_with_the_supervisor_cannot_be_refused_any_more(one):
     """It was being started when its supervisor was killed: nobody holds it."""
     one.step(assigned())
-    one.step(slave.SupervisorReplaced((), {}, frozenset()))
-    assert one.step(slave.LaunchRefused(InstanceId("p", 1), "no such package")) == []
+    one.step(reducer.SupervisorReplaced((), {}, frozenset()))
+    assert one.step(reducer.LaunchRefused(InstanceId("p", 1), "no such package")) == []
 
 
 def test_what_is_taken_back_at_once_is_not_launched(one):
@@ -70,9 +70,9 @@ def test_what_is_taken_back_at_once_is_not_launched(one):
 
     The master gives it again, and hears that it is refused.
     """
-    events = [assigned(), slave.SupervisorReplaced((), {}, frozenset())]
-    commands = slave.step_all(one.state, events, one.now)
-    assert [c for c in commands if isinstance(c, slave.Launch) and c.assignments] == []
+    events = [assigned(), reducer.SupervisorReplaced((), {}, frozenset())]
+    commands = reducer.step_all(one.state, events, one.now)
+    assert [c for c in commands if isinstance(c, reducer.Launch) and c.assignments] == []
     (report,) = one.step(assigned(), after=2.0)
     assert states([report]) == [STATE.REFUSED]
 
@@ -84,12 +84,12 @@ def awaited_names(one: Slave) -> list[str]:
 
 def states(commands) -> list[InstanceState]:
     """What is reported."""
-    return [s.state for c in commands if isinstance(c, slave.Report) for s in c.statuses]
+    return [s.state for c in commands if isinstance(c, reducer.Report) for s in c.statuses]
 
 
 def test_an_assignment_is_launched_once(one) -> None:
     """The same order twice starts nothing twice."""
-    assert [type(c) for c in one.step(assigned())] == [slave.Launch]
+    assert [type(c) for c in one.step(assigned())] == [reducer.Launch]
     assert one.step(assigned()) == []
     one.step(told(STATE.RUNNING, pid=5))
     one.step(told(STATE.EXITED))
@@ -100,9 +100,9 @@ def test_what_changed_while_the_registration_was_on_its_way_is_told(one) -> None
     """It stood otherwise in the request, and no batch was published without a link."""
     one.step(assigned())
     one.step(told(STATE.RUNNING, pid=5))
-    one.step(slave.MasterLost())
+    one.step(reducer.MasterLost())
     one.step(told(STATE.FAILED, exit_signal=9))
-    (report,) = one.step(slave.Registered(1))
+    (report,) = one.step(reducer.Registered(1))
     assert (states([report]), report.complete) == ([STATE.FAILED], False)
 
 
@@ -110,29 +110,29 @@ def test_a_registration_without_news_is_not_followed_by_a_report(one) -> None:
     """All of it stood in the request."""
     one.step(assigned())
     one.step(told(STATE.RUNNING, pid=5))
-    one.step(slave.MasterLost())
-    assert one.step(slave.Registered(2)) == []
+    one.step(reducer.MasterLost())
+    assert one.step(reducer.Registered(2)) == []
 
 
 def test_an_older_epoch_starts_nothing(one) -> None:
     """A master that was replaced gives no orders; the refusal says which epochs."""
-    one.step(slave.Registered(3))
+    one.step(reducer.Registered(3))
     assert states(one.step(assigned(epoch=2))) == [STATE.REFUSED]
     assert "epoch 2" in one.of().status.message
 
 
 def test_a_registration_sets_the_epoch(one) -> None:
     """A master whose journal was lost begins at epoch 1 again, and this host works for it."""
-    one.step(slave.Registered(7))
-    one.step(slave.Registered(1))
-    assert [type(c) for c in one.step(assigned(epoch=1))] == [slave.Launch]
+    one.step(reducer.Registered(7))
+    one.step(reducer.Registered(1))
+    assert [type(c) for c in one.step(assigned(epoch=1))] == [reducer.Launch]
 
 
 def test_stopped_before_it_was_started(one) -> None:
     """A stop that overtakes its start wins: what comes late is refused for good."""
-    assert states(one.step(slave.StopOrdered(InstanceId("p", 1)))) == [STATE.REFUSED]
+    assert states(one.step(reducer.StopOrdered(InstanceId("p", 1)))) == [STATE.REFUSED]
     assert one.step(assigned()) == []
-    one.step(slave.TimePassed(), after=slave.REMEMBER_END)
+    one.step(reducer.TimePassed(), after=reducer.REMEMBER_END)
     assert states(one.step(assigned())) == [STATE.REFUSED]
 
 
@@ -141,40 +141,40 @@ def test_a_dead_number_stays_dead(one, end) -> None:
     """Also after its end was forgotten, a late order of the same instance starts nothing."""
     one.step(assigned())
     if end == "refused":
-        one.step(slave.LaunchRefused(InstanceId("p", 1), "no such package"))
+        one.step(reducer.LaunchRefused(InstanceId("p", 1), "no such package"))
     else:
         one.step(told(STATE.EXITED))
-    forgotten = one.step(slave.TimePassed(), after=slave.REMEMBER_END)
-    assert forgotten == [slave.Forget((InstanceId("p", 1),))]
+    forgotten = one.step(reducer.TimePassed(), after=reducer.REMEMBER_END)
+    assert forgotten == [reducer.Forget((InstanceId("p", 1),))]
     assert states(one.step(assigned())) == [STATE.REFUSED]
-    assert [type(c) for c in one.step(assigned(number=2))] == [slave.Launch]
+    assert [type(c) for c in one.step(assigned(number=2))] == [reducer.Launch]
 
 
 def test_dead_numbers_are_given_again_by_a_master_that_has_lost_its_journal(one) -> None:
     """It knows nothing of them; another registration with the same one changes nothing."""
-    one.step(slave.StopOrdered(InstanceId("p", 1)))
-    one.step(slave.Registered(1))
-    one.step(slave.TimePassed(), after=slave.REMEMBER_END)
+    one.step(reducer.StopOrdered(InstanceId("p", 1)))
+    one.step(reducer.Registered(1))
+    one.step(reducer.TimePassed(), after=reducer.REMEMBER_END)
     assert states(one.step(assigned())) == [STATE.REFUSED]
-    one.step(slave.Registered(1, renumbers=True))
-    one.step(slave.TimePassed(), after=slave.REMEMBER_END)
-    assert [type(c) for c in one.step(assigned())] == [slave.Launch]
+    one.step(reducer.Registered(1, renumbers=True))
+    one.step(reducer.TimePassed(), after=reducer.REMEMBER_END)
+    assert [type(c) for c in one.step(assigned())] == [reducer.Launch]
 
 
 def test_an_end_is_kept_while_no_master_is_heard(one) -> None:
     """However long the master is away, it is told of a job that finished meanwhile."""
     one.step(assigned())
-    one.step(slave.MasterLost())
+    one.step(reducer.MasterLost())
     one.step(told(STATE.EXITED))
-    assert one.step(slave.TimePassed(), after=10 * slave.REMEMBER_END) == []
-    one.step(slave.Registered(2))
-    assert one.step(slave.TimePassed(), after=slave.REMEMBER_END / 2) == []
-    assert len(one.step(slave.TimePassed(), after=slave.REMEMBER_END)) == 1
+    assert one.step(reducer.TimePassed(), after=10 * reducer.REMEMBER_END) == []
+    one.step(reducer.Registered(2))
+    assert one.step(reducer.TimePassed(), after=reducer.REMEMBER_END / 2) == []
+    assert len(one.step(reducer.TimePassed(), after=reducer.REMEMBER_END)) == 1
 
 
 def test_an_older_epoch_that_was_refused_may_come_anew(one) -> None:
     """Only the order was too old: a newer master may still give the instance its own number."""
-    one.step(slave.Registered(3))
+    one.step(reducer.Registered(3))
     one.step(assigned(epoch=2, number=8))
     assert states(one.step(assigned(epoch=3, number=9))) == []
     assert one.of(number=9).status.state is STATE.STARTING
@@ -183,7 +183,7 @@ def test_an_older_epoch_that_was_refused_may_come_anew(one) -> None:
 def test_a_launch_that_is_refused_is_said(one) -> None:
     """The reason reaches the master."""
     one.step(assigned())
-    (report,) = one.step(slave.LaunchRefused(InstanceId("p", 1), "no such package"))
+    (report,) = one.step(reducer.LaunchRefused(InstanceId("p", 1), "no such package"))
     assert report.statuses[0].state is STATE.REFUSED
     assert report.statuses[0].message == "no such package"
 
@@ -201,37 +201,37 @@ def test_a_node_is_ready_when_it_is_seen(one) -> None:
     assert one.state.awaited_in_graph() == {}
     assert states(one.step(told(STATE.RUNNING, "n", pid=5))) == [STATE.RUNNING]
     assert awaited_names(one) == ["/robot/n"]
-    assert states(one.step(slave.SeenInGraph(InstanceId("n", 1)))) == [STATE.READY]
-    assert one.step(slave.SeenInGraph(InstanceId("n", 1))) == []
+    assert states(one.step(reducer.SeenInGraph(InstanceId("n", 1)))) == [STATE.READY]
+    assert one.step(reducer.SeenInGraph(InstanceId("n", 1))) == []
     assert one.state.awaited_in_graph() == {}
 
 
 def test_a_shadow_is_awaited_under_its_alias(one) -> None:
     """The source has the node's own name; the shadow's is in the graph as soon as it is ready."""
     shadow = Assignment(InstanceId("n", 2), NODE, 1, "n_1700000000", shadow=True)
-    one.step(slave.AssignmentsReceived((shadow,)))
+    one.step(reducer.AssignmentsReceived((shadow,)))
     one.step(told(STATE.RUNNING, "n", 2, pid=5))
     assert awaited_names(one) == ["/robot/n_1700000000"]
-    assert states(one.step(slave.SeenInGraph(InstanceId("n", 2)))) == [STATE.READY]
+    assert states(one.step(reducer.SeenInGraph(InstanceId("n", 2)))) == [STATE.READY]
 
 
 def test_readiness_kinds(one) -> None:
     """`running` makes a node ready at once, `graph` lets any process be awaited."""
     running = replace(NODE, readiness=Readiness("running"))
     graph = replace(PLAIN, readiness=Readiness("graph"))
-    assert not slave.awaits_graph(running)
-    assert slave.awaits_graph(graph)
-    assert slave.awaits_graph(NODE)
-    assert not slave.awaits_graph(PLAIN)
+    assert not reducer.awaits_graph(running)
+    assert reducer.awaits_graph(graph)
+    assert reducer.awaits_graph(NODE)
+    assert not reducer.awaits_graph(PLAIN)
 
 
 def test_never_ready_is_stopped_and_has_failed(one) -> None:
     """The reason is the time-out, whatever the process exits with."""
     one.step(assigned(NODE))
     one.step(told(STATE.RUNNING, "n", pid=5))
-    assert one.step(slave.TimePassed(), after=9.9) == []
-    assert one.step(slave.TimePassed(), after=0.2) == [slave.Stop(InstanceId("n", 1))]
-    assert one.step(slave.TimePassed(), after=1.0) == []
+    assert one.step(reducer.TimePassed(), after=9.9) == []
+    assert one.step(reducer.TimePassed(), after=0.2) == [reducer.Stop(InstanceId("n", 1))]
+    assert one.step(reducer.TimePassed(), after=1.0) == []
     assert states(one.step(told(STATE.STOPPING, "n", pid=5))) == [STATE.STOPPING]
     (report,) = one.step(told(STATE.EXITED, "n"))
     assert report.statuses[0].state is STATE.FAILED
@@ -243,19 +243,19 @@ def test_each_run_has_its_own_time_to_become_ready(one) -> None:
     """A node that crashed and was restarted must be seen anew."""
     one.step(assigned(NODE))
     one.step(told(STATE.RUNNING, "n", pid=5))
-    one.step(slave.SeenInGraph(InstanceId("n", 1)))
+    one.step(reducer.SeenInGraph(InstanceId("n", 1)))
     assert states(one.step(told(STATE.BACKOFF, "n"), after=60.0)) == [STATE.BACKOFF]
     assert one.state.awaited_in_graph() == {}
     assert states(one.step(told(STATE.STARTING, "n"))) == [STATE.STARTING]
     assert states(one.step(told(STATE.RUNNING, "n", pid=6))) == [STATE.RUNNING]
-    assert one.step(slave.TimePassed(), after=9.0) == []
-    assert states(one.step(slave.SeenInGraph(InstanceId("n", 1)))) == [STATE.READY]
+    assert one.step(reducer.TimePassed(), after=9.0) == []
+    assert states(one.step(reducer.SeenInGraph(InstanceId("n", 1)))) == [STATE.READY]
 
 
 def test_what_a_former_run_of_the_slave_left_is_ready(one) -> None:
     """Its spec is not known any more, but it runs: nothing is stopped for that."""
     assert states(one.step(told(STATE.RUNNING, "n", pid=5))) == [STATE.READY]
-    assert one.step(slave.TimePassed(), after=1000.0) == []
+    assert one.step(reducer.TimePassed(), after=1000.0) == []
     assert one.step(assigned(NODE)) == []
 
 
@@ -264,17 +264,17 @@ def test_what_a_former_run_of_the_slave_left_is_ready(one) -> None:
 NODE_1 = InstanceId("n", 1)
 
 
-def memo_of(commands) -> slave.Memo:
+def memo_of(commands) -> reducer.Memo:
     """What the supervisor is to remember, as a later run reads it."""
-    (memo,) = [c.memo for c in commands if isinstance(c, slave.Remember)]
+    (memo,) = [c.memo for c in commands if isinstance(c, reducer.Remember)]
     return from_memo(to_memo(memo))
 
 
-def taken_over(one: Slave, status: InstanceStatus, memo: slave.Memo) -> Slave:
+def taken_over(one: Slave, status: InstanceStatus, memo: reducer.Memo) -> Slave:
     """Another run of the slave, which found this with the supervisor."""
     later = Slave()
     later.now = one.now
-    later.step(slave.SupervisorReplaced((status,), {status.instance: memo}))
+    later.step(reducer.SupervisorReplaced((status,), {status.instance: memo}))
     return later
 
 
@@ -285,18 +285,18 @@ def test_a_node_that_was_still_awaited_is_awaited_by_the_next_slave(one) -> None
     later = taken_over(one, InstanceStatus(NODE_1, STATE.RUNNING, pid=5), awaited)
     assert later.of("n").status.state is STATE.RUNNING
     assert awaited_names(later) == ["/robot/n"]
-    assert later.step(slave.TimePassed(), after=9.9) == []
-    assert later.step(slave.TimePassed(), after=0.2) == [slave.Stop(NODE_1)]
+    assert later.step(reducer.TimePassed(), after=9.9) == []
+    assert later.step(reducer.TimePassed(), after=0.2) == [reducer.Stop(NODE_1)]
 
 
 def test_a_node_that_was_seen_is_ready_for_the_next_slave(one) -> None:
     """The run that was seen, that is: its next one must be seen anew."""
     one.step(assigned(NODE))
     one.step(told(STATE.RUNNING, "n", pid=5))
-    awaited = memo_of(one.step(slave.SeenInGraph(NODE_1)))
+    awaited = memo_of(one.step(reducer.SeenInGraph(NODE_1)))
     later = taken_over(one, InstanceStatus(NODE_1, STATE.RUNNING, pid=5), awaited)
     assert later.of("n").status.state is STATE.READY
-    assert later.step(slave.TimePassed(), after=1000.0) == []
+    assert later.step(reducer.TimePassed(), after=1000.0) == []
     later.step(told(STATE.BACKOFF, "n"))
     assert states(later.step(told(STATE.RUNNING, "n", pid=6))) == [STATE.RUNNING]
     assert awaited_names(later) == ["/robot/n"]
@@ -332,60 +332,60 @@ def test_a_restart_policy_is_settled_when_it_is_recorded() -> None:
     """Each time it is ordered; its status is told as well."""
     one = running()
     for _ in range(2):
-        assert one.step(slave.RestartPolicySet(ONE, NEVER)) == [slave.Amend(ONE, NEVER)]
-        report, settled = one.step(slave.RestartPolicyRecorded(ONE, NEVER))
+        assert one.step(reducer.RestartPolicySet(ONE, NEVER)) == [reducer.Amend(ONE, NEVER)]
+        report, settled = one.step(reducer.RestartPolicyRecorded(ONE, NEVER))
         assert states([report]) == [STATE.READY]
-        assert settled == slave.Settle(ONE, NEVER)
+        assert settled == reducer.Settle(ONE, NEVER)
 
 
 def test_a_restart_policy_of_what_the_slave_found_running() -> None:
     """Its spec is not known any more: the supervisor has all that is needed."""
     one = Slave()
-    one.step(slave.SupervisorReplaced((InstanceStatus(ONE, STATE.RUNNING, pid=5),)))
-    assert one.step(slave.RestartPolicySet(ONE, NEVER)) == [slave.Amend(ONE, NEVER)]
+    one.step(reducer.SupervisorReplaced((InstanceStatus(ONE, STATE.RUNNING, pid=5),)))
+    assert one.step(reducer.RestartPolicySet(ONE, NEVER)) == [reducer.Amend(ONE, NEVER)]
 
 
 def test_a_restart_policy_is_ordered_again_from_another_supervisor() -> None:
     """The one that was killed may have had it or not; the next one's word counts."""
     one = running()
-    one.step(slave.RestartPolicySet(ONE, NEVER))
-    replaced = slave.SupervisorReplaced((InstanceStatus(ONE, STATE.RUNNING, pid=5),))
-    assert slave.Amend(ONE, NEVER) in one.step(replaced)
-    one.step(slave.RestartPolicyRecorded(ONE, NEVER))
-    assert [type(c) for c in one.step(replaced)] == [slave.Report]
+    one.step(reducer.RestartPolicySet(ONE, NEVER))
+    replaced = reducer.SupervisorReplaced((InstanceStatus(ONE, STATE.RUNNING, pid=5),))
+    assert reducer.Amend(ONE, NEVER) in one.step(replaced)
+    one.step(reducer.RestartPolicyRecorded(ONE, NEVER))
+    assert [type(c) for c in one.step(replaced)] == [reducer.Report]
 
 
 def test_an_older_policy_that_is_recorded_does_not_settle_a_newer_one() -> None:
     """Both were under way: each is answered for itself."""
     one = running()
-    one.step(slave.RestartPolicySet(ONE, NEVER))
-    one.step(slave.RestartPolicySet(ONE, ON_FAILURE))
-    assert one.step(slave.RestartPolicyRecorded(ONE, NEVER))[-1] == slave.Settle(ONE, NEVER)
-    replaced = slave.SupervisorReplaced((InstanceStatus(ONE, STATE.RUNNING, pid=5),))
-    assert one.step(replaced)[:-1] == [slave.Amend(ONE, ON_FAILURE)]
+    one.step(reducer.RestartPolicySet(ONE, NEVER))
+    one.step(reducer.RestartPolicySet(ONE, ON_FAILURE))
+    assert one.step(reducer.RestartPolicyRecorded(ONE, NEVER))[-1] == reducer.Settle(ONE, NEVER)
+    replaced = reducer.SupervisorReplaced((InstanceStatus(ONE, STATE.RUNNING, pid=5),))
+    assert one.step(replaced)[:-1] == [reducer.Amend(ONE, ON_FAILURE)]
 
 
 def test_a_restart_policy_of_what_has_ended_tells_its_end() -> None:
     """The master can go on; so it can where the end came in between."""
     one = running()
-    one.step(slave.RestartPolicySet(ONE, NEVER))
+    one.step(reducer.RestartPolicySet(ONE, NEVER))
     one.step(told(STATE.FAILED))
-    report, settled = one.step(slave.RestartPolicySet(ONE, NEVER))
+    report, settled = one.step(reducer.RestartPolicySet(ONE, NEVER))
     assert states([report]) == [STATE.FAILED]
-    assert settled == slave.Settle(ONE, NEVER)
-    replaced = slave.SupervisorReplaced((InstanceStatus(ONE, STATE.FAILED),))
-    assert slave.Settle(ONE, NEVER) in one.step(replaced)
+    assert settled == reducer.Settle(ONE, NEVER)
+    replaced = reducer.SupervisorReplaced((InstanceStatus(ONE, STATE.FAILED),))
+    assert reducer.Settle(ONE, NEVER) in one.step(replaced)
 
 
 def test_a_restart_policy_of_a_stranger_is_refused() -> None:
     """Also where nobody but a supervisor that was killed could have known it."""
     one = Slave()
-    (settled,) = one.step(slave.RestartPolicySet(ONE, NEVER))
+    (settled,) = one.step(reducer.RestartPolicySet(ONE, NEVER))
     assert "p#1 is not known here" in settled.refusal
     one = running()
-    one.step(slave.RestartPolicySet(ONE, NEVER))
-    settled = one.step(slave.SupervisorReplaced(()))[0]
-    assert isinstance(settled, slave.Settle)
+    one.step(reducer.RestartPolicySet(ONE, NEVER))
+    settled = one.step(reducer.SupervisorReplaced(()))[0]
+    assert isinstance(settled, reducer.Settle)
     assert settled.refusal
 
 
@@ -394,24 +394,24 @@ def test_a_restart_policy_of_what_waits_for_a_slot() -> None:
     one = running()
     one.state.max_processes = 1
     shadow = Assignment(InstanceId("p", 2), PLAIN, 1, "p_1700000000", shadow=True)
-    one.step(slave.AssignmentsReceived((shadow,)))
-    _, settled = one.step(slave.RestartPolicySet(InstanceId("p", 2), ON_FAILURE))
-    assert settled == slave.Settle(InstanceId("p", 2), ON_FAILURE)
-    (launch,) = [c for c in one.step(told(STATE.EXITED)) if isinstance(c, slave.Launch)]
+    one.step(reducer.AssignmentsReceived((shadow,)))
+    _, settled = one.step(reducer.RestartPolicySet(InstanceId("p", 2), ON_FAILURE))
+    assert settled == reducer.Settle(InstanceId("p", 2), ON_FAILURE)
+    (launch,) = [c for c in one.step(told(STATE.EXITED)) if isinstance(c, reducer.Launch)]
     (assignment,) = launch.assignments
     assert assignment.spec.restart == ON_FAILURE
     assert not assignment.shadow
 
 
-def nodes(count: int) -> slave.AssignmentsReceived:
+def nodes(count: int) -> reducer.AssignmentsReceived:
     specs = [replace(NODE, name=f"n{number}") for number in range(count)]
-    return slave.AssignmentsReceived(
+    return reducer.AssignmentsReceived(
         tuple(Assignment(InstanceId(spec.name, 1), spec, 1, spec.name) for spec in specs)
     )
 
 
 def launched(commands) -> list[str]:
-    launches = [one for one in commands if isinstance(one, slave.Launch)]
+    launches = [one for one in commands if isinstance(one, reducer.Launch)]
     return [one.instance.process for launch in launches for one in launch.assignments]
 
 
@@ -423,7 +423,7 @@ def test_so_many_are_started_at_a_time(one) -> None:
     assert states(commands) == [STATE.HELD, STATE.HELD]
     assert "max_starting: 2" in one.of("n2").status.message
     assert launched(one.step(told(STATE.RUNNING, "n0", pid=5))) == []
-    assert launched(one.step(slave.SeenInGraph(InstanceId("n0", 1)))) == ["n2"]
+    assert launched(one.step(reducer.SeenInGraph(InstanceId("n0", 1)))) == ["n2"]
 
 
 def test_one_that_ends_before_it_is_ready_makes_room_for_the_next(one) -> None:
@@ -432,7 +432,7 @@ def test_one_that_ends_before_it_is_ready_makes_room_for_the_next(one) -> None:
     one.step(nodes(3))
     assert launched(one.step(told(STATE.FAILED, "n0", exit_code=1))) == ["n1"]
     one.step(told(STATE.RUNNING, "n1", pid=5))
-    assert one.step(slave.TimePassed(), after=11.0) == [slave.Stop(InstanceId("n1", 1))]
+    assert one.step(reducer.TimePassed(), after=11.0) == [reducer.Stop(InstanceId("n1", 1))]
     assert launched(one.step(told(STATE.STOPPING, "n1", pid=5))) == ["n2"]
 
 
@@ -447,11 +447,11 @@ def test_what_is_no_node_has_started_as_soon_as_it_runs(one) -> None:
 def test_a_restart_policy_of_what_is_forgotten_meanwhile() -> None:
     """The supervisor never says that it has it: the master is answered all the same."""
     one = running()
-    one.step(slave.Registered(1))
-    one.step(slave.RestartPolicySet(ONE, NEVER))
+    one.step(reducer.Registered(1))
+    one.step(reducer.RestartPolicySet(ONE, NEVER))
     one.step(told(STATE.EXITED))
-    commands = one.step(slave.TimePassed(), after=100.0)
-    assert slave.Settle(ONE, NEVER) in commands
+    commands = one.step(reducer.TimePassed(), after=100.0)
+    assert reducer.Settle(ONE, NEVER) in commands
 
 
 def test_stop_and_restart_go_to_the_supervisor(one) -> None:
@@ -459,12 +459,12 @@ def test_stop_and_restart_go_to_the_supervisor(one) -> None:
     instance = InstanceId("p", 1)
     one.step(assigned())
     one.step(told(STATE.RUNNING, pid=5))
-    assert one.step(slave.RestartOrdered(instance)) == [slave.Restart(instance)]
-    assert one.step(slave.StopOrdered(instance)) == [slave.Stop(instance)]
+    assert one.step(reducer.RestartOrdered(instance)) == [reducer.Restart(instance)]
+    assert one.step(reducer.StopOrdered(instance)) == [reducer.Stop(instance)]
     one.step(told(STATE.EXITED))
-    assert states(one.step(slave.StopOrdered(instance))) == [STATE.EXITED]
-    assert states(one.step(slave.RestartOrdered(instance))) == [STATE.EXITED]
-    assert one.step(slave.RestartOrdered(InstanceId("q", 2))) == []
+    assert states(one.step(reducer.StopOrdered(instance))) == [STATE.EXITED]
+    assert states(one.step(reducer.RestartOrdered(instance))) == [STATE.EXITED]
+    assert one.step(reducer.RestartOrdered(InstanceId("q", 2))) == []
 
 
 def test_a_complete_report_names_everything(one) -> None:
@@ -472,7 +472,7 @@ def test_a_complete_report_names_everything(one) -> None:
     one.step(assigned())
     one.step(assigned(number=2))
     one.step(told(STATE.EXITED))
-    (report,) = one.step(slave.ReportRequested())
+    (report,) = one.step(reducer.ReportRequested())
     assert report.complete
     assert {s.instance.number: s.state for s in report.statuses} == {
         1: STATE.EXITED, 2: STATE.STARTING,
@@ -500,7 +500,7 @@ def test_who_may_ask_for_work(usage, present, stale, under) -> None:
     values[: len(usage)] = usage
     limit = np.ones(16, np.float32)
     limit[1] = 0.5
-    assert slave.under_limits(values, limit, present, stale) is under
+    assert reducer.under_limits(values, limit, present, stale) is under
 
 
 # --- any order of events ----------------------------------------------------------------------
@@ -518,7 +518,7 @@ class AnySlave(RuleBasedStateMachine):
 
     def __init__(self) -> None:
         super().__init__()
-        self.state = slave.SlaveState()
+        self.state = reducer.SlaveState()
         self.now = 0.0
         self.launched: list[InstanceId] = []
         self.alive: dict[InstanceId, InstanceState] = {}
@@ -529,28 +529,28 @@ class AnySlave(RuleBasedStateMachine):
         self.heard_at = 0.0
 
     def feed(self, event) -> None:
-        for command in slave.step(self.state, event, self.now):
-            if isinstance(command, slave.Launch):
+        for command in reducer.step(self.state, event, self.now):
+            if isinstance(command, reducer.Launch):
                 for assignment in command.assignments:
                     self.check_fence(assignment)
                     self.launched.append(assignment.instance)
                     self.alive[assignment.instance] = STATE.STARTING
-            elif isinstance(command, slave.Report):
+            elif isinstance(command, reducer.Report):
                 for status in command.statuses:
                     self.reported[status.instance] = status.state
-            elif isinstance(command, (slave.Stop, slave.Fence)):
+            elif isinstance(command, (reducer.Stop, reducer.Fence)):
                 assert command.instance in self.alive, "a stop of what does not run"
                 self.stopped.add(command.instance)
-            elif isinstance(command, slave.Fail):
+            elif isinstance(command, reducer.Fail):
                 runs = self.alive.get(command.instance) is STATE.RUNNING
                 assert runs, "a run failed that does not run"
                 assert command.pid == 7, "another run than the one that was looked at"
-            elif isinstance(command, slave.Amend):
+            elif isinstance(command, reducer.Amend):
                 assert command.instance in self.alive, "a policy for what does not run"
                 self.amending.append((command.instance, command.restart))
-            elif isinstance(command, slave.Settle):
+            elif isinstance(command, reducer.Settle):
                 self.unsettled.discard((command.instance, command.restart))
-            elif isinstance(command, slave.Forget):
+            elif isinstance(command, reducer.Forget):
                 assert not self.alive.keys() & set(command.instances), "a live one forgotten"
 
     def check_fence(self, assignment) -> None:
@@ -565,34 +565,34 @@ class AnySlave(RuleBasedStateMachine):
     @rule(ago=st.sampled_from([0.0, 0.0, 0.05, 3.0]))
     def hear(self, ago) -> None:
         self.heard_at = max(self.heard_at, self.now - ago)
-        self.feed(slave.MasterHears(self.now - ago))
+        self.feed(reducer.MasterHears(self.now - ago))
 
     @rule(spec=SPECS, number=NUMBERS)
     def fence(self, spec, number) -> None:
-        self.feed(slave.FenceOrdered(InstanceId(spec.name, number)))
+        self.feed(reducer.FenceOrdered(InstanceId(spec.name, number)))
 
     @rule(epoch=st.integers(1, 3))
     def register(self, epoch) -> None:
-        self.feed(slave.Registered(epoch))
+        self.feed(reducer.Registered(epoch))
 
     @rule(spec=SPECS, number=NUMBERS)
     def stop(self, spec, number) -> None:
-        self.feed(slave.StopOrdered(InstanceId(spec.name, number)))
+        self.feed(reducer.StopOrdered(InstanceId(spec.name, number)))
 
     @rule(spec=SPECS, number=NUMBERS)
     def restart(self, spec, number) -> None:
-        self.feed(slave.RestartOrdered(InstanceId(spec.name, number)))
+        self.feed(reducer.RestartOrdered(InstanceId(spec.name, number)))
 
     @rule(spec=SPECS, number=NUMBERS, restart=st.sampled_from([NEVER, ON_FAILURE]))
     def set_restart(self, spec, number, restart) -> None:
         instance = InstanceId(spec.name, number)
         self.unsettled.add((instance, restart))
-        self.feed(slave.RestartPolicySet(instance, restart))
+        self.feed(reducer.RestartPolicySet(instance, restart))
 
     @precondition(lambda self: self.amending)
     @rule()
     def record(self) -> None:
-        self.feed(slave.RestartPolicyRecorded(*self.amending.pop(0)))
+        self.feed(reducer.RestartPolicyRecorded(*self.amending.pop(0)))
 
     @rule(hears=st.booleans())
     def replace_supervisor(self, hears) -> None:
@@ -601,11 +601,11 @@ class AnySlave(RuleBasedStateMachine):
             self.amending.clear()
         found = (InstanceStatus(one, state, 7) for one, state in self.alive.items())
         ended = (h.status for h in self.state.held.values() if h.status.state.ended)
-        self.feed(slave.SupervisorReplaced((*found, *ended)))
+        self.feed(reducer.SupervisorReplaced((*found, *ended)))
 
     @rule(spec=SPECS, number=NUMBERS)
     def see(self, spec, number) -> None:
-        self.feed(slave.SeenInGraph(InstanceId(spec.name, number)))
+        self.feed(reducer.SeenInGraph(InstanceId(spec.name, number)))
 
     @rule(number=NUMBERS, pid=st.sampled_from([7, 7, 7, 8]), runs=st.booleans())
     def look(self, number, pid, runs) -> None:
@@ -613,19 +613,19 @@ class AnySlave(RuleBasedStateMachine):
         instance = InstanceId(WATCHED.name, number)
         if runs and instance in self.alive:
             self.alive[instance] = STATE.RUNNING
-            self.feed(slave.SupervisorReported((InstanceStatus(instance, STATE.RUNNING, 7),)))
+            self.feed(reducer.SupervisorReported((InstanceStatus(instance, STATE.RUNNING, 7),)))
         for _ in range(5):
-            self.now += slave.LOOK_PERIOD
-            self.feed(slave.LookedAt(instance, pid, slave.Look(stopped=True)))
+            self.now += reducer.LOOK_PERIOD
+            self.feed(reducer.LookedAt(instance, pid, reducer.Look(stopped=True)))
 
     @rule(seconds=st.sampled_from([0.1, 5.0, 11.0, 61.0]))
     def wait(self, seconds) -> None:
         self.now += seconds
-        self.feed(slave.TimePassed())
+        self.feed(reducer.TimePassed())
 
     @rule()
     def report(self) -> None:
-        self.feed(slave.ReportRequested())
+        self.feed(reducer.ReportRequested())
 
     @precondition(lambda self: self.alive)
     @rule(data=st.data(), state=st.sampled_from(InstanceState))
@@ -638,7 +638,7 @@ class AnySlave(RuleBasedStateMachine):
         else:
             self.alive[instance] = state
         pid = 7 if state in (STATE.RUNNING, STATE.STOPPING) else 0
-        self.feed(slave.SupervisorReported((InstanceStatus(instance, state, pid),)))
+        self.feed(reducer.SupervisorReported((InstanceStatus(instance, state, pid),)))
 
     @invariant()
     def nothing_is_launched_twice(self) -> None:

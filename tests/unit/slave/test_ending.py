@@ -6,10 +6,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from rosrm.core import slave as core
-from rosrm.core.model import InstanceId, InstanceState, InstanceStatus, ProcessSpec, StopPolicy
-from rosrm.slave import ending
-from rosrm.slave.ending import Ending
+from rosrm.core.slave import reducer as core
+from rosrm.model.values import InstanceId, InstanceState, InstanceStatus, ProcessSpec, StopPolicy
+from rosrm.slave import shutdown
+from rosrm.slave.shutdown import Ending
 
 STOP = StopPolicy(interrupt_grace=1.0, terminate_grace=1.0)
 
@@ -54,7 +54,7 @@ class Slave:
 @pytest.fixture
 def slave(monkeypatch) -> Slave:
     slave = Slave()
-    monkeypatch.setattr(ending, "time", SimpleNamespace(monotonic=lambda: slave.now))
+    monkeypatch.setattr(shutdown, "time", SimpleNamespace(monotonic=lambda: slave.now))
     return slave
 
 

@@ -12,11 +12,11 @@ from queue import Queue
 
 import pytest
 
-from rosrm.core.events import BAD_RESULT
-from rosrm.core.plugin_calls import WORKS_AFTER
+from rosrm.core.master.events import BAD_RESULT
 from rosrm.errors import CriuError, Refused
-from rosrm.registry import OfferedExecutor
-from rosrm.slave.executing import UNABLE, Executors, Here
+from rosrm.extensions.plugin_calls import WORKS_AFTER
+from rosrm.extensions.registry import OfferedExecutor
+from rosrm.slave.executors import UNABLE, Executors, Here
 from rosrm.testing import FakeClock
 
 HERE = Here("alpha", Path("/state"), {})

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosrm.core import slave
-from rosrm.core.model import (
+from rosrm.core.slave import reducer
+from rosrm.model.values import (
     Assignment,
     Fence,
     InstanceId,
@@ -24,32 +24,32 @@ class Slave:
     """A state and its clock; registered at 100 s, when the master had heard it."""
 
     def __init__(self, **bounds) -> None:
-        self.state = slave.SlaveState(**bounds)
+        self.state = reducer.SlaveState(**bounds)
         self.now = 100.0
-        self.step(slave.MasterHears(self.now))
-        self.step(slave.Registered(1))
+        self.step(reducer.MasterHears(self.now))
+        self.step(reducer.Registered(1))
 
     def step(self, event, after=0.0):
         self.now += after
-        return list(slave.step(self.state, event, self.now))
+        return list(reducer.step(self.state, event, self.now))
 
     def assign(self, number=1, fence=FENCE, after=0.0):
         instance = InstanceId("p", number)
         spec = ProcessSpec("p", command=("true",))
-        order = slave.AssignmentsReceived((Assignment(instance, spec, 1, "p", fence=fence),))
+        order = reducer.AssignmentsReceived((Assignment(instance, spec, 1, "p", fence=fence),))
         return self.step(order, after)
 
     def tell(self, state, number=1, after=0.0):
         status = InstanceStatus(InstanceId("p", number), state, pid=5)
-        return self.step(slave.SupervisorReported((status,)), after)
+        return self.step(reducer.SupervisorReported((status,)), after)
 
     def hears(self, after=0.0):
         self.now += after
-        return self.step(slave.MasterHears(self.now))
+        return self.step(reducer.MasterHears(self.now))
 
 
 def refusals(commands) -> list[str]:
-    reported = [one for c in commands if isinstance(c, slave.Report) for one in c.statuses]
+    reported = [one for c in commands if isinstance(c, reducer.Report) for one in c.statuses]
     states = (InstanceState.REFUSED, InstanceState.FENCED)
     return [one.message for one in reported if one.state in states]
 
@@ -60,9 +60,9 @@ def test_the_supervisor_hears_it_while_there_is_a_fence() -> None:
     one.assign(fence=None)
     assert one.hears(1.0) == []
     one.assign(number=2, after=1.0)
-    assert one.hears(0.2) == [slave.Renew(one.now, one.now)]
+    assert one.hears(0.2) == [reducer.Renew(one.now, one.now)]
     assert one.hears(0.05) == []
-    assert one.hears(0.06) == [slave.Renew(one.now, one.now)]
+    assert one.hears(0.06) == [reducer.Renew(one.now, one.now)]
     one.tell(InstanceState.EXITED, number=2)
     assert one.hears(1.0) == []
 
@@ -72,19 +72,21 @@ def test_an_older_word_puts_nothing_off() -> None:
     one = Slave()
     one.assign()
     one.hears(1.0)
-    assert one.step(slave.MasterHears(one.now - 0.5), 0.5) == [slave.Renew(one.now - 0.5, one.now)]
+    assert one.step(reducer.MasterHears(one.now - 0.5), 0.5) == [
+        reducer.Renew(one.now - 0.5, one.now)
+    ]
     assert one.state.heard_at == one.now - 0.5
 
 
 def test_a_fence_is_known_again_from_the_supervisor() -> None:
     """By the next run of the slave; and a supervisor is told the newest at once."""
     status = InstanceStatus(ONE, InstanceState.RUNNING, pid=5)
-    replaced = slave.SupervisorReplaced((status,), fenced=frozenset({ONE}))
+    replaced = reducer.SupervisorReplaced((status,), fenced=frozenset({ONE}))
     one = Slave()
-    assert one.step(replaced)[0] == slave.Renew(100.0, 100.0)
-    assert one.hears(1.0) == [slave.Renew(101.0, 101.0)]
-    new = slave.SlaveState()
-    assert slave.step(new, replaced, 100.0)[0] == slave.Renew(0.0, 100.0)
+    assert one.step(replaced)[0] == reducer.Renew(100.0, 100.0)
+    assert one.hears(1.0) == [reducer.Renew(101.0, 101.0)]
+    new = reducer.SlaveState()
+    assert reducer.step(new, replaced, 100.0)[0] == reducer.Renew(0.0, 100.0)
 
 
 def test_what_is_given_out_too_late_is_not_started() -> None:
@@ -109,8 +111,8 @@ def test_an_answer_that_was_long_on_its_way_starts_nothing() -> None:
         ]
     ):
         given = Assignment(InstanceId("p", number), spec, 1, "p", fence=fence)
-        commands = one.step(slave.AssignmentsReceived((given,), one.now - age))
-        assert any(isinstance(c, slave.Launch) for c in commands) is taken, number
+        commands = one.step(reducer.AssignmentsReceived((given,), one.now - age))
+        assert any(isinstance(c, reducer.Launch) for c in commands) is taken, number
         assert len(refusals(commands)) == (not taken), number
 
 
@@ -120,12 +122,12 @@ def test_what_waits_for_its_start_is_fenced_too() -> None:
     one.assign(fence=None)
     one.assign(number=2)
     one.assign(number=3, fence=None)
-    assert refusals(one.step(slave.TimePassed(), 1.9)) == []
+    assert refusals(one.step(reducer.TimePassed(), 1.9)) == []
     one.hears()
-    assert refusals(one.step(slave.TimePassed(), 1.9)) == []
+    assert refusals(one.step(reducer.TimePassed(), 1.9)) == []
     commands = one.tell(InstanceState.EXITED, after=0.1)
     assert len(refusals(commands)) == 1
-    (launch,) = (c for c in commands if isinstance(c, slave.Launch))
+    (launch,) = (c for c in commands if isinstance(c, reducer.Launch))
     assert [a.instance.number for a in launch.assignments] == [3]
     assert refusals(one.assign(number=2)) == []  # it is remembered, and not started
 
@@ -135,19 +137,19 @@ def test_a_slave_at_work_says_so_while_it_hears_nothing() -> None:
     one = Slave()
     alive = Fence(after=2.0, grace=0.0, alive=True)
     (launch,) = one.assign(fence=alive, after=30.0)
-    assert isinstance(launch, slave.Launch)
-    assert one.step(slave.TimePassed(), 1.0) == [slave.Renew(100.0, one.now)]
+    assert isinstance(launch, reducer.Launch)
+    assert one.step(reducer.TimePassed(), 1.0) == [reducer.Renew(100.0, one.now)]
 
 
 def test_the_order_to_fence_is_passed_on() -> None:
     """For what runs; one never heard of will not be started, as after an order to stop."""
     one = Slave()
     one.assign()
-    assert one.step(slave.FenceOrdered(ONE)) == [slave.Fence(ONE)]
+    assert one.step(reducer.FenceOrdered(ONE)) == [reducer.Fence(ONE)]
     one.tell(InstanceState.FAILED)
-    assert [type(c) for c in one.step(slave.FenceOrdered(ONE))] == [slave.Report]
-    assert len(refusals(one.step(slave.FenceOrdered(InstanceId("p", 2))))) == 1
-    assert not any(isinstance(c, slave.Launch) for c in one.assign(number=2))
+    assert [type(c) for c in one.step(reducer.FenceOrdered(ONE))] == [reducer.Report]
+    assert len(refusals(one.step(reducer.FenceOrdered(InstanceId("p", 2))))) == 1
+    assert not any(isinstance(c, reducer.Launch) for c in one.assign(number=2))
 
 
 # --- when a beat was said ---------------------------------------------------------------------
@@ -155,7 +157,7 @@ def test_the_order_to_fence_is_passed_on() -> None:
 
 def test_beats_that_were_waiting_are_as_old_as_they_are() -> None:
     """Stopped for 30 s: the beats of the first second are no newer than that."""
-    clock = slave.BeatClock()
+    clock = reducer.BeatClock()
     for tenth in range(10):
         assert clock.said_at(tenth / 10, 500.0 + tenth / 10) == pytest.approx(500.0 + tenth / 10)
     assert clock.said_at(1.0, 530.0) == pytest.approx(501.0, abs=0.05)
@@ -168,7 +170,7 @@ def test_beats_that_were_waiting_are_as_old_as_they_are() -> None:
 )  # fmt: skip
 def test_a_beat_is_never_taken_as_newer_than_the_quickest_was_quick(ahead, drift, beats) -> None:
     """Whatever the clocks' difference, drift and delays: too new by the least delay at most."""
-    clock = slave.BeatClock()
+    clock = reducer.BeatClock()
     said, arrived, quickest = 1000.0, 0.0, 1e9
     for wait, delay in beats:
         said += wait
@@ -182,7 +184,7 @@ def test_a_beat_is_never_taken_as_newer_than_the_quickest_was_quick(ahead, drift
 
 def test_another_pace_of_the_clock_makes_no_beat_old() -> None:
     """An hour of beats by a clock that is 100 ppm slow: the newest is as new as the first."""
-    clock = slave.BeatClock()
+    clock = reducer.BeatClock()
     for second in range(0, 3600, 5):
         age = second - clock.said_at(second * (1 - 1e-4), float(second))
         assert age < 0.01
@@ -190,7 +192,7 @@ def test_another_pace_of_the_clock_makes_no_beat_old() -> None:
 
 def test_a_new_greeting_takes_another_clock() -> None:
     """The master's host was asleep: its beats would count as an hour old for ever."""
-    clock = slave.BeatClock()
+    clock = reducer.BeatClock()
     clock.said_at(10.0, 100.0)
     clock.restart()
     assert clock.said_at(11.0, 3700.0) == 3700.0

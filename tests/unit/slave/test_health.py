@@ -8,8 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosrm.core import slave
-from rosrm.core.model import (
+from rosrm.core.slave import reducer
+from rosrm.core.slave.health import Judgement, resolve, watch_of
+from rosrm.model.values import (
     Assignment,
     Health,
     InstanceId,
@@ -18,7 +19,6 @@ from rosrm.core.model import (
     ProcessSpec,
     RestartPolicy,
 )
-from rosrm.core.slave.health import Judgement, resolve, watch_of
 from rosrm.slave.memos import from_memo, to_memo
 
 SCAN = Health("~/scan", 5.0, "", 4.0)
@@ -26,7 +26,7 @@ SPEC = ProcessSpec("lidar", module="m", ros=True, namespace="/robot", health=SCA
 LIDAR = InstanceId("lidar", 1)
 
 
-def watched(health: Health = SCAN, **more) -> slave.Watch:
+def watched(health: Health = SCAN, **more) -> reducer.Watch:
     watch = watch_of(Assignment(LIDAR, replace(SPEC, health=health), 1, "lidar", **more))
     assert watch is not None
     return watch
@@ -52,7 +52,7 @@ class Node:
             if rate is not None:
                 said = int((self.now - begun) * rate + 1e-9)
                 heard, told = said - told, said
-            verdict = self.judgement.look(slave.Look(heard=heard, **look), self.now)
+            verdict = self.judgement.look(reducer.Look(heard=heard, **look), self.now)
             if verdict:
                 return verdict
         return ""
@@ -196,7 +196,7 @@ def test_under_an_alias_names_are_those_that_others_see() -> None:
     """And the alias's own, for a node that does not know rosrm."""
     spec = replace(SPEC, health=Health("~/scan", 5.0, "active", 4.0))
     watch = watch_of(Assignment(InstanceId("lidar", 2), spec, 1, "lidar_17", shadow=True))
-    assert watch == slave.Watch(
+    assert watch == reducer.Watch(
         spec.health,
         ("/robot/lidar/scan", "/robot/lidar_17/scan"),
         ("/robot/lidar/get_state", "/robot/lidar_17/get_state"),
@@ -217,25 +217,25 @@ class Slave:
     """A slave that holds one plain process whose health is watched."""
 
     def __init__(self, shadow: bool = False) -> None:
-        self.state = slave.SlaveState(registered=True)
+        self.state = reducer.SlaveState(registered=True)
         self.now = 0.0
         restart = RestartPolicy("always")
         spec = ProcessSpec("lidar", command=("true",), health=PLAIN, restart=restart)
-        self.step(slave.AssignmentsReceived((Assignment(LIDAR, spec, 1, "lidar", shadow),)))
+        self.step(reducer.AssignmentsReceived((Assignment(LIDAR, spec, 1, "lidar", shadow),)))
 
-    def step(self, event) -> list[slave.Command]:
-        return list(slave.step(self.state, event, self.now))
+    def step(self, event) -> list[reducer.Command]:
+        return list(reducer.step(self.state, event, self.now))
 
     def runs(self, pid: int) -> None:
         status = InstanceStatus(LIDAR, InstanceState.RUNNING, pid=pid)
-        self.step(slave.SupervisorReported((status,)))
+        self.step(reducer.SupervisorReported((status,)))
 
-    def looks(self, seconds: float, pid: int, **look) -> list[slave.Command]:
+    def looks(self, seconds: float, pid: int, **look) -> list[reducer.Command]:
         """What is ordered within so long."""
         ordered, until = [], self.now + seconds
         while self.now < until and not ordered:
-            self.now += slave.LOOK_PERIOD
-            ordered = self.step(slave.LookedAt(LIDAR, pid, slave.Look(**look)))
+            self.now += reducer.LOOK_PERIOD
+            ordered = self.step(reducer.LookedAt(LIDAR, pid, reducer.Look(**look)))
         return ordered
 
 
@@ -245,7 +245,7 @@ def test_an_unhealthy_run_is_ended_as_failed() -> None:
     one.runs(5)
     for _ in range(2):
         (fail,) = one.looks(10.0, 5, stopped=True)
-        assert isinstance(fail, slave.Fail)
+        assert isinstance(fail, reducer.Fail)
         assert (fail.instance, fail.pid, fail.kill) == (LIDAR, 5, True)
 
 
@@ -254,7 +254,7 @@ def test_a_restart_begins_anew() -> None:
     one = Slave()
     one.runs(5)
     assert one.looks(3.0, 5, stopped=True) == []
-    one.step(slave.SupervisorReported((InstanceStatus(LIDAR, InstanceState.BACKOFF),)))
+    one.step(reducer.SupervisorReported((InstanceStatus(LIDAR, InstanceState.BACKOFF),)))
     assert one.state.watched() == {}
     assert one.looks(10.0, 5, stopped=True) == []
     one.runs(6)
@@ -269,12 +269,12 @@ def test_a_shadow_is_watched_when_it_is_none_any_more() -> None:
     one.runs(5)
     assert one.state.watched() == {}
     assert one.looks(10.0, 5, stopped=True) == []
-    commands = one.step(slave.RestartPolicySet(LIDAR, RestartPolicy("always")))
-    (memo,) = [command.memo for command in commands if isinstance(command, slave.Remember)]
+    commands = one.step(reducer.RestartPolicySet(LIDAR, RestartPolicy("always")))
+    (memo,) = [command.memo for command in commands if isinstance(command, reducer.Remember)]
     assert list(one.state.watched()) == [LIDAR]
-    later = slave.SlaveState(registered=True)
+    later = reducer.SlaveState(registered=True)
     status = InstanceStatus(LIDAR, InstanceState.RUNNING, pid=5)
-    slave.step(later, slave.SupervisorReplaced((status,), {LIDAR: memo}), 0.0)
+    reducer.step(later, reducer.SupervisorReplaced((status,), {LIDAR: memo}), 0.0)
     assert list(later.watched()) == [LIDAR]
 
 
@@ -283,21 +283,21 @@ def test_what_is_being_moved_may_be_silent() -> None:
     one = Slave()
     one.runs(5)
     one.looks(3.0, 5, stopped=True)
-    one.step(slave.RestartPolicySet(LIDAR, RestartPolicy("never")))
+    one.step(reducer.RestartPolicySet(LIDAR, RestartPolicy("never")))
     assert one.looks(20.0, 5, stopped=True) == []
-    one.step(slave.RestartPolicySet(LIDAR, RestartPolicy("always")))
+    one.step(reducer.RestartPolicySet(LIDAR, RestartPolicy("always")))
     assert one.looks(3.0, 5, stopped=True) == []
     assert len(one.looks(3.0, 5, stopped=True)) == 1
 
 
 def test_a_shadow_that_waits_for_a_slot_is_watched_later() -> None:
     """It was told before it was started."""
-    state = slave.SlaveState(registered=True, max_processes=1)
+    state = reducer.SlaveState(registered=True, max_processes=1)
     spec = ProcessSpec("lidar", command=("true",), health=PLAIN)
     other = Assignment(InstanceId("other", 2), replace(spec, name="other"), 1, "other")
     shadow = Assignment(LIDAR, spec, 1, "lidar_1", shadow=True)
-    slave.step(state, slave.AssignmentsReceived((other, shadow)), 0.0)
-    slave.step(state, slave.RestartPolicySet(LIDAR, RestartPolicy("always")), 0.0)
+    reducer.step(state, reducer.AssignmentsReceived((other, shadow)), 0.0)
+    reducer.step(state, reducer.RestartPolicySet(LIDAR, RestartPolicy("always")), 0.0)
     watch = state.held[LIDAR].watch
     assert watch is not None
     assert not watch.paused
@@ -305,11 +305,11 @@ def test_a_shadow_that_waits_for_a_slot_is_watched_later() -> None:
 
 @given(
     st.builds(
-        slave.Memo,
-        st.none() | st.builds(slave.Awaited, st.text(), st.floats(0, 1e6), st.integers(0, 99)),
+        reducer.Memo,
+        st.none() | st.builds(reducer.Awaited, st.text(), st.floats(0, 1e6), st.integers(0, 99)),
         st.none()
         | st.builds(
-            slave.Watch,
+            reducer.Watch,
             st.builds(Health, st.text(), st.floats(0, 1e4), st.text(), st.floats(0.1, 1e6)),
             st.lists(st.text()).map(tuple), st.lists(st.text()).map(tuple), st.booleans(),
             st.booleans(),
@@ -319,5 +319,5 @@ def test_a_shadow_that_waits_for_a_slot_is_watched_later() -> None:
 def test_a_memo_survives_the_way(memo) -> None:
     """What a later run of the slave reads is what this one wrote; nothing is written of nothing."""
     text = to_memo(memo)
-    assert (from_memo(text) or slave.Memo()) == memo
-    assert bool(text) == (memo != slave.Memo())
+    assert (from_memo(text) or reducer.Memo()) == memo
+    assert bool(text) == (memo != reducer.Memo())

@@ -12,12 +12,12 @@ from collections.abc import Callable
 
 import pytest
 
-from rosrm import kept
+from rosrm import snapshots
 from rosrm.config.settings import KeepSettings
-from rosrm.core.model import Assignment, InstanceId, MigrationPolicy, ProcessSpec
-from rosrm.kept import Block, Part, SlotWriter
-from rosrm.slave import fetching
-from rosrm.slave.keeping import Keeping
+from rosrm.model.values import Assignment, InstanceId, MigrationPolicy, ProcessSpec
+from rosrm.slave.replication import fetch
+from rosrm.slave.replication.service import Keeping
+from rosrm.snapshots import Block, Part, SlotWriter
 
 P7 = InstanceId("p", 7)
 PATIENCE = 20.0
@@ -106,7 +106,7 @@ class Net:
         return self.root / host / "p"
 
     def age(self, host: str) -> tuple[int, int] | None:
-        head = kept.newest_head(self.directory(host))
+        head = snapshots.newest_head(self.directory(host))
         return None if head is None else head.age
 
     def until(self, condition: Callable[[], object], what: str, step: float = 0.1) -> None:
@@ -153,7 +153,9 @@ def test_a_state_is_shipped_when_it_has_changed(net):
     net.add("b")
     net.write("a", 1, 600_000)
     net.until(lambda: net.age("b") == (7, 1), "the first state")
-    assert kept.newest_content(net.directory("b")) == kept.newest_content(net.directory("a"))
+    assert snapshots.newest_content(net.directory("b")) == snapshots.newest_content(
+        net.directory("a")
+    )
     given = len(net.wires["a"].given)
     assert given == 3
     for _ in range(50):
@@ -251,7 +253,7 @@ def test_a_state_that_is_damaged_on_its_way_is_refused(net):
     """Nothing of it is kept, and nothing of it is left."""
     taker = net.add("b")
     net.write("b", 1, number=6)
-    good = kept.newest_content(net.directory("b"))[1]
+    good = snapshots.newest_content(net.directory("b"))[1]
     answers = []
     part = Part("p", 7, 5, 0, len(good), zlib.crc32(good), good[:-1] + b"?")
     taker.take_part(part, lambda *answer: answers.append(answer))
@@ -361,7 +363,7 @@ def test_a_start_fetches_the_newest_state(net):
 
 
 def test_the_next_host_is_asked_where_the_first_is_not_found(net, monkeypatch):
-    monkeypatch.setattr(fetching, "PATIENCE", 0.05)
+    monkeypatch.setattr(fetch, "PATIENCE", 0.05)
     for name in "abc":
         net.add(name)
     net.write("b", 42)
@@ -373,7 +375,7 @@ def test_the_next_host_is_asked_where_the_first_is_not_found(net, monkeypatch):
 
 def test_without_a_state_it_starts_from_what_is_there(net, monkeypatch):
     """And its slave says why."""
-    monkeypatch.setattr(fetching, "PATIENCE", 0.05)
+    monkeypatch.setattr(fetch, "PATIENCE", 0.05)
     net.add("a")
     net.add("b")
     prepare(net, "a", assignment("b"))

@@ -7,11 +7,11 @@ import stat
 
 import pytest
 
-from rosrm.core.model import InstanceId
 from rosrm.errors import Refused
-from rosrm.ros.slave_services import LogQuery
-from rosrm.slave import log_reading
-from rosrm.slave.log_reading import newest_instance, read_log
+from rosrm.model.values import InstanceId
+from rosrm.ros.slave.services import LogQuery
+from rosrm.slave import logs
+from rosrm.slave.logs import newest_instance, read_log
 from rosrm.supervisor import log_index
 from rosrm.supervisor.client import LogLimits, log_path
 from rosrm.supervisor.log_index import Mark
@@ -101,7 +101,7 @@ def test_what_is_written_while_a_log_is_cut_is_counted(tmp_path, log, monkeypatc
 @pytest.mark.parametrize("end", [b"", b"unfinished"])
 def test_tail(tmp_path, log, monkeypatch, tail, end) -> None:
     """So many lines, over files and blocks; one that is not finished counts."""
-    monkeypatch.setattr(log_reading, "_BLOCK", 50)
+    monkeypatch.setattr(logs, "_BLOCK", 50)
     log.write_bytes(LINES[:5000])
     rotate(str(log), 5000, LogLimits())
     log.write_bytes(LINES[5000:] + end)
@@ -148,7 +148,7 @@ def test_marks_cover_a_part(tmp_path, log) -> None:
 
 def test_an_answer_with_many_marks_ends_sooner(tmp_path, log, monkeypatch) -> None:
     """The next one continues there."""
-    monkeypatch.setattr(log_reading, "_MOST_MARKS", 5)
+    monkeypatch.setattr(logs, "_MOST_MARKS", 5)
     log_index.begin(str(log), Mark(10.0, 0, 1))
     for offset in range(1, 11):
         log_index.add(str(log), Mark(10.0, offset, 0))

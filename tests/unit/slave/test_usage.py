@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rosrm.core.model import InstanceId, InstanceState, InstanceStatus
+from rosrm.model.values import InstanceId, InstanceState, InstanceStatus
 from rosrm.slave.sessions import SessionUsage
 from rosrm.slave.usage import UsageWatch
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from rosrm.supervisor import protocol
+from rosrm.supervisor import messages
 from rosrm.supervisor.client import SupervisorClient, SupervisorEnded
 
 
@@ -16,7 +16,7 @@ def test_a_supervisor_that_ended_beside_an_order_has_ended(tmp_path: Path) -> No
     ours, its = socket.socketpair()
     with SupervisorClient(ours, tmp_path) as client:
         client.heard(1.0, 1.0)
-        its.sendall(protocol.encode_ended())
+        its.sendall(messages.encode_ended())
         its.close()
         with pytest.raises(SupervisorEnded):
             client.receive(5.0)

@@ -9,7 +9,7 @@ import signal
 
 import pytest
 
-from rosrm.core import supervision as sv
+from rosrm.core.supervisor import reducer as sv
 
 ONE = ("one", 7)
 FENCE = sv.FenceRule(after=10.0, grace=3.0)

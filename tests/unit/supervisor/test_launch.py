@@ -12,7 +12,8 @@ import pytest
 import yaml
 from hypothesis import given
 
-from rosrm.core.model import (
+from rosrm.errors import LaunchError
+from rosrm.model.values import (
     Assignment,
     InstanceId,
     MigrationPolicy,
@@ -20,11 +21,10 @@ from rosrm.core.model import (
     RestartPolicy,
     StopPolicy,
 )
-from rosrm.errors import LaunchError
-from rosrm.slave.ament_index import find_executable
-from rosrm.slave.environment import Whereabouts, process_environment, without_bootstrapper
-from rosrm.slave.launch import launch_order
-from rosrm.slave.ros_arguments import join_arguments, parameters_text
+from rosrm.slave.launch.ament_index import find_executable
+from rosrm.slave.launch.command import launch_order
+from rosrm.slave.launch.environment import Whereabouts, process_environment, without_bootstrapper
+from rosrm.slave.launch.ros_arguments import join_arguments, parameters_text
 
 HERE = Whereabouts("robot1", "fleet", "/rosrm/state_config")
 VENV = "/home/robot/venv"

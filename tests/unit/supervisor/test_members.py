@@ -7,7 +7,7 @@ import subprocess
 
 import pytest
 
-from rosrm.supervisor.members import read_environment, read_marks
+from rosrm.supervisor.procfs import read_environment, read_marks
 
 #: On one processor 298 of 300 starts were seen in the middle of their execve.
 STARTS = 20

@@ -6,7 +6,7 @@ import hypothesis.strategies as st
 import pytest
 from hypothesis import given
 
-from rosrm.core.supervision import (
+from rosrm.core.supervisor.reducer import (
     AmendOrdered,
     FailOrdered,
     FenceOrdered,
@@ -19,8 +19,8 @@ from rosrm.core.supervision import (
     StopOrdered,
     StopRule,
 )
-from rosrm.supervisor import lines as ls
-from rosrm.supervisor import protocol
+from rosrm.supervisor import json_lines as ls
+from rosrm.supervisor import messages
 from rosrm.supervisor.logs import LogLimits
 
 SECONDS = st.floats(0, 1e6)
@@ -38,10 +38,10 @@ RULES = st.builds(
 )
 CHANGES = st.dictionaries(WORDS, st.none() | WORDS)
 ORDERS = st.one_of(
-    st.builds(protocol.Hello, st.integers(), st.integers(), st.just(LogLimits(1, 2, 3, 4))),
-    st.builds(protocol.Environment, st.text(), st.dictionaries(WORDS, WORDS)),
+    st.builds(messages.Hello, st.integers(), st.integers(), st.just(LogLimits(1, 2, 3, 4))),
+    st.builds(messages.Environment, st.text(), st.dictionaries(WORDS, WORDS)),
     st.builds(
-        protocol.Launch,
+        messages.Launch,
         KEYS,
         st.lists(WORDS, min_size=1).map(tuple),
         st.text(),
@@ -58,9 +58,9 @@ ORDERS = st.one_of(
     st.builds(Heard, SECONDS, SECONDS),
     st.builds(RestartOrdered, KEYS),
     st.builds(FailOrdered, KEYS, st.integers(1, 2**31), st.text(), st.booleans()),
-    st.builds(protocol.Amend, st.builds(AmendOrdered, KEYS, RULES), CHANGES),
-    st.builds(protocol.Remember, KEYS, st.text()),
-    st.builds(protocol.Forget, st.lists(st.builds(Forgotten, KEYS)).map(tuple)),
+    st.builds(messages.Amend, st.builds(AmendOrdered, KEYS, RULES), CHANGES),
+    st.builds(messages.Remember, KEYS, st.text()),
+    st.builds(messages.Forget, st.lists(st.builds(Forgotten, KEYS)).map(tuple)),
     st.just(ShutdownOrdered()),
 )
 
@@ -68,9 +68,9 @@ ORDERS = st.one_of(
 @given(ORDERS)
 def test_orders_survive_the_way(order):
     """Any order reads back as what it was, of the same type, from one line."""
-    line = protocol.encode_order(order)
+    line = messages.encode_order(order)
     assert line.count(b"\n") == 1
-    read = protocol.decode_order(line)
+    read = messages.decode_order(line)
     assert read == order
     assert type(read) is type(order)
 
@@ -105,7 +105,7 @@ def test_lines_are_cut_wherever_the_stream_is(lines, data):
 def test_what_is_not_understood_is_refused(line, said):
     """Never guessed at: the answer says what was wrong."""
     with pytest.raises(ls.ProtocolError, match=said):
-        protocol.decode_order(line)
+        messages.decode_order(line)
 
 
 def test_a_line_without_end_is_refused():

@@ -8,9 +8,9 @@ import os
 
 import pytest
 
-from rosrm.core import supervision as sv
-from rosrm.supervisor import record as rc
-from rosrm.supervisor.protocol import Amend, Launch
+from rosrm.core.supervisor import reducer as sv
+from rosrm.supervisor import instance_record as rc
+from rosrm.supervisor.messages import Amend, Launch
 
 TALKER = ("talker", 7)
 LAUNCH = Launch(TALKER, ("sleep", "1"), "base", {}, None, sv.RestartRule(), sv.StopRule(), "memo")
@@ -126,7 +126,7 @@ def test_the_forgotten_are_gone_but_stay_dead(tmp_path, record):
 
 def test_another_boot_is_noticed(tmp_path, record, monkeypatch):
     """After a restart of the machine none of the pids means anything."""
-    monkeypatch.setattr(rc.members, "boot_id", lambda: "another")
+    monkeypatch.setattr(rc.procfs, "boot_id", lambda: "another")
     assert not rc.read(str(tmp_path)).same_boot
 
 

@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from rosrm.core import model
-from rosrm.core import supervision as sv
-from rosrm.supervisor import protocol
+from rosrm.core.supervisor import reducer as sv
+from rosrm.model import values
+from rosrm.supervisor import messages
 
 TALKER = ("talker", 7)
 
@@ -38,24 +38,24 @@ def started(**policies):
 def test_policies_are_those_of_the_model():
     """The supervisor's light policies have the fields and defaults of the model's."""
     for light, heavy in (
-        (sv.RestartRule, model.RestartPolicy),
-        (sv.StopRule, model.StopPolicy),
+        (sv.RestartRule, values.RestartPolicy),
+        (sv.StopRule, values.StopPolicy),
     ):
         assert light._fields == tuple(field.name for field in dataclasses.fields(heavy))
         assert tuple(light()) == dataclasses.astuple(heavy())
-    assert sv.FenceRule._fields == tuple(field.name for field in dataclasses.fields(model.Fence))
+    assert sv.FenceRule._fields == tuple(field.name for field in dataclasses.fields(values.Fence))
 
 
 def test_status_is_that_of_the_model():
     """What is told has the fields of the model's status, and its words for the states."""
-    assert protocol.Status._fields == tuple(
-        field.name for field in dataclasses.fields(model.InstanceStatus)
+    assert messages.Status._fields == tuple(
+        field.name for field in dataclasses.fields(values.InstanceStatus)
     )
     ours = {sv.STARTING, sv.RUNNING, sv.BACKOFF, sv.STOPPING, *sv.ENDED}
     slaves = {"ready", "held"}  # the slave decides these
-    theirs = {state.value for state in model.InstanceState} - slaves
+    theirs = {state.value for state in values.InstanceState} - slaves
     assert ours == theirs
-    assert {state.value for state in model.InstanceState if state.ended} == sv.ENDED
+    assert {state.value for state in values.InstanceState if state.ended} == sv.ENDED
 
 
 def test_rules_stand_in_the_table_of_the_module():
@@ -492,7 +492,7 @@ class Host(RuleBasedStateMachine):
         self.leaders: set[sv.Key] = set()
         self.strays: set[sv.Key] = set()
         self.killed: set[sv.Key] = set()
-        self.final: dict[sv.Key, protocol.Status] = {}
+        self.final: dict[sv.Key, messages.Status] = {}
         self.policy_restarts: dict[sv.Key, list[float]] = {}
         self.stopped: set[sv.Key] = set()
         self.fences: dict[sv.Key, sv.FenceRule] = {}
@@ -537,7 +537,7 @@ class Host(RuleBasedStateMachine):
             del self.final[key]
 
     def hear(self, key):
-        status = protocol.Status.of(self.core.instances[key])
+        status = messages.Status.of(self.core.instances[key])
         if key in self.final:
             assert status == self.final[key], "a second final status"
         elif status.state in sv.ENDED:

@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from rosrm.config.units import PositiveSeconds
-from rosrm.hookspecs import hookimpl
-from rosrm.plans import AwaitReady, Commit, Execute, Move, Plan, Start, Stop
-from rosrm.ports import MigrationOffer
+from rosrm.extensions.contracts import MigrationOffer
+from rosrm.extensions.hookspecs import hookimpl
+from rosrm.extensions.plans import AwaitReady, Commit, Execute, Move, Plan, Start, Stop
+from rosrm.extensions.units import PositiveSeconds
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,8 @@ from typing import Annotated
 from annotated_types import Gt, Le
 
 from rosrm.errors import SkipPlugin
-from rosrm.hookspecs import hookimpl
-from rosrm.ports import ProbeContext, ProbeOffer, Reading, ResourceDescription
+from rosrm.extensions.contracts import ProbeContext, ProbeOffer, Reading, ResourceDescription
+from rosrm.extensions.hookspecs import hookimpl
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,262 @@
+"""Commands that change something, from `submit` to `drain`."""
+
+# Each command imports what it needs when it runs, so that `rosrm --help` is quick.
+# ruff: noqa: PLC0415
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Annotated, Final
+
+import typer
+
+from rosrm.cli import connection
+from rosrm.cli.options import Domain, Host, Name, Names
+from rosrm.errors import ConfigError
+from rosrm.wording import counted
+
+if TYPE_CHECKING:
+    from rosrm.model.values import ProcessSpec
+    from rosrm.ros.client import MasterClient
+
+Wait = Annotated[
+    bool, typer.Option("--wait", help="Wait for the result; exit 1 with the reason if it failed.")
+]
+Timeout = Annotated[
+    str,
+    typer.Option("--timeout", metavar="TIME", help="With --wait: longest wait, e.g. 5min."),
+]
+#: A process has a name without a slash, and a name that ends like this is rather a file's.
+_FILE_ENDINGS: Final = (".yaml", ".yml")
+
+
+def submit(
+    ctx: typer.Context,
+    files: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="WORK...", help="work.yaml: the processes to run; - is the standard input."
+        ),
+    ],
+    wait: Annotated[
+        bool,
+        typer.Option(
+            "--wait",
+            help="Wait until each job has ended and each service runs; exit 1 if one does not.",
+        ),
+    ] = False,
+    timeout: Timeout = "",
+    domain: Domain = None,
+) -> None:
+    """Queue the processes of work files.
+
+    If one process cannot be queued, none is.
+    """
+    from rosrm.cli.waiting import interruptible, longest, wait_for
+    from rosrm.config import load_work
+
+    limit = longest(timeout)
+    specs = [spec for file in files for spec in load_work(file)]
+    with connection.master(ctx, domain) as client:
+        typer.echo(client.submit(specs))
+        if wait:
+            with interruptible("what was submitted stays queued or runs (`rosrm ps`)"):
+                _exit_unless(wait_for(client, [spec.name for spec in specs], limit))
+
+
+def _exit_unless(done: bool) -> None:
+    if not done:
+        raise typer.Exit(1)
+
+
+def cancel(
+    ctx: typer.Context,
+    words: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="NAME|WORK...", help="Processes, or work files that name them."),
+    ] = None,
+    everything: Annotated[
+        bool, typer.Option("--all", help="All processes that have not ended.")
+    ] = False,
+    wait: Wait = False,
+    timeout: Timeout = "",
+    domain: Domain = None,
+) -> None:
+    """Cancel processes: take them out of the queue, or stop them for good.
+
+    A work file stands for those of its processes that have not ended.
+    """
+    from rosrm.cli.waiting import interruptible, longest, over, wait_for
+
+    limit, chosen = longest(timeout), words or []
+    if everything == bool(chosen):
+        raise ConfigError("cancel: give names of processes or work files, or --all")
+    named = [word for word in chosen if not _is_file(word)]
+    filed = [spec.name for word in chosen if _is_file(word) for spec in _load(word)]
+    with connection.master(ctx, domain) as client:
+        if everything or filed:
+            rows = client.list(processes=True).processes
+            live = [row.name for row in rows if over(row) != "done"]
+            named += [name for name in live if everything or name in filed]
+        names = list(dict.fromkeys(named))
+        if not names:
+            typer.echo("no process to cancel: all of them have ended, or were never submitted")
+            return
+        outcome = client.cancel(names)
+        typer.echo(outcome)
+        # The reply of the master has the end of each already, where all of them waited.
+        if wait and outcome != f"{counted(len(names), 'process', 'processes')} cancelled":
+            with interruptible("the processes are still being cancelled (`rosrm ps`)"):
+                _exit_unless(wait_for(client, names, limit, over, missing="done"))
+
+
+def _is_file(word: str) -> bool:
+    return word == "-" or "/" in word or word.endswith(_FILE_ENDINGS)
+
+
+def _load(file: str) -> Sequence[ProcessSpec]:
+    from rosrm.config import load_work
+
+    return load_work(file)
+
+
+def restart(
+    ctx: typer.Context,
+    names: Names,
+    wait: Wait = False,
+    timeout: Timeout = "",
+    domain: Domain = None,
+) -> None:
+    """Restart processes.
+
+    A running process is restarted on its host; one that has ended is queued again.
+    """
+    from rosrm.cli.waiting import identity, interruptible, longest, over, restarted, wait_for
+
+    limit = longest(timeout)
+    with connection.master(ctx, domain) as client:
+        rows = client.list(processes=True).processes if wait else ()
+        typer.echo(client.restart(names))
+        if wait:
+            judge = restarted({row.name: identity(row) for row in rows if over(row) != "done"})
+            with interruptible("the processes are still being restarted (`rosrm ps`)"):
+                _exit_unless(wait_for(client, names, limit, judge))
+
+
+def migrate(
+    ctx: typer.Context,
+    name: Name,
+    to: Annotated[
+        str | None,
+        typer.Option("--to", metavar="HOST", help="Destination; default: the master chooses."),
+    ] = None,
+    wait: Wait = False,
+    timeout: Timeout = "",
+    domain: Domain = None,
+) -> None:
+    """Move a process to another host.
+
+    The migration strategy that its work file names moves it.
+    """
+    _with_ending(ctx, name, lambda client: client.migrate(name, to), domain, wait, timeout)
+
+
+def checkpoint(
+    ctx: typer.Context, name: Name, wait: Wait = False, timeout: Timeout = "", domain: Domain = None
+) -> None:
+    """Stop a process, with its memory in an image on its host.
+
+    `rosrm restore` continues the process from there.
+    """
+    _with_ending(ctx, name, lambda client: client.checkpoint(name), domain, wait, timeout)
+
+
+def restore(
+    ctx: typer.Context, name: Name, wait: Wait = False, timeout: Timeout = "", domain: Domain = None
+) -> None:
+    """Restore a process from its image, on the host of the image."""
+    _with_ending(ctx, name, lambda client: client.restore(name), domain, wait, timeout)
+
+
+def _with_ending(
+    ctx: typer.Context, name: str, ask: Callable[[MasterClient], str], domain: int | None,
+    wait: bool, timeout: str,
+) -> None:  # fmt: skip
+    """Send a request whose end is an event; wait for the event if asked to."""
+    from rosrm.cli.waiting import interruptible, longest, wait_for_ending
+
+    limit = longest(timeout)
+    with connection.master(ctx, domain) as client:
+        since = client.list().last_sequence if wait else 0
+        typer.echo(ask(client))
+        if wait:
+            with interruptible(f"what was begun with {name} continues (`rosrm events --process`)"):
+                _exit_unless(wait_for_ending(client, name, since, limit))
+
+
+def cordon(ctx: typer.Context, host: Host, domain: Domain = None) -> None:
+    """Give a host no new work."""
+    _set_host(ctx, host, "cordon", domain)
+
+
+def uncordon(ctx: typer.Context, host: Host, domain: Domain = None) -> None:
+    """Give a host work again."""
+    _set_host(ctx, host, "uncordon", domain)
+
+
+def drain(
+    ctx: typer.Context,
+    host: Host,
+    wait: Annotated[
+        bool,
+        typer.Option(
+            "--wait", help="Wait until the host is drained; exit 1 if processes stay there."
+        ),
+    ] = False,
+    timeout: Timeout = "",
+    domain: Domain = None,
+) -> None:
+    """Cordon a host and move away the processes that can leave it.
+
+    The master says which can and which cannot; when no process is left that can, the host is
+    `drained`.
+    """
+    from rosrm.cli.waiting import interruptible, longest, wait_until_drained
+
+    limit = longest(timeout)
+    with connection.master(ctx, domain) as client:
+        since = client.list().last_sequence if wait else 0
+        typer.echo(client.set_host_state(host, "drain"))
+        if wait:
+            with interruptible(f"{host} is still draining (`rosrm uncordon {host}` ends that)"):
+                _exit_unless(wait_until_drained(client, host, since, limit))
+
+
+def _set_host(ctx: typer.Context, host: str, action: str, domain: int | None) -> None:
+    with connection.master(ctx, domain) as client:
+        typer.echo(client.set_host_state(host, action))
+
+
+def prune(
+    ctx: typer.Context,
+    names: Annotated[
+        list[str] | None, typer.Argument(metavar="NAME...", help="Names of ended processes.")
+    ] = None,
+    hosts: Annotated[
+        list[str] | None,
+        typer.Option("--host", metavar="HOST", help="A host that left or is lost; repeatable."),
+    ] = None,
+    domain: Domain = None,
+) -> None:
+    """Remove ended processes and departed hosts from all listings.
+
+    Without names, remove all ended processes and all hosts that left. A lost host is removed by its
+    name alone; what was cancelled there then counts as cancelled.
+    """
+    with connection.master(ctx, domain) as client:
+        typer.echo(client.prune(names or [], hosts or []))
+
+
+COMMANDS: Final = (
+    submit, cancel, restart, migrate, checkpoint, restore, cordon, uncordon, drain, prune,
+)  # fmt: skip

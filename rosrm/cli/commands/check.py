@@ -1,0 +1,172 @@
+"""`rosrm config check`: is this file right, before it is used?"""
+
+# Each command imports what it needs when it runs, so that `rosrm --help` is quick.
+# ruff: noqa: PLC0415
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from enum import Enum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final
+
+import typer
+
+from rosrm.wording import counted, get_close_matches, listed
+
+if TYPE_CHECKING:
+    from rosrm.config.documents import Node
+    from rosrm.config.settings import ClusterConfig, HostConfig
+    from rosrm.extensions.registry import Registry
+
+#: Least likeness of two words that are taken for one misspelt; gpu_memory and memory have less.
+_NEAR: Final = 0.8
+
+config = typer.Typer(no_args_is_help=True, help="Check configuration files.")
+
+
+class KindOfFile(str, Enum):
+    """What a file configures."""
+
+    CLUSTER = "cluster"
+    HOST = "host"
+    WORK = "work"
+    SIMULATION = "simulation"
+
+
+@config.callback()
+def _group() -> None:
+    """Check configuration files."""
+
+
+@config.command()
+def check(
+    files: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="FILE...", help="cluster.yaml, host.yaml, work.yaml or a simulation's workload."
+        ),
+    ],
+    kind: Annotated[
+        KindOfFile | None,
+        typer.Option("--kind", help="Kind of the files; default: their keys or names decide."),
+    ] = None,
+) -> None:
+    """Check files before they are used.
+
+    The files are checked against all rules and against the plugins installed on this machine.
+    """
+    from rosrm.errors import ConfigError
+    from rosrm.extensions.registry import Registry
+
+    registry = Registry.discover()
+    wrong = []
+    for file in files:
+        try:
+            typer.echo(f"{file}: ok, {_checked(file, kind, registry)}")
+        except ConfigError as error:
+            wrong.append(str(error))
+    if wrong:
+        raise ConfigError("\n".join(wrong))
+
+
+def _make(file: Path, cluster: ClusterConfig, registry: Registry) -> None:
+    """Make the plugins that a master would make; raises `ConfigError` with all that fail."""
+    from rosrm.errors import ConfigError, PluginError
+
+    wrong = []
+    for section, make in (
+        ("scoring", lambda: registry.scoring(cluster.scoring.policy, cluster.scoring.options)),
+        ("migration", lambda: registry.migrations(cluster.migration.strategies)),
+        (
+            "checkpoint",
+            lambda: registry.checkpoint(cluster.checkpoint.policy, cluster.checkpoint.options),
+        ),
+    ):
+        try:
+            make()
+        except (ConfigError, PluginError) as error:
+            wrong.append(f"{file}: {section}: {error}")
+    if wrong:
+        raise ConfigError("\n".join(wrong))
+
+
+def _make_probes(file: Path, host: HostConfig, registry: Registry) -> None:
+    """Make the probes that a slave would make; raises `ConfigError` with all that fail.
+
+    One that says that it is absent here is none of them: the file may be for another host.
+    """
+    from rosrm.errors import ConfigError
+    from rosrm.extensions.contracts import ProbeContext
+    from rosrm.extensions.registry import FailedProbe, close_quietly
+    from rosrm.slave.sessions import SessionTable
+
+    context = ProbeContext(host.scope, host.budget, host.state, SessionTable())
+    made = registry.probes(host.probes, context).made
+    wrong = [
+        f"{file}: probes: {one.name}: {one.probe.reason}"
+        for one in made
+        if isinstance(one.probe, FailedProbe)
+    ]
+    for one in made:
+        close_quietly(one.probe)
+    if wrong:
+        raise ConfigError("\n".join(wrong))
+
+
+def _checked(file: Path, kind: KindOfFile | None, registry: Registry) -> str:
+    """A summary of a file; raises `ConfigError`."""
+    from rosrm.config import load_cluster, load_host, load_work
+    from rosrm.config.documents import read
+    from rosrm.config.kinds import kind_of
+    from rosrm.core.master.graph_names import shared_nodes
+
+    root = read(file)
+    match kind.value if kind else kind_of(root):
+        case "cluster":
+            cluster = load_cluster(file, registry)
+            _make(file, cluster, registry)
+            strategies = ", ".join(cluster.migration.strategies) or "none"
+            return (
+                f"a cluster: scoring {cluster.scoring.policy}, migration {strategies}, "
+                f"checkpoint {cluster.checkpoint.policy or 'none'}"
+            )
+        case "host":
+            host = load_host(file, registry)
+            _make_probes(file, host, registry)
+            probes = ", ".join(registry.default_probes() if host.probes is None else host.probes)
+            return f"a host: {host.host}, probes {probes or 'none'}"
+        case "simulation":
+            from rosrm.config.workload import load_workload
+
+            comparison = load_workload(file, registry)
+            hosts, processes = len(comparison.workload.hosts), len(comparison.workload.processes)
+            held = counted(processes, "process", "processes")
+            return f"a simulation: {counted(hosts, 'host')}, {held}"
+        case _:
+            for warning in _misspelt_needs(root, registry):  # a wrong file has them too
+                typer.echo(warning, err=True)
+            specs = load_work(file, registry)
+            for warning in shared_nodes(specs):
+                typer.echo(f"{file}: warning: {warning}", err=True)
+            jobs = sum(spec.kind.value == "job" for spec in specs)
+            numbers = ((jobs, "job"), (len(specs) - jobs, "service"))
+            parts = [counted(number, noun) for number, noun in numbers if number]
+            return f"work: {listed(parts) if parts else 'no processes'}"
+
+
+def _misspelt_needs(root: Node, registry: Registry) -> Iterator[str]:
+    """Warn of resources in `needs` that are nearly named as one that a probe installed here reads.
+
+    Only a warning: another host may have a probe that this machine lacks.
+    """
+    read = registry.resources()
+    listed_there = root.get("processes")
+    entries = listed_there.value if listed_there and isinstance(listed_there.value, tuple) else ()
+    for needs in [one.get("needs") for one in (root.child("defaults"), *entries) if one]:
+        for name, amount in needs.items.items() if needs else ():
+            near = get_close_matches(name, read, n=1, cutoff=_NEAR)
+            if near and name not in read:
+                place = amount.key_place or amount.place
+                hint = f"no probe reads {name!r}; did you mean {near[0]!r}?"
+                yield f"{place}: warning: needs: {hint}"

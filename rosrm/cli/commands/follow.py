@@ -1,0 +1,161 @@
+"""Commands that may go on until Ctrl-C: events, logs, top."""
+
+# Each command imports what it needs when it runs, so that `rosrm --help` is quick.
+# ruff: noqa: PLC0415
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Annotated, Final
+
+import typer
+
+from rosrm.cli import connection
+from rosrm.cli.options import AsJson, Domain, Names
+from rosrm.cli.patience import PERIOD, ask_until_answered
+
+if TYPE_CHECKING:
+    from rosrm.model.rows import Snapshot
+    from rosrm.ros.client import MasterClient
+
+
+def events(  # noqa: PLR0917 - an argument for each option
+    ctx: typer.Context,
+    follow: Annotated[
+        bool, typer.Option("--follow", "-f", help="Keep printing what is new until Ctrl-C.")
+    ] = False,
+    process: Annotated[
+        str, typer.Option("--process", metavar="NAME", help="Show only events of this process.")
+    ] = "",
+    host: Annotated[
+        str, typer.Option("--host", metavar="HOST", help="Show only events of this host.")
+    ] = "",
+    newest: Annotated[
+        int, typer.Option("--newest", "-n", metavar="N", min=1, help="Show the newest N events.")
+    ] = 100,
+    as_json: AsJson = False,
+    domain: Domain = None,
+) -> None:
+    """Show events of the cluster, oldest first.
+
+    With -f the command keeps printing; with --json too, each event is an object on its own line.
+    """
+    from rosrm.cli.output import json_forms, tables
+
+    with connection.master(ctx, domain) as client:
+        snapshot = client.list(events=True, process=process, host=host, newest=newest)
+        connection.say_trouble(snapshot)
+        if not snapshot.events:
+            _check_names(client, process, host)
+        console = tables.console()
+        if as_json and not follow:
+            json_forms.show(json_forms.forms(snapshot.events))
+            return
+        while True:
+            for row in snapshot.events:
+                if as_json:
+                    json_forms.show_line(json_forms.form(row))
+                elif console.is_terminal:
+                    console.print(tables.event(row))
+                else:
+                    typer.echo(tables.event_line(row))
+            if not follow:
+                _say_left_out(len(snapshot.events), newest)
+                return
+            time.sleep(PERIOD)
+            snapshot = _later(client, snapshot, process, host)
+
+
+def _check_names(client: MasterClient, process: str, host: str) -> None:
+    """Refuse the name of a process or host that the master does not know."""
+    known = client.list(hosts=True, processes=True)
+    connection.check_name("process", process, [row.name for row in known.processes])
+    connection.check_name("host", host, [row.description.name for row in known.hosts])
+
+
+def _say_left_out(shown: int, newest: int) -> None:
+    if shown >= newest:
+        typer.echo(f"rosrm: at most the newest {newest} are shown; -n N shows more", err=True)
+
+
+def _later(client: MasterClient, before: Snapshot, process: str, host: str) -> Snapshot:
+    def look() -> Snapshot:
+        return client.list(events=True, process=process, host=host, after=before.last_sequence)
+
+    return ask_until_answered(look)
+
+
+def logs(  # noqa: PLR0917 - an argument for each option
+    ctx: typer.Context,
+    names: Names,
+    follow: Annotated[
+        bool,
+        typer.Option(
+            "--follow", "-f", help="Keep printing what is new until the processes have ended."
+        ),
+    ] = False,
+    tail: Annotated[
+        int | None,
+        typer.Option("--tail", metavar="N", min=1, help="Only the last N lines of each."),
+    ] = None,
+    since: Annotated[
+        str,
+        typer.Option("--since", metavar="TIME", help="Only what was written since, e.g. 10min."),
+    ] = "",
+    timestamps: Annotated[
+        bool,
+        typer.Option("--timestamps", "-t", help="Begin lines with their time, by their host."),
+    ] = False,
+    host: Annotated[
+        str, typer.Option("--host", metavar="HOST", help="Only what was written on this host.")
+    ] = "",
+    domain: Domain = None,
+) -> None:
+    """Print what processes wrote, from their hosts.
+
+    The output is complete, over restarts and moves; a line tells where the bound on logs dropped
+    something, and how much.
+    """
+    from rosrm.cli.log_reader import Wanted, copy_logs, since_of
+    from rosrm.cli.output.log_lines import Stream
+
+    wanted = Wanted(tail or 0, since_of(since), host, follow)
+    width = max(map(len, names)) if len(names) > 1 else 0
+    streams = [
+        Stream(name, f"{name:<{width}} | ".encode() if width else b"", timestamps)
+        for name in dict.fromkeys(names)
+    ]
+    with connection.master(ctx, domain) as client:
+        copy_logs(client, streams, wanted)
+
+
+def top(
+    ctx: typer.Context,
+    period: Annotated[
+        str,
+        typer.Option("--period", metavar="TIME", help="Time between two pictures, e.g. 2s."),
+    ] = "1s",
+    count: Annotated[
+        int, typer.Option("--count", "-n", metavar="N", min=0, help="End after N; 0: never.")
+    ] = 0,
+    sort: Annotated[
+        str,
+        typer.Option("--sort", metavar="KEY", help="Order: state, cpu, memory or name."),
+    ] = "state",
+    domain: Domain = None,
+) -> None:
+    """Show a live table until q or Ctrl-C.
+
+    In a terminal the keys s, c, m and n sort the processes by state, CPU, memory and name.
+    """
+    from rosrm.cli.output import top_screen
+
+    seconds, order = top_screen.period_of(period), top_screen.sort_of(sort)
+    with connection.master(ctx, domain) as client:
+        top_screen.show(
+            lambda: client.list(hosts=True, processes=True, events=True, newest=4),
+            seconds, count, order,
+        )  # fmt: skip
+
+
+COMMANDS: Final = (events, logs, top)

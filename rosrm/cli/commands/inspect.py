@@ -1,0 +1,132 @@
+"""Commands that show something once: status, ps, hosts, plugins, explain."""
+
+# Each command imports what it needs when it runs, so that `rosrm --help` is quick.
+# ruff: noqa: PLC0415
+
+from __future__ import annotations
+
+from typing import Annotated, Final
+
+import typer
+
+from rosrm.cli import connection
+from rosrm.cli.options import AsJson, Domain, Name
+from rosrm.errors import Refused
+
+
+def status(ctx: typer.Context, as_json: AsJson = False, domain: Domain = None) -> None:
+    """Show the cluster on half a page."""
+    from rosrm.cli.output import json_forms
+    from rosrm.cli.output import status as overview
+    from rosrm.cli.output.tables import show
+
+    with connection.master(ctx, domain) as client:
+        snapshot = client.list(hosts=True, processes=True, plugins="failing", events=True, newest=5)
+    connection.say_trouble(snapshot)
+    if as_json:
+        json_forms.show(json_forms.status_form(snapshot))
+    else:
+        show(overview.render(snapshot))
+
+
+def ps(
+    ctx: typer.Context,
+    everything: Annotated[
+        bool, typer.Option("--all", "-a", help="List finished and cancelled processes too.")
+    ] = False,
+    host: Annotated[
+        str, typer.Option("--host", metavar="HOST", help="List only processes on this host.")
+    ] = "",
+    as_json: AsJson = False,
+    domain: Domain = None,
+) -> None:
+    """List the processes."""
+    from rosrm.cli.output import json_forms, tables
+
+    with connection.master(ctx, domain) as client:
+        snapshot = client.list(processes=True, hosts=bool(host))
+    connection.say_trouble(snapshot)
+    connection.check_name("host", host, [row.description.name for row in snapshot.hosts])
+    shown = [row for row in snapshot.processes if not host or row.host == host]
+    if as_json:
+        json_forms.show(json_forms.forms(shown))
+        return
+    listed = [row for row in shown if everything or row.state not in ("finished", "cancelled")]
+    if listed:
+        tables.show(tables.processes(listed))
+    if len(listed) < len(shown):
+        typer.echo(f"{len(shown) - len(listed)} finished or cancelled (--all shows them)")
+    elif not listed:
+        typer.echo("no process")
+
+
+def hosts(ctx: typer.Context, as_json: AsJson = False, domain: Domain = None) -> None:
+    """List the hosts and what they use.
+
+    Usage and limit are percent of the capacity; `?` stands before a reading that is stale.
+    """
+    from rosrm.cli.output import json_forms, tables
+
+    with connection.master(ctx, domain) as client:
+        snapshot = client.list(hosts=True)
+    connection.say_trouble(snapshot)
+    rows = snapshot.hosts
+    if as_json:
+        json_forms.show(json_forms.forms(rows))
+    elif rows:
+        tables.show(tables.hosts(rows))
+    else:
+        typer.echo("no host; start `rosrm slave` on each")
+
+
+def plugins(
+    ctx: typer.Context,
+    local: Annotated[
+        bool,
+        typer.Option("--local", help="List what is installed here, without a master."),
+    ] = False,
+    as_json: AsJson = False,
+    domain: Domain = None,
+) -> None:
+    """List the plugins and their states.
+
+    A plugin is selected, available, absent on a host, broken, or failing, and the reason is shown.
+    """
+    from rosrm.cli.output import json_forms, tables
+    from rosrm.extensions.registry import Registry
+
+    if local:
+        rows = list(Registry.discover().rows())
+    else:
+        with connection.master(ctx, domain) as client:
+            rows = list(client.list(plugins=True).plugins)
+    if as_json:
+        json_forms.show(json_forms.forms(rows))
+    elif rows:
+        tables.show(tables.plugins(rows))
+    else:
+        typer.echo("no plugin is installed; rosrm's own are in rosrm-scoring and its siblings")
+
+
+def explain(ctx: typer.Context, name: Name, as_json: AsJson = False, domain: Domain = None) -> None:
+    """Explain why a process is where it is, or why it waits.
+
+    Each host is listed with its score, its veto or what it lacks; the events follow.
+    """
+    from rosrm.cli.output import explain, json_forms, tables
+
+    with connection.master(ctx, domain) as client:
+        try:
+            story = client.explain(name)
+        except Refused as refusal:
+            if refusal.code == "unknown":
+                known = client.list(processes=True).processes
+                connection.check_name("process", name, [row.name for row in known])
+            raise
+    if as_json:
+        json_forms.show(dict(story))
+    else:
+        tables.show(explain.render(story))
+
+
+COMMANDS: Final = (status, ps, hosts, plugins, explain)

@@ -1,0 +1,152 @@
+"""`rosrm master` and `rosrm slave`: check everything, say what starts, and become the runtime.
+
+The runtime takes this process's place and starts without pydantic, typer and rich, which it has no
+use for; it reads the settings that were checked from an inherited file.
+"""
+
+# Each command imports what it needs when it runs, so that `rosrm --help` is quick.
+# ruff: noqa: PLC0415
+
+from __future__ import annotations
+
+import os
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final
+
+import typer
+
+from rosrm.cli.options import Common, Domain
+from rosrm.runtime.bootstrap import arguments, hand_over, interrupts_held
+
+if TYPE_CHECKING:
+    from rosrm.config.settings import ClusterConfig, HostConfig
+    from rosrm.model.ros_settings import RosSettings
+
+
+def master(
+    ctx: typer.Context,
+    config: Annotated[
+        Path | None,
+        typer.Option("--config", metavar="FILE", help="cluster.yaml; without it, the defaults."),
+    ] = None,
+    recover: Annotated[
+        bool,
+        typer.Option("--recover", help="Recover what can still be read of a damaged journal."),
+    ] = False,
+    domain: Domain = None,
+) -> None:
+    """Start the master of a cluster.
+
+    The master runs until Ctrl-C, which stops no process; started again it continues from there.
+    """
+    from rosrm.config.cluster import default_cluster, load_cluster
+    from rosrm.extensions.registry import Registry
+    from rosrm.runtime.state_lock import only_one
+
+    registry = Registry.discover()
+    file = config or ctx.ensure_object(Common).cluster
+    settings = load_cluster(file, registry) if file else default_cluster(registry)
+    settings = replace(settings, ros=_with_domain(settings.ros, ctx, domain))
+    if recover:
+        typer.echo(_recover(settings.state), err=True)
+    with only_one(settings.state, "master", code="second_master", remedy="another `state:`"):
+        typer.echo(_says(settings), err=True)
+    become("rosrm.master", settings.to_json())
+
+
+def slave(
+    ctx: typer.Context,
+    config: Annotated[
+        Path | None,
+        typer.Option("--config", metavar="FILE", help="host.yaml; without it, the defaults."),
+    ] = None,
+    stop_everything: Annotated[
+        bool,
+        typer.Option(
+            "--stop-all",
+            help="Start no slave: stop the processes that an ended one left running here.",
+        ),
+    ] = False,
+    domain: Domain = None,
+) -> None:
+    """Start the slave of this host.
+
+    The slave runs until Ctrl-C, SIGTERM or SIGHUP (a closed terminal), which stop its processes
+    too, unless the file has `on_stop: keep`.
+    """
+    from rosrm.config import HostConfig, load_host
+    from rosrm.extensions.registry import Registry
+    from rosrm.runtime.state_lock import only_one
+
+    registry = Registry.discover()
+    settings = load_host(config, registry) if config else HostConfig()
+    settings = replace(settings, ros=_with_domain(settings.ros, ctx, domain))
+    if stop_everything:
+        if not (settings.state / "supervisor").is_dir():
+            typer.echo(
+                f"nothing to stop: no slave was started with the state directory {settings.state}"
+            )
+            return
+        with only_one(settings.state, "slave", code="name_taken", remedy=""):
+            pass  # a running slave stops its processes itself
+        become("rosrm.slave.stop_all", settings.to_json())
+        return
+    if settings.probes is None:
+        registry.default_probes()  # raises where there is none
+    remedy = "another `host:` and `state:`"
+    with only_one(settings.state, "slave", code="name_taken", remedy=remedy):
+        typer.echo(_says_of_host(settings), err=True)
+    become("rosrm.slave", settings.to_json())
+
+
+def become(module: str, settings: str) -> None:
+    """Put a runtime in this process's place."""
+    descriptor = hand_over(settings)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    interpreter = [sys.executable, *_without_this_folder()]
+    with interrupts_held():
+        os.execv(  # noqa: S606 - no shell is wanted
+            sys.executable, [*interpreter, "-m", module, *arguments(descriptor)]
+        )
+
+
+def _without_this_folder() -> list[str]:
+    """`-m` looks for modules in the working directory first: not wanted, save in a checkout."""
+    in_checkout = Path(__file__).is_relative_to(Path.cwd())
+    return ["-P"] if sys.version_info >= (3, 11) and not in_checkout else []
+
+
+def _with_domain(settings: RosSettings, ctx: typer.Context, domain: int | None) -> RosSettings:
+    chosen = ctx.ensure_object(Common).domain if domain is None else domain
+    settings = settings if chosen is None else replace(settings, domain=chosen)
+    settings.check_domain()
+    return settings
+
+
+def _recover(state: Path) -> str:
+    from rosrm.journal.recovery import recover
+    from rosrm.runtime.state_lock import only_one
+
+    with only_one(state, "master", code="second_master", remedy="another `state:`"):
+        return recover(state / "journal.sqlite")
+
+
+def _says(settings: ClusterConfig) -> str:
+    return (
+        f"master {settings.name!r}: {settings.ros.describe()}; scoring {settings.scoring.policy}; "
+        f"migration {', '.join(settings.migration.strategies) or 'none'}; state in {settings.state}"
+    )
+
+
+def _says_of_host(settings: HostConfig) -> str:
+    limits = ", ".join(f"{name} {limit:.0%}" for name, limit in settings.limits.items())
+    return (
+        f"slave of {settings.host!r}: {settings.ros.describe()}; scope {settings.scope}; "
+        f"limits {limits}; state in {settings.state}"
+    )
+
+
+COMMANDS: Final = (master, slave)

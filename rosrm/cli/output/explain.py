@@ -1,0 +1,113 @@
+"""`rosrm explain`: why a process is where it is, host by host."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any, Final
+
+from rich.console import Group, RenderableType
+from rich.text import Text
+
+from rosrm.cli.output import formats, tables
+from rosrm.wording import counted, listed
+
+#: What the master decided about a process.
+_DECIDED: Final = {
+    "assigned": "The master assigned {process} to {host}{ago}",
+    "migrated": "The master chose {host} as the destination of a move of {process}{ago}",
+    "stayed": "The master chose {host} as the destination of a move{ago}, and the move was undone",
+    "waits": "{process} waits for a host",
+    "set_aside": "No host may take {process}",
+}
+_STYLES: Final = {"chosen": "green", "vetoed": "yellow", "excluded": "red", "full": "yellow"}
+_UNITS: Final = {"memory": "B", "disk": "B", "cpu": "core"}
+
+
+def render(story: Mapping[str, Any]) -> RenderableType:
+    """The master's explanation of one process."""
+    return Group(*_parts(story))
+
+
+def _parts(story: Mapping[str, Any]) -> Iterator[RenderableType]:
+    yield _headline(story)
+    if story.get("kept"):
+        yield _kept(story["kept"])
+    if story.get("checkpoint"):
+        yield _checkpoint(story["checkpoint"])
+    decision = story.get("decision")
+    if decision:
+        yield Text()
+        yield _sentence(story["process"], decision)
+        yield _needs(decision.get("need") or {})
+        if decision.get("hosts"):
+            yield _hosts(decision["hosts"])
+        for reason, count in (decision.get("omitted") or {}).items():
+            if count:
+                yield Text(f"and {counted(count, 'more host')} {reason}", "dim")
+    history = story.get("history") or ()
+    yield Text()
+    if not history or history[0]["kind"] != "submitted":
+        name = story["process"]
+        yield Text(f"Older events are left out: `rosrm events --process {name}`", "dim")
+    for entry in history:
+        ago = f"{formats.duration(entry['elapsed'])} ago"
+        yield tables.entry(f"{ago:>14}", entry["kind"], entry["message"])
+
+
+def _headline(story: Mapping[str, Any]) -> Text:
+    text = tables.sentence(story["process"], story["state"])
+    if story.get("host"):
+        text.append(f" on {story['host']}")
+    if story.get("reason"):
+        text.append(f": {story['reason']}")
+    return text
+
+
+def _kept(kept: list[Mapping[str, Any]]) -> Text:
+    """The hosts with a snapshot of the state, and the cycle of each."""
+    places = [
+        f"{one['host']} (cycle {one['sequence']}, {formats.size(one['size'])}, "
+        f"{formats.duration(one['elapsed'])} ago)"
+        for one in kept
+    ]
+    return Text(f"Snapshots of its state are on {listed(places)}.")
+
+
+def _checkpoint(told: Mapping[str, Any]) -> Text:
+    """The newest periodic checkpoint, and what is wrong with the next."""
+    if told["elapsed"] is None:
+        text = "No periodic checkpoint of its memory exists yet"
+    else:
+        text = (
+            f"The last periodic checkpoint is {formats.duration(told['elapsed'])} old "
+            f"({formats.size(told['size'])}; the process was paused for {told['pause']:.1f} s)"
+        )
+    return Text(f"{text}: {told['trouble']}" if told["trouble"] else f"{text}.")
+
+
+def _sentence(name: str, decision: Mapping[str, Any]) -> Text:
+    ago = f" {formats.duration(decision['elapsed'])} ago" if decision.get("elapsed") else ""
+    said = _DECIDED.get(decision["kind"], "{process}: " + formats.words(decision["kind"]))
+    what = said.format(process=name, host=decision.get("chosen"), ago=ago)
+    return Text(f"{what}. Scoring policy: {decision['policy'] or 'none'}; the lowest score wins.")
+
+
+def _needs(need: Mapping[str, float]) -> Text:
+    amounts = [
+        f"{name} {formats.amount(value, _UNITS.get(name, ''))}" for name, value in need.items()
+    ]
+    return Text(f"Needs that were counted: {', '.join(amounts) or 'none'}.")
+
+
+def _hosts(hosts: list[Mapping[str, Any]]) -> RenderableType:
+    made = tables.table("HOST", "", "SCORE", "WHY", right=("SCORE",))
+    for host in hosts:
+        score = host.get("score")
+        verdict = host["verdict"]
+        made.add_row(
+            Text(host["name"]),
+            Text(verdict, _STYLES.get(verdict, "")),
+            "" if score is None else f"{score:.4g}",
+            Text(host.get("reason") or ""),
+        )
+    return made

@@ -1,0 +1,130 @@
+"""The output of `rosrm logs`: the bytes of one process, with times and its name on demand.
+
+Lines of rosrm's own begin with `---`: where a program starts another time, and what is missing.
+With several processes each start has such a line.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+
+from rosrm.cli.output import formats
+
+Marks = Sequence[tuple[float, int, int]]
+#: Output, and the unix time by which it was written; 0.0: not known.
+Piece = tuple[float, bytes]
+
+
+def show(pieces: Iterable[Piece]) -> None:
+    """Write output to standard output."""
+    for _, text in pieces:
+        sys.stdout.buffer.write(text)
+    sys.stdout.flush()
+
+
+@dataclass
+class Stream:
+    """The output for one process, to be taken piece by piece.
+
+    Attributes:
+        name: of the process.
+        prefix: begins each line; b"": no prefix, and bytes are copied as they are.
+        timestamps: each line begins with the time by which it was written, by its host's clock.
+        wrote: there was something to print.
+    """
+
+    name: str
+    prefix: bytes = b""
+    timestamps: bool = False
+    wrote: bool = False
+    _host: str = ""
+    _is_new: bool = False
+    _unfinished: bytes = b""
+    _when: float = 0.0
+    _at_line_start: bool = True
+    _pieces: list[Piece] = field(default_factory=list)
+
+    def take(self) -> list[Piece]:
+        """Return the pieces that are ready, each once."""
+        pieces, self._pieces = self._pieces, []
+        return pieces
+
+    def enter(self, host: str) -> None:
+        """Begin with another instance, on a host."""
+        self._host, self._is_new = host, self.wrote
+
+    def write(self, content: bytes, offset: int, marks: Marks, dropped: int = 0) -> None:
+        """Add a part.
+
+        Args:
+            content: the bytes.
+            offset: of the first byte, like the offsets of the marks.
+            marks: when the bytes were written, and where a program was started.
+            dropped: bytes before this part that are missing.
+        """
+        begun = marks[0][0] if marks else 0.0
+        starts = [(at, when) for when, at, pid in marks if pid and 0 <= at - offset < len(content)]
+        if dropped:
+            self._say(f"{formats.size(dropped)} before this were dropped", begun)
+        if self._is_new and content and (not starts or starts[0][0] > offset):
+            self._say(f"on {self._host}", begun)
+        done = offset
+        for at, when in starts:
+            self._text(content[done - offset : at - offset], done, marks)
+            done = at
+            if self.wrote or self.prefix:
+                self._say(f"started on {self._host} at {_stamp(when)}", when)
+            self.wrote = True
+        self._text(content[done - offset :], done, marks)
+        self._is_new = self._is_new and not content
+
+    def close(self) -> None:
+        """Add an unfinished line that waits for its end."""
+        if self._unfinished:
+            self._line(self._unfinished + b"\n", self._when)
+            self._unfinished = b""
+
+    def _say(self, text: str, when: float) -> None:
+        """Add a line of rosrm's own; `when` gives its place among the lines of other processes."""
+        self.close()
+        if not self._at_line_start:
+            self._add(b"\n")
+        self._add(self.prefix + f"--- {text} ---\n".encode(), when)
+
+    def _text(self, text: bytes, offset: int, marks: Marks) -> None:
+        if not text:
+            return
+        self.wrote = True
+        if not self.prefix and not self.timestamps:
+            self._add(text)
+            return
+        at, late = offset, iter(marks)
+        mark = next(late, None)
+        for line in text.splitlines(keepends=True):
+            at += len(line)
+            while mark is not None and mark[1] < at:
+                mark = next(late, None)
+            self._when = mark[0] if mark else 0.0
+            if line.endswith(b"\n"):
+                self._line(self._unfinished + line, self._when)
+                self._unfinished = b""
+            else:
+                self._unfinished += line
+
+    def _line(self, line: bytes, when: float) -> None:
+        stamp = f"{_stamp(when)} ".encode() if self.timestamps else b""
+        self._add(self.prefix + stamp + line, when)
+
+    def _add(self, text: bytes, when: float = 0.0) -> None:
+        self._pieces.append((when, text))
+        self._at_line_start = text.endswith(b"\n")
+
+
+def _stamp(when: float) -> str:
+    """Return a time of this host's zone: a log from before there were times has "?"."""
+    if when <= 0.0:
+        return "?"
+    return time.strftime("%Y-%m-%dT%H:%M:%S", time.localtime(when)) + f".{int(when * 10) % 10}"

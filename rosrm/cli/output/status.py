@@ -1,0 +1,78 @@
+"""`rosrm status`: the cluster on half a page."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator
+
+from rich.console import Group, RenderableType
+from rich.styled import Styled
+from rich.text import Text
+
+from rosrm.cli.output import formats, tables
+from rosrm.model.rows import HostRow, PluginRow, ProcessRow, Snapshot
+
+#: States of a process that somebody should look at.
+_TROUBLE = ("stuck", "unreachable", "unknown", "failed", "set_aside", "backoff")
+_MOST_NAMED = 5
+
+
+def render(snapshot: Snapshot) -> RenderableType:
+    """The overview of a snapshot with hosts, processes and the newest events."""
+    return Group(*_lines(snapshot))
+
+
+def _lines(snapshot: Snapshot) -> Iterator[RenderableType]:
+    yield Text(f"master     {snapshot.master}, up {formats.duration(snapshot.uptime)}")
+    yield Text(f"hosts      {_counted(row.state for row in snapshot.hosts)}{_set(snapshot.hosts)}")
+    yield Text(f"processes  {_counted(row.state for row in snapshot.processes)}")
+    if snapshot.hosts:
+        yield Text()
+        yield tables.hosts(snapshot.hosts)
+    yield from _troubles(snapshot.processes)
+    yield from _failing(snapshot.plugins)
+    if snapshot.events:
+        yield Text()
+        yield from (Styled(tables.event(event), "dim") for event in snapshot.events)
+
+
+def _counted(states: Iterable[str]) -> str:
+    counts = Counter(states)
+    return ", ".join(f"{n} {formats.words(word)}" for word, n in counts.most_common()) or "none"
+
+
+def _set(hosts: Iterable[HostRow]) -> str:
+    rows = list(hosts)
+    drained = sum(row.drained for row in rows)
+    draining = sum(row.draining and not row.drained for row in rows)
+    cordoned = sum(row.cordoned and not row.draining for row in rows)
+    parts = [
+        f"{n} {word}"
+        for n, word in ((cordoned, "cordoned"), (draining, "draining"), (drained, "drained"))
+        if n
+    ]
+    return f" ({', '.join(parts)})" if parts else ""
+
+
+def _troubles(processes: Iterable[ProcessRow]) -> Iterator[RenderableType]:
+    rows = [row for row in processes if row.state in _TROUBLE]
+    rows.sort(key=lambda row: _TROUBLE.index(row.state))
+    if rows:
+        yield Text()
+    for row in rows[:_MOST_NAMED]:
+        text = tables.sentence(row.name, row.state)
+        yield text.append(f": {row.reason}" if row.reason else "")
+    if len(rows) > _MOST_NAMED:
+        yield Text(f"and {len(rows) - _MOST_NAMED} more; see rosrm ps")
+
+
+def _failing(plugins: Iterable[PluginRow]) -> Iterator[RenderableType]:
+    rows = list(plugins)
+    if rows:
+        yield Text()
+    for row in rows[:_MOST_NAMED]:
+        place = f" on {row.host}" if row.host else ""
+        text = Text(f"plugin {row.kind} {row.name}{place} is ")
+        yield text.append_text(tables.state(row.state)).append(f": {row.reason}")
+    if len(rows) > _MOST_NAMED:
+        yield Text(f"and {len(rows) - _MOST_NAMED} more; see rosrm plugins")

@@ -1,0 +1,178 @@
+"""Listings as tables that read at 80 columns."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Sequence
+from typing import Final
+
+from rich import box
+from rich.console import Console, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from rosrm.cli.output import formats
+from rosrm.model.rows import EventRow, HostRow, PluginRow, ProcessRow, ResourceRow
+from rosrm.wording import counted, standing
+
+#: Width of tables that go into a file or pipe: no line there is cut or wrapped.
+_PIPE_WIDTH: Final = 100_000
+
+#: How a state looks; others are plain.
+STYLES: Final = {
+    "running": "green",
+    "finished": "green",
+    "up": "green",
+    "selected": "green",
+    "queued": "yellow",
+    "set_aside": "yellow",
+    "backoff": "yellow",
+    "migrating": "cyan",
+    "checkpointed": "cyan",
+    "suspect": "yellow",
+    "detached": "yellow",
+    "absent": "yellow",
+    "failed": "red",
+    "stuck": "bold red",
+    "unreachable": "red",
+    "unknown": "yellow",
+    "lost": "red",
+    "broken": "red",
+    "failing": "red",
+}
+
+
+def console() -> Console:
+    """Where tables go: as wide as the terminal or COLUMNS says, else wide enough not to be cut."""
+    output = Console(highlight=False)
+    if output.is_terminal or os.environ.get("COLUMNS", "").strip("0").isdigit():
+        return output
+    return Console(highlight=False, width=_PIPE_WIDTH)
+
+
+def table(*columns: str, right: Sequence[str] = ()) -> Table:
+    """An empty table; the columns named in `right` hold numbers."""
+    made = Table(box=box.SIMPLE_HEAD, pad_edge=False, header_style="bold", show_edge=False)
+    for column in columns:
+        number = column in right
+        made.add_column(
+            column, justify="right" if number else "left", no_wrap=number, overflow="fold"
+        )
+    return made
+
+
+def show(renderable: RenderableType) -> None:
+    """Print; into a file or pipe without the blanks that fill the last column."""
+    output = console()
+    if output.is_terminal:
+        output.print(renderable)
+        return
+    with output.capture() as captured:
+        output.print(renderable)
+    output.file.write("".join(f"{line.rstrip()}\n" for line in captured.get().splitlines()))
+    output.file.flush()  # here click turns a broken pipe into exit code 1
+
+
+def state(word: str) -> Text:
+    """A state in its colour."""
+    return Text(formats.words(word), style=STYLES.get(word, ""))
+
+
+def sentence(name: str, word: str) -> Text:
+    """A process and its state as the beginning of a sentence, the state in its colour."""
+    verb, _, rest = standing(word).partition(" ")
+    return Text(f"{name} {verb} ").append(rest, STYLES.get(word, ""))
+
+
+def processes(rows: Iterable[ProcessRow]) -> Table:
+    """For `rosrm ps`."""
+    numbers = ("SINCE", "CPU", "MEMORY")
+    made = table("NAME", "STATE", "HOST", *numbers, "WHY", right=numbers)
+    for row in rows:
+        runs = row.pid != 0
+        made.add_row(
+            Text(row.name),
+            state(row.state),
+            Text(row.host),
+            formats.duration(row.since),
+            age(row, f"{row.cpu:.2f}") if runs else "",
+            age(row, formats.size(row.memory)) if runs else "",
+            Text(why(row)),
+        )
+    return made
+
+
+def age(row: ProcessRow, reading: str) -> Text:
+    """Return a reading of a process; `?` stands before an old one."""
+    return Text(f"?{reading}", "dim") if row.stale and reading else Text(reading)
+
+
+def why(row: ProcessRow) -> str:
+    """Say in one line why a process is in its state, and what it went through."""
+    parts = [f"no. {row.queue_position} in the queue"] if row.queue_position else []
+    if row.reason:
+        parts.append(row.reason)
+    elif row.state == "failed" and row.exit_code is not None:
+        parts.append(f"exit code {row.exit_code}")
+    if row.restarts and "restart" not in row.reason:
+        parts.append(counted(row.restarts, "restart"))
+    if row.migrations:
+        parts.append(f"moved {row.migrations}x")
+    return "; ".join(parts)
+
+
+def hosts(rows: Sequence[HostRow]) -> Table:
+    """For `rosrm hosts`: usage against limit, in percent of the capacity."""
+    resources = list(dict.fromkeys(r.name for row in rows for r in row.resources))
+    numbers = ("RUNS", *(f"{name} %" for name in resources))
+    made = table("HOST", "STATE", *numbers, right=numbers)
+    for row in rows:
+        by_name = {resource.name: resource for resource in row.resources}
+        cells = [usage(by_name[name]) if name in by_name else Text("-") for name in resources]
+        made.add_row(Text(row.description.name), host_state(row), str(row.processes), *cells)
+    return made
+
+
+def host_state(row: HostRow) -> Text:
+    """The state of a host and what an operator did to it."""
+    text = state(row.state)
+    if row.draining:
+        text.append(", drained" if row.drained else ", draining", "yellow")
+    elif row.cordoned:
+        text.append(", cordoned", "yellow")
+    return text
+
+
+def usage(resource: ResourceRow) -> Text:
+    """`34/80`: used and limit, percent."""
+    text = f"{formats.percent(resource.usage)}/{formats.percent(resource.limit)}"
+    if resource.stale:
+        return Text(f"?{text}", "dim")
+    return Text(text, "red" if resource.usage > resource.limit else "")
+
+
+def plugins(rows: Iterable[PluginRow]) -> Table:
+    """For `rosrm plugins`."""
+    made = table("KIND", "NAME", "STATE", "HOST", "FROM", "ABOUT")
+    for row in rows:
+        cells = (row.kind, row.name, row.host, row.distribution, row.reason)
+        kind, name, host, distribution, reason = map(Text, cells)
+        made.add_row(kind, name, state(row.state), host, distribution, reason)
+    return made
+
+
+def event_line(row: EventRow) -> str:
+    """One line of the event record."""
+    return f"{formats.clock(row.wall_time)}  {formats.words(row.kind):<18} {row.message}"
+
+
+def event(row: EventRow) -> Table:
+    """One event for a terminal: a long message is wrapped below itself."""
+    return entry(formats.clock(row.wall_time), row.kind, row.message)
+
+
+def entry(when: str, kind: str, message: str) -> Table:
+    """Time, kind and message of an event; a long message is wrapped below itself."""
+    made = Table.grid(padding=(0, 1, 0, 0), pad_edge=False)
+    made.add_row(Text(f"{when} "), Text(f"{formats.words(kind):<18}"), Text(message))
+    return made

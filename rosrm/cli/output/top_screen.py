@@ -1,0 +1,122 @@
+"""`rosrm top`: pictures of the cluster one after the other, and the keys that a user presses."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import os
+import select
+import sys
+import termios
+import time
+import tty
+from collections.abc import Callable, Iterator
+from typing import Final
+
+from rich.console import Console
+from rich.live import Live
+
+from rosrm.cli.output import tables, top
+from rosrm.errors import ConfigError, NoMaster
+from rosrm.extensions.units import Quantity
+from rosrm.model.rows import Snapshot
+
+#: The least time between two pictures, in seconds.
+LEAST_PERIOD: Final = 0.1
+#: What a key does: sort by this.
+KEYS: Final = {"s": "state", "c": "cpu", "m": "memory", "n": "name"}
+_QUIT: Final = "q"
+_HINT: Final = "q quits; sort: s state, c CPU, m memory, n name"
+#: Lines beside those of hosts and processes: title (two), heads, events, hint and gaps.
+_OTHER_LINES: Final = 13
+_LEAST_ROWS: Final = 5
+
+
+def period_of(text: str) -> float:
+    """Return the option --period in seconds; raises `ConfigError`."""
+    try:
+        return Quantity("duration", low=LEAST_PERIOD).parse(text)
+    except ValueError as error:
+        raise ConfigError(f"--period: {error}") from None
+
+
+def sort_of(text: str) -> str:
+    """Return the option --sort if there is such an order; raises `ConfigError`."""
+    if text not in top.SORTS:
+        raise ConfigError(f"--sort: {text!r} is not one of {', '.join(top.SORTS)}")
+    return text
+
+
+def show(look: Callable[[], Snapshot], period: float, count: int, sort: str) -> None:
+    """Show pictures until q or Ctrl-C, or until there were `count`; 0: no bound.
+
+    Args:
+        look: asks the master; raises `NoMaster`.
+        period: seconds between two pictures.
+        count: of pictures.
+        sort: order of the processes.
+    """
+    console = tables.console()
+    if console.is_terminal and count != 1:
+        _keep_up_to_date(console, look, period, count, sort)
+        return
+    snapshot, note = look(), ""
+    for shown in itertools.count(1):
+        rows = top.ROWS if console.is_terminal else len(snapshot.processes)
+        console.print(top.render(snapshot, rows=rows, note=note, sort=sort))
+        if shown == count:
+            return
+        time.sleep(period)
+        snapshot, note = _look_again(look, snapshot)
+
+
+def _keep_up_to_date(
+    console: Console, look: Callable[[], Snapshot], period: float, count: int, sort: str
+) -> None:
+    """Draw each picture over the one before."""
+    snapshot, note = look(), ""
+    with _keyboard() as key, Live(console=console, auto_refresh=False) as screen:
+        for shown in itertools.count(1):
+            rows = max(_LEAST_ROWS, console.height - _OTHER_LINES - len(snapshot.hosts))
+            picture = top.render(snapshot, rows=rows, note=note, sort=sort, foot=_HINT)
+            screen.update(picture, refresh=True)
+            if shown == count:
+                return
+            pressed = key(period)
+            if pressed == _QUIT:
+                return
+            sort = KEYS.get(pressed, sort)
+            snapshot, note = _look_again(look, snapshot)
+
+
+def _look_again(look: Callable[[], Snapshot], before: Snapshot) -> tuple[Snapshot, str]:
+    try:
+        return look(), ""
+    except NoMaster:
+        return before, "the master does not answer"
+
+
+@contextlib.contextmanager
+def _keyboard() -> Iterator[Callable[[float], str]]:
+    """Deliver keys one by one, unseen; yields a function that waits so many seconds for one."""
+    if not sys.stdin.isatty():
+        yield _no_key
+        return
+    terminal = sys.stdin.fileno()
+    before = termios.tcgetattr(terminal)
+    tty.setcbreak(terminal)  # Ctrl-C stays a signal
+    try:
+        yield lambda seconds: _key(terminal, seconds)
+    finally:
+        termios.tcsetattr(terminal, termios.TCSADRAIN, before)
+
+
+def _no_key(seconds: float) -> str:
+    time.sleep(seconds)
+    return ""
+
+
+def _key(terminal: int, seconds: float) -> str:
+    """Return the key that is pressed within so many seconds; "" for none."""
+    ready, _, _ = select.select([terminal], [], [], seconds)
+    return os.read(terminal, 1).decode(errors="replace") if ready else ""

@@ -1,0 +1,1 @@
+"""Assignments: a waiting process gets a host, and its load is reserved there."""

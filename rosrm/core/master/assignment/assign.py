@@ -1,0 +1,307 @@
+"""Serving the queue: its head goes to the asking host that fits with the largest margin."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from math import inf
+from typing import Any, Final
+
+import numpy as np
+
+from rosrm.core.master.checkpoint.replication import awaits_states
+from rosrm.core.master.commands import Assign
+from rosrm.core.master.hosts import capabilities
+from rosrm.core.master.master_state import MasterState, Process, ProcessPhase, larger
+from rosrm.core.master.recovery.journal_gap import why_no_work
+from rosrm.core.master.scheduling.decision import (
+    Decision,
+    a_known_host_may,
+    decide,
+    refused_everywhere,
+    why_all_away,
+    why_never,
+)
+from rosrm.core.master.scheduling.ranking import Ranking
+from rosrm.core.master.state.demand import Demand
+from rosrm.core.master.state.hosts import HostCondition
+from rosrm.model.values import EMPTY
+from rosrm.wording import listed
+
+_AWAY: Final = (HostCondition.EXPECTED, HostCondition.LOST, HostCondition.DETACHED)
+_STATE_MAY_COME: Final = "a host that may have a snapshot of its state has not come back yet"
+#: Seconds for which placement waits at most for the first request of a host that has registered.
+_FIRST_REQUEST: Final = 1.0
+_NOBODY: Final[frozenset[str]] = frozenset()
+
+
+def demand_of(state: MasterState, process: Process) -> Demand:
+    """What decides where a process may go; made anew only when something of it has changed."""
+    version = state.learned.version
+    near = state.keeping.holdings.hosts_of(process.name, process.born)
+    known = process.demand
+    if known is None or known[0] != version or known[1].near != near:
+        estimate = state.learned.estimate(process.spec, state.settings.default_needs)
+        demand = Demand(
+            process.spec, estimate.amounts, estimate.estimated, dict(process.excluded), near=near,
+            reads=state.declared.reads,
+        )  # fmt: skip
+        # Equal processes share one: thousands of them may wait.
+        known = process.demand = (version, state.demands.setdefault(demand.key, demand))
+    return known[1]
+
+
+def demand_to_move(
+    state: MasterState, process: Process, seen: Mapping[str, float], source: str, headroom: float,
+    lacking: Mapping[str, str] = EMPTY,
+) -> Demand:  # fmt: skip
+    """What decides where a running process may go on; `lacking`: hosts without an executor."""
+    excluded = {
+        **process.excluded, **unable(state, process, source), **lacking,
+        source: "it is the source of the move",
+    }  # fmt: skip
+    return Demand(
+        process.spec, *amounts_of(state, process, seen), excluded, headroom,
+        reads=state.declared.reads,
+    )  # fmt: skip
+
+
+def demand_to_restore(state: MasterState, process: Process, seen: Mapping[str, float]) -> Demand:
+    """What its host must have for a process that goes on from an image that lies there."""
+    return Demand(process.spec, *amounts_of(state, process, seen), reads=state.declared.reads)
+
+
+def amounts_of(
+    state: MasterState, process: Process, seen: Mapping[str, float]
+) -> tuple[Mapping[str, float], frozenset[str]]:
+    """Return what a process needs of each resource, and which of that is a guess.
+
+    What was seen of its use is no guess.
+    """
+    estimate = state.learned.estimate(process.spec, state.settings.default_needs)
+    amounts = larger(estimate.amounts, seen)
+    guessed = {name for name in estimate.estimated if amounts[name] > seen.get(name, 0.0)}
+    return amounts, frozenset(guessed)
+
+
+def unable(state: MasterState, process: Process, source: str) -> dict[str, str]:
+    """Hosts to which its strategy cannot move it, with the reason."""
+    strategy = process.spec.migration.strategy or ""
+    here = state.hosts.by_name[source]
+    faults = {
+        host.name: capabilities.fault(state, strategy, here, host) for host in state.hosts.hosts
+    }
+    return {name: fault for name, fault in faults.items() if fault}
+
+
+def ranking_of(state: MasterState, demand: Demand) -> Ranking:
+    """All hosts judged for a demand, up to date; kept while only assignments change it."""
+    if state.rankings_version != state.hosts.version:
+        state.rankings.clear()
+        state.demands.clear()
+        state.rankings_version = state.hosts.version
+    ranking = state.rankings.get(demand.key)
+    if ranking is None:
+        ranking = Ranking(state.hosts, state.policies, demand, state.plugins)
+        state.rankings[demand.key] = ranking
+    else:
+        ranking.refresh()
+    return ranking
+
+
+def decide_now(state: MasterState, process: Process) -> Decision:
+    """What would be decided about a waiting process at this moment."""
+    return decide(ranking_of(state, demand_of(state, process)))
+
+
+def place_waiting(state: MasterState, now: float) -> None:
+    """Assign from the queue until its head fits nowhere (with `backfill`, until nobody fits)."""
+    head = state.queue.head()
+    if head is None or state.placed_at == _versions(state):
+        return
+    why = why_no_work(state, now)
+    if why:
+        state.processes[head].reason = why
+        return
+    why = _first_request_awaited(state, now)
+    if why:
+        state.processes[head].reason = state.processes[head].reason or why
+        return
+    passed_over = _passed_over(state, now)
+    if state.settings.backfill:
+        _place_any(state, passed_over, now)
+    else:
+        _place_in_order(state, passed_over, now)
+    if not passed_over:
+        state.placed_at = _versions(state)
+
+
+def _first_request_awaited(state: MasterState, now: float) -> str:
+    """Return why placement waits for hosts that have registered just now; "" if it does not.
+
+    Without the wait, the host whose request comes first takes all that was submitted while the
+    hosts register. Further hosts that register do not prolong the wait.
+    """
+    awaited = state.hosts.about_to_ask(now - _FIRST_REQUEST)
+    if not len(awaited):
+        state.held_since = inf
+        return ""
+    state.held_since = min(state.held_since, now)
+    if now - state.held_since >= _FIRST_REQUEST:
+        return ""
+    names = listed((state.hosts.hosts[column].name for column in awaited), most=3)
+    return f"waits for the first request for work of {names}, registered just now"
+
+
+def _passed_over(state: MasterState, now: float) -> frozenset[str]:
+    """Who is not placed yet, and holds nobody up who is behind."""
+    if not np.isin(state.hosts.condition, _AWAY).any():
+        return _NOBODY
+    names = (name for name in state.queue if awaits_states(state, state.processes[name], now))
+    passed_over = frozenset(names)
+    for name in passed_over:
+        _tell_waits(state, state.processes[name], _STATE_MAY_COME, now)
+    return passed_over
+
+
+def _place_in_order(state: MasterState, passed_over: frozenset[str], now: float) -> None:
+    while (name := _next_in_line(state, passed_over)) is not None:
+        if not _place_or_set_aside(state, state.processes[name], now):
+            return
+
+
+def _next_in_line(state: MasterState, passed_over: frozenset[str]) -> str | None:
+    if not passed_over:
+        return state.queue.head()
+    return next((name for name in state.queue if name not in passed_over), None)
+
+
+def _versions(state: MasterState) -> tuple[int, ...]:
+    """As long as none of these grows, who did not fit does not fit."""
+    hosts = state.hosts
+    return (hosts.version, len(hosts.touched), state.queue.version, state.learned.version)
+
+
+def _place_any(state: MasterState, passed_over: frozenset[str], now: float) -> None:
+    fit_nowhere = set()
+    for name in state.queue:
+        if name in passed_over:
+            continue
+        process = state.processes[name]
+        key = demand_of(state, process).key
+        if key not in fit_nowhere and not _place_or_set_aside(state, process, now):
+            fit_nowhere.add(key)
+
+
+def _place_or_set_aside(state: MasterState, process: Process, now: float) -> bool:
+    """False: it goes on waiting, and those behind it with it."""
+    demand = demand_of(state, process)
+    ranking = ranking_of(state, demand)
+    column = ranking.best()
+    if column >= 0:
+        _assign(state, process, ranking, column, now)
+        return True
+    never = why_never(state.hosts, demand)
+    if never:
+        _set_aside(state, process, never, now)
+        return True
+    _tell_waiting(state, process, now)
+    return False
+
+
+def _assign(
+    state: MasterState, process: Process, ranking: Ranking, column: int, now: float
+) -> None:
+    decision = decide(ranking, chosen=column)
+    host = state.hosts.hosts[column]
+    instance = state.new_instance_id(process)
+    state.queue.remove(process.name)
+    state.charge_ranked(instance, host, now, ranking)
+    ranking.took()
+    process.owner, process.left_behind, process.exit_code = instance.number, None, None
+    state.set_phase(process, ProcessPhase.ASSIGNED, now)
+    state.note_decision(process, decision, "assigned", now)
+    state.record(
+        now, "assigned", f"{process.name} goes to {host.name}", process=process.name,
+        host=host.name, facts={"number": instance.number, "decision": process.decision},
+    )  # fmt: skip
+    state.save(process)
+    state.emit(Assign(host.host_id, state.assignment(instance, process.spec)))
+
+
+def _set_aside(state: MasterState, process: Process, reason: str, now: float) -> None:
+    state.queue.remove(process.name)
+    if refused_everywhere(state.hosts, demand_of(state, process)):
+        state.set_phase(process, ProcessPhase.FAILED, now, f"no host can start it: {reason}")
+        state.note_decision(process, decide_now(state, process), "set_aside", now)
+        state.record(
+            now, "failed", f"{process.name} failed: {process.reason}", process=process.name
+        )
+    else:
+        state.set_phase(process, ProcessPhase.SET_ASIDE, now, _why_aside(reason))
+        state.set_aside.add(process.name)
+        state.record(
+            now, "set_aside", f"{process.name} is set aside: {process.reason}", process=process.name
+        )
+    state.save(process)
+
+
+def _why_aside(reason: str) -> str:
+    return f"no host may take it: {reason}"
+
+
+def _keep_aside(state: MasterState, process: Process, reason: str, now: float) -> None:
+    """Replace the reason of a process that is set aside, if there is another one now."""
+    if process.reason != _why_aside(reason):
+        state.set_phase(process, ProcessPhase.SET_ASIDE, now, _why_aside(reason))
+        state.save(process)
+
+
+def reconsider_set_aside(state: MasterState, now: float) -> None:
+    """Return what a host may take now to the queue, in order; keep the other reasons current.
+
+    As long as the limits of the hosts are not known, a process keeps its place and its reason.
+    """
+    if not state.set_aside:
+        return
+    judged: dict[object, str] = {}
+    for process in sorted(
+        (state.processes[name] for name in state.set_aside), key=lambda one: one.order
+    ):
+        demand = demand_of(state, process)
+        if demand.key not in judged:
+            judged[demand.key] = why_never(state.hosts, demand)
+        if judged[demand.key]:
+            _keep_aside(state, process, judged[demand.key], now)
+            continue
+        if not a_known_host_may(state.hosts, demand):
+            continue
+        state.set_aside.discard(process.name)
+        state.enqueue(process, now)
+        state.record(
+            now, "queued", f"{process.name} returns to the queue: a host may take it now",
+            process=process.name,
+        )  # fmt: skip
+        state.save(process)
+
+
+def _tell_waiting(state: MasterState, process: Process, now: float) -> None:
+    """Say once that the head of the queue waits, and why."""
+    if not state.hosts.listed():
+        _tell_waits(state, process, "no host has registered yet", now)
+        return
+    reason = why_all_away(state.hosts) or "no host can take it now"
+    if process.reason != reason:
+        state.note_decision(process, decide_now(state, process), "waits", now)
+        _tell_waits(state, process, reason, now, {"decision": process.decision})
+
+
+def _tell_waits(
+    state: MasterState, process: Process, reason: str, now: float,
+    facts: Mapping[str, Any] = EMPTY,
+) -> None:  # fmt: skip
+    """Say so once."""
+    if process.reason != reason:
+        process.reason = reason
+        state.record(
+            now, "waits", f"{process.name} waits: {reason}", process=process.name, facts=facts
+        )

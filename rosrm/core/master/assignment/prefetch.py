@@ -1,0 +1,62 @@
+"""A short job ahead: where jobs that end soon take every slot of a host, one more waits there.
+
+Between the end of one job and the start of the next lie several messages, which is much for a job
+of a tenth of a second. So a host with `max_processes` may be given one assignment beyond it, which
+its slave holds and starts by itself as soon as a slot is free. Only the run times of earlier runs
+of the same program allow this, so that nothing waits long behind the wrong job; what waits longer
+than expected all the same returns to its place in the queue.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from rosrm.core.master.master_state import Instance, MasterState
+from rosrm.core.master.state.hosts import Host
+from rosrm.model.values import InstanceState, InstanceStatus, Kind, ProcessSpec
+
+#: Seconds: jobs that run no longer than this on average are short.
+SHORT: Final = 0.5
+#: Seconds after which a job that was thought short has proved otherwise.
+PROVED_LONG: Final = 4 * SHORT
+#: Weight of the newest run in the mean.
+_NEWEST: Final = 0.3
+
+
+def learn_run_time(state: MasterState, spec: ProcessSpec, status: InstanceStatus) -> None:
+    """Remember how long a job ran."""
+    if spec.kind is Kind.JOB and status.state is InstanceState.EXITED and status.run_time > 0.0:
+        before = state.run_times.get(spec.program, status.run_time)
+        state.run_times[spec.program] = before + _NEWEST * (status.run_time - before)
+
+
+def review_slots(state: MasterState, host: Host, now: float) -> None:
+    """Open or close the place ahead of a host whose processes have changed."""
+    most = host.description.max_processes
+    if not most:
+        return
+    running = [
+        instance
+        for instance in (state.instances[number] for number in host.instances)
+        if instance.runs
+    ]
+    ahead = len(running) >= most and all(_ends_soon(state, one, now) for one in running)
+    state.hosts.set_bound(host, most + ahead)
+
+
+def _ends_soon(state: MasterState, instance: Instance, now: float) -> bool:
+    process = state.processes.get(instance.id.process)
+    if process is None or process.spec.kind is not Kind.JOB:
+        return False
+    expected = state.run_times.get(process.spec.program)
+    return expected is not None and expected <= SHORT and now - instance.since < PROVED_LONG
+
+
+def waits_too_long(instance: Instance, now: float) -> bool:
+    """Whether an assignment ahead waits for a job that is not short after all."""
+    return (
+        instance.state is InstanceState.HELD
+        and instance.host.description.max_processes > 0  # else it waits for others to start
+        and not instance.stopping
+        and now - instance.since >= PROVED_LONG
+    )

@@ -1,0 +1,48 @@
+"""In-flight load: what counts against a host until its readings show it, and what is learned."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from rosrm.core.master.master_state import Instance, MasterState
+from rosrm.extensions.contracts import Intent
+from rosrm.model.values import InstanceState, InstanceStatus, ProcessSpec
+
+#: A run shorter than this says nothing about the CPU that a program uses: it is all start-up.
+_TELLING_RUN: Final = 1.0
+
+
+def settle_charge(state: MasterState, instance: Instance, now: float) -> None:
+    """Lower what is counted in flight to what does not show in the readings yet."""
+    table = state.hosts
+    instance.settled = now - instance.since >= state.settings.settle
+    left = {}
+    for resource, amount in instance.amounts.items():
+        hidden = amount - instance.seen.get(resource, 0.0)
+        if hidden > 0.0 and not (instance.settled and resource in instance.estimated):
+            left[resource] = hidden
+    need = table.fractions_of(instance.host, left, instance.estimated)
+    need = np.where(need < np.inf, need, 0.0)
+    change = need.copy()
+    change[: len(instance.charged)] -= instance.charged
+    if np.any(change):
+        instance.charged = need
+        table.charge(instance.host, change)
+
+
+def learn_from(
+    state: MasterState, spec: ProcessSpec, instance: Instance, status: InstanceStatus
+) -> None:
+    """Remember what a run used, for the next process of the same program."""
+    if status.state is InstanceState.REFUSED:
+        return
+    cpu = status.cpu_time / status.run_time if status.run_time >= _TELLING_RUN else 0.0
+    peaks = {
+        "memory": max(status.peak_memory, instance.peak.get("memory", 0.0)),
+        "cpu": max(cpu, instance.peak.get("cpu", 0.0)),
+    }
+    counts = state.learned.learn(spec.program, peaks)
+    if counts is not None:
+        state.emit(Intent("learned", spec.program, counts))

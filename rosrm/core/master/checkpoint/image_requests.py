@@ -1,0 +1,253 @@
+"""Checkpoint and restore of a process on its own host: how they begin, and what they leave.
+
+They are plans as those of moves, and `moves` carries them out: undone before the commit, rolled
+forward after it. A checkpoint commits to an image (`images`), and no instance owns the name then; a
+restore commits to the instance that goes on from it.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from rosrm.core.master.assignment.assign import demand_to_restore, ranking_of
+from rosrm.core.master.checkpoint import images
+from rosrm.core.master.hosts import capabilities
+from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.migration.start import destination_node, proposed, why_busy, why_no_executor
+from rosrm.core.master.migration.steps import nobody_there, title
+from rosrm.core.master.scheduling.decision import verdict_of
+from rosrm.core.master.scheduling.ranking import Ranking
+from rosrm.core.master.state.hosts import Host
+from rosrm.core.master.state.migration import Run
+from rosrm.core.master.state.process import Image, Instance, Process, ProcessPhase, Wanted
+from rosrm.extensions.contracts import Imaging
+from rosrm.extensions.plugin_calls import implements
+from rosrm.model.plan import Aim, Commit, Execute, Move
+from rosrm.model.values import InstanceId
+from rosrm.wording import standing
+
+#: Kinds of the records by which each begins.
+_BEGUN: Final = {Aim.CHECKPOINT: "checkpoint_begun", Aim.RESTORE: "restore_begun"}
+
+
+# --- checkpoint -------------------------------------------------------------------------------
+
+
+def begin_checkpoint(state: MasterState, process: Process, cause: str, now: float) -> str:
+    """Begin to dump a running process into an image.
+
+    Returns:
+        "" or why it cannot be; then nothing has changed.
+    """
+    refusal = _why_no_checkpoint(state, process)
+    if refusal:
+        return refusal
+    owner, name = state.instances[process.owner], _strategy_of(state, process)
+    if not name:
+        return (
+            f"nothing that is selected here can checkpoint {process.name}: name `criu` below "
+            f"`migration: strategies:` in the cluster's file, and start the master again"
+        )
+    refusal = capabilities.fault(state, name, owner.host, owner.host)
+    if refusal:
+        return f"{process.name} cannot be checkpointed: {refusal}"
+    move = _planned(state, process, owner.id, owner.host, owner.node_name or process.name)
+    return _begin(state, process, move, name, Aim.CHECKPOINT, now, cause=cause)
+
+
+def _why_no_checkpoint(state: MasterState, process: Process) -> str:
+    if process.name in state.runs:
+        return why_busy(state.runs[process.name])
+    if process.phase is ProcessPhase.CHECKPOINTED:
+        return f"{process.name} is checkpointed already: {images.reason_of(state, process)}"
+    if process.phase is not ProcessPhase.RUNNING:
+        stands = standing(process.phase.value)
+        return f"{process.name} {stands}; only a running process is checkpointed"
+    if process.spec.standby.wanted:
+        return (
+            f"{process.name} has a standby, which would take over: submit the process without "
+            f"`standby` to checkpoint it"
+        )
+    if process.spec.keeps_state:
+        return (
+            f"{process.name} moves by handoff: its node takes part under the number of its "
+            f"instance, and the restored instance would have another one"
+        )
+    if process.instances - {process.owner}:
+        return f"an earlier instance of {process.name} is still being stopped"
+    return ""
+
+
+def _strategy_of(state: MasterState, process: Process) -> str:
+    """Its own strategy if that takes images, else the first that does; "": none does."""
+    own = process.spec.migration.strategy or ""
+    names = [*([own] if own in state.strategies else []), *state.strategies]
+    return next((name for name in names if implements(state.strategies[name], Imaging)), "")
+
+
+# --- restore ----------------------------------------------------------------------------------
+
+
+def begin_restore(state: MasterState, process: Process, cause: str, now: float) -> str:
+    """Begin to restore a process from its image, where that lies; returns as `begin_checkpoint`."""
+    image = process.image
+    refusal = _why_no_restore(state, process)
+    if refusal or image is None:
+        return refusal
+    host = state.hosts.by_name[image.host]
+    ranking = ranking_of(state, demand_to_restore(state, process, image.needs))
+    if not ranking.fits(host.column):
+        why = verdict_of(ranking, host.column).reason
+        return (
+            f"{process.name} can be restored on {host.name} alone, where its image is, and does "
+            f"not fit there now: {why or 'no room'}"
+        )
+    source = InstanceId(process.name, image.number)
+    move = _planned(state, process, source, host, image.node_name or process.name)
+    return _begin(
+        state, process, move, image.strategy, Aim.RESTORE, now, cause=cause, ranking=ranking
+    )
+
+
+def _why_no_restore(state: MasterState, process: Process) -> str:
+    if process.name in state.runs:
+        return why_busy(state.runs[process.name])
+    image = process.image
+    if image is None or process.phase is not ProcessPhase.CHECKPOINTED:
+        stands = standing(process.phase.value)
+        return f"{process.name} {stands}; only a checkpointed process is restored"
+    if process.instances:
+        return f"an earlier instance of {process.name} is still being stopped"
+    away = images.why_away(state, image)
+    if away:
+        return f"{process.name} can be restored on {image.host} alone, which {away}"
+    strategy: object = state.strategies.get(image.strategy)
+    if not implements(strategy, Imaging):
+        return (
+            f"the image of {process.name} was made by {image.strategy!r}, which is not selected "
+            f"here: name it below `migration: strategies:` in the cluster's file"
+        )
+    host = state.hosts.by_name[image.host]
+    fault = capabilities.fault(state, image.strategy, host, host)
+    return f"{process.name} cannot be restored: {fault}" if fault else ""
+
+
+# --- both -------------------------------------------------------------------------------------
+
+
+def _planned(
+    state: MasterState, process: Process, source: InstanceId, host: Host, node: str
+) -> Move:
+    """What a strategy is told of a process that stays on its host."""
+    return Move(
+        process.spec, source, host.name, state.new_instance_id(process), host.name,
+        state.new_instance_id(process), int(state.wall), node,
+    )  # fmt: skip
+
+
+def _begin(
+    state: MasterState, process: Process, move: Move, strategy: str, aim: Aim, now: float,
+    *, cause: str, ranking: Ranking | None = None,
+) -> str:  # fmt: skip
+    """Have the strategy plan it, and begin; `ranking`: by which the destination is charged."""
+    plan = proposed(state, strategy, move, aim)
+    if isinstance(plan, str):
+        return plan
+    host = state.hosts.by_name[move.source_host]
+    run = Run(
+        process.name, plan, strategy, move.source, host, move.destination, host, cause, now,
+        move.source_node, destination_node(plan, move), state.wall, aim=aim,
+    )  # fmt: skip
+    lacking = why_no_executor(state, run)
+    if lacking:
+        return lacking
+    state.runs[process.name] = run
+    if ranking is not None:
+        state.charge_ranked(run.destination, host, now, ranking)
+    state.set_phase(process, ProcessPhase.MIGRATING, now, run.course)
+    state.record(
+        now, _BEGUN[aim], f"{process.name}: {run.course}; {cause}", process=process.name,
+        host=host.name,
+        facts={
+            "strategy": strategy, "cause": cause, "steps": [title(step) for step in plan.steps],
+            "source": move.source.number, "destination": move.destination.number,
+        },
+    )  # fmt: skip
+    state.save(process)
+    state.save_run(run)
+    return ""
+
+
+def commit_to_image(state: MasterState, process: Process, run: Run, step: Commit) -> None:
+    """The source stands still for good: its image owns the name."""
+    source: Instance | None = state.instances.get(run.source.number)
+    needs = {} if source is None else source.measured
+    image = Image(
+        run.source.number, run.source_host.name, run.strategy, step.image, state.wall,
+        "" if run.source_node == process.name else run.source_node, needs,
+    )  # fmt: skip
+    process.owner = 0
+    images.set_image(state, process, image)
+
+
+def leave_behind(state: MasterState, run: Run, step: Execute) -> bool:
+    """Whether a plan that may not stop goes on without an executor: nobody is there to need it.
+
+    What stood still there, or waited to be told to go on, still does if it is there at all. So it
+    is not taken back when its host is heard: it is ended then.
+    """
+    if run.aim is Aim.CHECKPOINT:
+        if run.undo is None or run.source.number not in run.ended:
+            return False
+        _remove_unmade(state, run)
+    elif not nobody_there(state, run, step):
+        return False
+    process = state.processes[run.process]
+    if process.left_behind is not None and process.left_behind.host == step.host:
+        process.left_behind = None
+        state.save(process)
+    return True
+
+
+def _remove_unmade(state: MasterState, run: Run) -> None:
+    """What may lie on its host of an image that nobody waits for."""
+    commit = run.plan.steps[run.commit_index]
+    if isinstance(commit, Commit):
+        number = run.source.number
+        images.remove(state, run.process, run.source_host.name, commit.image, number)
+
+
+def settle(state: MasterState, process: Process, run: Run, now: float) -> None:
+    """A plan has ended, and an image owns the name: it waits, unless nobody wants it."""
+    if process.wanted is Wanted.CANCEL:
+        images.drop(state, process, run.destination.number)
+        state.set_phase(process, ProcessPhase.CANCELLED, now)
+        state.record(
+            now, "cancelled", f"{process.name} cancelled; its image is removed",
+            process=process.name,
+        )  # fmt: skip
+    else:
+        process.wanted = Wanted.RUN
+        trouble = f"it was not restored: {run.failure}" if run.aim is Aim.RESTORE else ""
+        images.note_checkpointed(state, process, now, trouble)
+    state.save(process)
+
+
+def ending_of(run: Run) -> tuple[str, str]:
+    """The kind and the words of the record by which a plan ends."""
+    name, done = run.process, run.undo is None
+    here, there = run.source_host.name, run.destination_host.name
+    if run.aim is Aim.CHECKPOINT:
+        if done:
+            return "checkpointed", f"{name} is checkpointed: its image is on {here}"
+        return (
+            "checkpoint_failed",
+            f"{name} was not checkpointed and still runs on {here}: {run.failure}",
+        )
+    if run.aim is Aim.RESTORE:
+        if done:
+            return "restored", f"{name} was restored from its image on {here}"
+        return "restore_failed", f"{name} stays checkpointed on {here}: {run.failure}"
+    if done:
+        return "migrated", f"{name} moved from {here} to {there}"
+    return "stayed", f"{name} stayed on {here}: {run.failure}"

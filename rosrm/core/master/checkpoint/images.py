@@ -1,0 +1,159 @@
+"""Images of processes that are checkpointed, and the end of those that nobody wants.
+
+===========================  ===================================================================
+the process                  its image
+===========================  ===================================================================
+is checkpointed              owns the name, also while its host is lost, closed or switched off
+is restored                  is gone with the commit: it has become the process again
+is cancelled or restarted    is removed as soon as its host is heard; until then that is an intent
+===========================  ===================================================================
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Final
+
+from rosrm.core.master import events as happened
+from rosrm.core.master.commands import Order
+from rosrm.core.master.state.hosts import HostCondition
+from rosrm.core.master.state.images import Unwanted
+from rosrm.core.master.state.process import Image, Process, ProcessPhase
+from rosrm.extensions.contracts import Intent
+
+if TYPE_CHECKING:
+    from rosrm.core.master.master_state import MasterState
+
+#: Seconds for a removal, and until one that failed is asked for again.
+_PATIENCE: Final = 30.0
+_ASK_AGAIN: Final = 60.0
+#: Where what is unwanted is kept, in the table "cluster".
+_KEY: Final = "unwanted_images"
+
+
+# --- of a process -----------------------------------------------------------------------------
+
+
+def set_image(state: MasterState, process: Process, image: Image | None) -> None:
+    """From now on an image owns the name of a process, or none does any more."""
+    process.image = image
+    if image is None:
+        state.images.of.discard(process.name)
+    else:
+        state.images.of.add(process.name)
+
+
+def note_checkpointed(state: MasterState, process: Process, now: float, trouble: str = "") -> None:
+    """It waits in its image until somebody asks for it; `trouble`: of the last restore."""
+    state.set_phase(process, ProcessPhase.CHECKPOINTED, now, trouble)
+    if process.image is not None:  # the wall clock may have been set back
+        process.since = now - max(0.0, state.wall - process.image.made_at)
+
+
+def why_away(state: MasterState, image: Image) -> str:
+    """Why nothing can be done with an image now: its host is not there; "": it is."""
+    host = state.hosts.by_name.get(image.host)
+    return "is not known" if host is None else state.hosts.condition_of(host).words()
+
+
+def reason_of(state: MasterState, process: Process) -> str:
+    """Where the image of a process is and how it fares, for people; else the process's reason."""
+    image = process.image
+    if image is None or process.phase is not ProcessPhase.CHECKPOINTED:
+        return process.reason
+    away = why_away(state, image)
+    where = f"its image is on {image.host}" + (f", which {away}" if away else "")
+    return f"{where}; {process.reason}" if process.reason else where
+
+
+# --- those that nobody wants ------------------------------------------------------------------
+
+
+def drop(state: MasterState, process: Process, *numbers: int) -> None:
+    """A process does without its image, if it has one; it is removed.
+
+    Args:
+        numbers: of other instances under which it may lie on its host.
+    """
+    image = process.image
+    if image is not None:
+        set_image(state, process, None)
+        process.ended_on = image.host
+        remove(state, process.name, image.host, image.drop, image.number, *numbers)
+
+
+def remove(
+    state: MasterState, process: str, host: str, drop: str, number: int, *numbers: int
+) -> None:
+    """Have an image removed from a host, as soon as that is heard; as the fields of `Unwanted`."""
+    state.images.unwanted[number] = Unwanted(process, host, drop, (number, *numbers))
+    _save(state)
+
+
+def review(state: MasterState, now: float) -> None:
+    """Ask the hosts that are up to remove what nobody wants."""
+    for one in state.images.unwanted.values():
+        host = state.hosts.by_name.get(one.host)
+        if host is None or now < one.ask_at:
+            continue
+        if state.hosts.condition_of(host) is not HostCondition.UP:
+            continue
+        one.order, one.ask_at = state.order_id(), now + _PATIENCE + _ASK_AGAIN
+        arguments = {"process": one.process, "numbers": list(one.numbers)}
+        state.emit(
+            Order(
+                one.order, host.host_id, "execute", executor=one.drop, arguments=arguments,
+                timeout=_PATIENCE,
+            )
+        )  # fmt: skip
+
+
+def order_answered(state: MasterState, event: happened.OrderAnswered, now: float) -> bool:
+    """Whether the answer was to a removal; it is noted then."""
+    for number, one in state.images.unwanted.items():
+        if one.order == event.order:
+            _note_answer(state, number, one, event, now)
+            return True
+    return False
+
+
+def _note_answer(
+    state: MasterState, number: int, one: Unwanted, event: happened.OrderAnswered, now: float
+) -> None:
+    one.order = 0
+    if event.accepted or event.code == happened.BAD_RESULT:  # it ran, though it answered nothing
+        del state.images.unwanted[number]
+        state.record(
+            now, "image_removed", f"the image of {one.process} was removed from {one.host}",
+            process=one.process, host=one.host, facts={"number": number},
+        )  # fmt: skip
+        _save(state)
+        return
+    one.ask_at = now + _ASK_AGAIN
+    state.record(
+        now, "image_left",
+        f"the image of {one.process} was not removed from {one.host}: "
+        f"{event.message or event.code}; tried again",
+        process=one.process, host=one.host, facts={"number": number},
+    )  # fmt: skip
+
+
+def _save(state: MasterState) -> None:
+    unwanted = {
+        str(number): {"process": one.process, "host": one.host, "drop": one.drop,
+                      "numbers": list(one.numbers)}
+        for number, one in state.images.unwanted.items()
+    }  # fmt: skip
+    state.emit(Intent("cluster", _KEY, unwanted or None))
+
+
+def restore(state: MasterState, cluster: Mapping[str, Mapping[str, Any]]) -> None:
+    """What was unwanted when the last master ended still is.
+
+    Args:
+        cluster: the journal's table of that name.
+    """
+    for number, one in cluster.get(_KEY, {}).items():
+        state.images.unwanted[int(number)] = Unwanted(
+            one["process"], one["host"], one["drop"], tuple(map(int, one["numbers"]))
+        )

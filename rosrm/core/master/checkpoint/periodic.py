@@ -1,0 +1,248 @@
+"""Periodic checkpoints: dumps of processes that go on, and start from the newest after a crash.
+
+==================================  ==========================================================
+what is seen                        what is ordered
+==================================  ==========================================================
+a process asks for them, and runs   `execute` of its strategy's step, at the policy's pace
+that fails                          it is said once, and tried again at the same pace
+an instance of such a one is gone   its images are removed from its host
+==================================  ==========================================================
+
+Nothing of it is durable. The slave that dumps a process lets it go on by itself, whoever is there;
+and its supervisor starts it from its image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from math import inf
+from typing import TYPE_CHECKING, Any, Final
+
+from rosrm.core.master import events as happened
+from rosrm.core.master.commands import Order
+from rosrm.core.master.hosts import capabilities
+from rosrm.core.master.state.hosts import Host, HostCondition
+from rosrm.core.master.state.periodic import BEFORE_FIRST, Dumped
+from rosrm.core.master.state.process import Instance, Process, ProcessPhase
+from rosrm.errors import PluginError
+from rosrm.extensions.contracts import MemoryPacing, MemoryView, PeriodicImaging
+from rosrm.extensions.plugin_calls import implements, required
+from rosrm.model.plan import Execute
+from rosrm.model.plan_json import checked_step
+from rosrm.wording import size
+
+if TYPE_CHECKING:
+    from rosrm.core.master.master_state import MasterState
+
+#: Seconds between two looks.
+_LOOK_EVERY: Final = 1.0
+#: Seconds for a removal.
+_PATIENCE: Final = 30.0
+
+
+def review(state: MasterState, now: float) -> None:
+    """Once a second: have dumped what is due, and removed what is over."""
+    known = state.periodic
+    if now - known.looked < _LOOK_EVERY:
+        return
+    known.looked = now
+    for number in [number for number in known.of if number not in state.instances]:
+        if _remove(state, known.of[number]):
+            del known.of[number]
+    if any(implements(one, PeriodicImaging) for one in state.strategies.values()):
+        for process in state.processes.values():
+            if process.spec.checkpointed:
+                _review(state, process, now)
+
+
+def order_answered(state: MasterState, event: happened.OrderAnswered, now: float) -> bool:
+    """Whether the answer was to an order of this module; it is noted then."""
+    if event.order <= BEFORE_FIRST:
+        return False
+    for dumped in state.periodic.of.values():
+        if dumped.order == event.order:
+            _note(state, dumped, event, now)
+    return True
+
+
+def of_process(state: MasterState, process: Process, now: float) -> Mapping[str, Any] | None:
+    """The newest checkpoint of the instance that owns the name, for people; None: none is asked."""
+    dumped = state.periodic.of.get(process.owner)
+    if dumped is None:
+        return None
+    elapsed = now - dumped.since if dumped.made else None
+    return {
+        "elapsed": elapsed, "size": dumped.size, "pause": dumped.pause, "trouble": dumped.trouble,
+    }  # fmt: skip
+
+
+# --- what is due ------------------------------------------------------------------------------
+
+
+def _review(state: MasterState, process: Process, now: float) -> None:
+    strategy: object = state.strategies.get(process.spec.migration.strategy or "")
+    owner = state.instances.get(process.owner)
+    if owner is None or not implements(strategy, PeriodicImaging):
+        return
+    number, host = process.owner, owner.host
+    dumped = state.periodic.of.get(number)
+    if dumped is None:
+        name = process.spec.migration.strategy or ""
+        discard = _discard_of(state, name)
+        dumped = state.periodic.of[number] = Dumped(process.name, host.name, name, discard, now)
+    if dumped.order and dumped.asked != host.description.incarnation:
+        dumped.order, dumped.since = 0, now  # it ended with the slave that was at it
+    if dumped.order or not _may_be_dumped(state, process, owner):
+        return
+    pace, trouble = _pace(state, process, strategy, host, dumped)
+    if pace is not None:
+        if now < dumped.since + pace:
+            return
+        trouble = capabilities.fault(state, process.spec.migration.strategy or "", host, host)
+    if pace is None or trouble:
+        _say_trouble(state, dumped, trouble, now)
+    else:
+        _order(state, process, strategy, owner, dumped, now)
+
+
+def _discard_of(state: MasterState, name: str) -> str | None:
+    """Return the executor with which a strategy removes images; "": none; None: the call failed."""
+    strategy: object = state.strategies.get(name)
+    if not implements(strategy, PeriodicImaging):
+        return ""
+    asked = strategy
+    try:
+        return state.plugins.ask("migration", name, "discard", lambda: required(asked.discard, str))
+    except PluginError:
+        return None
+
+
+def _may_be_dumped(state: MasterState, process: Process, owner: Instance) -> bool:
+    """Nobody else is at it, and its host is heard."""
+    return (
+        process.phase is ProcessPhase.RUNNING
+        and owner.runs
+        and not owner.stopping
+        and process.name not in state.runs
+        and state.hosts.condition_of(owner.host) is HostCondition.UP
+    )
+
+
+def _pace(
+    state: MasterState, process: Process, strategy: PeriodicImaging, host: Host, dumped: Dumped
+) -> tuple[float | None, str]:
+    """Seconds from one to the next, None for none, and what is wrong with that."""
+    policy, name = state.keeping.policy, state.keeping.policy_name
+    if policy is None:
+        return None, "no checkpoint policy is selected: name one in the cluster's file"
+    if not implements(policy, MemoryPacing):
+        return None, f"the checkpoint policy {name!r} makes none of memory"
+    pacing = policy
+    asked_of = process.spec.migration.strategy or ""
+    try:
+        asked = state.plugins.ask(
+            "migration", asked_of, "checkpoint_every",
+            lambda: float(strategy.checkpoint_every(process.spec)),
+        )  # fmt: skip
+        if not asked > 0.0:
+            return None, ""
+        view = MemoryView(process.spec, host.name, asked, dumped.size, dumped.pause)
+        asked_of = name
+        return state.plugins.ask(
+            "checkpoint", name, "pace", lambda: sound_pace(pacing.pace(view))
+        ), ""  # fmt: skip
+    except PluginError as error:
+        return None, f"{asked_of!r} sets no pace: {error}"
+
+
+def sound_pace(pace: float | None) -> float | None:
+    """A pace that keeps to the contract; raises for any other."""
+    if pace is not None and not 0.0 < pace < inf:
+        raise PluginError(f"one every {pace} s; allowed: more than 0")
+    return pace
+
+
+def _order(
+    state: MasterState, process: Process, strategy: PeriodicImaging, owner: Instance,
+    dumped: Dumped, now: float,
+) -> None:  # fmt: skip
+    spec, host = process.spec, owner.host.name
+
+    def ask() -> Execute:
+        step = required(strategy.periodic(spec, owner.id, host, int(state.wall)), Execute)
+        return required(checked_step(step), Execute)
+
+    try:
+        step = state.plugins.ask("migration", spec.migration.strategy or "", "periodic", ask)
+    except PluginError as error:
+        _say_trouble(state, dumped, str(error), now)
+        return
+    state.periodic.last_order += 1
+    dumped.order, dumped.asked = state.periodic.last_order, owner.host.description.incarnation
+    state.emit(
+        Order(
+            dumped.order, owner.host.host_id, "execute", executor=step.executor,
+            arguments=step.arguments, timeout=step.timeout,
+        )
+    )  # fmt: skip
+
+
+# --- what came of it --------------------------------------------------------------------------
+
+
+def _note(state: MasterState, dumped: Dumped, event: happened.OrderAnswered, now: float) -> None:
+    dumped.order, dumped.since = 0, now
+    if not event.accepted:
+        _say_trouble(state, dumped, event.message or event.code, now)
+        return
+    result = event.result or {}
+    dumped.size = int(_number(result.get("size")))
+    parts = result.get("seconds")
+    dumped.pause = sum(map(_number, parts.values())) if isinstance(parts, Mapping) else 0.0
+    told = dumped.made and not dumped.trouble
+    dumped.made, dumped.trouble = True, ""
+    if not told:
+        state.record(
+            now, "periodic_checkpoint",
+            f"the first periodic checkpoint of {dumped.process} is made ({size(dumped.size)}, "
+            f"paused for {dumped.pause:.2f} s): a crash starts the process from the newest",
+            process=dumped.process, host=dumped.host,
+            facts={"size": dumped.size, "seconds": parts or {}},
+        )  # fmt: skip
+
+
+def _number(value: Any) -> float:
+    return float(value) if isinstance(value, int | float) else 0.0
+
+
+def _say_trouble(state: MasterState, dumped: Dumped, trouble: str, now: float) -> None:
+    """Once, until something else is the matter."""
+    if not trouble or trouble == dumped.trouble:
+        return
+    dumped.trouble = trouble
+    state.record(
+        now, "periodic_failed", f"no periodic checkpoint of {dumped.process} was made: {trouble}",
+        process=dumped.process, host=dumped.host,
+    )  # fmt: skip
+
+
+def _remove(state: MasterState, dumped: Dumped) -> bool:
+    """Order the removal of images; return False if the strategy must be asked again first.
+
+    A host that is not up removes them when it registers.
+    """
+    host = state.hosts.by_name.get(dumped.host)
+    if host is None or state.hosts.condition_of(host) is not HostCondition.UP:
+        return True
+    if dumped.discard is None:
+        dumped.discard = _discard_of(state, dumped.strategy)
+    if not dumped.discard:
+        return dumped.discard is not None
+    state.periodic.last_order += 1
+    state.emit(
+        Order(
+            state.periodic.last_order, host.host_id, "execute", executor=dumped.discard,
+            timeout=_PATIENCE,
+        )
+    )  # fmt: skip
+    return True

@@ -1,0 +1,299 @@
+"""Keeping states: where they are kept by the checkpoint policy, and which are kept no more.
+
+A node keeps its newest state on its own host by itself. What this decides is told to the slaves
+again and again until the books say that it is so; nothing of it is durable. Each stateful process
+is looked at about once a second.
+
+==========================================  =====================================================
+what is seen                                what is ordered
+==========================================  =====================================================
+it runs, and the policy chooses hosts       `keep`: its slave ships the state to them from now on,
+                                            beginning with the first that this instance has
+its slave was told something else before    `keep`: the new choice
+it runs, and the policy gives no answer     as it chose last; where it has not chosen since the
+                                            master started, `keep` on the hosts that keep a state
+it is cancelled, or has finished            `drop_kept` wherever something is kept of it
+it was submitted anew                       `drop_kept` of what is kept of its former life
+it was removed, says the journal            `drop_kept` wherever something is kept of it
+a host that is not chosen keeps a state     `drop_kept`, once a newer one lies where it should;
+                                            never before the policy has chosen
+==========================================  =====================================================
+
+What is kept of any other name that this master does not know is left alone: its journal may be
+lost. Of the removed names the journal has the last 10,000.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Final
+
+from rosrm.core.master import events as happened
+from rosrm.core.master.commands import Order
+from rosrm.core.master.master_state import MasterState, Process, ProcessPhase
+from rosrm.core.master.state.hosts import Host, HostCondition
+from rosrm.core.master.state.replicas import Holding, Told
+from rosrm.errors import PluginError
+from rosrm.extensions.contracts import CheckpointChoice, CheckpointView
+from rosrm.extensions.plugin_calls import required
+from rosrm.model.values import InstanceId, KeptState
+
+#: Seconds between two looks at the same process.
+_LOOK_EVERY: Final = 1.0
+#: Most drop orders remembered, so as not to repeat them at once.
+_REMEMBERED: Final = 10_000
+#: What is kept of a process that ended so is of no use any more.
+_DONE: Final = frozenset({ProcessPhase.FINISHED, ProcessPhase.CANCELLED})
+
+
+# --- what is heard ----------------------------------------------------------------------------
+
+
+def kept_states_received(
+    state: MasterState, event: happened.KeptStatesReceived, now: float
+) -> None:
+    """Note all that a host keeps."""
+    host = state.hosts.find(event.host_id, event.incarnation)
+    if host is not None:
+        note_states(state, host, event.states, now)
+
+
+def note_states(state: MasterState, host: Host, states: tuple[KeptState, ...], now: float) -> None:
+    """A host says all that it keeps."""
+    # Of a journal that was lost: no instance may get a number that a kept state has already.
+    state.skip_numbers(max((one.instance.number for one in states), default=0))
+    state.keeping.holdings.replace(host.name, states, now)
+
+
+def awaits_states(state: MasterState, process: Process, now: float) -> bool:
+    """A host that keeps a state of a process, or may, is away, and may come back at any moment.
+
+    Started now it might begin from nothing beside its own state. So it waits for hosts that have
+    not come back since the master started, until they are lost; and, where nobody else is in reach
+    who keeps its state, for a host that was lost beside its own, for one lease.
+    """
+    if not process.spec.keeps_state:
+        return False
+    if (state.hosts.condition == HostCondition.EXPECTED).any():
+        return True
+    return not state.keeping.in_reach(process.name, process.born, state.hosts) and any(
+        _may_come_back(state, state.hosts.by_name[name], now)
+        for name in state.keeping.holdings.hosts_of(process.name, process.born)
+        if name in state.hosts.by_name and not _was_left_on(process, name)
+    )
+
+
+def _may_come_back(state: MasterState, host: Host, now: float) -> bool:
+    away = state.hosts.condition_of(host) in (HostCondition.LOST, HostCondition.DETACHED)
+    return away and now < host.lost_since + state.settings.lease
+
+
+def _was_left_on(process: Process, host: str) -> bool:
+    """Its own host is lost: that is why it waits, and alone no reason to wait longer."""
+    return process.left_behind is not None and process.left_behind.host == host
+
+
+def order_answered(state: MasterState, event: happened.OrderAnswered) -> bool:
+    """Whether the answer was to an order of this module; it is noted then."""
+    name = state.keeping.orders.pop(event.order, None)
+    if name is None:
+        return False
+    told = state.keeping.told.get(name)
+    if told is not None and told.order == event.order:
+        told.taken = event.accepted
+    return True
+
+
+# --- what is asked for ----------------------------------------------------------------------
+
+
+def begin_anew(state: MasterState, process: Process) -> None:
+    """A process that is over is asked for again: a finished or cancelled one has no past."""
+    if process.phase in _DONE:
+        process.born = state.next_instance
+
+
+# --- the rounds -------------------------------------------------------------------------------
+
+
+def review(state: MasterState, now: float) -> None:
+    """Look at some of the processes of which a state is kept: at all of them once a second."""
+    keeping = state.keeping
+    names = keeping.holdings.processes()
+    if len(keeping.dropped_at) > _REMEMBERED:
+        keeping.dropped_at.clear()
+    share = min(1.0, (now - keeping.looked) / _LOOK_EVERY)
+    keeping.looked = now
+    if not keeping.waiting:
+        keeping.waiting = names[::-1]
+    for _ in range(math.ceil(share * len(names))):
+        if not keeping.waiting:
+            return
+        name = keeping.waiting.pop()
+        process = state.processes.get(name)
+        if process is None:
+            keeping.told.pop(name, None)
+            _drop_removed(state, name, now)
+        else:
+            _review(state, process, now)
+
+
+def _drop_removed(state: MasterState, name: str, now: float) -> None:
+    """Drop every replica of a process that was removed and is not known again."""
+    end = state.keeping.removed.get(name, 0)
+    for host, holding in state.keeping.holdings.of(name).items():
+        if holding.number < end:
+            _drop(state, name, host, holding, now)
+
+
+def _review(state: MasterState, process: Process, now: float) -> None:
+    holdings = state.keeping.holdings.of(process.name)
+    owner = state.instances.get(process.owner)
+    if owner is not None and owner.runs and process.phase is ProcessPhase.RUNNING:
+        _choose(state, process, owner.host, holdings, now)
+    for name, holding in holdings.items():
+        if _is_stale(state, process, name, holding, holdings):
+            _drop(state, process.name, name, holding, now)
+
+
+def _choose(
+    state: MasterState, process: Process, host: Host, holdings: Mapping[str, Holding], now: float
+) -> None:
+    """Ask the policy, and tell the slave what is new to it."""
+    choice = _choice(state, process, host, holdings, now)
+    told = state.keeping.told.get(process.name)
+    chosen = choice is not None or (told is not None and told.chosen)
+    if choice is None:
+        choice = told.choice if told is not None and chosen else _as_kept(process, host, holdings)
+    if not chosen and not choice.hosts:
+        return  # no other host keeps a state, and the policy has asked for none
+    incarnation = host.description.incarnation
+    known = (
+        told is not None
+        and (told.number, told.incarnation) == (process.owner, incarnation)
+        and _is_same(told.choice, choice)
+    )  # fmt: skip
+    if told is not None:
+        told.chosen = chosen
+    if told is not None and known and (told.taken or now - told.at < state.settings.order_retry):
+        return
+    order = state.keeping.order_id()
+    state.keeping.orders[order] = process.name
+    state.keeping.told[process.name] = Told(process.owner, incarnation, choice, order, now, chosen)
+    state.emit(
+        Order(
+            order, host.host_id, "keep", InstanceId(process.name, process.owner),
+            keep_on=choice.hosts, keep_every=choice.every,
+        )
+    )  # fmt: skip
+    if not known and (told is None or set(told.choice.hosts) != set(choice.hosts)):
+        where = ", ".join(choice.hosts) or "no other host"
+        state.record(
+            now, "kept_on", f"the state of {process.name} is kept on {where}",
+            process=process.name, host=host.name,
+            facts={"hosts": list(choice.hosts), "every": choice.every},
+        )  # fmt: skip
+
+
+def _as_kept(
+    process: Process, host: Host, holdings: Mapping[str, Holding]
+) -> CheckpointChoice:  # fmt: skip
+    """Choose the other hosts whose slaves report a state of this life of the process."""
+    kept = (name for name, one in holdings.items() if one.number >= process.born)
+    return CheckpointChoice(tuple(sorted(name for name in kept if name != host.name)))
+
+
+def _is_same(one: CheckpointChoice, other: CheckpointChoice) -> bool:
+    """Return True if two choices differ at most in the order of their hosts."""
+    return set(one.hosts) == set(other.hosts) and one.every == other.every
+
+
+def _choice(
+    state: MasterState, process: Process, host: Host, holdings: Mapping[str, Holding], now: float
+) -> CheckpointChoice | None:
+    """What the policy says; None: as before. One that raises, or makes no sense, is named."""
+    keeping = state.keeping
+    if keeping.policy is None:
+        return CheckpointChoice(())
+    kept = keeping.holdings.hosts_of(process.name, process.born)
+    others = tuple(name for name in kept if name != host.name)
+    hosts = {
+        one.name: one.description.labels
+        for one in state.hosts.hosts
+        if _may_keep(state, one, others)
+    }
+    since = max((holdings[name].since for name in others), default=None)
+    view = CheckpointView(
+        process.spec, host.name, None if since is None else now - since,
+        _newest_size(holdings), others, hosts,
+    )  # fmt: skip
+    policy = keeping.policy
+    try:
+        return state.plugins.ask(
+            "checkpoint",
+            keeping.policy_name,
+            "choose",
+            lambda: sound_choice(policy.choose(view), view),
+        )
+    except PluginError:
+        return None
+
+
+def _may_keep(state: MasterState, host: Host, keepers: tuple[str, ...]) -> bool:
+    """A host that is silent for a moment is not given up as a keeper."""
+    condition = state.hosts.condition_of(host)
+    return condition is HostCondition.UP or (
+        condition is HostCondition.SUSPECT and host.name in keepers
+    )
+
+
+def _newest_size(holdings: Mapping[str, Holding]) -> int:
+    return max(((one.age, one.size) for one in holdings.values()), default=((0, 0), 0))[1]
+
+
+def sound_choice(choice: CheckpointChoice | None, view: CheckpointView) -> CheckpointChoice | None:
+    """A choice that keeps to the contract; raises for any other."""
+    if choice is None:
+        return None
+    required(choice, CheckpointChoice)
+    strange = [name for name in choice.hosts if name not in view.hosts or name == view.host]
+    if strange or len(set(choice.hosts)) != len(choice.hosts):
+        raise PluginError(
+            f"it chose {', '.join(choice.hosts)} for a process on {view.host}; allowed: each of "
+            f"{', '.join(name for name in view.hosts if name != view.host) or 'no host'} once"
+        )
+    if not 0.0 < choice.every < math.inf:
+        raise PluginError(f"it chose every {choice.every} s; allowed: more than 0")
+    return choice
+
+
+def _is_stale(
+    state: MasterState, process: Process, host: str, holding: Holding,
+    holdings: Mapping[str, Holding],
+) -> bool:  # fmt: skip
+    """Nobody will go on from it, as far as can be known."""
+    if holding.number < process.born or process.phase in _DONE:
+        return True
+    owner, told = state.instances.get(process.owner), state.keeping.told.get(process.name)
+    if owner is None or process.phase is not ProcessPhase.RUNNING or host == owner.host.name:
+        return False
+    if told is None or not told.chosen or told.number != process.owner:
+        return False
+    if host in told.choice.hosts:
+        return False
+    # A copy that is no longer wanted is worth something until there is a newer one elsewhere.
+    better = told.choice.hosts or (owner.host.name,)
+    return any(name in holdings and holdings[name].age > holding.age for name in better)
+
+
+def _drop(state: MasterState, process: str, name: str, holding: Holding, now: float) -> None:
+    host = state.hosts.by_name.get(name)
+    if host is None or state.hosts.condition_of(host) is not HostCondition.UP:
+        return  # it says again what it keeps when it comes back
+    at = state.keeping.dropped_at.get((process, name), -math.inf)
+    if now - at < state.settings.order_retry:
+        return
+    state.keeping.dropped_at[process, name] = now
+    instance = InstanceId(process, holding.number)
+    state.emit(Order(state.keeping.order_id(), host.host_id, "drop_kept", instance))

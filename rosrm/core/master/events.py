@@ -1,0 +1,287 @@
+"""Events of the master, in the past tense. Readings arrive as one batch.
+
+`by` of a request is the name of the client that sent it; "": unknown.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from rosrm.model.plan import ReportPhase
+from rosrm.model.values import (
+    EMPTY,
+    HostDescription,
+    InstanceId,
+    InstanceStatus,
+    KeptState,
+    ProcessSpec,
+)
+
+#: Code of an answer to an order.
+BAD_RESULT: Final = "bad_result"
+
+
+@dataclass(frozen=True, slots=True)
+class HostRegistered:
+    """A slave came and named itself.
+
+    Attributes:
+        instances: what it holds already.
+        journal_seen: newest record that a former run of this master has told it of; 0: none.
+        kept: all states that it keeps.
+    """
+
+    request: int
+    description: HostDescription
+    instances: tuple[InstanceStatus, ...] = ()
+    journal_seen: int = 0
+    kept: tuple[KeptState, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class HostLeft:
+    """A slave is stopped.
+
+    Attributes:
+        kept: all instances of a slave that leaves them running; (): it stops them, and reports
+            their ends.
+    """
+
+    request: int
+    host_id: int
+    incarnation: int
+    kept: tuple[InstanceStatus, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessRequested:
+    """A slave is under all its limits and asks for work."""
+
+    request: int
+    host_id: int
+    incarnation: int
+
+
+@dataclass(frozen=True, slots=True)
+class ReadingsReceived:
+    """N readings, at most one of each host (the newest), in parallel arrays.
+
+    Attributes:
+        host_id, incarnation, sequence, status_sequence: (N,) as in `ResourceInfo`.
+        accepting: (N,) bool: the slave is under all its limits.
+        stale: (N,) bit i: slot i is stale.
+        usage, limit: (N, RESOURCE_SLOTS) fractions.
+    """
+
+    host_id: npt.NDArray[np.int64]
+    incarnation: npt.NDArray[np.uint64]
+    sequence: npt.NDArray[np.uint64]
+    status_sequence: npt.NDArray[np.uint64]
+    accepting: npt.NDArray[np.bool_]
+    stale: npt.NDArray[np.uint32]
+    usage: npt.NDArray[np.float64]
+    limit: npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class StatusesReceived:
+    """Changes of instances on a host; `complete`: these are all that the host holds.
+
+    Complete in each are `failing`, resource to the reason why its probe gives no readings, and
+    `failing_strategies`, migration strategy to the reason why its executors fail there.
+    """
+
+    host_id: int
+    incarnation: int
+    sequence: int
+    complete: bool
+    statuses: tuple[InstanceStatus, ...]
+    failing: Mapping[str, str] = field(default_factory=lambda: EMPTY)
+    failing_strategies: Mapping[str, str] = field(default_factory=lambda: EMPTY)
+
+    def failing_plugins(self) -> dict[tuple[str, str], str]:
+        """Return all plugins that fail there by kind and name, and why."""
+        by_kind = (("probe", self.failing), ("migration", self.failing_strategies))
+        return {(kind, name): why for kind, found in by_kind for name, why in found.items()}
+
+
+@dataclass(frozen=True, slots=True)
+class UsagesReceived:
+    """What each instance of a host uses: parallel arrays (cores, bytes)."""
+
+    host_id: int
+    incarnation: int
+    numbers: npt.NDArray[np.uint64]
+    cpu: npt.NDArray[np.float64]
+    memory: npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class KeptStatesReceived:
+    """A host says all the states that it keeps, the newest of each process."""
+
+    host_id: int
+    incarnation: int
+    states: tuple[KeptState, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class SubmissionReceived:
+    """Somebody submits processes: all are taken, or none."""
+
+    request: int
+    specs: tuple[ProcessSpec, ...]
+    by: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class CancelRequested:
+    """Somebody cancels processes."""
+
+    request: int
+    names: tuple[str, ...]
+    by: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class RestartRequested:
+    """Somebody restarts processes where they are, or queues ended ones anew."""
+
+    request: int
+    names: tuple[str, ...]
+    by: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class MigrationRequested:
+    """Somebody moves a process; `host` None: the core chooses."""
+
+    request: int
+    name: str
+    host: str | None = None
+    by: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class CheckpointRequested:
+    """Somebody has a process dumped into an image, and stopped there."""
+
+    request: int
+    name: str
+    by: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class RestoreRequested:
+    """Somebody has a process go on from its image."""
+
+    request: int
+    name: str
+    by: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class HostStateRequested:
+    """Somebody cordons, uncordons or drains a host."""
+
+    request: int
+    host: str
+    action: str
+    by: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class PruneRequested:
+    """A client removes ended processes and departed hosts from the listings.
+
+    Attributes:
+        names: of processes.
+        hosts: their names; with no names either: all that ended, and all hosts that left.
+    """
+
+    request: int
+    names: tuple[str, ...] = ()
+    hosts: tuple[str, ...] = ()
+    by: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class OrderAnswered:
+    """A slave answered an `Order`, or did not in time (code "timeout").
+
+    The code `BAD_RESULT`: an executor ran to its end, but answered no JSON object.
+    """
+
+    order: int
+    accepted: bool
+    code: str = ""
+    message: str = ""
+    result: Mapping[str, Any] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class AssignmentWithdrawn:
+    """An assignment was taken back before its slave had fetched it."""
+
+    instance: InstanceId
+
+
+@dataclass(frozen=True, slots=True)
+class HandoffReported:
+    """The source or the destination of a handoff says how far it is.
+
+    Attributes:
+        destination: instance number of the destination; it names the handoff.
+        instance: number of the one that says it.
+        sequence: cycles that its newest state covers.
+        message: for people.
+    """
+
+    process: str
+    destination: int
+    instance: int
+    phase: ReportPhase
+    sequence: int = 0
+    message: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class PeerRefused:
+    """Somebody was turned away at the edge: another version, a message that makes no sense."""
+
+    who: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class TimePassed:
+    """Nothing else happened; deadlines are looked at."""
+
+
+Event = (
+    HostRegistered
+    | HostLeft
+    | ProcessRequested
+    | ReadingsReceived
+    | StatusesReceived
+    | UsagesReceived
+    | KeptStatesReceived
+    | SubmissionReceived
+    | CancelRequested
+    | RestartRequested
+    | MigrationRequested
+    | CheckpointRequested
+    | RestoreRequested
+    | HostStateRequested
+    | PruneRequested
+    | OrderAnswered
+    | AssignmentWithdrawn
+    | HandoffReported
+    | PeerRefused
+    | TimePassed
+)

@@ -1,0 +1,50 @@
+"""Names of nodes in the ROS graph, as far as specs tell them: which processes share one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Final
+
+from rosrm.model.values import ProcessSpec
+from rosrm.wording import listed
+
+_RUN: Final = ("ros2", "run")
+
+
+def shared_nodes(specs: Sequence[ProcessSpec], others: Iterable[ProcessSpec] = ()) -> list[str]:
+    """Return a sentence for each node name that several processes put into the ROS graph.
+
+    Args:
+        specs: processes to be submitted; each sentence is about at least one of them.
+        others: live processes.
+    """
+    users: dict[str, list[str]] = {}
+    for spec in specs:
+        if node := _node_of(spec):
+            users.setdefault(node, []).append(spec.name)
+    for spec in others if users else ():
+        if (node := _node_of(spec)) in users:
+            users[node].append(spec.name)
+    return [
+        f"{listed(names)} put {node} into the ROS graph; give each node a name of its own"
+        for node, names in users.items()
+        if len(names) > 1
+    ]
+
+
+def _node_of(spec: ProcessSpec) -> str:
+    """Return which node a process puts into the graph; "" if its spec does not tell.
+
+    rosrm adds its name rule behind the arguments of the user, and the first rule counts.
+    """
+    words = (*spec.command, *spec.arguments)
+    rules = dict(
+        word.split(":=", 1) for word in reversed(words) if word.startswith(("__node:=", "__ns:="))
+    )
+    name = rules.get("__node") or (spec.name if spec.ros else "")
+    if name:
+        namespace = rules.get("__ns", spec.namespace).strip("/")
+        return f"the node /{namespace}/{name}" if namespace else f"the node /{name}"
+    if spec.command[:2] == _RUN and len(spec.command) >= 4:
+        return f"the default node of {' '.join(spec.command[2:4])}"
+    return ""

@@ -1,0 +1,1 @@
+"""Hosts: registration, readings, liveness, loss, re-adoption, fencing."""

@@ -1,0 +1,159 @@
+"""Where a migration strategy works: each host is asked, by an executor of the strategy's plugin.
+
+=============================  ==============================================================
+of a host                      what is done
+=============================  ==============================================================
+it is up, and was not asked    `execute` of the strategy's executor
+it has answered                its answer holds until it registers anew
+it did not answer              it is asked again after a while
+the plugin's `ability` fails   the plugin is asked again after a while
+=============================  ==============================================================
+
+Nothing of it is durable, and until a host has answered nothing is moved to or from it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from math import inf
+from typing import TYPE_CHECKING, Final
+
+from rosrm.core.master import events as happened
+from rosrm.core.master.commands import Order
+from rosrm.core.master.plugin_failures import why_broken
+from rosrm.core.master.state.capabilities import BEFORE_FIRST, Answer
+from rosrm.core.master.state.hosts import Host, HostCondition
+from rosrm.errors import PluginError
+from rosrm.extensions.contracts import HostChecking
+from rosrm.extensions.plugin_calls import implements, required
+from rosrm.wording import listed
+
+if TYPE_CHECKING:
+    from rosrm.core.master.master_state import MasterState
+
+#: Seconds for an answer, and until a host that gave none is asked again.
+_PATIENCE: Final = 30.0
+_ASK_AGAIN: Final = 10.0
+
+
+def ask_hosts(state: MasterState, now: float) -> None:
+    """Ask every host that is up and has not been asked, or did not answer."""
+    for name, strategy in _checking(state):
+        for host in state.hosts.hosts:
+            if state.hosts.condition_of(host) is HostCondition.UP:
+                _ask(state, name, strategy, host, now)
+
+
+def _checking(state: MasterState) -> Iterator[tuple[str, HostChecking]]:
+    for name, strategy in state.strategies.items():
+        if implements(strategy, HostChecking):
+            yield name, strategy
+
+
+def _ask(state: MasterState, name: str, strategy: HostChecking, host: Host, now: float) -> None:
+    known = state.abilities.answers.get((name, host.name))
+    incarnation = host.description.incarnation
+    if known is not None and known.incarnation == incarnation and now < known.ask_at:
+        return
+    try:
+        ability = state.plugins.ask(
+            "migration", name, "ability", lambda: required(strategy.ability, str)
+        )
+    except PluginError as error:
+        answer = Answer(
+            incarnation, 0, reason=f"its ability is not known: {error}", ask_at=now + _ASK_AGAIN
+        )
+        state.abilities.answers[name, host.name] = answer
+        return
+    if ability not in host.description.executors:
+        reason = why_broken(host, name) or f"the plugin of {name!r} is not installed there"
+        # Looked at again, because the slave reports what is broken after its registration.
+        state.abilities.answers[name, host.name] = Answer(
+            incarnation, 0, reason=reason, ask_at=now + _ASK_AGAIN
+        )
+        return
+    state.abilities.last_order += 1
+    order = state.abilities.last_order
+    state.abilities.answers[name, host.name] = Answer(
+        incarnation, order, ask_at=now + _PATIENCE + _ASK_AGAIN
+    )
+    state.emit(Order(order, host.host_id, "execute", executor=ability, timeout=_PATIENCE))
+
+
+def order_answered(state: MasterState, event: happened.OrderAnswered, now: float) -> bool:
+    """Whether the answer was to a question of this module; it is noted then."""
+    if event.order <= BEFORE_FIRST:
+        return False
+    for (strategy, host), answer in state.abilities.answers.items():
+        if answer.order == event.order:
+            _note(state, strategy, host, answer, event, now)
+            return True
+    return False
+
+
+def _note(
+    state: MasterState,
+    strategy: str,
+    host: str,
+    answer: Answer,
+    event: happened.OrderAnswered,
+    now: float,
+) -> None:
+    if event.accepted:
+        answer.facts = {key: str(value) for key, value in (event.result or {}).items()}
+        answer.reason, answer.ask_at = "", inf
+    elif event.code == "timeout":
+        answer.ask_at = now + _ASK_AGAIN
+    else:
+        answer.reason, answer.ask_at = event.message or event.code, inf
+        state.record(
+            now, "strategy_absent", f"{strategy} does not work on {host}: {answer.reason}",
+            host=host, facts={"strategy": strategy},
+        )  # fmt: skip
+
+
+def fault(state: MasterState, strategy: str, source: Host, destination: Host) -> str:
+    """Why a strategy cannot move anything from one host to another; "": it can, by what is known.
+
+    Args:
+        strategy: its name; one that works everywhere has no fault.
+    """
+    checking: object = state.strategies.get(strategy)
+    if not implements(checking, HostChecking):
+        return ""
+    facts = []
+    for host in (source, destination):
+        answer = state.abilities.answers.get((strategy, host.name))
+        if answer is None or answer.facts is None:
+            return _absent(strategy, answer, [host.name])
+        facts.append(answer.facts)
+    asked = checking
+    try:
+        return state.plugins.ask(
+            "migration", strategy, "host_fault", lambda: required(asked.host_fault(*facts), str)
+        )
+    except PluginError as error:
+        return f"the check of the hosts by {strategy} failed: {error}"
+
+
+def faults(state: MasterState, strategy: str, source: Host) -> list[str]:
+    """Return why a strategy cannot move anything from a host to others, an equal reason once."""
+    absent: dict[str, tuple[Answer | None, list[str]]] = {}
+    others: dict[str, None] = {}
+    answers = state.abilities.answers
+    here = answers.get((strategy, source.name))
+    for host in state.hosts.listed():
+        found = "" if host is source else fault(state, strategy, source, host)
+        answer = answers.get((strategy, host.name))
+        if found and here and here.facts is not None and (answer is None or answer.facts is None):
+            absent.setdefault(answer.reason if answer else "", (answer, []))[1].append(host.name)
+        elif found:
+            others[found] = None
+    return [*(_absent(strategy, *alike) for alike in absent.values()), *others]
+
+
+def _absent(strategy: str, answer: Answer | None, hosts: Sequence[str]) -> str:
+    """Say that a strategy does not work on hosts, or has not answered there yet."""
+    if answer is None or not answer.reason:
+        return f"it is not known yet whether {strategy} works on {listed(hosts, most=3)}"
+    return f"{strategy} does not work on {listed(hosts, most=3)}: {answer.reason}"

@@ -1,0 +1,102 @@
+"""Silence: a host is first suspect (no new work), then, after its lease, lost.
+
+A host whose slave was stopped and left processes running is detached instead. What becomes of them
+follows the same lease (`host_loss`).
+
+Ages are judged by the master's own monotonic clock alone, and never by the ROS graph. A host that
+reports seldom, by its own word, is given as much more time as it needs for a few reports.
+"""
+
+from __future__ import annotations
+
+from math import inf
+from typing import Final
+
+import numpy as np
+
+from rosrm.core.master.assignment.assign import reconsider_set_aside
+from rosrm.core.master.commands import Order
+from rosrm.core.master.hosts import loss
+from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.state.host_arrays import FloatArray
+from rosrm.core.master.state.hosts import Host, HostCondition
+
+#: Reports that a host may owe before it is suspect, however seldom it reports.
+_REPORTS_MISSED: Final = 3
+
+
+def review_liveness(state: MasterState, now: float) -> None:
+    """Move every host between up, suspect and lost by the age of its newest message."""
+    table = state.hosts
+    if not len(table):
+        return
+    age = now - table.heard
+    condition = table.condition
+    grace = _grace(state)
+    fresh = age < state.settings.suspect + grace
+    lease = state.settings.lease + grace
+    gone = age >= lease
+    up, suspect = condition == HostCondition.UP, condition == HostCondition.SUSPECT
+    lost = condition == HostCondition.LOST
+    # Of a host that left nothing more is expected, unless it still holds something; one that is
+    # expected back has its lease from this master's start on.
+    left = (condition == HostCondition.LEFT) & (table.processes > 0)
+    past_lease = (up | suspect | left | (condition == HostCondition.EXPECTED)) & gone
+    for column in np.flatnonzero(up & ~fresh & ~past_lease):
+        _suspect(state, table.hosts[column], float(age[column]), now)
+    _note_company(state, bool((up & ~past_lease).any()), now)
+    for column in np.flatnonzero(past_lease):
+        _lose(state, table.hosts[column], float(age[column]), float(lease[column]), now)
+    for column in np.flatnonzero((suspect | lost) & fresh):
+        welcome_back(state, table.hosts[column], now)
+
+
+def lease_of(state: MasterState, host: Host) -> float:
+    """Return the seconds of silence after which a host is lost."""
+    return state.settings.lease + float(_grace(state)[host.column])
+
+
+def lease_end(state: MasterState, host: Host) -> float:
+    """Return the time at which the lease of a host ends, unless the host is heard before."""
+    return float(state.hosts.heard[host.column]) + lease_of(state, host)
+
+
+def _grace(state: MasterState) -> FloatArray:
+    """Return the seconds, (H,), by which hosts that report seldom may be silent for longer."""
+    return np.maximum(0.0, _REPORTS_MISSED * state.hosts.period - state.settings.suspect)
+
+
+def _note_company(state: MasterState, heard: bool, now: float) -> None:
+    """Whether any host is heard at all: a master that hears none may itself be cut off."""
+    state.in_company_since = min(state.in_company_since, now) if heard else inf
+
+
+def _suspect(state: MasterState, host: Host, age: float, now: float) -> None:
+    state.hosts.set_condition(host, HostCondition.SUSPECT)
+    state.record(
+        now, "host_suspect",
+        f"{host.name} is suspect: it has not reported for {age:.1f} s and gets no new work",
+        host=host.name,
+    )  # fmt: skip
+
+
+def _lose(state: MasterState, host: Host, age: float, lease: float, now: float) -> None:
+    state.hosts.set_condition(host, HostCondition.LOST)
+    state.record(
+        now, "host_lost",
+        f"{host.name} is lost: it has not reported for {age:.1f} s, its lease is {lease:g} s",
+        host=host.name,
+    )  # fmt: skip
+    loss.lose_sight(state, host, now)
+
+
+def welcome_back(state: MasterState, host: Host, now: float) -> None:
+    """A host that was suspect or lost is heard again."""
+    was_lost = state.hosts.condition_of(host) is HostCondition.LOST
+    state.hosts.set_condition(host, HostCondition.UP)
+    state.record(now, "host_back", f"{host.name} reports again", host=host.name)
+    if was_lost:
+        loss.regain_sight(state, host, now)
+        state.hosts.set_untold(host, untold=True)
+        state.emit(Order(state.order_id(), host.host_id, "report"))
+    reconsider_set_aside(state, now)

@@ -1,0 +1,70 @@
+"""What a host brings back that was given up when it was lost.
+
+Where nothing has followed the instance yet, it is the owner again, and its process leaves the
+queue; a job that has completed meanwhile has completed. Where something has, it is fenced.
+"""
+
+from __future__ import annotations
+
+from rosrm.core.master.commands import Order
+from rosrm.core.master.master_state import WAITING, MasterState, Process, ProcessPhase
+from rosrm.core.master.state.hosts import Host
+from rosrm.core.master.state.process import LeftBehind
+from rosrm.model.values import InstanceId, InstanceState, InstanceStatus
+
+
+def take_back_all(state: MasterState, host: Host, now: float) -> None:
+    """A host is heard again: what nothing has followed is its own, until it says otherwise."""
+    for name in [*state.queue, *sorted(state.set_aside)]:
+        process = state.processes[name]
+        if process.left_behind is not None and process.left_behind.host == host.name:
+            _take_back(state, process, process.left_behind, host, now)
+
+
+def take_back(state: MasterState, host: Host, status: InstanceStatus, now: float) -> bool:
+    """The first that is heard of a host is of an instance that was given up; as `take_back_all`.
+
+    Returns:
+        False: it is not that.
+    """
+    process = state.processes.get(status.instance.process)
+    left = None if process is None else process.left_behind
+    if process is None or left is None or process.phase not in WAITING:
+        return False
+    if (left.number, left.host) != (status.instance.number, host.name):
+        return False
+    _take_back(state, process, left, host, now)
+    return True
+
+
+def _take_back(
+    state: MasterState, process: Process, left: LeftBehind, host: Host, now: float
+) -> None:
+    state.unqueue(process)
+    instance = state.add_instance(InstanceId(process.name, left.number), process.spec, host, now)
+    # Not as one that was assigned a moment ago: if the host does not hold it, it is gone.
+    instance.node_name, instance.state = left.node_name, InstanceState.RUNNING
+    process.owner, process.left_behind = left.number, None
+    state.set_phase(process, ProcessPhase.STARTING, now)
+    state.record(
+        now, "readopted", f"{host.name} reports again: {instance.id} still runs there",
+        process=process.name, host=host.name, facts={"number": left.number},
+    )  # fmt: skip
+    state.save(process)
+    # A move that was under way when its host was lost had told the slave not to restart it.
+    restart = process.spec.restart
+    state.emit(Order(state.order_id(), host.host_id, "set_restart", instance.id, restart=restart))
+
+
+def has_successor(state: MasterState, status: InstanceStatus) -> bool:
+    """Another instance owns the name that this one ran under, or is about to.
+
+    It is where a plan goes on as if this one had ended, and where its image owns the name.
+    """
+    process = state.processes.get(status.instance.process)
+    number, run = status.instance.number, state.runs.get(status.instance.process)
+    if run is not None and number in run.ended:
+        return True
+    if process is None:
+        return False
+    return process.owner not in (0, number) or process.image is not None

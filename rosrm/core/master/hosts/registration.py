@@ -1,0 +1,255 @@
+"""What hosts say of themselves: they come, ask for work, report readings, leave."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from rosrm.core.master import events as happened
+from rosrm.core.master import lifecycle
+from rosrm.core.master.assignment.assign import reconsider_set_aside
+from rosrm.core.master.assignment.reservations import settle_charge
+from rosrm.core.master.checkpoint import replication
+from rosrm.core.master.commands import Order, Reply
+from rosrm.core.master.hosts import loss
+from rosrm.core.master.hosts.liveness import lease_end, welcome_back
+from rosrm.core.master.hosts.readings import take_readings
+from rosrm.core.master.master_state import MasterState, ProcessPhase, Wanted
+from rosrm.core.master.recovery.journal_gap import note_seen
+from rosrm.core.master.state.hosts import Host, HostCondition
+from rosrm.extensions.contracts import Intent
+from rosrm.model.description_checks import description_fault
+from rosrm.model.plan import Execute
+from rosrm.model.values import InstanceStatus
+from rosrm.wording import counted
+
+#: Seconds between two records about the same nonsense from the same host.
+_TOLD_EVERY = 10.0
+
+
+def host_registered(state: MasterState, event: happened.HostRegistered, now: float) -> None:
+    """Take a host in, unless a live slave has its name."""
+    description = event.description
+    fault = description_fault(description)
+    if fault:
+        _refuse_host(state, event, "invalid", fault, now)
+        return
+    known = state.hosts.by_name.get(description.name)
+    if known is not None and known.description.incarnation == description.incarnation:
+        _registered_again(state, known, event, now)
+        return
+    taken = _name_taken(state, known, event)
+    if taken:
+        _refuse_host(state, event, "name_taken", taken, now)
+        return
+    is_new = known is None or known.pruned
+    host = state.hosts.register(description, now)
+    host.failing.clear()  # the slave reports what fails in this run
+    if is_new:
+        save_host(state, host)
+    state.record(
+        now, "host_registered", f"{host.name} registered with {_live(event.instances)}",
+        host=host.name,
+        facts={
+            "host_id": host.host_id, "labels": dict(description.labels),
+            "resources": {r.name: r.capacity for r in description.resources},
+            "absent": dict(description.absent),
+        },
+    )  # fmt: skip
+    note_seen(state, host.name, event.journal_seen, now)
+    replication.note_states(state, host, event.kept, now)  # it decides where what is queued goes on
+    loss.regain_sight(state, host, now)
+    stopping = [number for number in sorted(host.instances) if state.instances[number].stopping]
+    lifecycle.reconcile(state, host, event.instances, now, registering=True)
+    _stop_again(state, stopping, now)
+    _forgive(state, host)
+    _execute_again(state, host)
+    reconsider_set_aside(state, now)
+    state.emit(Reply(event.request, host_id=host.host_id))
+
+
+def _stop_again(state: MasterState, stopping: list[int], now: float) -> None:
+    """Order the stops again at once that the former run of a slave may not have taken."""
+    for number in stopping:
+        if number in state.instances:
+            lifecycle.stop_instance(state, state.instances[number], now)
+
+
+def _live(held: Iterable[InstanceStatus]) -> str:
+    """Return how many of the instances that a slave reports have not ended: "2 processes"."""
+    return counted(sum(not one.state.ended for one in held), "process", "processes")
+
+
+def _execute_again(state: MasterState, host: Host) -> None:
+    """What an executor of the slave's former run had in hand ended with it: it begins anew."""
+    for run in state.runs.values():
+        step = run.step_in_hand
+        if isinstance(step, Execute) and step.host == host.name:
+            run.begun = False
+
+
+def _refuse_host(
+    state: MasterState, event: happened.HostRegistered, code: str, why: str, now: float
+) -> None:
+    known = state.hosts.by_name.get(event.description.name)
+    if known is None:
+        state.record(now, "host_refused", why, host=event.description.name)
+    else:  # a slave whose name is taken asks again for a moment
+        _tell(state, known, "host_refused", now, why)
+    state.emit(Reply(event.request, False, code, why))
+
+
+def _registered_again(
+    state: MasterState, host: Host, event: happened.HostRegistered, now: float
+) -> None:
+    """The same run of a slave once more: its first answer was lost, or the request came twice.
+
+    Nothing that it has said since is forgotten, and what it says it holds may be old news: it is
+    asked for everything in order.
+    """
+    state.hosts.heard[host.column] = now
+    replication.note_states(state, host, event.kept, now)
+    condition = state.hosts.condition_of(host)
+    if condition in (HostCondition.LOST, HostCondition.SUSPECT):
+        welcome_back(state, host, now)
+    if condition is not HostCondition.LOST:
+        state.emit(Order(state.order_id(), host.host_id, "report"))
+    state.emit(Reply(event.request, host_id=host.host_id))
+
+
+def _forgive(state: MasterState, host: Host) -> None:
+    """Forget what was held against a host before its slave was started again.
+
+    It may find what it lacked, and the master stops there what may have run on while it was away.
+    """
+    for name in state.over:
+        process = state.processes[name]
+        if process.phase is ProcessPhase.CANCELLED and process.ended_on == host.name:
+            process.reason = ""
+    for process in state.processes.values():
+        if host.name in process.excluded and not process.phase.over:
+            del process.excluded[host.name]
+            process.demand = None
+
+
+def _name_taken(state: MasterState, known: Host | None, event: happened.HostRegistered) -> str:
+    if known is None or state.hosts.condition_of(known) is not HostCondition.UP:
+        return ""
+    first = known.description
+    return (
+        f"a live slave has the name {first.name!r} already: pid {first.pid} on {first.hostname}; "
+        f"give this one (pid {event.description.pid} on {event.description.hostname}) another "
+        f"`host:` in its configuration, or stop the first"
+    )
+
+
+def save_host(state: MasterState, host: Host) -> None:
+    """Make durable what is intended with a host."""
+    state.emit(
+        Intent(
+            "host",
+            host.name,
+            {
+                "host_id": host.host_id,
+                "cordoned": host.cordoned,
+                "draining": host.draining,
+            },
+        )
+    )
+
+
+def host_left(state: MasterState, event: happened.HostLeft, now: float) -> None:
+    """A slave is stopped: what it ends goes back to the queue, and what it keeps is detached."""
+    host = state.hosts.find(event.host_id, event.incarnation)
+    if host is None:
+        state.emit(Reply(event.request, False, "unknown", "this host is not registered"))
+        return
+    if event.kept:
+        _detach(state, host, event.kept, now)
+        state.emit(Reply(event.request))
+        return
+    state.hosts.set_condition(host, HostCondition.LEFT)
+    state.record(now, "host_left", f"{host.name} leaves: its slave stops", host=host.name)
+    for number in sorted(host.instances):
+        process = state.owned_by(state.instances[number])
+        if process is not None and process.wanted is Wanted.RUN:
+            process.wanted = Wanted.REQUEUE
+            state.save(process)
+    state.emit(Reply(event.request))
+
+
+def _detach(state: MasterState, host: Host, kept: tuple[InstanceStatus, ...], now: float) -> None:
+    """Take in what a slave that was stopped left running; what it does not hold has not begun."""
+    state.hosts.set_condition(host, HostCondition.DETACHED)
+    state.record(
+        now, "host_detached",
+        f"{host.name} is detached: its slave was stopped and left {_live(kept)} running",
+        host=host.name,
+    )  # fmt: skip
+    lifecycle.reconcile(state, host, kept, now, registering=True)
+    loss.detach(state, host, lease_end(state, host), now)
+
+
+def process_requested(state: MasterState, event: happened.ProcessRequested, now: float) -> None:
+    """Note that a host asks for work; the request stays open until there is some."""
+    host = state.hosts.find(event.host_id, event.incarnation)
+    if host is None:
+        state.emit(Reply(event.request, False, "unknown", "register first"))
+        return
+    state.hosts.ask(host)
+
+
+def readings_received(state: MasterState, event: happened.ReadingsReceived, now: float) -> None:
+    """Note a batch of readings; nonsense is refused and said."""
+    first = bool(state.set_aside) and bool(state.hosts.without_reading().any())
+    refused = take_readings(state.hosts, event, now)
+    if first:  # before the queue is served, which keeps the order
+        reconsider_set_aside(state, now)
+    for row in np.flatnonzero(refused):
+        host = state.hosts.find(int(event.host_id[row]), int(event.incarnation[row]))
+        if host is not None:
+            _tell(
+                state, host, "reading_refused", now,
+                f"a reading of {host.name} was refused (NaN, negative, absurd, or a limit outside "
+                f"0..1): usage {_shown(event.usage[row])}, limit {_shown(event.limit[row])}",
+            )  # fmt: skip
+
+
+def _shown(values: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> str:
+    return "[" + ", ".join(f"{value:.3g}" for value in values[:8]) + ", …]"
+
+
+def _tell(state: MasterState, host: Host, kind: str, now: float, message: str) -> None:
+    if now - host.told.get(kind, float("-inf")) >= _TOLD_EVERY:
+        host.told[kind] = now
+        state.record(now, kind, message, host=host.name)
+
+
+def usages_received(state: MasterState, event: happened.UsagesReceived, now: float) -> None:
+    """What now shows of an instance no longer counts as in flight."""
+    host = state.hosts.find(event.host_id, event.incarnation)
+    if host is None:
+        return
+    for number, cpu, memory in zip(event.numbers, event.cpu, event.memory, strict=True):
+        instance = state.instances.get(int(number))
+        if instance is None or instance.host is not host:
+            continue
+        if not (np.isfinite(cpu) and np.isfinite(memory) and cpu >= 0.0 and memory >= 0.0):
+            _tell(
+                state,
+                host,
+                "reading_refused",
+                now,
+                f"a usage of {instance.id} was refused (NaN or negative)",
+            )
+            continue
+        instance.seen = {"cpu": float(cpu), "memory": float(memory)}
+        for resource, amount in instance.seen.items():
+            instance.peak[resource] = max(amount, instance.peak.get(resource, 0.0))
+        settle_charge(state, instance, now)
+
+
+def peer_refused(state: MasterState, event: happened.PeerRefused, now: float) -> None:
+    """Somebody was turned away at the edge."""
+    state.record(now, "peer_refused", f"{event.who} was refused: {event.reason}")

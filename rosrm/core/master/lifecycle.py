@@ -1,0 +1,409 @@
+"""What becomes of instances, and what that means for their processes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import Final
+
+from rosrm.core.master import events as happened
+from rosrm.core.master.assignment.prefetch import learn_run_time, review_slots
+from rosrm.core.master.assignment.reservations import learn_from
+from rosrm.core.master.commands import Order
+from rosrm.core.master.hosts import readoption
+from rosrm.core.master.master_state import (
+    WAITING,
+    Instance,
+    MasterState,
+    Process,
+    ProcessPhase,
+    Wanted,
+)
+from rosrm.core.master.migration import failover
+from rosrm.core.master.plugin_failures import note_on_host
+from rosrm.core.master.state.hosts import Host, HostCondition
+from rosrm.core.master.state.migration import End, Run
+from rosrm.model.plan import Start
+from rosrm.model.values import EMPTY, InstanceId, InstanceState, InstanceStatus, Kind, RestartPolicy
+from rosrm.wording import standing
+
+#: What the state of the owning instance means for the process.
+_PHASE: Final = {
+    None: ProcessPhase.ASSIGNED,
+    InstanceState.HELD: ProcessPhase.ASSIGNED,
+    InstanceState.STARTING: ProcessPhase.STARTING,
+    InstanceState.RUNNING: ProcessPhase.STARTING,
+    InstanceState.READY: ProcessPhase.RUNNING,
+    InstanceState.BACKOFF: ProcessPhase.BACKOFF,
+    InstanceState.STOPPING: ProcessPhase.STOPPING,
+}
+#: What a slave says of an instance whose restart it has begun.
+_RESTARTS: Final = frozenset({InstanceState.STOPPING, InstanceState.STARTING})
+_ALIVE: Final = frozenset({InstanceState.STARTING, InstanceState.RUNNING, InstanceState.READY})
+
+
+def statuses_received(state: MasterState, event: happened.StatusesReceived, now: float) -> None:
+    """Take in what a slave says of its instances, in order; what comes late is known already."""
+    host = state.hosts.find(event.host_id, event.incarnation)
+    if host is None or state.hosts.condition_of(host) is HostCondition.DETACHED:
+        return  # the last message of a slave that leaves processes running has all that it holds
+    is_next = state.hosts.note_statuses(host, event.sequence, now)
+    if is_next is None:
+        return
+    note_on_host(state, host, event.failing_plugins(), now)
+    if event.complete:
+        state.missing_since.pop(host.column, None)
+        state.hosts.set_untold(host, untold=False)
+        reconcile(state, host, event.statuses, now)
+        return
+    if not is_next:
+        state.emit(Order(state.order_id(), host.host_id, "report"))
+    for status in event.statuses:
+        take_status(state, host, status, now)
+
+
+def reconcile(
+    state: MasterState, host: Host, statuses: Iterable[InstanceStatus], now: float,
+    *, registering: bool = False,
+) -> None:  # fmt: skip
+    """Compare all that a host holds with what is intended there.
+
+    An assignment of which the host has said nothing may be on its way, unless the host is
+    `registering`: a slave takes up nothing that was sent before its registration.
+    """
+    held = {status.instance: status for status in statuses}
+    state.skip_numbers(max((one.number for one in held), default=0))
+    for status in held.values():
+        take_status(state, host, status, now)
+    for instance in [state.instances[number] for number in sorted(host.instances)]:
+        if instance.id in held:
+            continue
+        if instance.state is None and (not registering or _yet_to_start(state, instance)):
+            continue
+        gone(state, instance, now, f"{host.name} does not run it any more")
+
+
+def _yet_to_start(state: MasterState, instance: Instance) -> bool:
+    """A plan has it counted there, and this master has not given the order to start it."""
+    run = state.runs.get(instance.id.process)
+    return run is not None and any(
+        isinstance(step, Start) and step.instance == instance.id for step in run.ahead
+    )
+
+
+def take_status(state: MasterState, host: Host, status: InstanceStatus, now: float) -> None:
+    """One instance changed."""
+    instance = state.instances.get(status.instance.number)
+    if instance is None or instance.host is not host or instance.id != status.instance:
+        _take_stranger(state, host, status, now)
+        return
+    before = instance.state
+    instance.state, instance.pid, instance.restarts = status.state, status.pid, status.restarts
+    if instance.state is InstanceState.READY and before is not InstanceState.READY:
+        instance.ready_at = now
+    if status.state.ended:
+        _ended(state, instance, status, before, now)
+    review_slots(state, host, now)
+    if status.state.ended:
+        return
+    if status.state in _ALIVE:
+        instance.recalled = False
+    if status.state in _RESTARTS:
+        instance.restarting = False
+    process = state.owned_by(instance)
+    if process is None:
+        return
+    if process.restarts != status.restarts:
+        process.out_of_sight = None  # another run began while its host was silent
+    process.restarts = status.restarts
+    if process.wanted is not Wanted.RUN and not instance.stopping:
+        stop_instance(state, instance, now)
+    if status.state is InstanceState.BACKOFF and failover.is_ready(state, process):
+        stop_instance(state, instance, now)  # its standby goes on sooner, and with its state
+    if process.name not in state.runs:
+        _follow(state, process, instance, status, now, repeated=before is status.state)
+
+
+def _follow(
+    state: MasterState, process: Process, instance: Instance, status: InstanceStatus, now: float,
+    *, repeated: bool,
+) -> None:  # fmt: skip
+    """The process goes where its owning instance went."""
+    before = process.phase
+    phase = phase_of(process, instance)
+    state.set_phase(process, phase, now, status.message)
+    if phase is not before:
+        # A job that has begun is not ready for anything: it runs to its end.
+        is_ready = phase is ProcessPhase.RUNNING and process.spec.kind is not Kind.JOB
+        kind = "ready" if is_ready else phase.value
+        kind = "reachable" if repeated else kind
+        state.record(
+            now, kind, f"{process.name} {standing(kind)} on {instance.host.name}"
+            + (f": {status.message}" if status.message else ""),
+            process=process.name, host=instance.host.name,
+            facts={"number": instance.id.number, "pid": status.pid, "restarts": status.restarts},
+        )  # fmt: skip
+        if phase in (ProcessPhase.RUNNING, ProcessPhase.BACKOFF):
+            state.save(process)
+
+
+def phase_of(process: Process, owner: Instance) -> ProcessPhase:
+    """Where a process stands by what is known of the instance that owns its name."""
+    if process.wanted is not Wanted.RUN:
+        return ProcessPhase.STOPPING
+    return _PHASE.get(owner.state, ProcessPhase.STARTING)
+
+
+def _take_stranger(state: MasterState, host: Host, status: InstanceStatus, now: float) -> None:
+    """An instance that nobody intends here must not run: it may have a successor elsewhere.
+
+    It is kept on the books until it has ended, so that it is told to stop until it does, and no
+    successor is started beside it.
+    """
+    if readoption.take_back(state, host, status, now):
+        take_status(state, host, status, now)
+        return
+    if status.state.ended:
+        return
+    if status.instance.number in state.instances:  # it is intended, but elsewhere
+        if status.state is not InstanceState.STOPPING:
+            state.emit(Order(state.order_id(), host.host_id, "stop", status.instance))
+        return
+    followed = readoption.has_successor(state, status)
+    how = "has it killed: another instance owns its name" if followed else "stops it"
+    state.record(
+        now, "fenced" if followed else "unassigned_stopped",
+        f"{status.instance} is not assigned to {host.name}: the master {how}",
+        process=status.instance.process, host=host.name,
+    )  # fmt: skip
+    stranger = adopt_to_stop(state, status.instance, host, now)
+    stranger.state, stranger.pid = status.state, status.pid
+    stranger.at_once = followed
+    stop_instance(state, stranger, now)
+    process = state.processes.get(status.instance.process)
+    if process is not None and process.phase in WAITING:
+        _wait_for_ends(state, process, now)
+
+
+def adopt_to_stop(state: MasterState, instance: InstanceId, host: Host, now: float) -> Instance:
+    """Keep an instance on the books that is only to end; what it uses shows in the readings."""
+    nothing = state.hosts.fractions_of(host, EMPTY)
+    adopted = state.charge_instance(instance, host, now, EMPTY, frozenset(), nothing)
+    adopted.stopping = True
+    return adopted
+
+
+def stop_instance(state: MasterState, instance: Instance, now: float) -> None:
+    """Order an instance to stop, for good; asked again until it has ended."""
+    instance.stopping = True
+    instance.order, instance.order_at = state.order_id(), now
+    action = "fence" if instance.at_once else "stop"
+    state.emit(Order(instance.order, instance.host.host_id, action, instance.id))
+
+
+# --- ends -------------------------------------------------------------------------------------
+
+
+def _ended(
+    state: MasterState, instance: Instance, status: InstanceStatus, before: InstanceState | None,
+    now: float,
+) -> None:  # fmt: skip
+    process = state.processes.get(instance.id.process)
+    state.drop_instance(instance)
+    if process is None:
+        return
+    learn_from(state, process.spec, instance, status)
+    learn_run_time(state, process.spec, status)
+    end = _end(process, instance, status, before)
+    run = state.runs.get(process.name)
+    if run is not None:
+        run.ended[instance.id.number] = end
+        state.save_run(run)
+        if status.state is InstanceState.REFUSED and not _recalled(run, instance):
+            exclude(process, instance.host, status)
+    if process.owner != instance.id.number:
+        state.record(
+            now, "instance_ended", f"{instance.id} ended on {instance.host.name}"
+            + (f": {status.message}" if status.message else ""),
+            process=process.name, host=instance.host.name,
+        )  # fmt: skip
+        requeue_if_clear(state, process, now)
+        return
+    if run is not None:
+        return  # the plan in hand knows what this end means
+    if instance.restarting:  # its end was on its way when the restart was ordered
+        missed = replace(status, message="it ended before it was restarted")
+        end = End(missed, gone=True)
+    conclude(state, process, end, instance.host, now)
+
+
+def _end(
+    process: Process, instance: Instance, status: InstanceStatus, before: InstanceState | None
+) -> End:
+    """How it ended: by itself, or because it was told to."""
+    completed = (
+        process.spec.kind is Kind.JOB
+        and status.succeeded
+        and before is not InstanceState.STOPPING
+        and status.run_time > 0.0  # else it was stopped before it was started
+    )  # fmt: skip
+    told = instance.stopping or instance.recalled or process.wanted is Wanted.REQUEUE
+    told = told or status.state is InstanceState.WITHDRAWN  # the slave stopped it, no order did
+    return End(status, ordered=told and not completed, completed=completed)
+
+
+def conclude(state: MasterState, process: Process, end: End, host: Host, now: float) -> None:
+    """The owning instance has ended, and no plan is under way: what becomes of the process?"""
+    if failover.take_over(state, process, end, now):
+        return
+    status = end.status
+    process.owner = 0
+    process.exit_code = None if end.gone else status.known_exit
+    if process.wanted is Wanted.CANCEL:
+        _finish(state, process, ProcessPhase.CANCELLED, host, now, "")
+    elif end.gone:
+        _requeue(state, process, host, now, status.message)
+    elif end.ordered:
+        _requeue(state, process, host, now, f"its instance on {host.name} was stopped")
+    elif status.state is InstanceState.FENCED and process.spec.host_loss.then != "stop":
+        _requeue(state, process, host, now, status.message)
+    elif status.state is InstanceState.REFUSED:
+        exclude(process, host, status)
+        _requeue(state, process, host, now, f"{host.name} cannot run it: {status.message}")
+    elif status.succeeded:
+        _finish(state, process, ProcessPhase.FINISHED, host, now, status.message)
+    else:
+        reason = status.message or f"exit code {status.exit_code}"
+        _finish(state, process, ProcessPhase.FAILED, host, now, reason)
+
+
+def restarts_after(policy: RestartPolicy, status: InstanceStatus) -> bool:
+    """Whether a slave would have started an instance again that ended so."""
+    if status.state is InstanceState.REFUSED or policy.when == "never":
+        return False
+    if policy.when == "always" or status.state is InstanceState.FAILED:
+        return True  # the unhealthy have failed, though they may exit with 0
+    return bool(status.exit_code or status.exit_signal)
+
+
+def exclude(process: Process, host: Host, status: InstanceStatus) -> None:
+    """The host cannot run this process: it is not asked again."""
+    process.excluded[host.name] = status.message or "its slave refused it"
+    process.demand = None
+
+
+def _recalled(run: Run, instance: Instance) -> bool:
+    """A refusal may only say that the order to stop came before the order to start."""
+    return instance.stopping or (run.undo is not None and instance.id == run.destination)
+
+
+def _finish(
+    state: MasterState, process: Process, phase: ProcessPhase, host: Host, now: float, reason: str
+) -> None:
+    state.set_phase(process, phase, now, reason)
+    process.ended_on = host.name
+    state.record(
+        now, phase.value,
+        f"{process.name} {phase.value} on {host.name}" + (f": {reason}" if reason else ""),
+        process=process.name, host=host.name, facts={"exit_code": process.exit_code},
+    )  # fmt: skip
+    state.save(process)
+
+
+def _requeue(state: MasterState, process: Process, host: Host, now: float, reason: str) -> None:
+    """Back to its place in the line, once no other instance of it can be active any more."""
+    state.record(
+        now, "queued", f"{process.name} returns to the queue: {reason}", process=process.name,
+        host=host.name,
+    )  # fmt: skip
+    process.wanted = Wanted.REQUEUE
+    for instance in state.instances_of(process):
+        if not instance.stopping:
+            stop_instance(state, instance, now)
+    if not requeue_if_clear(state, process, now):
+        _wait_for_ends(state, process, now)
+
+
+def _wait_for_ends(state: MasterState, process: Process, now: float) -> None:
+    """It is queued, at its place, once nothing of it runs any more."""
+    state.unqueue(process)
+    process.wanted = Wanted.REQUEUE
+    note_awaited_ends(state, process, now)
+    state.save(process)
+
+
+def note_awaited_ends(state: MasterState, process: Process, now: float) -> None:
+    """Set the phase of a process without an owner, of which instances are still to end."""
+    left = ", ".join(f"{one.id} on {one.host.name}" for one in state.instances_of(process))
+    state.set_phase(process, ProcessPhase.STOPPING, now, f"waits until {left} has ended")
+
+
+def requeue_if_clear(state: MasterState, process: Process, now: float) -> bool:
+    """Queue or cancel a process as it is wanted, unless an instance of it may still run."""
+    if process.owner or process.instances or process.name in state.runs or process.phase.over:
+        return False
+    if process.wanted is Wanted.CANCEL:
+        state.set_phase(process, ProcessPhase.CANCELLED, now)
+        state.record(now, "cancelled", f"{process.name} cancelled", process=process.name)
+    elif process.wanted is Wanted.REQUEUE:
+        state.enqueue(process, now)
+    else:
+        return False
+    state.save(process)
+    return True
+
+
+def gone(
+    state: MasterState, instance: Instance, now: float, reason: str, *, comes_again: bool = True
+) -> None:
+    """An instance that should be there is not, or counts as lost; nothing is known of its end."""
+    process = state.processes.get(instance.id.process)
+    state.drop_instance(instance)
+    if process is None:
+        return
+    status = InstanceStatus(instance.id, InstanceState.FAILED, exit_code=1, message=reason)
+    end = End(status, gone=comes_again)
+    run = state.runs.get(process.name)
+    if run is not None:
+        run.ended[instance.id.number] = end
+        state.save_run(run)
+    elif process.owner == instance.id.number:
+        conclude(state, process, end, instance.host, now)
+    else:
+        requeue_if_clear(state, process, now)
+
+
+def assignment_withdrawn(
+    state: MasterState, event: happened.AssignmentWithdrawn, now: float
+) -> None:
+    """The slave never saw it: the process goes back to its place."""
+    instance = state.instances.get(event.instance.number)
+    if instance is not None:
+        gone(state, instance, now, f"{instance.host.name} did not accept the assignment in time")
+
+
+def note_phase(state: MasterState, process: Process, owner: Instance, now: float) -> None:
+    """Set the phase of a process that no plan moves, by its owner and by the owner's host."""
+    host = owner.host
+    unreachable = state.hosts.why_unreachable(host)
+    if process.wanted is Wanted.CANCEL:
+        where = f"; it may still run on {host.name}, which {unreachable}" if unreachable else ""
+        ends = f", and ends when {host.name} returns" if unreachable else ""
+        if state.hosts.condition_of(host) is HostCondition.DETACHED:
+            where, ends = f": waits for {host.name}, whose slave was stopped", ""
+        state.set_phase(process, ProcessPhase.STOPPING, now, f"being cancelled{where}{ends}")
+    elif unreachable:
+        lost = state.hosts.condition_of(host) is HostCondition.LOST
+        reason = f"{host.name} {unreachable}{_what_follows(process) if lost else ''}"
+        state.set_phase(process, ProcessPhase.UNREACHABLE, now, reason)
+    else:
+        state.set_phase(process, phase_of(process, owner), now)
+
+
+def _what_follows(process: Process) -> str:
+    policy = process.spec.host_loss
+    if policy.then == "wait":
+        return ""
+    when = f" in {policy.delay:g} s" if policy.delay else ""
+    what = "is started on another host" if policy.then == "elsewhere" else "fails"
+    return f"; the process {what}{when}"

@@ -1,0 +1,201 @@
+"""The state as rows for people, and the story of one process."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+from rosrm.core.master.assignment.assign import decide_now
+from rosrm.core.master.checkpoint import periodic
+from rosrm.core.master.checkpoint.images import reason_of
+from rosrm.core.master.master_state import (
+    Instance,
+    MasterState,
+    Process,
+    ProcessPhase,
+    Wanted,
+)
+from rosrm.core.master.migration import handoff
+from rosrm.core.master.state.hosts import Host, HostCondition
+from rosrm.model.rows import HostRow, ProcessRow, ResourceRow
+from rosrm.model.values import InstanceState, StopPolicy
+
+_CONDITION: Final = {
+    HostCondition.UP: "up",
+    HostCondition.SUSPECT: "suspect",
+    HostCondition.LOST: "lost",
+    HostCondition.LEFT: "left",
+    HostCondition.EXPECTED: "lost",
+    HostCondition.DETACHED: "detached",
+}
+#: Of hosts that report: one that leaves reports until all that it held has ended.
+_HEARD: Final = (HostCondition.UP, HostCondition.LEFT)
+_OUT_OF_REACH: Final = (HostCondition.LOST, HostCondition.DETACHED)
+#: Phases that a slave observes: of a silent host they are not known.
+_OBSERVED: Final = (ProcessPhase.STARTING, ProcessPhase.RUNNING, ProcessPhase.BACKOFF)
+
+
+def host_rows(state: MasterState, now: float) -> list[HostRow]:
+    """Every host, in order of registration."""
+    return [_host_row(state, host, now) for host in state.hosts.listed()]
+
+
+def _host_row(state: MasterState, host: Host, now: float) -> HostRow:
+    table, column = state.hosts, host.column
+    stale = set(table.stale_resources(host))
+    condition = table.condition_of(host)
+    rows = []
+    for resource in host.description.resources:
+        at = table.resources.index(resource.name)
+        rows.append(
+            ResourceRow(
+                resource.name, resource.unit, resource.capacity, resource.scope,
+                float(table.usage[at, column]), float(table.load[at, column]),
+                float(table.limit[at, column]),
+                resource.name in stale or condition is not HostCondition.UP,
+            )
+        )  # fmt: skip
+    return HostRow(
+        host.description, host.host_id, _CONDITION[condition], host.cordoned,
+        host.draining, table.is_accepting(host) and condition is HostCondition.UP,
+        now - float(table.heard[column]), tuple(rows), int(table.processes[column]), host.drained,
+    )  # fmt: skip
+
+
+def process_rows(state: MasterState, now: float) -> list[ProcessRow]:
+    """Every process, in order of submission."""
+    return [process_row(state, process, now) for process in state.processes.values()]
+
+
+def process_row(state: MasterState, process: Process, now: float) -> ProcessRow:
+    """One process."""
+    owner = state.instances.get(process.owner)
+    seen = owner.seen if owner else {}
+    silence = _silence(state, owner, now)
+    phase = process.phase.value
+    reason = reason_of(state, process) or _of_standby(process) or _awaited_node(process, owner)
+    if silence and process.phase in _OBSERVED:
+        phase, reason = "unknown", f"{silence}; last known: {phase}"
+    if owner is not None and process.wanted is Wanted.CANCEL and process.name not in state.runs:
+        reason += _awaited(state, owner.host, now)
+    elif owner is not None and process.phase is ProcessPhase.STOPPING:
+        reason = _stopped_by_slave(state, owner, process.spec.stop, reason)
+    return ProcessRow(
+        name=process.name, kind=process.spec.kind.value, state=phase,
+        host=_host_of(process, owner), number=process.owner,
+        pid=owner.pid if owner else 0, restarts=process.restarts, migrations=process.migrations,
+        exit_code=process.exit_code, priority=process.spec.priority,
+        queue_position=state.queue.position(process.name), since=now - process.since,
+        cpu=seen.get("cpu", 0.0), memory=int(seen.get("memory", 0.0)), reason=reason,
+        stale=bool(silence),
+    )  # fmt: skip
+
+
+def _silence(state: MasterState, owner: Instance | None, now: float) -> str:
+    """Return why readings of an instance are old; "" where its host reports."""
+    if owner is None or state.hosts.condition_of(owner.host) in _HEARD:
+        return ""
+    age = now - float(state.hosts.heard[owner.host.column])
+    return f"{owner.host.name} has been silent for {age:.0f} s"
+
+
+def _stopped_by_slave(state: MasterState, owner: Instance, stop: StopPolicy, reason: str) -> str:
+    """Return the reason with the cause and the longest duration where a slave ends its host."""
+    if state.hosts.condition_of(owner.host) is not HostCondition.LEFT:
+        return reason
+    until = f"SIGKILL after {stop.interrupt_grace + stop.terminate_grace:g} s"
+    return "; ".join(filter(None, (f"the slave of {owner.host.name} was stopped", reason, until)))
+
+
+def _awaited(state: MasterState, host: Host, now: float) -> str:
+    """Return for how long the end of a cancelled process waits for its host; "" if it does not."""
+    condition = state.hosts.condition_of(host)
+    if condition is HostCondition.DETACHED:
+        return f" {now - host.detached_since:.0f} s ago"
+    if condition is HostCondition.SUSPECT:
+        silence = now - float(state.hosts.heard[host.column])
+        return f": waits for {host.name}, which has been silent for {silence:.0f} s"
+    return ""
+
+
+def _host_of(process: Process, owner: Instance | None) -> str:
+    if owner is not None:
+        return owner.host.name
+    return process.image.host if process.image is not None else process.ended_on
+
+
+def _of_standby(process: Process) -> str:
+    return process.standby_reason if process.phase is ProcessPhase.RUNNING else ""
+
+
+def _awaited_node(process: Process, owner: Instance | None) -> str:
+    """Return which node a process that runs must show to be ready; "" for none."""
+    if owner is None or process.phase is not ProcessPhase.STARTING:
+        return ""
+    spec = process.spec
+    if owner.state is not InstanceState.RUNNING or not spec.ros or spec.readiness.kind == "running":
+        return ""
+    node = handoff.qualified(spec, owner.node_name or spec.name)
+    return f"waits for its node {node} in the ROS graph, for at most {spec.readiness.timeout:g} s"
+
+
+def explanation(state: MasterState, name: str, now: float) -> Mapping[str, Any] | None:
+    """Why a process is where it is, or why it waits; None: there is no such process."""
+    process = state.processes.get(name)
+    if process is None:
+        return None
+    row = process_row(state, process, now)
+    decision, age = process.decision, now - process.decided_at
+    if process.phase in (ProcessPhase.QUEUED, ProcessPhase.SET_ASIDE):
+        now_decided = decide_now(state, process)
+        now_decided.kind = "waits" if process.phase is ProcessPhase.QUEUED else "set_aside"
+        decision, age = now_decided, 0.0
+    return {
+        "process": name, "state": row.state, "host": row.host,
+        "reason": "; ".join(
+            filter(None, (_reason(state, process, row), _advice(state, process)))
+        ),
+        "decision": None if decision is None else {**decision, "elapsed": age},
+        "kept": _kept(state, process, now),
+        "checkpoint": periodic.of_process(state, process, now),
+        "history": [
+            {"elapsed": now - at, "kind": kind, "message": message}
+            for at, kind, message in process.history
+        ],
+    }  # fmt: skip
+
+
+def _kept(state: MasterState, process: Process, now: float) -> list[Mapping[str, Any]]:
+    """Where a state of it is kept, the newest first."""
+    holdings = state.keeping.holdings
+    known = holdings.of(process.name)
+    return [
+        {
+            "host": host, "number": known[host].number, "sequence": known[host].sequence,
+            "size": known[host].size, "elapsed": now - known[host].since,
+        }
+        for host in holdings.hosts_of(process.name, process.born)
+    ]  # fmt: skip
+
+
+def _reason(state: MasterState, process: Process, row: ProcessRow) -> str:
+    position = row.queue_position
+    if process.phase is not ProcessPhase.QUEUED or position <= 1:
+        awaited = _awaited_node(process, state.instances.get(process.owner))
+        return reason_of(state, process) or awaited
+    ahead = f"{position - 1} before it in the queue, {state.queue.head()} first"
+    return ahead if state.settings.backfill else f"{ahead}, and those behind wait with it"
+
+
+def _advice(state: MasterState, process: Process) -> str:
+    """Return the commands that help a process on; "" for none."""
+    owner = state.instances.get(process.owner)
+    if owner is not None and state.hosts.condition_of(owner.host) in _OUT_OF_REACH:
+        return f"start the slave of {owner.host.name} again"
+    logs = f"`rosrm logs {process.name}` shows its output"
+    if process.phase is ProcessPhase.BACKOFF:
+        return logs
+    if process.phase is ProcessPhase.FAILED:
+        again = f"`rosrm restart {process.name}` starts it again"
+        return f"{logs}, {again}" if process.ended_on else again
+    return ""

@@ -1,0 +1,428 @@
+"""All that the master's core knows; the handlers of `master.py` change it in place."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+from math import inf
+from typing import Any, Final
+
+import numpy as np
+
+from rosrm.core.master.commands import Command
+from rosrm.core.master.hosts.fencing import fence_of
+from rosrm.core.master.scheduling.decision import Decision
+from rosrm.core.master.scheduling.ranking import NamedPolicy, Ranking
+from rosrm.core.master.settings import CoreSettings
+from rosrm.core.master.state.capabilities import Abilities
+from rosrm.core.master.state.demand import Demand
+from rosrm.core.master.state.host_arrays import FloatArray
+from rosrm.core.master.state.hosts import Host, HostTable
+from rosrm.core.master.state.images import Images
+from rosrm.core.master.state.learned_needs import LearnedNeeds
+from rosrm.core.master.state.migration import Run, run_to_dict
+from rosrm.core.master.state.periodic import Periodic
+from rosrm.core.master.state.process import Instance, Process, ProcessPhase, Wanted
+from rosrm.core.master.state.queue import Queue
+from rosrm.core.master.state.replicas import Keeping
+from rosrm.extensions.contracts import Intent, MigrationStrategy, Record, ScoringPolicy
+from rosrm.extensions.declared_fields import Declared
+from rosrm.extensions.plugin_calls import PluginCalls
+from rosrm.model.values import EMPTY, Assignment, InstanceId, ProcessSpec
+from rosrm.wording import one_line
+
+#: Records of one process that `explain` tells.
+_HISTORY: Final = 12
+#: Instance numbers are made durable by so many at a time.
+_RESERVED: Final = 1000
+#: Phases between the return of a host and its report of what runs there.
+_ON_THE_WAY_BACK: Final = frozenset({ProcessPhase.ASSIGNED, ProcessPhase.STARTING})
+#: Of processes that wait for a host.
+WAITING: Final = (ProcessPhase.QUEUED, ProcessPhase.SET_ASIDE)
+#: Most removed processes of which replicas are still dropped.
+_REMOVED_KEPT: Final = 10_000
+#: No instance gets a number as large as this.
+_LARGEST: Final = 2**53
+
+__all__ = [
+    "WAITING",
+    "Instance",
+    "MasterState",
+    "Process",
+    "ProcessPhase",
+    "Run",
+    "Wanted",
+    "larger",
+]
+
+
+@dataclass(slots=True)
+class Tail:
+    """What is known of the end of the journal, as it was when this master started.
+
+    Attributes:
+        newest: sequence of its newest record.
+        started: time of the start.
+        fell: the machine fell before it, and not every host has come back.
+        lost: records that are known to be lost.
+        short: some are, and not every host has had the time to be heard since.
+    """
+
+    newest: int = _LARGEST
+    started: float = 0.0
+    fell: bool = False
+    lost: int = 0
+    short: bool = False
+
+
+class MasterState:
+    """The state of the master's core, with the few moves that every handler shares.
+
+    Attributes:
+        declared: what the offers of the selected plugins declare.
+        over: names of the processes that are over, in the order in which they ended.
+        standbys: process name to the handoff whose destination is its standby.
+        wants_standby: names of the processes that ask for one and are not over.
+        held_since: time since when placement waits for first requests for work; inf: it does not.
+        in_company_since: time since when at least one host has been heard; inf: none is.
+        tail: whether the journal has lost what was newest in it.
+        plugins: guards every call of a plugin.
+    """
+
+    def __init__(
+        self,
+        settings: CoreSettings,
+        policy_name: str,
+        policy: ScoringPolicy,
+        strategies: Mapping[str, MigrationStrategy],
+        epoch: int,
+        fallback: tuple[str, ScoringPolicy] | None = None,
+        *,
+        declared: Declared | None = None,
+    ) -> None:
+        self.settings = settings
+        self.declared = declared or Declared()
+        self.policy_name = policy_name
+        self.policies: tuple[NamedPolicy, ...] = ((policy_name, policy),)
+        if fallback is not None:
+            self.policies += (fallback,)
+        self.strategies = dict(strategies)
+        self.epoch = epoch
+        self.hosts = HostTable()
+        self.queue = Queue()
+        self.processes: dict[str, Process] = {}
+        self.over: dict[str, None] = {}
+        self.instances: dict[int, Instance] = {}
+        self.runs: dict[str, Run] = {}
+        self.runs_by_order: dict[int, str] = {}
+        self.standbys: dict[str, Run] = {}
+        self.wants_standby: set[str] = set()
+        self.learned = LearnedNeeds()
+        self.run_times: dict[str, float] = {}
+        self.set_aside: set[str] = set()
+        self.orphans: dict[str, set[int]] = {}
+        self.rankings: dict[Any, Ranking] = {}
+        self.rankings_version = 0
+        self.placed_at: tuple[int, ...] = ()
+        self.plugins = PluginCalls()
+        self.keeping = Keeping()
+        self.abilities = Abilities()
+        self.images = Images()
+        self.periodic = Periodic()
+        self.next_order = 1
+        self.next_instance = 1
+        self.reserved_instances = 1
+        self.next_order_id = 1
+        self.wall = 0.0
+        self.in_company_since = inf
+        self.held_since = inf
+        self.tail = Tail()
+        self.missing_since: dict[int, float] = {}
+        self.reviewed = float("-inf")
+        self.demands: dict[Any, Demand] = {}
+        self._out: list[Command] = []
+        self._unsaved: dict[str, Process] = {}
+        self._unsaved_runs: dict[str, Run] = {}
+
+    # --- what handlers emit --------------------------------------------------------------
+
+    def emit(self, command: Command) -> None:
+        """Add a command to the outcome of the event in hand."""
+        self._out.append(command)
+
+    def take(self) -> list[Command]:
+        """The commands so far; the next event begins with none."""
+        for process in self._unsaved.values():
+            self._out.append(self._intent_of(process))
+        self._unsaved.clear()
+        for run in self._unsaved_runs.values():
+            self._out.append(self._intent_of_run(run))
+        self._unsaved_runs.clear()
+        out, self._out = self._out, []
+        return out
+
+    def record(
+        self, now: float, kind: str, message: str, *, process: str = "", host: str = "",
+        facts: Mapping[str, Any] = EMPTY, by: str = "",
+    ) -> None:  # fmt: skip
+        """Write a line of the event record; `by` is the client that asked for it."""
+        if by:
+            message, facts = f"{message} (by {by})", {**facts, "by": by}
+        message = one_line(message)
+        self.emit(Record(kind, process, host, message, facts))
+        known = self.processes.get(process)
+        if known is not None:
+            known.history.append((now, kind, message))
+            if len(known.history) > _HISTORY:
+                del known.history[0]
+
+    def save(self, process: Process) -> None:
+        """Make what is intended with a process durable, as it stands after the event in hand."""
+        self._unsaved[process.name] = process
+
+    def _intent_of(self, process: Process) -> Intent:
+        owner, left = self.instances.get(process.owner), process.left_behind
+        phase, _, began = process.out_of_sight or (process.phase, 0.0, process.wall)
+        held = {str(number): self.instances[number].host.name for number in process.instances}
+        aliases = {
+            str(number): alias
+            for number in process.instances
+            if (alias := self.instances[number].node_name)
+        }
+        return Intent(
+            "process", process.name,
+            {
+                "spec": process.plain, "order": process.order, "phase": phase.value, "since": began,
+                "wanted": process.wanted.value, "owner": process.owner,
+                "host": owner.host.name if owner else process.ended_on, "instances": held,
+                "reason": process.reason, "excluded": dict(process.excluded),
+                "migrations": process.migrations, "exit_code": process.exit_code,
+                "restarts": process.restarts, "node_names": aliases,
+                "standby": self._standby_of(process), "born": process.born,
+                "left_behind": left and [left.number, left.host, left.node_name],
+                "image": None if process.image is None else asdict(process.image),
+            },
+        )  # fmt: skip
+
+    def _standby_of(self, process: Process) -> Mapping[str, Any] | None:
+        run = self.standbys.get(process.name)
+        return None if run is None else run_to_dict(run, ())
+
+    def save_run(self, run: Run) -> None:
+        """Make durable how far a move is, as it stands after the event in hand."""
+        if self.standbys.get(run.process) is run:
+            self.save(self.processes[run.process])
+            return
+        self._unsaved_runs[run.process] = run
+
+    def end_run(self, run: Run) -> None:
+        """A move is over."""
+        del self.runs[run.process]
+        self._unsaved_runs.pop(run.process, None)
+        self.emit(Intent("migration", run.process, None))
+
+    def _intent_of_run(self, run: Run) -> Intent:
+        numbers = sorted(self.processes[run.process].instances)
+        stopping = [number for number in numbers if self.instances[number].stopping]
+        return Intent("migration", run.process, run_to_dict(run, stopping))
+
+    def order_id(self) -> int:
+        """A number for an order to a slave, unique within this run of the master."""
+        self.next_order_id += 1
+        return self.next_order_id - 1
+
+    # --- processes -----------------------------------------------------------------------
+
+    def set_phase(
+        self, process: Process, phase: ProcessPhase, now: float, reason: str = ""
+    ) -> None:
+        """Move a process to another phase."""
+        if process.phase is not phase:
+            self._begin_phase(process, phase, now)
+        process.reason = reason
+        self._note_whether_over(process)
+
+    def _begin_phase(self, process: Process, phase: ProcessPhase, now: float) -> None:
+        """Change the phase and note its start.
+
+        A process that was unreachable and then has its former phase again keeps the former start.
+        """
+        before, began = process.phase, (now, self.wall)
+        if phase is ProcessPhase.UNREACHABLE:
+            process.out_of_sight = (before, process.since, process.wall)
+        elif process.out_of_sight is not None and phase not in _ON_THE_WAY_BACK:
+            if process.out_of_sight[0] is phase:
+                began = process.out_of_sight[1:]
+            process.out_of_sight = None
+        process.phase = phase
+        process.since, process.wall = began
+
+    def add_process(self, process: Process) -> None:
+        """One more is known; of a name that was known, this one is from now on."""
+        self.processes.pop(process.name, None)  # listings are in order of submission
+        self.processes[process.name] = process
+        self._note_whether_over(process)
+
+    def _note_whether_over(self, process: Process) -> None:
+        """Keep `over` in the order in which they ended."""
+        if not process.phase.over:
+            self.over.pop(process.name, None)
+            if process.spec.standby.wanted:
+                self.wants_standby.add(process.name)
+        else:
+            self.over.setdefault(process.name)
+            self.wants_standby.discard(process.name)
+
+    def forget_oldest(self) -> None:
+        """Of what is over keep the youngest `keep_ended`, and what is not quite gone."""
+        excess = len(self.over) - self.settings.keep_ended
+        if excess <= 0:
+            return
+        gone = [name for name in self.over if self.is_gone(self.processes[name])]
+        for name in gone[:excess]:
+            self.remove_process(name)
+
+    def is_gone(self, process: Process) -> bool:
+        """Return True if no instance of an ended process may run and no standby is known."""
+        return not process.instances and process.name not in self.standbys
+
+    def remove_process(self, name: str) -> None:
+        """Remove an ended process of which no instance may run from memory and journal."""
+        del self.over[name]
+        if self.processes.pop(name).spec.keeps_state:
+            self._note_removed(name)
+        self._unsaved.pop(name, None)
+        self.emit(Intent("process", name, None))
+
+    def _note_removed(self, name: str) -> None:
+        """Journal that a process with state was removed: a host may return with a replica."""
+        removed = self.keeping.removed
+        removed.pop(name, None)  # the oldest stand first
+        removed[name] = self.next_instance
+        self.emit(Intent("removed", name, {"next": self.next_instance}))
+        if len(removed) > _REMOVED_KEPT:
+            oldest = next(iter(removed))
+            del removed[oldest]
+            self.emit(Intent("removed", oldest, None))
+
+    def enqueue(self, process: Process, now: float, reason: str = "") -> None:
+        """Queue a process at its place in the line."""
+        process.owner, process.ended_on = 0, ""
+        process.wanted = Wanted.RUN
+        self.set_phase(process, ProcessPhase.QUEUED, now, reason)
+        self.queue.add(process.name, process.spec.priority, process.order)
+
+    def unqueue(self, process: Process) -> None:
+        """It waits for a host no more, or not yet again."""
+        if process.name in self.queue:
+            self.queue.remove(process.name)
+        self.set_aside.discard(process.name)
+
+    def instances_of(self, process: Process) -> Iterable[Instance]:
+        """Every instance of a process that may still run."""
+        return [self.instances[number] for number in sorted(process.instances)]
+
+    def owned_by(self, instance: Instance) -> Process | None:
+        """The process of which this instance owns the name; None: it is a former or later one."""
+        process = self.processes.get(instance.id.process)
+        return process if process and process.owner == instance.id.number else None
+
+    # --- instances -----------------------------------------------------------------------
+
+    def new_instance_id(self, process: Process) -> InstanceId:
+        """A number that no instance has had, in any run of the master."""
+        if self.next_instance >= self.reserved_instances:
+            self._reserve_numbers()
+        self.next_instance += 1
+        return InstanceId(process.name, self.next_instance - 1)
+
+    def _reserve_numbers(self) -> None:
+        self.reserved_instances = self.next_instance + _RESERVED
+        self.emit(Intent("cluster", "instances", {"next": self.reserved_instances}))
+
+    def skip_numbers(self, seen: int) -> None:
+        """A slave holds an instance that was not numbered by us: our journal was lost.
+
+        Others may have been numbered after it, and have ended.
+        """
+        if self.next_instance <= seen < _LARGEST:
+            self.next_instance = seen + _RESERVED
+            self._reserve_numbers()  # that slave may never say it again
+
+    def add_instance(
+        self, instance: InstanceId, spec: ProcessSpec, host: Host, now: float
+    ) -> Instance:
+        """Count an instance of a spec against a host from now on."""
+        estimate = self.learned.estimate(spec, self.settings.default_needs)
+        need = self.hosts.fractions_of(host, estimate.amounts, estimate.estimated)
+        return self.charge_instance(instance, host, now, estimate.amounts, estimate.estimated, need)
+
+    def _numbers_of(self, name: str) -> set[int]:
+        """Where the instances of a name are noted, of a process that is known or not."""
+        process = self.processes.get(name)
+        return self.orphans.setdefault(name, set()) if process is None else process.instances
+
+    def charge_instance(
+        self, instance: InstanceId, host: Host, now: float, amounts: Mapping[str, float],
+        estimated: frozenset[str], need: FloatArray,
+    ) -> Instance:  # fmt: skip
+        """Count an instance against a host from now on.
+
+        `need`, (R,), is what `amounts` are of the host's capacity.
+        """
+        charged = need.copy()
+        charged[charged == np.inf] = 0.0
+        added = Instance(instance, host, now, amounts, estimated, charged)
+        self.instances[instance.number] = added
+        host.instances.add(instance.number)
+        self._numbers_of(instance.process).add(instance.number)
+        self.hosts.charge(host, charged, processes=1)
+        return added
+
+    def charge_ranked(
+        self, instance: InstanceId, host: Host, now: float, ranking: Ranking
+    ) -> Instance:
+        """As `charge_instance`, by the ranking that has chosen the host."""
+        demand = ranking.demand
+        return self.charge_instance(
+            instance, host, now, demand.amounts, demand.estimated, ranking.need[:, host.column]
+        )
+
+    def drop_instance(self, instance: Instance) -> None:
+        """An instance has ended: it counts no more."""
+        del self.instances[instance.id.number]
+        instance.host.instances.discard(instance.id.number)
+        name = instance.id.process
+        self._numbers_of(name).discard(instance.id.number)
+        if not self.orphans.get(name, True):
+            del self.orphans[name]
+        self.hosts.charge(instance.host, -instance.charged, processes=-1)
+
+    def assignment(
+        self, instance: InstanceId, spec: ProcessSpec, node_name: str = "", *,
+        shadow: bool = False, restored: bool = False,
+    ) -> Assignment:  # fmt: skip
+        """The order for a slave to run an instance."""
+        fence = fence_of(spec, self.settings)
+        kept_on: tuple[str, ...] = ()
+        born = self.processes[spec.name].born if spec.name in self.processes else 0
+        if spec.keeps_state and not shadow and not restored:
+            kept_on = self.keeping.in_reach(spec.name, born, self.hosts)
+        return Assignment(
+            instance, spec, self.epoch, node_name or spec.name, shadow, fence, kept_on, born,
+            restored,
+        )  # fmt: skip
+
+    def note_decision(self, process: Process, decision: Decision, kind: str, now: float) -> None:
+        """Remember the newest decision about a process, for `explain`."""
+        decision.kind = kind
+        process.decision = decision
+        process.decided_at = now
+
+
+def larger(first: Mapping[str, float], second: Mapping[str, float]) -> Mapping[str, float]:
+    """The larger amount of each resource."""
+    if not second:
+        return first
+    names = {**first, **second}
+    return {name: max(first.get(name, 0.0), second.get(name, 0.0)) for name in names}

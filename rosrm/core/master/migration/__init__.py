@@ -1,0 +1,1 @@
+"""Migrations: why one starts, its plan, the execution of its steps, standbys, failover."""

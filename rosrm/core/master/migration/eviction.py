@@ -1,0 +1,322 @@
+"""Which process leaves a host that is over a limit or is being drained, and where it goes.
+
+It must relieve the resource that is over, fit where it goes without putting that host over, and of
+those the one with the largest relief goes. When no host has room nothing moves.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable
+from typing import Final
+
+from rosrm.core.master.assignment.assign import amounts_of, demand_to_move, ranking_of
+from rosrm.core.master.hosts import capabilities
+from rosrm.core.master.master_state import Instance, MasterState, Process, Wanted
+from rosrm.core.master.migration.start import (
+    begin_move,
+    moves_under_way,
+    plan_move,
+    why_immovable,
+    why_never_movable,
+    why_no_executor,
+    without_executor,
+)
+from rosrm.core.master.scheduling.decision import decide, may_ever_take, verdict_of
+from rosrm.core.master.scheduling.ranking import Ranking
+from rosrm.core.master.state.demand import Demand
+from rosrm.core.master.state.hosts import Host
+from rosrm.model.values import InstanceState
+from rosrm.wording import counted, few, listed
+
+#: Least seconds between two records that nothing can be moved off a host, for different reasons.
+_TOLD_EVERY = 10.0
+#: Reasons against hosts that one answer names.
+_MOST_SAID: Final = 3
+_ALONE: Final = "there is no other host"
+
+
+def relieve_hosts(state: MasterState, now: float) -> None:
+    """Move processes off hosts that were over a limit for long enough, and off drained ones."""
+    _note_limits(state, now)
+    for host in state.hosts.listed():
+        if host.draining:
+            _note_drained(state, host, now)
+    for host in state.hosts.listed():
+        if moves_under_way(state) >= state.settings.max_migrations:
+            return
+        if host.draining:
+            if not host.drained:
+                _drain(state, host, now)
+        elif state.settings.automatic and host.over_since:
+            _relieve(state, host, now)
+
+
+def _note_limits(state: MasterState, now: float) -> None:
+    """Note since when each host is over which of its limits."""
+    over = {int(column) for column in state.hosts.hosts_over_limit()}
+    for host in state.hosts.listed():
+        # A stale reading tells neither that the host is over its limit nor that it is under it.
+        stale = state.hosts.stale_resources(host) if state.hosts.stale[host.column] else ()
+        names = state.hosts.over_limit(host.column) if host.column in over else []
+        names = [name for name in names if name not in stale]
+        host.over_at.update({name: now for name in stale if name in host.over_at})
+        for name in names:
+            host.over_since.setdefault(name, now)
+            if name not in host.over_at:
+                state.record(
+                    now, "over_limit", f"{host.name} reached its limit of {name}", host=host.name,
+                    facts={"resource": name},
+                )  # fmt: skip
+            host.over_at[name] = now
+        for name in host.over_since.keys() - names:
+            del host.over_since[name]
+        if len(host.over_at) > len(names):
+            _note_under_limit(state, host, now)
+
+
+def _note_under_limit(state: MasterState, host: Host, now: float) -> None:
+    """Record that a host is under its limits, once it has stayed there.
+
+    A reading at the limit crosses it many times a minute, which says nothing new.
+    """
+    for name, at in list(host.over_at.items()):
+        if name not in host.over_since and now - at >= state.settings.hysteresis:
+            del host.over_at[name]
+    if not host.over_at:
+        host.blocked.clear()
+        state.record(now, "under_limit", f"{host.name} is under its limits", host=host.name)
+
+
+def _relieve(state: MasterState, host: Host, now: float) -> None:
+    if any(run.source_host is host for run in state.runs.values()):
+        return  # see first what the move under way brings
+    for resource, since in list(host.over_since.items()):
+        if now - since >= state.settings.hysteresis:
+            _relieve_resource(state, host, resource, now)
+            return
+
+
+def _relieve_resource(state: MasterState, host: Host, resource: str, now: float) -> None:
+    reasons = []
+    for instance in _largest_first(state, host, resource):
+        process = state.processes[instance.id.process]
+        reason = _why_not_now(state, process, instance, resource, now)
+        reason = reason or try_move(
+            state, process, f"{host.name} is over its limit of {resource}", now,
+            headroom=state.settings.headroom,
+        )  # fmt: skip
+        if not reason:
+            return
+        reasons.append((process.name, reason))
+    _tell_nothing_moves(state, host, resource, reasons, now)
+
+
+def _largest_first(state: MasterState, host: Host, resource: str) -> list[Instance]:
+    held = [state.instances[number] for number in host.instances]
+    owned = [instance for instance in held if state.owned_by(instance) is not None]
+    return sorted(owned, key=lambda one: (-relief_of(one, resource), one.id.number))
+
+
+def relief_of(instance: Instance, resource: str) -> float:
+    """What leaves the host with an instance, base units of the resource."""
+    return instance.seen.get(resource, instance.amounts.get(resource, 0.0))
+
+
+def _why_not_now(
+    state: MasterState, process: Process, instance: Instance, resource: str, now: float
+) -> str:
+    refusal = why_immovable(state, process)
+    if refusal:
+        return refusal
+    if relief_of(instance, resource) <= 0.0:
+        return f"{process.name} uses no {resource}"
+    since_move, cooldown = now - process.moved_at, state.settings.cooldown
+    if since_move < cooldown:
+        return f"{process.name} is in its cool-down of {cooldown:g} s after a move"
+    if instance.state is not InstanceState.READY:
+        return f"{process.name} is not ready"
+    return ""
+
+
+def try_move(
+    state: MasterState, process: Process, cause: str, now: float, *, headroom: float = 0.0,
+    host: Host | None = None,
+) -> str:  # fmt: skip
+    """Move a process to the host with the largest margin, or to a given one.
+
+    A host that lacks an executor of the plan is passed over, unless it was given.
+
+    Returns:
+        "" or why it cannot go; then nothing has changed.
+    """
+    refusal = why_immovable(state, process)
+    if refusal:
+        return refusal
+    source, lacking = state.instances[process.owner], dict[str, str]()
+    measured = source.measured
+    while True:
+        demand = demand_to_move(state, process, measured, source.host.name, headroom, lacking)
+        ranking = ranking_of(state, demand)
+        destination = _destination(state, process, ranking, source.host, host)
+        if isinstance(destination, str):
+            return "; ".join(dict.fromkeys(lacking.values())) or destination
+        run = plan_move(state, process, destination, cause, now)
+        if isinstance(run, str):
+            return run
+        refusal = why_no_executor(state, run)
+        if not refusal:
+            break
+        hosts, shared = without_executor(state, run)
+        if host is not None or not hosts:
+            return refusal
+        lacking.update(dict.fromkeys(hosts, shared))
+    decision = decide(ranking, chosen=destination.column)
+    begin_move(state, process, run, ranking, now)
+    state.note_decision(process, decision, "migrated", now)
+    return ""
+
+
+def _destination(
+    state: MasterState, process: Process, ranking: Ranking, source: Host, host: Host | None
+) -> Host | str:
+    """Return the best host of a ranking, or the given one if it fits; else why there is none."""
+    if host is None:
+        column = ranking.best()
+        if column < 0:
+            if _is_alone(state, source):
+                return _ALONE
+            return f"no host has room for {process.name}{_and_why(state, process, source)}"
+        return state.hosts.hosts[column]
+    if host is source:
+        return f"{process.name} runs on {host.name} already"
+    if not ranking.fits(host.column):
+        why = verdict_of(ranking, host.column).reason
+        return f"{process.name} does not fit on {host.name}: {why or 'no room'}"
+    return host
+
+
+def _is_alone(state: MasterState, source: Host) -> bool:
+    return all(host is source for host in state.hosts.listed())
+
+
+def _and_why(state: MasterState, process: Process, source: Host) -> str:
+    """What its strategy has against hosts, a few of them; "" for nothing."""
+    faults = capabilities.faults(state, process.spec.migration.strategy or "", source)
+    return "".join(f"; {fault}" for fault in few(faults, _MOST_SAID))
+
+
+# --- drain ------------------------------------------------------------------------------------
+
+
+def departures(state: MasterState, host: Host) -> str:
+    """Return which processes leave a draining host, and which cannot and why."""
+    leaving, staying = _leaving(state, host), _staying(state, host)
+    if not leaving:
+        return f"nothing can leave: {'; '.join(few(staying))}" if staying else "no process is left"
+    count = counted(len(leaving), "process leaves", "processes leave")
+    said = f"{count} ({listed(leaving)})"
+    return f"{said}; cannot leave: {'; '.join(few(staying))}" if staying else said
+
+
+def _leaving(state: MasterState, host: Host) -> list[str]:
+    """Names of the processes of which an instance is on a host and will leave it or end."""
+    held = [state.instances[number] for number in host.instances]
+    return sorted({one.id.process for one in held if not _why_it_stays(state, one)})
+
+
+def _staying(state: MasterState, host: Host) -> list[str]:
+    """Return the reasons of the processes that cannot leave a host, an equal one once."""
+    held = [state.instances[number] for number in sorted(host.instances)]
+    reasons = [(one.id.process, reason) for one in held if (reason := _why_it_stays(state, one))]
+    return _grouped(reasons + _images_on(state, host))
+
+
+def _grouped(reasons: Iterable[tuple[str, str]]) -> list[str]:
+    """Return the reasons of processes, equal ones once: "each of a and b is not ready".
+
+    Args:
+        reasons: name of the process, and its reason as a whole sentence.
+    """
+    names = defaultdict[tuple[str, bool], list[str]](list)
+    for name, reason in dict.fromkeys(reasons):
+        predicate = reason.removeprefix(f"{name} ")
+        names[predicate, predicate != reason].append(name)
+    return [
+        f"{alike[0] if len(alike) == 1 else f'each of {listed(alike)}'} {said}" if of_it else said
+        for (said, of_it), alike in names.items()
+    ]
+
+
+def _why_it_stays(state: MasterState, instance: Instance) -> str:
+    """Return why an instance can neither leave its host nor is about to end; "" if it can."""
+    process, source = state.owned_by(instance), instance.host
+    if process is None or process.wanted is not Wanted.RUN or process.name in state.runs:
+        return ""
+    reason = why_never_movable(state, process)
+    if reason:
+        return reason
+    # What a strategy or a lost host lacks may change later; labels and resources do not.
+    lasting = {**process.excluded, source.name: "it is there"}
+    amounts, estimated = amounts_of(state, process, instance.measured)
+    possible = may_ever_take(state.hosts, Demand(process.spec, amounts, estimated, lasting))
+    if any(possible[host.column] for host in state.hosts.listed() if host is not source):
+        return ""
+    if _is_alone(state, source):
+        return _ALONE
+    return f"{process.name} may run on no other host (`rosrm explain NAME` says why)"
+
+
+def _note_drained(state: MasterState, host: Host, now: float) -> None:
+    """Say once that nothing which can leave a host is left on it."""
+    if state.hosts.why_unreachable(host):
+        return
+    held = (state.instances[number] for number in host.instances)
+    was, host.drained = host.drained, all(_why_it_stays(state, one) for one in held)
+    if host.drained and not was:
+        state.record(
+            now, "host_drained", f"{host.name} is drained: {departures(state, host)}",
+            host=host.name,
+        )  # fmt: skip
+
+
+def _drain(state: MasterState, host: Host, now: float) -> None:
+    reasons = []
+    for instance in _largest_first(state, host, "memory"):
+        process = state.processes[instance.id.process]
+        if moves_under_way(state) >= state.settings.max_migrations:
+            return
+        if process.name in state.runs:
+            continue
+        reason = try_move(state, process, f"{host.name} is being drained", now)
+        if reason:
+            reasons.append((process.name, reason))
+    reasons += _images_on(state, host)
+    if reasons:
+        _tell_nothing_moves(state, host, "drain", reasons, now)
+
+
+def _images_on(state: MasterState, host: Host) -> list[tuple[str, str]]:
+    """An image is restored where it lies: what is checkpointed leaves with nobody."""
+    names = sorted(state.images.of)
+    of_host = ((name, state.processes[name].image) for name in names)
+    return [
+        (name, f"{name} is checkpointed: its image stays on {host.name}")
+        for name, image in of_host
+        if image is not None and image.host == host.name
+    ]
+
+
+def _tell_nothing_moves(
+    state: MasterState, host: Host, what: str, reasons: list[tuple[str, str]], now: float
+) -> None:
+    why = "; ".join(_grouped(reasons)[:8]) or "it holds no process of this cluster"
+    key = f"nothing_moves {what}"
+    soon = now - host.told.get(key, float("-inf")) < _TOLD_EVERY
+    if soon or host.blocked.get(what) == why:
+        return
+    host.told[key], host.blocked[what] = now, why
+    state.record(
+        now, "nothing_moves", f"nothing can leave {host.name}: {why}", host=host.name,
+        facts={"cause": what},
+    )  # fmt: skip

@@ -1,0 +1,356 @@
+"""Carrying out plans: one step at a time, forward, or back before the commit.
+
+========  ==================  ==============================================================
+the run   a step              what follows
+========  ==================  ==============================================================
+forward   is done             the next step; after the last, the move is complete
+forward   fails, no commit    the undo of every step so far, newest first
+forward   fails, committed    it is tried again; the process is shown as stuck until it is done
+back      is done             the next undo; after the last, the source goes on
+back      fails               it is tried again; the process is shown as stuck until it is done
+any       cannot be done      it is left out: an instance that has ended never starts again, and
+                              what an executor had to do for one whose host is lost has no use.
+                              An executor that ran and answered no object counts as done
+back      destination active  forward to the commit: in a handoff it decides itself; of a restore
+                              an executor has found that it goes on
+========  ==================  ==============================================================
+
+A process that is to be cancelled turns back; one that is stuck is given up, and all its instances
+are stopped. When neither source nor destination is left, the process returns to the queue.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, Final
+
+from rosrm.core.master import events as happened
+from rosrm.core.master import lifecycle
+from rosrm.core.master.checkpoint import image_requests, images, periodic, replication
+from rosrm.core.master.events import BAD_RESULT
+from rosrm.core.master.hosts import capabilities
+from rosrm.core.master.master_state import MasterState, Process, ProcessPhase, Run, Wanted
+from rosrm.core.master.migration import handoff
+from rosrm.core.master.migration.steps import (
+    DONE,
+    give_order,
+    give_order_again,
+    note_result,
+    outcome_of,
+    timed_out,
+    title,
+)
+from rosrm.core.master.state.hosts import HostCondition
+from rosrm.core.master.state.migration import End
+from rosrm.model.plan import Aim, AwaitReady, Commit, Configure, Execute, Start, Step, Stop
+from rosrm.model.values import InstanceId, InstanceState
+
+#: What a commit means.
+_COMMITTED: Final = {
+    Aim.MOVE: "the process is now the one at the destination: the move cannot be undone any more",
+    Aim.CHECKPOINT: "the process is now in its image: the checkpoint cannot be undone any more",
+    Aim.RESTORE: "the process is now the restored one: the restore cannot be undone any more",
+}
+
+# --- go on ------------------------------------------------------------------------------------
+
+
+def advance_all(state: MasterState, now: float) -> None:
+    """Take every run as far as it goes now."""
+    for run in list(state.runs.values()):
+        while run.process in state.runs and _advance(state, run, now):
+            pass
+
+
+def order_answered(state: MasterState, event: happened.OrderAnswered, now: float) -> None:
+    """A slave took an order, refused it, or did not answer in time."""
+    if (
+        periodic.order_answered(state, event, now)
+        or replication.order_answered(state, event)
+        or capabilities.order_answered(state, event, now)
+        or images.order_answered(state, event, now)
+    ):
+        return
+    name = state.runs_by_order.pop(event.order, None)
+    run = state.runs.get(name) if name is not None else None
+    if run is not None and run.order == event.order and event.code != "timeout":
+        run.answer = (event.accepted, event.message or event.code)
+        run.bad_result = event.code == BAD_RESULT
+        if event.accepted and event.result:
+            note_result(run, event.result)
+
+
+def _advance(state: MasterState, run: Run, now: float) -> bool:
+    """Look at the step in hand; True: there may be more to do at once."""
+    _choose_way(state, run, now)
+    step = run.step_in_hand
+    if step is None or (run.stuck and state.processes[run.process].wanted is Wanted.CANCEL):
+        _conclude(state, run, now)
+        return False
+    if isinstance(step, Start) and run.undo is not None and not _goes_on(state, run):
+        _go_on(state, run, now)
+        return True
+    if not run.begun:
+        if now < run.retry_at or _is_expected(state, run, step):
+            return False
+        run.begun, run.answer, run.bad_result = True, None, False
+        run.deadline = now + max(step.timeout, 0.0)
+        give_order(state, run, step, now)
+    outcome = _outcome(state, run, step, now)
+    if outcome is None:
+        return False
+    if outcome == DONE:
+        _next(state, run, step, now)
+    else:
+        _failed(state, run, step, outcome, now)
+    return run.begun or not run.stuck
+
+
+def _choose_way(state: MasterState, run: Run, now: float) -> None:
+    """Before the commit: a destination that is active decides, or else what befell the source."""
+    if run.committed:
+        return
+    if handoff.is_active(state, run) or run.went_on:
+        if run.undo is not None:
+            _go_forward(state, run, now)
+    elif run.undo is None:
+        reason = _why_turn_back(state, run)
+        if reason:
+            _turn_back(state, run, reason, now)
+
+
+def _is_expected(state: MasterState, run: Run, step: Step) -> bool:
+    """A host that the step needs has not come back since the master started.
+
+    It is waited for until its lease is over; then the step is begun, and its own time-out judges.
+    """
+    if isinstance(step, Commit):
+        return False
+    if not isinstance(step, Configure):
+        concerned = [state.hosts.by_name[step.host]]
+    else:
+        both = (run.source.number, run.destination.number) if step.awaited else ()
+        concerned = [state.instances[one].host for one in both if one in state.instances]
+    return any(state.hosts.condition_of(host) is HostCondition.EXPECTED for host in concerned)
+
+
+def _outcome(state: MasterState, run: Run, step: Step, now: float) -> str | None:
+    """Of the step in hand, now; what can be done about one that takes its time is done."""
+    outcome = outcome_of(step, state, run, now)
+    if outcome is None:
+        give_order_again(state, run, step, now)
+        if now >= run.deadline:
+            outcome = timed_out(state, run, step, now)
+    return outcome
+
+
+def _next(state: MasterState, run: Run, step: Step, now: float) -> None:
+    what = _COMMITTED[run.aim] if isinstance(step, Commit) else f"{title(step)}: done"
+    state.record(
+        now, "migration_step", f"{run.process}: {what}", process=run.process,
+        facts={"step": title(step), "back": run.undo is not None},
+    )  # fmt: skip
+    process = state.processes[run.process]
+    if isinstance(step, Commit):
+        _commit(state, run, step, now)
+    elif isinstance(step, Start) and run.undo is not None:
+        process.owner = step.instance.number
+        state.save(process)
+    _go_on(state, run, now)
+
+
+def _commit(state: MasterState, run: Run, step: Commit, now: float) -> None:
+    process = state.processes[run.process]
+    run.committed = True
+    if run.aim is Aim.CHECKPOINT:
+        image_requests.commit_to_image(state, process, run, step)
+    else:
+        process.owner = run.destination.number
+        images.set_image(state, process, None)
+    process.left_behind = None  # a source whose host was lost meanwhile has a successor now
+    process.migrations += run.aim is Aim.MOVE
+    process.moved_at = now
+    if process.wanted is Wanted.REQUEUE:
+        process.wanted = Wanted.RUN  # that was meant for the host which it has left
+    state.save(process)
+
+
+def _cannot_be_done(state: MasterState, run: Run, step: Step, now: float) -> bool:
+    """Trying again would never help: the instance has ended, or its slot was given away."""
+    if isinstance(step, Execute):
+        # Asked again the executor would answer so for ever. Of a restore the answer may say that
+        # the destination is active, so that plan waits until the plugin is corrected.
+        done = run.bad_result and run.aim is not Aim.RESTORE
+        return done or image_requests.leave_behind(state, run, step)
+    if not isinstance(step, (Start, AwaitReady)):
+        return False
+    instance = state.instances.get(step.instance.number)
+    if instance is not None and instance.state is InstanceState.HELD:
+        lifecycle.stop_instance(state, instance, now)
+        return True
+    return step.instance.number in run.ended
+
+
+def _go_on(state: MasterState, run: Run, now: float) -> None:
+    """To the next step, or the next undo."""
+    run.index += 1
+    run.begun = False
+    run.retry_at = now
+    if run.stuck:
+        _not_stuck(state, run, now)
+    state.save_run(run)
+
+
+def _not_stuck(state: MasterState, run: Run, now: float) -> None:
+    run.stuck = False
+    process = state.processes[run.process]
+    state.set_phase(process, ProcessPhase.MIGRATING, now, run.course)
+
+
+def _failed(state: MasterState, run: Run, step: Step, reason: str, now: float) -> None:
+    if not run.stuck:
+        state.record(
+            now, "migration_step_failed", f"{run.process}: {reason}", process=run.process,
+            facts={"step": title(step), "back": run.undo is not None},
+        )  # fmt: skip
+    if run.undo is None and not run.committed:
+        _turn_back(state, run, reason, now)
+        return
+    if _cannot_be_done(state, run, step, now):
+        _go_on(state, run, now)
+        return
+    run.begun = False
+    run.retry_at = now + state.settings.order_retry
+    if not run.stuck:
+        run.stuck = True
+        end = "finished" if run.undo is None else "undone"
+        process = state.processes[run.process]
+        why = f"its {run.aim.value} cannot be {end} yet: {reason}; the master tries again"
+        state.set_phase(process, ProcessPhase.STUCK, now, why)
+        state.record(now, "migration_stuck", f"{run.process} is stuck: {why}", process=run.process)
+
+
+def _turn_back(state: MasterState, run: Run, reason: str, now: float) -> None:
+    """Before the commit: undo every step so far, the one in hand included, newest first."""
+    run.failure = reason
+    run.turn_back()
+    state.record(
+        now,
+        "migration_undone",
+        f"the {run.aim.value} of {run.process} is undone: {reason}",
+        process=run.process,
+    )
+    state.save_run(run)
+
+
+def _go_forward(state: MasterState, run: Run, now: float) -> None:
+    """On the way back it turns out that the destination is active: it owns the name."""
+    run.undo, run.index, run.begun = None, run.commit_index, False
+    run.retry_at = now
+    if run.stuck:
+        _not_stuck(state, run, now)
+    state.record(
+        now, "migration_redone",
+        f"the {run.aim.value} of {run.process} is finished after all: {run.destination} is active",
+        process=run.process,
+    )  # fmt: skip
+    state.save_run(run)
+
+
+def _why_turn_back(state: MasterState, run: Run) -> str:
+    """Why the steps before the commit are not worth going on with; "" if they are."""
+    if state.processes[run.process].wanted is Wanted.CANCEL:
+        return f"{run.process} is to be cancelled"
+    end = run.ended.get(run.source.number)
+    if end is None:
+        return ""
+    excused = _told_to_stop(run, run.source) or handoff.is_switching(run) or _has_left_in_image(run)
+    return f"{run.source} ended during the {run.aim.value}" if end.completed or not excused else ""
+
+
+def _has_left_in_image(run: Run) -> bool:
+    """The destination is being made of an image of the source, which stands still: all is in it."""
+    return any(
+        isinstance(step, Start) and step.restored and step.instance.number in run.launched
+        for step in run.plan.steps
+    )
+
+
+def _goes_on(state: MasterState, run: Run) -> bool:
+    """The process is to go on where it was: nobody cancelled it, and it has not completed."""
+    end = run.ended.get(run.source.number)
+    completed = end is not None and end.completed
+    return not completed and state.processes[run.process].wanted is Wanted.RUN
+
+
+def _told_to_stop(run: Run, instance: InstanceId) -> bool:
+    """The plan has ordered this instance to stop."""
+    return any(isinstance(step, Stop) and step.instance == instance for step in run.so_far)
+
+
+# --- the end ----------------------------------------------------------------------------------
+
+
+def _conclude(state: MasterState, run: Run, now: float) -> None:
+    """The last step is done: the process goes its own way again."""
+    handoff.close(state, run)
+    state.end_run(run)
+    process = state.processes[run.process]
+    moved = run.undo is None
+    process.moved_at = now
+    standby = state.standbys.get(run.process)
+    kept = {process.owner, standby.destination.number if standby else 0}
+    for instance in state.instances_of(process):
+        if instance.id.number not in kept and not instance.stopping:
+            if instance.state is None and instance.id.number not in run.launched:
+                state.drop_instance(instance)  # it was counted, and never started
+            else:
+                lifecycle.stop_instance(state, instance, now)
+    for name in run.source_host.over_since:
+        run.source_host.over_since[name] = now  # see first what this move brings
+    kind, message = image_requests.ending_of(run)
+    state.record(
+        now, kind, message,
+        process=run.process, host=(run.destination_host if moved else run.source_host).name,
+        facts={
+            "from": run.source_host.name, "to": run.destination_host.name,
+            "seconds": now - run.started, "cause": run.cause, "strategy": run.strategy,
+            "parts": _parts(run),
+        },
+    )  # fmt: skip
+    if kind == "stayed" and process.decision and process.decision["kind"] == "migrated":
+        process.decision = {**process.decision, "kind": kind}
+    _settle_owner(state, process, run, now)
+
+
+def _parts(run: Run) -> dict[str, Any]:
+    """What executors say of their own time, by their names."""
+    return {name: result["seconds"] for name, result in run.results.items() if "seconds" in result}
+
+
+def _settle_owner(state: MasterState, process: Process, run: Run, now: float) -> None:
+    owner = state.instances.get(process.owner)
+    if process.image is not None and process.owner == 0:
+        image_requests.settle(state, process, run, now)
+        return
+    if owner is None:
+        host = run.destination_host if run.committed else run.source_host
+        lifecycle.conclude(state, process, _end_of_owner(process, run), host, now)
+        return
+    if process.wanted is not Wanted.RUN and not owner.stopping:
+        lifecycle.stop_instance(state, owner, now)
+    lifecycle.note_phase(state, process, owner, now)
+    state.save(process)
+
+
+def _end_of_owner(process: Process, run: Run) -> End:
+    """How the owner ended, if a move had not been in the way."""
+    end = run.ended[process.owner]
+    policy = process.spec.restart
+    if process.owner == run.source.number and _told_to_stop(run, run.source) and not end.completed:
+        return replace(end, ordered=True)
+    if process.owner in run.suspended and lifecycle.restarts_after(policy, end.status):
+        how = run.how_ended(InstanceId(process.name, process.owner))
+        why = f"restart by policy {policy.when!r}: {how}"
+        return replace(end, gone=True, status=replace(end.status, message=why))
+    return end

@@ -1,0 +1,72 @@
+"""A standby goes on in the place of its primary.
+
+A standby is the first half of a handoff that waits: its plan was begun, and stands before the step
+in which the destination becomes active. When the primary has ended, that step is taken: the
+destination is told to take over, and the plan goes its usual way, forward or back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.state.migration import End, Run
+from rosrm.core.master.state.process import Process, ProcessPhase, Wanted
+from rosrm.model.plan import Configure, HandoffPhase, ReportPhase, Step
+
+_OVER: Final = frozenset({ReportPhase.FAILED, ReportPhase.ABORTED})
+
+
+def index_of(phase: HandoffPhase, steps: Sequence[Step]) -> int:
+    """Where in a plan a phase of a handoff is awaited; -1: nowhere."""
+    for at, step in enumerate(steps):
+        if isinstance(step, Configure) and step.phase is phase and step.awaited:
+            return at
+    return -1
+
+
+def is_ready(state: MasterState, process: Process) -> bool:
+    """It has a standby that could go on now."""
+    standby = state.standbys.get(process.name)
+    if standby is None or standby.source.number != process.owner:
+        return False
+    if process.wanted is Wanted.CANCEL:
+        return False
+    said: Mapping[ReportPhase, str] = standby.phases_of(standby.destination)
+    instance = state.instances.get(standby.destination.number)
+    follows = ReportPhase.READY in said and not said.keys() & _OVER
+    return follows and instance is not None and not instance.stopping
+
+
+def take_over(state: MasterState, process: Process, end: End, now: float) -> bool:
+    """The primary has ended: its standby goes on.
+
+    Returns:
+        False: it has none that could, or has come to its end as it was meant to.
+    """
+    if _succeeded(end) or not is_ready(state, process):
+        return False
+    run: Run = state.standbys.pop(process.name)
+    run.ended[run.source.number] = end
+    run.index, run.begun = index_of(HandoffPhase.SWITCH, run.plan.steps), False
+    run.started, run.wall = now, state.wall
+    run.cause = f"{run.source} has ended"
+    process.wanted = Wanted.RUN
+    process.left_behind, process.standby_reason = None, ""
+    state.runs[process.name] = run
+    state.set_phase(process, ProcessPhase.MIGRATING, now, f"its standby takes over: {run.cause}")
+    state.record(
+        now, "failed_over",
+        f"the standby of {process.name} on {run.destination_host.name} takes over: {run.cause}"
+        + (f" ({end.status.message})" if end.status.message else ""),
+        process=process.name, host=run.destination_host.name,
+        facts={"source": run.source.number, "destination": run.destination.number},
+    )  # fmt: skip
+    state.save(process)
+    state.save_run(run)
+    return True
+
+
+def _succeeded(end: End) -> bool:
+    return end.status.succeeded and not end.ordered and not end.gone

@@ -1,0 +1,268 @@
+"""What the master says of a handoff, what it makes of the answers, and which way that decides.
+
+The destination alone decides when it becomes active. From the moment at which it was told to SWITCH
+the master may guess that it has not, but never act on the guess: the source is told to go on only
+when the destination has said that it never will be active, or has ended.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Final
+
+from rosrm.core.master import events as happened
+from rosrm.core.master import lifecycle
+from rosrm.core.master.commands import PublishStateConfig
+from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.state.migration import Heard, Run
+from rosrm.model.plan import Configure, HandoffPhase, ReportPhase
+from rosrm.model.values import InstanceId, ProcessSpec
+
+DONE: Final = ""
+#: What a destination says when it follows the source, or is further still.
+_READY: Final = frozenset({ReportPhase.READY, ReportPhase.SWITCHING, ReportPhase.ACTIVE})
+
+#: What the master asks for in each phase, as the subject of a sentence.
+TITLES: Final[Mapping[HandoffPhase, str]] = {
+    HandoffPhase.SHADOW: "copying the state to the destination",
+    HandoffPhase.SWITCH: "switching from the source to the destination",
+    HandoffPhase.TAKE_OVER: "letting the destination take over",
+    HandoffPhase.ABORT: "calling the handoff off at the destination",
+    HandoffPhase.RESUME: "letting the source publish again",
+    HandoffPhase.DONE: "ending the handoff",
+}
+#: What a node reports, as a sentence with the node as its subject.
+_REPORTS: Final[Mapping[ReportPhase, str]] = {
+    ReportPhase.ATTACHED: "takes part in the handoff",
+    ReportPhase.SILENT: "has stopped publishing",
+    ReportPhase.RELEASED: "has handed everything over",
+    ReportPhase.RESUMED: "publishes again",
+    ReportPhase.SHADOWING: "receives the state of the source",
+    ReportPhase.READY: "has the state of the source and can take over",
+    ReportPhase.SWITCHING: "is taking over",
+    ReportPhase.ACTIVE: "is active",
+    ReportPhase.ABORTED: "has called the handoff off",
+    ReportPhase.FAILED: "cannot continue the handoff",
+}
+
+
+# --- what is said -----------------------------------------------------------------------------
+
+
+def publish(state: MasterState, run: Run, phase: HandoffPhase) -> None:
+    """Say to the source and the destination where the handoff stands."""
+    spec = state.processes[run.process].spec
+    state.emit(
+        PublishStateConfig(
+            run.process, phase, run.source.number, run.destination.number,
+            qualified(spec, run.source_node), qualified(spec, run.destination_node),
+        )
+    )  # fmt: skip
+
+
+def qualified(spec: ProcessSpec, node_name: str) -> str:
+    """Return the name of a node with the namespace of its process: "/robot/camera"."""
+    namespace = spec.namespace.strip("/")
+    return f"/{namespace}/{node_name}" if namespace else f"/{node_name}"
+
+
+def close(state: MasterState, run: Run) -> None:
+    """The move is over: if anything was said of it, nothing more will be."""
+    said = [step.phase for step in run.so_far if isinstance(step, Configure)]
+    if said and HandoffPhase.DONE not in said:
+        publish(state, run, HandoffPhase.DONE)
+
+
+def say_again(state: MasterState, run: Run, step: Configure, now: float) -> None:
+    """A phase that was not answered may not have been heard; a lost source needs another one."""
+    if _needs_take_over(state, run, step):
+        _take_over(state, run, step, now)
+    elif step.awaited and now - run.order_at >= state.settings.order_retry:
+        run.order_at = now
+        publish(state, run, step.phase)
+
+
+def _needs_take_over(state: MasterState, run: Run, step: Configure) -> bool:
+    """The source ended while it was to fall silent: its successor goes on from what it has."""
+    alone = run.source.number not in state.instances and run.destination.number in state.instances
+    return step.phase is HandoffPhase.SWITCH and alone and not is_active(state, run)
+
+
+def _take_over(state: MasterState, run: Run, step: Configure, now: float) -> None:
+    if run.taking_over and now - run.order_at < state.settings.order_retry:
+        return
+    if not run.taking_over:
+        run.taking_over = True
+        run.deadline = now + step.timeout
+        state.record(
+            now, "take_over", f"{run.source} has ended: {run.destination} takes over from it",
+            process=run.process, host=run.destination_host.name,
+        )  # fmt: skip
+    run.order_at = now
+    publish(state, run, HandoffPhase.TAKE_OVER)
+
+
+# --- what is heard ----------------------------------------------------------------------------
+
+
+def handoff_reported(state: MasterState, event: happened.HandoffReported, now: float) -> None:
+    """Note how far the source or the destination is."""
+    for run in (state.runs.get(event.process), state.standbys.get(event.process)):
+        if run is not None and run.destination.number == event.destination:
+            _note(state, run, event, now)
+
+
+def _note(state: MasterState, run: Run, event: happened.HandoffReported, now: float) -> None:
+    if event.instance not in (run.source.number, run.destination.number):
+        return
+    heard = run.heard.setdefault(event.instance, Heard())
+    if event.phase not in heard.phases:
+        # What a destination waits for is over when it receives the state; a time-out names it.
+        is_news = event.message and event.phase is not ReportPhase.SHADOWING
+        said = f": {event.message}" if is_news else ""
+        message = f"{run.process}#{event.instance} {_REPORTS[event.phase]}{said}"
+        state.record(
+            now, "handoff_reported", message,
+            process=run.process,
+            facts={"phase": event.phase.name, "sequence": event.sequence},
+        )  # fmt: skip
+    heard.phases[event.phase] = heard.message = event.message
+
+
+def is_active(state: MasterState, run: Run) -> bool:
+    """The destination has said that it is active, and nobody has ordered it to stop since.
+
+    If somebody has, only its end decides.
+    """
+    instance = state.instances.get(run.destination.number)
+    if instance is None or instance.stopping:
+        return False
+    said = run.phases_of(run.destination)
+    return ReportPhase.ACTIVE in said and ReportPhase.ABORTED not in said
+
+
+def is_released(state: MasterState, run: Run, instance: InstanceId) -> bool:
+    """A silent source has nothing more to do, or has ended."""
+    ended = instance.number not in state.instances
+    return ended or ReportPhase.RELEASED in run.phases_of(instance)
+
+
+def is_switching(run: Run) -> bool:
+    """The step in hand is the one in which the destination becomes active."""
+    step = run.step_in_hand
+    if run.undo is not None or not isinstance(step, Configure):
+        return False
+    return step.phase is HandoffPhase.SWITCH
+
+
+# --- when a phase is done ---------------------------------------------------------------------
+
+
+def outcome(step: Configure, state: MasterState, run: Run) -> str | None:
+    """Of the phase in hand: None: not yet; "": done; else why it failed."""
+    return _OUTCOMES[step.phase](state, run) if step.awaited else DONE
+
+
+def _shadowing(state: MasterState, run: Run) -> str | None:
+    fault = _fault(state, run)
+    if fault:
+        return fault
+    return DONE if _READY & run.phases_of(run.destination).keys() else None
+
+
+def _switching(state: MasterState, run: Run) -> str | None:
+    return DONE if is_active(state, run) else _fault(state, run) or None
+
+
+def _fault(state: MasterState, run: Run) -> str:
+    """Why the destination cannot become active any more; "" if it can."""
+    if run.destination.number not in state.instances:
+        how = run.how_ended(run.destination)
+        return f"{run.destination} ended on {run.destination_host.name}: {how}"
+    for instance in (run.destination, run.source):
+        said = run.phases_of(instance)
+        if ReportPhase.FAILED in said:
+            return f"{instance} {_REPORTS[ReportPhase.FAILED]}: {said[ReportPhase.FAILED]}"
+    if ReportPhase.ABORTED in run.phases_of(run.destination):
+        return f"{run.destination} {_REPORTS[ReportPhase.ABORTED]}"
+    return ""
+
+
+def _aborting(state: MasterState, run: Run) -> str | None:
+    said = run.phases_of(run.destination)
+    aborted = ReportPhase.ABORTED in said or ReportPhase.FAILED in said
+    return DONE if aborted or run.destination.number not in state.instances else None
+
+
+def _resuming(state: MasterState, run: Run) -> str | None:
+    resumed = ReportPhase.RESUMED in run.phases_of(run.source)
+    ended = run.source.number not in state.instances
+    # One that follows no protocol says nothing, and never fell silent.
+    deaf = not was_switched(run) and not run.phases_of(run.source)
+    return DONE if resumed or ended or deaf else None
+
+
+def _at_once(state: MasterState, run: Run) -> str | None:
+    return DONE
+
+
+_OUTCOMES: Final[Mapping[HandoffPhase, Callable[[MasterState, Run], str | None]]] = {
+    HandoffPhase.SHADOW: _shadowing,
+    HandoffPhase.SWITCH: _switching,
+    HandoffPhase.ABORT: _aborting,
+    HandoffPhase.RESUME: _resuming,
+    HandoffPhase.DONE: _at_once,
+}
+
+
+def was_switched(run: Run) -> bool:
+    """The destination may have been told to switch, so that the source may be silent."""
+    return any(
+        isinstance(step, Configure) and step.phase is HandoffPhase.SWITCH for step in run.so_far
+    )
+
+
+# --- when its time has passed -----------------------------------------------------------------
+
+
+def timed_out(state: MasterState, run: Run, step: Configure, now: float) -> str | None:
+    """What the passing of a phase's time means: as `outcome`."""
+    if step.phase is HandoffPhase.RESUME and not was_switched(run):
+        return DONE  # it was never asked for silence
+    if step.phase is HandoffPhase.ABORT:
+        instance = state.instances[run.destination.number]
+        if not instance.stopping:
+            _stop_unheard(state, run, now)
+            return None
+    return f"{TITLES[step.phase]} took longer than {step.timeout:g} s: {_waited(run)}"
+
+
+def _stop_unheard(state: MasterState, run: Run, now: float) -> None:
+    """It may become active at any moment, or be so: only its end makes sure that it never is."""
+    stop = state.processes[run.process].spec.stop
+    lifecycle.stop_instance(state, state.instances[run.destination.number], now)
+    run.deadline = now + stop.timeout
+    state.record(
+        now, "destination_unheard",
+        f"{run.destination} does not confirm that the handoff is called off: the master stops it",
+        process=run.process, host=run.destination_host.name,
+    )  # fmt: skip
+    state.save_run(run)
+
+
+def _waited(run: Run) -> str:
+    """What is still waited for, in the words of those who wait."""
+    source, destination = run.heard.get(run.source.number), run.heard.get(run.destination.number)
+    if source is None and destination is None:
+        return (
+            "neither node has reported. Do they use rosrm.node? One that keeps only the "
+            "paper's constraints needs `protocol: paper` in the options of its migration"
+        )
+    said = [
+        f"{instance} has not reported"
+        if heard is None
+        else f"{instance} {_REPORTS[list(heard.phases)[-1]]}"
+        + (f": {heard.message}" if heard.message else "")
+        for instance, heard in ((run.destination, destination), (run.source, source))
+    ]
+    return "; ".join(said)

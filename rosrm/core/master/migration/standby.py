@@ -1,0 +1,215 @@
+"""Standbys: a second instance on another host follows the state of a process that asks for one.
+
+======================  =====================================================================
+the process             what is done about its standby
+======================  =====================================================================
+runs, has none          one is started on another host that has room, as a shadow
+has one that runs       source and standby are told of each other, until it says READY
+has one that gave up    it is stopped; another one is started after a while, ever longer
+waits for its restart   it is stopped for good: its end hands over to the standby
+moves                   it is kept until the move is committed: a move may fail
+is over                 the standby is stopped
+======================  =====================================================================
+
+`failover` says what follows when the primary has ended.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from rosrm.core.master import lifecycle
+from rosrm.core.master.assignment.assign import demand_of, ranking_of
+from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.migration import failover, handoff
+from rosrm.core.master.migration.start import plan_move, why_no_executor
+from rosrm.core.master.migration.steps import give_order
+from rosrm.core.master.state.demand import Demand
+from rosrm.core.master.state.hosts import Host
+from rosrm.core.master.state.migration import Run
+from rosrm.core.master.state.process import Process, ProcessPhase, Wanted
+from rosrm.model.plan import HandoffPhase, ReportPhase, Start
+
+#: Seconds until another standby is tried after one that failed; doubled with each.
+_FIRST_WAIT: Final = 2.0
+_LONGEST_WAIT: Final = 60.0
+#: Most standbys that are begun in one review.
+_AT_A_TIME: Final = 2
+
+
+def review_standbys(state: MasterState, now: float) -> None:
+    """See to the standby of every process that asks for one."""
+    for run in list(state.standbys.values()):
+        _review(state, run, now)
+    begun = 0
+    for name in state.wants_standby:
+        process = state.processes[name]
+        if begun < _AT_A_TIME and _lacks_one(state, process, now):
+            begun += _begin(state, process, now)
+
+
+def _lacks_one(state: MasterState, process: Process, now: float) -> bool:
+    alone = process.name not in state.standbys and process.name not in state.runs
+    calm = process.phase is ProcessPhase.RUNNING and process.wanted is Wanted.RUN
+    return alone and calm and len(process.instances) == 1 and now >= process.standby_at
+
+
+# --- a new one --------------------------------------------------------------------------------
+
+
+def _begin(state: MasterState, process: Process, now: float) -> bool:
+    owner = state.instances[process.owner]
+    ranking = ranking_of(state, _demand(state, process, owner.host))
+    column = ranking.best()
+    if column < 0:
+        _wait(state, process, "no host has room for its standby", now)
+        return False
+    host = state.hosts.hosts[column]
+    run = plan_move(state, process, host, "standby", now)
+    why = run if isinstance(run, str) else why_no_executor(state, run)
+    if isinstance(run, str) or why or not _can_wait(run):
+        why = why or "its migration strategy keeps no standby ready"
+        _wait(state, process, f"it can have no standby: {why}", now)
+        return False
+    state.standbys[process.name] = run
+    state.charge_ranked(run.destination, host, now, ranking)
+    state.record(
+        now, "standby_begun", f"the standby of {process.name} starts on {host.name}",
+        process=process.name, host=host.name, facts={"number": run.destination.number},
+    )  # fmt: skip
+    process.standby_reason = f"its standby starts on {host.name}"
+    _order_start(state, run, now)
+    state.save(process)
+    return True
+
+
+def _can_wait(run: Run) -> bool:
+    """Its plan is one of a handoff: with a shadow that is ready before it is active."""
+    shadow, switch = (
+        failover.index_of(phase, run.plan.steps)
+        for phase in (HandoffPhase.SHADOW, HandoffPhase.SWITCH)
+    )
+    return 0 <= shadow < switch and any(
+        isinstance(step, Start) and step.shadow for step in run.plan.steps[:shadow]
+    )
+
+
+def _demand(state: MasterState, process: Process, primary: Host) -> Demand:
+    """As of the process itself, on a host that is apart from that of the primary."""
+    own = demand_of(state, process)
+    excluded = {**process.excluded, primary.name: "the primary runs there"}
+    labels = primary.description.labels
+    for host in state.hosts.hosts:
+        for label in process.spec.standby.apart_by:
+            value = host.description.labels.get(label)
+            if value is None:
+                excluded.setdefault(
+                    host.name, f"it has no label {label!r}, in which the standby must differ"
+                )
+            elif value == labels.get(label):
+                excluded.setdefault(
+                    host.name, f"it has {label}={value} as the host of the primary has"
+                )
+    return Demand(process.spec, own.amounts, own.estimated, excluded, reads=state.declared.reads)
+
+
+def _wait(state: MasterState, process: Process, why: str, now: float) -> None:
+    """Said once, tried again after a while."""
+    process.standby_at = now + _FIRST_WAIT
+    if process.standby_reason != why:
+        process.standby_reason = why
+        state.record(now, "standby_waits", f"{process.name}: {why}", process=process.name)
+
+
+def _order_start(state: MasterState, run: Run, now: float) -> None:
+    start = next(step for step in run.plan.steps if isinstance(step, Start))
+    if not run.begun:
+        run.deadline, run.begun = now + start.timeout, True
+    give_order(state, run, start, now)
+
+
+# --- one that is there ------------------------------------------------------------------------
+
+
+def _review(state: MasterState, run: Run, now: float) -> None:
+    process, instance = state.processes[run.process], state.instances.get(run.destination.number)
+    move = state.runs.get(run.process)
+    if process.wanted is Wanted.CANCEL or process.phase.over or (move and move.committed):
+        end_standby(state, process, now)
+    elif move is not None:
+        return
+    elif instance is None:
+        how = run.how_ended(run.destination)
+        _lost(state, process, run, f"{run.destination} ended: {how}", now)
+    elif process.owner != run.source.number:
+        end_standby(state, process, now)
+    elif instance.host.draining:
+        _lost(state, process, run, f"{instance.host.name} is being drained", now)
+    elif not instance.runs:
+        _see_it_start(state, process, run, now)
+    else:
+        _see_it_follow(state, process, run, now)
+
+
+def _see_it_start(state: MasterState, process: Process, run: Run, now: float) -> None:
+    if run.begun and now >= run.deadline:
+        _lost(state, process, run, f"{run.destination} did not start in time", now)
+    elif not run.begun or now - run.order_at >= state.settings.order_retry:
+        _order_start(state, run, now)
+
+
+def _see_it_follow(state: MasterState, process: Process, run: Run, now: float) -> None:
+    said = run.phases_of(run.destination)
+    gave_up = said.get(ReportPhase.FAILED) or said.get(ReportPhase.ABORTED)
+    if gave_up is not None:
+        _lost(state, process, run, gave_up or f"{run.destination} has called the handoff off", now)
+    elif ReportPhase.READY not in said:
+        _say_shadow(state, run, now)
+    else:
+        _note_ready(state, process, run, now)
+
+
+def _note_ready(state: MasterState, process: Process, run: Run, now: float) -> None:
+    host = run.destination_host.name
+    ready = f"its standby is ready on {host}"
+    if process.standby_reason != ready:
+        process.standby_reason, process.standby_tries = ready, 0
+        state.record(
+            now, "standby_ready", f"the standby of {process.name} is ready on {host}",
+            process=process.name, host=host,
+        )  # fmt: skip
+
+
+def _say_shadow(state: MasterState, run: Run, now: float) -> None:
+    shadow = failover.index_of(HandoffPhase.SHADOW, run.plan.steps)
+    if run.index != shadow:
+        run.index, run.begun = shadow, False
+    if not run.begun or now - run.order_at >= state.settings.order_retry:
+        run.begun, run.order_at = True, now
+        handoff.publish(state, run, HandoffPhase.SHADOW)
+
+
+def _lost(state: MasterState, process: Process, run: Run, why: str, now: float) -> None:
+    wait = min(_FIRST_WAIT * 2.0**process.standby_tries, _LONGEST_WAIT)
+    process.standby_tries = min(process.standby_tries + 1, 16)
+    process.standby_at = now + wait
+    state.record(
+        now, "standby_lost",
+        f"{process.name} has no standby: {why}; the master starts another one in {wait:g} s",
+        process=process.name, host=run.destination_host.name,
+    )  # fmt: skip
+    end_standby(state, process, now)
+    process.standby_reason = f"it has no standby: {why}"
+
+
+def end_standby(state: MasterState, process: Process, now: float) -> None:
+    """Stop the standby of a process, if it has one."""
+    run = state.standbys.pop(process.name, None)
+    if run is None:
+        return
+    process.standby_reason = ""
+    handoff.close(state, run)
+    instance = state.instances.get(run.destination.number)
+    if instance is not None and process.owner != instance.id.number and not instance.stopping:
+        lifecycle.stop_instance(state, instance, now)
+    state.save(process)

@@ -1,0 +1,209 @@
+"""Beginning a move: is there a way, a room and a plan?"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Final
+
+from rosrm.core.master.checkpoint.images import reason_of
+from rosrm.core.master.master_state import MasterState, Process, ProcessPhase, Run
+from rosrm.core.master.migration.steps import title
+from rosrm.core.master.plugin_failures import why_broken
+from rosrm.core.master.scheduling.ranking import Ranking
+from rosrm.core.master.state.hosts import Host
+from rosrm.errors import PluginError, describe_fault
+from rosrm.extensions.plugin_calls import required
+from rosrm.model.plan import Aim, Commit, Move, Plan, Start, executors_of, plan_fault
+from rosrm.model.plan_json import checked_plan
+from rosrm.wording import listed, standing
+
+#: The method of a strategy that plans for an aim.
+_HOOKS: Final = {Aim.MOVE: "propose", Aim.CHECKPOINT: "checkpoint", Aim.RESTORE: "restore"}
+
+
+def begin_move(
+    state: MasterState, process: Process, run: Run, ranking: Ranking, now: float
+) -> None:
+    """Begin a planned move to a host that has room for the process by a ranking."""
+    destination, cause = run.destination_host, run.cause
+    state.runs[process.name] = run
+    state.charge_ranked(run.destination, destination, now, ranking)
+    state.set_phase(process, ProcessPhase.MIGRATING, now, f"to {destination.name}: {cause}")
+    state.record(
+        now, "migration_begun",
+        f"{process.name} moves from {run.source_host.name} to {destination.name} by "
+        f"{run.strategy}: {cause}",
+        process=process.name, host=destination.name,
+        facts={
+            "from": run.source_host.name, "to": destination.name, "strategy": run.strategy,
+            "cause": cause, "steps": [title(step) for step in run.plan.steps],
+            "overlap": run.plan.overlap, "source": run.source.number,
+            "destination": run.destination.number,
+        },
+    )  # fmt: skip
+    state.save(process)
+    state.save_run(run)
+
+
+def plan_move(
+    state: MasterState, process: Process, destination: Host, cause: str, now: float
+) -> Run | str:
+    """What its strategy proposes for a move of a running process, or why there is no plan."""
+    source = state.instances[process.owner]
+    name = process.spec.migration.strategy or ""
+    move = Move(
+        process.spec, source.id, source.host.name, state.new_instance_id(process),
+        destination.name, state.new_instance_id(process), int(state.wall),
+        source.node_name or process.name,
+    )  # fmt: skip
+    plan = proposed(state, name, move)
+    if isinstance(plan, str):
+        return plan
+    return Run(
+        process.name, plan, name, source.id, source.host, move.destination, destination, cause,
+        now, move.source_node, destination_node(plan, move), state.wall,
+    )  # fmt: skip
+
+
+def moves_under_way(state: MasterState) -> int:
+    """How many processes are moving; one that is stuck does not keep others from moving."""
+    return sum(not run.stuck for run in state.runs.values())
+
+
+def why_busy(run: Run) -> str:
+    """What is under way with a process already."""
+    if run.aim is Aim.MOVE:
+        return f"{run.process} is moving already, to {run.destination_host.name}"
+    return f"{run.process} is busy: {run.course}"
+
+
+def why_immovable(state: MasterState, process: Process) -> str:
+    """Why a process cannot be moved now; "" if it can."""
+    if process.name in state.runs:
+        return why_busy(state.runs[process.name])
+    if process.phase is ProcessPhase.CHECKPOINTED:
+        return f"{process.name} is checkpointed: {reason_of(state, process)}; restore it first"
+    if process.phase is not ProcessPhase.RUNNING:
+        return (
+            f"{process.name} {standing(process.phase.value)}; only a running process can be moved"
+        )
+    standby = state.standbys.get(process.name)
+    others = process.instances - {process.owner, standby.destination.number if standby else 0}
+    if others:
+        return f"an earlier instance of {process.name} is still being stopped"
+    return why_never_movable(state, process)
+
+
+def why_never_movable(state: MasterState, process: Process) -> str:
+    """Return why a process cannot be moved in any phase; "" if it can."""
+    strategy = process.spec.migration.strategy
+    if strategy is None:
+        return f"{process.name} has no migration strategy; give it `migration:` in its file"
+    if strategy not in state.strategies:
+        return (
+            f"{process.name} wants the migration strategy {strategy!r}, which is not selected "
+            f"here; there are {', '.join(sorted(state.strategies)) or 'none'}"
+        )
+    return ""
+
+
+def why_no_executor(state: MasterState, run: Run) -> str:
+    """Return which host of a plan lacks an executor that it names; "": none does."""
+    lacking = _lacking(state, run)
+    return "" if lacking is None else _lacks(state, run, lacking[0], [lacking[1].name])
+
+
+def without_executor(state: MasterState, run: Run) -> tuple[list[str], str]:
+    """Return all hosts that lack the executor that the destination of a plan lacks, and say so.
+
+    No host, if the plan can be carried out on its destination.
+    """
+    lacking = _lacking(state, run)
+    if lacking is None or lacking[1] is not run.destination_host:
+        return [], ""
+    executor, _ = lacking
+    hosts = [
+        host.name
+        for host in state.hosts.listed()
+        if host is not run.source_host and _has_not(host, executor)
+    ]
+    return hosts, _lacks(state, run, executor, hosts)
+
+
+def _lacking(state: MasterState, run: Run) -> tuple[str, Host] | None:
+    """Return an executor that a plan names and the host that lacks it."""
+    if run.strategy not in state.declared.executors:
+        return None  # its offer is not known
+    commit = run.plan.steps[run.commit_index]
+    named = [*executors_of(run.plan)]
+    if isinstance(commit, Commit) and commit.image:
+        named.append((commit.image, run.source_host.name))
+    for executor, name in named:
+        host = state.hosts.by_name[name]
+        if _has_not(host, executor):
+            return executor, host
+    return None
+
+
+def _has_not(host: Host, executor: str) -> bool:
+    return bool(host.description.incarnation) and executor not in host.description.executors
+
+
+def _lacks(state: MasterState, run: Run, executor: str, hosts: list[str]) -> str:
+    brought_by = state.declared.brought_by.get(run.strategy) or "the plugin"
+    one = len(hosts) == 1
+    lacking = f"{listed(hosts, most=3)} {'has' if one else 'have'} no executor {executor!r}"
+    lacking += f", which {run.strategy} needs there to move {run.process}"
+    broken = ((name, why_broken(state.hosts.by_name[name], run.strategy)) for name in hosts)
+    faults = [f"on {name} {reason}" for name, reason in broken if reason]
+    if faults:
+        return f"{lacking}: {faults[0]}; then restart its slave"
+    return (
+        f"{lacking}: install {brought_by} "
+        f"on {hosts[0] if one else 'them'} and restart {'its slave' if one else 'their slaves'}"
+    )
+
+
+def proposed(state: MasterState, name: str, move: Move, aim: Aim = Aim.MOVE) -> Plan | str:
+    """The plan of a strategy, or why there is none; a strategy that raises is named.
+
+    Args:
+        state: guards the call, and says what the strategy's offer declares.
+        name: of the strategy.
+        move: to be planned; it is given its options.
+        aim: of the plan.
+    """
+
+    def ask() -> Plan | str:
+        try:
+            given = replace(move, options=state.declared.options_of(name, move.spec))
+            plan = required(getattr(state.strategies[name], _HOOKS[aim])(given), Plan)
+        except ValueError as reason:  # by its contract: the strategy cannot move this process
+            return f"the migration strategy {name!r} gave no plan: {describe_fault(reason)}"
+        fault = plan_fault(plan, move, aim) or _strange_executor(state, name, plan)
+        if fault:
+            raise PluginError(f"an unsound plan: {fault}")
+        return checked_plan(plan)  # it goes into the journal
+
+    try:
+        return state.plugins.ask("migration", name, _HOOKS[aim], ask)
+    except PluginError as fault:
+        return f"the migration strategy {name!r} gave no plan: {fault}"
+
+
+def _strange_executor(state: MasterState, name: str, plan: Plan) -> str:
+    """Return what is wrong with an executor of a plan that its own offer lacks; "": nothing."""
+    own = state.declared.executors.get(name)
+    images = [step.image for step in plan.steps if isinstance(step, Commit) and step.image]
+    for executor in [*(executor for executor, _ in executors_of(plan)), *images]:
+        if own is not None and executor not in own:
+            there = ", ".join(sorted(own)) or "none"
+            return f"it names the executor {executor!r}, which its offer lacks; its own: {there}"
+    return ""
+
+
+def destination_node(plan: Plan, move: Move) -> str:
+    """The name under which the node of the destination runs, without its namespace."""
+    starts = (step for step in plan.steps if isinstance(step, Start))
+    aliases = [step.node_name for step in starts if step.instance == move.destination]
+    return next(iter(aliases), "") or move.spec.name

@@ -1,0 +1,257 @@
+"""The steps of a plan: what is asked of a slave for each, and when each is done or has failed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import singledispatch
+from typing import Any, Final
+
+from rosrm.core.master import lifecycle
+from rosrm.core.master.commands import Order
+from rosrm.core.master.master_state import MasterState, Run
+from rosrm.core.master.migration import handoff
+from rosrm.core.master.migration.handoff import DONE
+from rosrm.core.master.state.hosts import Host, HostCondition
+from rosrm.model.plan import (
+    Aim,
+    AwaitReady,
+    AwaitReleased,
+    Commit,
+    Configure,
+    Execute,
+    SetRestart,
+    Start,
+    Step,
+    Stop,
+)
+from rosrm.model.values import InstanceState
+
+__all__ = [
+    "DONE",
+    "give_order",
+    "give_order_again",
+    "nobody_there",
+    "note_result",
+    "outcome_of",
+    "timed_out",
+    "title",
+]
+
+_TITLES: Final[Mapping[type[Step], str]] = {
+    Commit: "the commit",
+    Start: "starting {0.instance} on {0.host}",
+    AwaitReady: "waiting until {0.instance} is ready on {0.host}",
+    AwaitReleased: "waiting until {0.instance} on {0.host} has handed everything over",
+    Stop: "stopping {0.instance} on {0.host}",
+    Execute: "the step {0.executor!r} of the migration strategy on {0.host}",
+}
+#: Of a host that answers nothing, and may never do so again.
+_AWAY: Final = (HostCondition.LOST, HostCondition.LEFT, HostCondition.DETACHED)
+
+
+def give_order(state: MasterState, run: Run, step: Step, now: float) -> None:
+    """Ask the slave for what the step needs; the nodes themselves, in a handoff."""
+    if isinstance(step, Commit | AwaitReady | AwaitReleased):
+        return
+    if isinstance(step, Configure):
+        run.order, run.order_at = 0, now
+        handoff.publish(state, run, step.phase)
+        return
+    if isinstance(step, Start) and _in_the_way(state, run, step, now):
+        run.order = 0
+        return
+    host = state.hosts.by_name[step.host]
+    run.order, run.order_at = state.order_id(), now
+    state.runs_by_order[run.order] = run.process
+    if isinstance(step, Stop):
+        state.emit(Order(run.order, host.host_id, "stop", step.instance))
+    elif isinstance(step, Execute):
+        state.emit(
+            Order(
+                run.order, host.host_id, "execute", executor=step.executor,
+                arguments=_arguments(run, step), timeout=step.timeout,
+            )
+        )  # fmt: skip
+    elif isinstance(step, SetRestart):
+        _order_restart_policy(state, run, step, host)
+    else:
+        _order_start(state, run, step, host, now)
+
+
+def _arguments(run: Run, step: Execute) -> Mapping[str, Any]:
+    return {**step.arguments, "results": run.results} if run.results else step.arguments
+
+
+def note_result(run: Run, result: Mapping[str, Any]) -> None:
+    """What an executor has answered is for those of later steps."""
+    step = run.step_in_hand
+    if isinstance(step, Execute):
+        run.results[step.executor] = result
+
+
+def _order_restart_policy(state: MasterState, run: Run, step: SetRestart, host: Host) -> None:
+    if step.restart != state.processes[run.process].spec.restart:
+        run.suspended.add(step.instance.number)
+        state.save_run(run)
+    state.emit(Order(run.order, host.host_id, "set_restart", step.instance, restart=step.restart))
+
+
+def _order_start(state: MasterState, run: Run, step: Start, host: Host, now: float) -> None:
+    process = state.processes[run.process]
+    spec, number = process.spec, step.instance.number
+    run.launched.add(number)
+    if step.shadow or step.restored:
+        run.suspended.add(number)
+    state.save_run(run)
+    if number not in state.instances and number not in run.ended:
+        state.add_instance(step.instance, spec, host, now)
+        state.save(process)
+    instance = state.instances.get(number)
+    if instance is not None and instance.node_name != step.node_name:
+        instance.node_name = step.node_name
+        state.save(process)
+    remapped = replace(spec, remappings={**spec.remappings, **step.remappings})
+    assignment = state.assignment(
+        step.instance, remapped, step.node_name, shadow=step.shadow, restored=step.restored
+    )
+    state.emit(Order(run.order, host.host_id, "start", step.instance, assignment))
+
+
+def _in_the_way(state: MasterState, run: Run, step: Start, now: float) -> bool:
+    """Another instance of the name may still run, and the plan does not allow two at a time.
+
+    A source of which there is an image stands still.
+    On the way back it is stopped, whatever the plan says: the step that did not stop it failed.
+    """
+    process = state.processes[run.process]
+    back = run.undo is not None
+    aliased = step.node_name not in ("", process.name)
+    if not back and (run.plan.overlap > 0.0 or aliased or step.restored):
+        return False
+    others = [one for one in state.instances_of(process) if one.id != step.instance]
+    for other in others:
+        if back and not other.stopping:
+            lifecycle.stop_instance(state, other, now)
+    return bool(others)
+
+
+def give_order_again(state: MasterState, run: Run, step: Step, now: float) -> None:
+    """Order again a start, a stop or a restart policy: one may be lost, and two do no harm.
+
+    A start that another instance delayed is ordered as soon as that one has ended.
+    """
+    if isinstance(step, Configure):
+        handoff.say_again(state, run, step, now)
+    elif isinstance(step, Execute | AwaitReady | AwaitReleased | Commit):
+        return
+    elif _has_waited(run, step) or now - run.order_at >= state.settings.order_retry:
+        give_order(state, run, step, now)
+
+
+def _has_waited(run: Run, step: Step) -> bool:
+    """Return True if the start was not ordered yet, because another instance was in its way."""
+    return isinstance(step, Start) and step.instance.number not in run.launched
+
+
+def timed_out(state: MasterState, run: Run, step: Step, now: float) -> str | None:
+    """What the passing of a step's time means: as `outcome_of`."""
+    if isinstance(step, Configure):
+        return handoff.timed_out(state, run, step, now)
+    if isinstance(step, AwaitReleased):
+        return DONE
+    return f"{title(step)} took longer than {step.timeout:g} s"
+
+
+@singledispatch
+def outcome_of(step: Any, state: MasterState, run: Run, now: float) -> str | None:
+    """Of the step in hand: None: not yet; "": done; else why it failed."""
+    raise TypeError(step)
+
+
+@outcome_of.register
+def _(step: Start, state: MasterState, run: Run, now: float) -> str | None:
+    if step.instance.number in run.ended:
+        return f"{step.instance} ended on {step.host}: {run.how_ended(step.instance)}"
+    instance = state.instances.get(step.instance.number)
+    if instance is None:
+        return None  # what is in its way has to end first
+    if run.answer is not None and not run.answer[0]:
+        return f"{step.host} refused to start {step.instance}: {run.answer[1]}"
+    return DONE if instance.runs else None
+
+
+@outcome_of.register
+def _(step: AwaitReady, state: MasterState, run: Run, now: float) -> str | None:
+    instance = state.instances.get(step.instance.number)
+    if instance is None:
+        return f"{step.instance} ended on {step.host}: {run.how_ended(step.instance)}"
+    settled = instance.state is InstanceState.READY and now >= instance.ready_at + step.settle
+    return DONE if settled else None
+
+
+@outcome_of.register
+def _(step: AwaitReleased, state: MasterState, run: Run, now: float) -> str | None:
+    return DONE if handoff.is_released(state, run, step.instance) else None
+
+
+@outcome_of.register
+def _(step: Stop, state: MasterState, run: Run, now: float) -> str | None:
+    return DONE if step.instance.number not in state.instances else None
+
+
+@outcome_of.register
+def _(step: Configure, state: MasterState, run: Run, now: float) -> str | None:
+    return handoff.outcome(step, state, run)
+
+
+@outcome_of.register
+def _(step: SetRestart, state: MasterState, run: Run, now: float) -> str | None:
+    if step.instance.number not in state.instances:
+        return DONE  # it has ended: there is nothing to restart
+    if run.answer is None:
+        return None
+    accepted, message = run.answer
+    return (
+        DONE
+        if accepted
+        else f"{step.host} did not change the restart policy of {step.instance}: {message}"
+    )
+
+
+@outcome_of.register
+def _(step: Commit, state: MasterState, run: Run, now: float) -> str | None:
+    return DONE
+
+
+@outcome_of.register
+def _(step: Execute, state: MasterState, run: Run, now: float) -> str | None:
+    if run.answer is None:
+        away = state.hosts.condition_of(state.hosts.by_name[step.host]).words(*_AWAY)
+        # Who stands still meanwhile is not to wait for a time-out that may be long. On a way that
+        # has to be gone to its end, the host is waited for as long as somebody is there.
+        turns = run.undo is None and not run.committed
+        return f"{step.host} {away}" if away and (turns or nobody_there(state, run, step)) else None
+    accepted, message = run.answer
+    return DONE if accepted else f"{step.executor} failed on {step.host}: {message}"
+
+
+def nobody_there(state: MasterState, run: Run, step: Execute) -> bool:
+    """Whether a host is away, and the instances of a move that it held have ended or count as lost.
+
+    An executor of it could do nothing for them, and its host may never come back.
+    """
+    host = state.hosts.by_name[step.host]
+    if run.aim is not Aim.MOVE or state.hosts.condition_of(host) not in _AWAY:
+        return False
+    return all(one.host is not host for one in state.instances_of(state.processes[run.process]))
+
+
+def title(step: Step) -> str:
+    """Return a step as the subject of a sentence."""
+    if isinstance(step, Configure):
+        return handoff.TITLES[step.phase]
+    if isinstance(step, SetRestart):
+        what = "turning off the restarts" if step.restart.when == "never" else "allowing restarts"
+        return f"{what} of {step.instance} on {step.host}"
+    return _TITLES[type(step)].format(step)

@@ -1,0 +1,51 @@
+"""Plugins that fail, in the master or on a host: the begin and the end of it are recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.state.hosts import Host
+from rosrm.extensions.plugin_calls import TITLES, Failing, Plugin
+
+
+def note(state: MasterState, now: float) -> None:
+    """Record which plugins of the master began to fail since the last call, or work again."""
+    for (kind, name), error in state.plugins.changes(now):
+        event, outcome = (
+            ("plugin_failed", f"fails: {error}") if error else ("plugin_works", "works again")
+        )
+        facts = {"plugin": kind, "name": name}
+        state.record(now, event, f"the {TITLES[kind]} {name!r} {outcome}", facts=facts)
+
+
+def note_on_host(state: MasterState, host: Host, failing: Mapping[Plugin, str], now: float) -> None:
+    """Note which plugins fail on a host by the report of its slave, and record what changed.
+
+    Args:
+        failing: all that fail there, and why. A probe goes by the resource that it reads.
+    """
+    for plugin in sorted(failing.keys() | host.failing.keys()):
+        if plugin not in failing:
+            del host.failing[plugin]
+            _record_on_host(state, host, plugin, "works again", now)
+        elif host.failing.setdefault(plugin, Failing()).note(failing[plugin], 1, now):
+            _record_on_host(state, host, plugin, f"fails: {failing[plugin]}", now)
+
+
+def why_broken(host: Host, strategy: str) -> str:
+    """Return why a migration strategy fails on a host, as its slave reports; "": it does not."""
+    known = host.failing.get(("migration", strategy))
+    return "" if known is None else known.error
+
+
+def _record_on_host(
+    state: MasterState, host: Host, plugin: Plugin, outcome: str, now: float
+) -> None:
+    kind, name = plugin
+    title = f"probe of {name}" if kind == "probe" else f"{TITLES[kind]} {name!r}"
+    state.record(
+        now, "plugin_works" if outcome == "works again" else "plugin_failed",
+        f"the {title} on {host.name} {outcome}", host=host.name,
+        facts={"plugin": kind, "name": name},
+    )  # fmt: skip

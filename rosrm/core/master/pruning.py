@@ -1,0 +1,134 @@
+"""Removing ended processes and departed hosts from memory, journal and listings."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from rosrm.core.master import events as happened
+from rosrm.core.master import lifecycle
+from rosrm.core.master.commands import Reply
+from rosrm.core.master.hosts.liveness import lease_of
+from rosrm.core.master.master_state import MasterState, Process, ProcessPhase, Wanted
+from rosrm.core.master.requests import count, known_host, known_processes, refuse
+from rosrm.core.master.state.hosts import Host, HostCondition
+from rosrm.extensions.contracts import Intent
+from rosrm.wording import counted, listed
+
+_DEPARTED: Final = (HostCondition.LEFT, HostCondition.DETACHED)
+
+
+def prune_requested(state: MasterState, event: happened.PruneRequested, now: float) -> None:
+    """Remove the named processes and hosts, or all that ended and left; all of them, or none."""
+    if event.names or event.hosts:
+        found = _named(state, event, now)
+        if found is None:
+            return
+        processes, hosts = found
+    else:
+        ended = [state.processes[name] for name in state.over]
+        processes = [process for process in ended if not _why_kept(state, process)]
+        left = [
+            host
+            for host in state.hosts.listed()
+            if state.hosts.condition_of(host) in _DEPARTED and not host.instances
+        ]
+        hosts = [host for host in left if not _why_held(state, host, now)]
+    for process in processes:
+        state.remove_process(process.name)
+    left_running = [_prune_host(state, host, event.by, now) for host in hosts]
+    if processes:
+        state.record(now, "pruned", f"{count(len(processes))} removed", by=event.by)
+    removed = [count(len(processes))] if processes else []
+    removed += [counted(len(hosts), "host")] if hosts else []
+    message = f"{listed(removed)} removed" if removed else "nothing to remove"
+    state.emit(Reply(event.request, message="; ".join([message, *filter(None, left_running)])))
+
+
+def _named(
+    state: MasterState, event: happened.PruneRequested, now: float
+) -> tuple[list[Process], list[Host]] | None:
+    """The processes and hosts that a request names; None: it was refused."""
+    processes = known_processes(state, event.request, event.names)
+    if processes is None:
+        return None
+    hosts = []
+    for name in dict.fromkeys(event.hosts):
+        host = known_host(state, event.request, name)
+        if host is None:
+            return None
+        hosts.append(host)
+    faults = [_why_kept(state, process) for process in processes]
+    faults += [_why_held(state, host, now) for host in hosts]
+    for fault in faults:
+        if fault:
+            refuse(state, event.request, f"{fault}. Nothing was removed")
+            return None
+    return processes, hosts
+
+
+def _why_kept(state: MasterState, process: Process) -> str:
+    """Return why a process cannot be removed; "" if it can."""
+    if not process.phase.over:
+        return f"{process.name} is {process.phase.value}; cancel it first"
+    if process.instances:
+        instance = state.instances[min(process.instances)]
+        return f"{instance.id} is still being stopped on {instance.host.name}"
+    return "" if state.is_gone(process) else f"the standby of {process.name} is being ended"
+
+
+def _why_held(state: MasterState, host: Host, now: float) -> str:
+    """Return why a host cannot be removed; "" if it can."""
+    condition = state.hosts.condition_of(host)
+    if condition is HostCondition.UP:
+        return f"{host.name} is up; stop its slave first"
+    if condition is HostCondition.SUSPECT:
+        silence = now - float(state.hosts.heard[host.column])
+        return (
+            f"{host.name} is suspect: it has not reported for {silence:.1f} s and may report "
+            f"again. Stop its slave if it runs; a host can be pruned once it has left or is lost, "
+            f"which is after {lease_of(state, host):g} s of silence"
+        )
+    held = [state.instances[number] for number in sorted(host.instances)]
+    owned = [one.id.process for one in held if (process := state.owned_by(one)) is not None
+             and process.wanted is not Wanted.CANCEL]  # fmt: skip
+    if owned and condition is HostCondition.LEFT:
+        end = "it has ended" if len(owned) == 1 else "they have ended"
+        return f"{host.name} is still stopping {listed(owned)}; wait until {end}"
+    if owned:
+        them = "it" if len(owned) == 1 else "them"
+        return f"{host.name} may still run {listed(owned)}; cancel {them} first"
+    for instance in held:
+        if instance.id.process in state.runs:
+            return f"{instance.id.process} is moving from or to {host.name}"
+    for name in state.images.of:
+        image = state.processes[name].image
+        if image is not None and image.host == host.name:
+            return f"the image of {name} is on {host.name}; cancel {name} first"
+    return ""
+
+
+def _prune_host(state: MasterState, host: Host, by: str, now: float) -> str:
+    """Give up what may still run on a host; if the host returns, that is stopped there.
+
+    Returns:
+        which processes may still run there, and what stops them; "" if none may.
+    """
+    ends_all = state.hosts.condition_of(host) is HostCondition.LEFT
+    held = [] if ends_all else [state.instances[number] for number in sorted(host.instances)]
+    state.hosts.prune(host)
+    for number in sorted(host.instances):
+        lifecycle.gone(state, state.instances[number], now, f"{host.name} was pruned")
+    names = list(dict.fromkeys(instance.id.process for instance in held))
+    for process in [state.processes[name] for name in names if name in state.processes]:
+        if process.phase is ProcessPhase.CANCELLED:
+            process.reason = f"it may still run on {host.name}, which was removed"
+            state.save(process)
+    state.emit(Intent("host", host.name, None))
+    state.record(now, "host_pruned", f"{host.name} was removed", host=host.name, by=by)
+    if not names:
+        return ""
+    them = "it" if len(names) == 1 else "them"
+    return (
+        f"{listed(names)} may still run on {host.name}: `rosrm slave --stop-all` on that host "
+        f"stops {them}"
+    )

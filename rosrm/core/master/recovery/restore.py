@@ -1,0 +1,214 @@
+"""The state as the journal's intents have it, at the start of a master."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from rosrm.core.master.checkpoint import images
+from rosrm.core.master.lifecycle import adopt_to_stop, note_awaited_ends, note_phase
+from rosrm.core.master.master_state import MasterState, Process, ProcessPhase, Run, Wanted
+from rosrm.core.master.recovery import journal_gap
+from rosrm.core.master.state.migration import end_from_dict, way_back
+from rosrm.core.master.state.process import Image, LeftBehind
+from rosrm.extensions.contracts import Intent
+from rosrm.model.plan import Aim
+from rosrm.model.plan_json import plan_from_dict
+from rosrm.model.spec_json import spec_from_dict
+from rosrm.model.values import InstanceId
+
+_Table = Mapping[str, Mapping[str, Any]]
+
+
+def restore(state: MasterState, intents: Callable[[str], _Table], now: float) -> None:
+    """Fill an empty state with what was intended.
+
+    Nothing is started or stopped here: processes that run are expected on their hosts, and are
+    compared with what those hold when their slaves register. A migration under way goes on with the
+    step that was in hand, which is given once more; every step can be.
+
+    `intents` gives the journal's table of a name; the state must know the wall clock.
+    """
+    by_id = sorted(intents("host").items(), key=lambda item: int(item[1]["host_id"]))
+    for name, host in by_id:
+        state.hosts.expect(
+            name, now, cordoned=bool(host["cordoned"]), draining=bool(host.get("draining"))
+        )
+    for program, amounts in intents("learned").items():
+        state.learned.restore(program, amounts)
+    removed = ((int(one["next"]), name) for name, one in intents("removed").items())
+    state.keeping.removed.update((name, end) for end, name in sorted(removed))
+    stored = sorted(intents("process").values(), key=lambda item: int(item["order"]))
+    moves = intents("migration")
+    for item in stored:
+        process = _restore_process(state, item, now)
+        move = moves.get(process.name)
+        _restore_instances(state, process, item, move, now)
+        _restore_standby(state, process, item, now)
+        if move is None or not _restore_move(state, process, item, move, now):
+            _restore_place(state, process, now)
+    state.next_order = 1 + max((int(item["order"]) for item in stored), default=0)
+    cluster = intents("cluster")
+    numbers = cluster.get("instances", {})
+    state.next_instance = state.reserved_instances = int(numbers.get("next", 1))
+    journal_gap.restore(state, cluster)
+    images.restore(state, cluster)
+
+
+def _restore_process(state: MasterState, item: Mapping[str, Any], now: float) -> Process:
+    phase, exit_code = ProcessPhase(item["phase"]), item["exit_code"]
+    wall = float(item.get("since", state.wall))  # older journals say nothing of it
+    process = Process(
+        spec_from_dict(item["spec"]), int(item["order"]), phase,
+        now - max(0.0, state.wall - wall), wall=wall,  # the clock may have been set back
+        wanted=Wanted(item["wanted"]), reason=item["reason"], excluded=dict(item["excluded"]),
+        migrations=int(item["migrations"]), exit_code=exit_code if phase.over else None,
+        ended_on=item["host"] if phase.over else "",
+        restarts=int(item["restarts"]), born=int(item.get("born", 0)),
+        left_behind=LeftBehind(*left) if (left := item.get("left_behind")) else None,
+    )  # fmt: skip
+    state.add_process(process)
+    image = item.get("image")  # older journals have none
+    images.set_image(state, process, None if image is None else Image(**image))
+    return process
+
+
+def _restore_place(state: MasterState, process: Process, now: float) -> None:
+    if process.phase is ProcessPhase.QUEUED:
+        state.queue.add(process.name, process.spec.priority, process.order)
+    elif process.phase is ProcessPhase.SET_ASIDE:
+        state.set_aside.add(process.name)
+    elif process.image is not None:
+        trouble = process.reason if process.phase is ProcessPhase.CHECKPOINTED else ""
+        images.note_checkpointed(state, process, now, trouble)
+    elif not process.phase.over:
+        _expect_to_run(state, process, now)
+
+
+def _restore_instances(
+    state: MasterState, process: Process, item: Mapping[str, Any],
+    move: Mapping[str, Any] | None, now: float,
+) -> None:  # fmt: skip
+    """Put on the books what may still run: the owner, what moves, and any other to be stopped."""
+    aliases, standby = item.get("node_names", {}), item.get("standby")
+    moving = _numbers_of(move) | ({int(standby["destination"])} if standby else frozenset())
+    ended = move.get("ended", {}) if move is not None else {}
+    for number, host_name in item["instances"].items():
+        host = state.hosts.by_name.get(host_name)
+        if host is None or number in ended:
+            continue
+        instance = InstanceId(process.name, int(number))
+        if instance.number == item["owner"] or instance.number in moving:
+            held = state.add_instance(instance, process.spec, host, now)
+            held.node_name = str(aliases.get(number, ""))
+        else:
+            adopt_to_stop(state, instance, host, now)
+    process.owner = item["owner"] if item["owner"] in process.instances else 0
+
+
+def _expect_to_run(state: MasterState, process: Process, now: float) -> None:
+    owner = state.instances.get(process.owner)
+    if owner is not None:
+        note_phase(state, process, owner, now)
+    elif process.instances:
+        if process.wanted is not Wanted.CANCEL:
+            process.wanted = Wanted.REQUEUE
+        note_awaited_ends(state, process, now)
+    elif process.wanted is Wanted.CANCEL:
+        state.set_phase(process, ProcessPhase.CANCELLED, now)
+    else:
+        state.enqueue(process, now, "no instance of it was left when the master started")
+
+
+def _restore_standby(
+    state: MasterState, process: Process, item: Mapping[str, Any], now: float
+) -> None:
+    """It is told of its primary again, and says how far it is."""
+    standby = item.get("standby")
+    if standby is None or int(standby["destination"]) not in process.instances:
+        return
+    try:
+        run = _run_of(state, process, standby, now)
+    except (KeyError, TypeError, ValueError):
+        state.instances[int(standby["destination"])].stopping = True  # another one follows
+        return
+    run.index = 0
+    state.standbys[process.name] = run
+
+
+# --- moves ------------------------------------------------------------------------------------
+
+
+def _numbers_of(move: Mapping[str, Any] | None) -> frozenset[int]:
+    """The instances of a move; none, where it cannot be taken up again."""
+    if move is None or "plan" not in move:
+        return frozenset()
+    return frozenset({int(move["source"]), int(move["destination"]), *map(int, move["launched"])})
+
+
+def _restore_move(
+    state: MasterState, process: Process, item: Mapping[str, Any], move: Mapping[str, Any],
+    now: float,
+) -> bool:  # fmt: skip
+    """Take a move up again; False: nobody can, and it is over."""
+    try:
+        run = _run_of(state, process, move, now)
+    except (KeyError, TypeError, ValueError) as fault:
+        _forget_move(state, process, move, str(fault), now)
+        return False
+    process.owner = int(item["owner"])
+    state.runs[process.name] = run
+    for number in process.instances.intersection(move["stopping"]):
+        state.instances[number].stopping = True
+    state.set_phase(process, ProcessPhase.MIGRATING, now, run.course)
+    goes_on = (
+        f"continues its move to {run.destination_host.name}"
+        if run.aim is Aim.MOVE
+        else f"continues: {run.course}"
+    )
+    state.record(
+        now, "migration_taken_up", f"{process.name} {goes_on}",
+        process=process.name, host=run.destination_host.name,
+    )  # fmt: skip
+    return True
+
+
+def _run_of(state: MasterState, process: Process, move: Mapping[str, Any], now: float) -> Run:
+    hosts = state.hosts.by_name
+    plan = plan_from_dict(move["plan"])
+    wall = float(move.get("wall", state.wall))  # older journals say nothing of it
+    started = now - max(0.0, state.wall - wall)  # it may have been set back
+    run = Run(
+        process.name, plan, move["strategy"], InstanceId(process.name, int(move["source"])),
+        hosts[move["source_host"]], InstanceId(process.name, int(move["destination"])),
+        hosts[move["destination_host"]], move["cause"], started, move["source_node"],
+        move["destination_node"], wall, index=int(move["index"]), turned_at=int(move["turned_at"]),
+        committed=bool(move["committed"]), failure=move["failure"],
+        launched=set(move["launched"]), suspended=set(move["suspended"]),
+        results=dict(move.get("results", {})),  # older journals have none
+        aim=Aim(move.get("aim", Aim.MOVE)),
+    )  # fmt: skip
+    if move["back"]:
+        run.undo = way_back(plan, run.turned_at)
+    for number, end in move["ended"].items():
+        run.ended[int(number)] = end_from_dict(InstanceId(process.name, int(number)), end)
+    return run
+
+
+def _forget_move(
+    state: MasterState, process: Process, move: Mapping[str, Any], fault: str, now: float
+) -> None:
+    """The owner of the name goes on, and any other instance is stopped.
+
+    The source may have been told to stop already.
+    """
+    source = state.instances.get(int(move["source"]))
+    if source is not None and process.owner == source.id.number:
+        source.recalled = True
+    for instance in state.instances_of(process):
+        instance.stopping = instance.id.number != process.owner
+    state.record(
+        now, "migration_forgotten", f"the move of {process.name} cannot be continued: {fault}",
+        process=process.name,
+    )  # fmt: skip
+    state.emit(Intent("migration", process.name, None))

@@ -1,0 +1,382 @@
+"""What people ask for: submit, cancel, restart, migrate, checkpoint, restore, cordon, drain."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable
+
+from rosrm.core.master import events as happened
+from rosrm.core.master import lifecycle
+from rosrm.core.master.assignment.assign import reconsider_set_aside
+from rosrm.core.master.checkpoint import image_requests, images, replication
+from rosrm.core.master.commands import Order, Reply
+from rosrm.core.master.graph_names import shared_nodes
+from rosrm.core.master.hosts.registration import save_host
+from rosrm.core.master.master_state import WAITING, MasterState, Process, ProcessPhase, Wanted
+from rosrm.core.master.migration.eviction import departures, try_move
+from rosrm.core.master.migration.start import why_busy
+from rosrm.core.master.state.hosts import Host
+from rosrm.errors import PluginError
+from rosrm.extensions.contracts import SpecChecking
+from rosrm.extensions.plugin_calls import implements, required
+from rosrm.model.values import ProcessSpec
+from rosrm.wording import counted, listed, no_such
+
+
+def refuse(state: MasterState, request: int, message: str, code: str = "invalid") -> None:
+    """Answer a request that changes nothing."""
+    state.emit(Reply(request, False, code, message))
+
+
+# --- submit -----------------------------------------------------------------------------------
+
+
+def submission_received(state: MasterState, event: happened.SubmissionReceived, now: float) -> None:
+    """Queue all of the processes, or refuse all."""
+    taken = _taken(state, event)
+    if taken:
+        refuse(state, event.request, taken, "name_taken")
+        return
+    fault = _submission_fault(state, event)
+    if fault:
+        refuse(state, event.request, fault)
+        return
+    live = (one.spec for one in state.processes.values() if not one.phase.over)
+    shared = shared_nodes(event.specs, live)
+    for spec in event.specs:
+        process = Process(
+            spec,
+            state.next_order,
+            ProcessPhase.QUEUED,
+            now,
+            wall=state.wall,
+            born=state.next_instance,
+        )
+        state.next_order += 1
+        state.add_process(process)
+        state.enqueue(process, now)
+        state.record(now, "submitted", f"{spec.name} was submitted", process=spec.name, by=event.by)
+        state.save(process)
+    warnings = "".join(f". Warning: {one}" for one in shared)
+    state.emit(Reply(event.request, message=f"{count(len(event.specs))} queued{warnings}"))
+
+
+def _taken(state: MasterState, event: happened.SubmissionReceived) -> str:
+    """Which names cannot be given; "" for none."""
+    twice = [name for name, n in Counter(spec.name for spec in event.specs).items() if n > 1]
+    if twice:
+        return f"submitted twice at once: {listed(twice)}; names are unique. Nothing was queued"
+    taken = [
+        spec.name for spec in event.specs
+        if spec.name in state.processes and not state.processes[spec.name].phase.over
+    ]  # fmt: skip
+    if taken:
+        return f"{'; '.join(_in_use(state, taken))}. Nothing was queued"
+    for spec in event.specs:
+        if spec.name in state.processes or spec.name in state.orphans:
+            left = _still_stopping(state, spec.name)
+            if left:
+                return f"{left}. Nothing was queued"
+    return ""
+
+
+def _in_use(state: MasterState, taken: list[str]) -> list[str]:
+    """Say that names belong to processes that are not over, and what frees them."""
+    live = [name for name in taken if state.processes[name].wanted is not Wanted.CANCEL]
+    ending: dict[str, list[str]] = {}
+    for name in taken:
+        if name not in live:
+            ending.setdefault(state.processes[name].reason, []).append(name)
+    said = [f"{_names(alike)} still in use: {reason}" for reason, alike in ending.items()]
+    if live:
+        said.append(
+            f"{_names(live)} in use already; `rosrm cancel` with the name or the file cancels "
+            f"{'it' if len(live) == 1 else 'them'}"
+        )
+    return said
+
+
+def _names(names: list[str]) -> str:
+    return f"the name {names[0]} is" if len(names) == 1 else f"the names {listed(names)} are"
+
+
+def _still_stopping(state: MasterState, name: str) -> str:
+    """Of a process that is over or unknown, an instance that may still run; "" for none."""
+    process = state.processes.get(name)
+    numbers = state.orphans.get(name) if process is None else process.instances
+    if not numbers:
+        return ""
+    instance = state.instances[min(numbers)]
+    return f"an earlier {instance.id} is still being stopped on {instance.host.name}"
+
+
+def _submission_fault(state: MasterState, event: happened.SubmissionReceived) -> str:
+    known = set(state.strategies)
+    for spec in event.specs:
+        strategy = spec.migration.strategy
+        if strategy is not None and strategy not in known:
+            return (
+                f"{spec.name}: unknown migration strategy {strategy!r}; selected here: "
+                f"{listed(sorted(known))}. Nothing was queued"
+            )
+        fault = _strategy_fault(state, spec)
+        if fault:
+            return f"{spec.name}: migration by {strategy!r}: {fault}. Nothing was queued"
+    return ""
+
+
+def _strategy_fault(state: MasterState, spec: ProcessSpec) -> str:
+    """Return why the strategy of a spec cannot move the process; "": it can, by what is known."""
+    name = spec.migration.strategy or ""
+    strategy: object = state.strategies.get(name)
+    if strategy is None:
+        return ""
+
+    def fault_of() -> str:
+        try:
+            state.declared.options_of(name, spec)
+        except ValueError as fault:
+            return str(fault)
+        if not implements(strategy, SpecChecking):
+            return ""
+        return required(strategy.spec_fault(spec), str)
+
+    try:
+        return state.plugins.ask("migration", name, "spec_fault", fault_of)
+    except PluginError as error:
+        return f"its check of this process failed: {error}"
+
+
+def count(number: int) -> str:
+    """Return a number of processes: "1 process", "3 processes"."""
+    return counted(number, "process", "processes")
+
+
+# --- cancel, restart --------------------------------------------------------------------------
+
+
+def known_processes(state: MasterState, request: int, names: Iterable[str]) -> list[Process] | None:
+    """The processes of these names; a name that nobody has refuses the whole request."""
+    unknown = [name for name in names if name not in state.processes]
+    if unknown:
+        refuse(state, request, no_such("process", unknown, reversed(state.processes)), "unknown")
+        return None
+    return [state.processes[name] for name in dict.fromkeys(names)]
+
+
+def cancel_requested(state: MasterState, event: happened.CancelRequested, now: float) -> None:
+    """Take processes out of the queue, or stop them."""
+    processes = known_processes(state, event.request, event.names)
+    if processes is None:
+        return
+    over = [process.name for process in processes if process.phase.over]
+    for process in processes:
+        if not process.phase.over:
+            _cancel(state, process, now, event.by)
+    state.emit(Reply(event.request, message=_cancelled(state, processes, over)))
+
+
+def _cancelled(state: MasterState, processes: Iterable[Process], over: list[str]) -> str:
+    """Return what has become of cancelled processes; `over` had ended before."""
+    asked = [process for process in processes if process.name not in over]
+    pending = [process for process in asked if not process.phase.over]
+    said = [f"{count(len(asked) - len(pending))} cancelled"] if len(asked) > len(pending) else []
+    if pending:
+        said.append(f"{count(len(pending))} being cancelled")
+    said += [
+        f"{process.name} is {process.reason}"
+        for process in pending
+        if (owner := state.instances.get(process.owner)) is not None
+        and state.hosts.why_unreachable(owner.host)
+    ]
+    if over:
+        said.append(f"ended before: {listed(over)}")
+    return "; ".join(said)
+
+
+def _cancel(state: MasterState, process: Process, now: float, by: str) -> None:
+    process.wanted, process.left_behind = Wanted.CANCEL, None
+    state.record(
+        now, "cancel_requested", f"{process.name} is to be cancelled", process=process.name, by=by
+    )
+    if process.phase in WAITING:
+        state.unqueue(process)
+        state.set_phase(process, ProcessPhase.CANCELLED, now)
+        state.record(
+            now, "cancelled", f"{process.name} cancelled in the queue", process=process.name
+        )
+    elif process.image is not None and process.name not in state.runs:
+        images.drop(state, process)
+        state.set_phase(process, ProcessPhase.CANCELLED, now)
+        state.record(
+            now, "cancelled", f"{process.name} cancelled; its image is removed",
+            process=process.name,
+        )  # fmt: skip
+    elif process.owner == 0 and process.name not in state.runs:
+        # Its owner has ended, and former instances are being stopped.
+        if not lifecycle.requeue_if_clear(state, process, now):
+            lifecycle.note_awaited_ends(state, process, now)
+    elif process.name not in state.runs:  # else the plan in hand turns back first
+        owner = state.instances[process.owner]
+        lifecycle.note_phase(state, process, owner, now)
+        lifecycle.stop_instance(state, owner, now)
+    state.save(process)
+
+
+def restart_requested(state: MasterState, event: happened.RestartRequested, now: float) -> None:
+    """Restart what runs where it runs; queue anew what has ended."""
+    processes = known_processes(state, event.request, event.names)
+    if processes is None:
+        return
+    for process in processes:
+        fault = _restart_fault(state, process)
+        if fault:
+            refuse(state, event.request, f"{fault}. Nothing was restarted")
+            return
+    for process in processes:
+        _restart(state, process, now, event.by)
+    state.emit(Reply(event.request, message=f"{count(len(processes))} restarted"))
+
+
+def _restart_fault(state: MasterState, process: Process) -> str:
+    if process.phase is ProcessPhase.SET_ASIDE:
+        return f"{process.name} is set aside: {process.reason}"
+    if process.phase in WAITING:
+        return f"{process.name} waits in the queue already"
+    if process.name in state.runs:
+        return why_busy(state.runs[process.name])
+    if process.phase.over or process.image is not None:
+        return _still_stopping(state, process.name)
+    if process.wanted is not Wanted.RUN:
+        return f"{process.name} is being stopped"
+    if process.phase is ProcessPhase.UNREACHABLE:
+        return f"{process.name} is out of reach: {process.reason}"
+    return ""
+
+
+def _restart(state: MasterState, process: Process, now: float, by: str) -> None:
+    state.record(
+        now,
+        "restart_requested",
+        f"a restart of {process.name} was requested",
+        process=process.name,
+        by=by,
+    )
+    if process.phase.over or process.image is not None:
+        images.drop(state, process)
+        replication.begin_anew(state, process)
+        process.excluded.clear()
+        process.demand = None
+        process.order = state.next_order
+        state.next_order += 1
+        state.enqueue(process, now)
+    elif (owner := state.instances[process.owner]).state is not None:
+        # One that its slave has not taken up yet is about to start anyway: a restart that came
+        # before it would keep it from ever starting.
+        owner.restarting = True
+        state.emit(Order(state.order_id(), owner.host.host_id, "restart", owner.id))
+    state.save(process)
+
+
+# --- migrate, cordon, drain -------------------------------------------------------------------
+
+
+def migration_requested(state: MasterState, event: happened.MigrationRequested, now: float) -> None:
+    """Begin to move a process."""
+    processes = known_processes(state, event.request, [event.name])
+    if processes is None:
+        return
+    host = None
+    if event.host is not None:
+        host = known_host(state, event.request, event.host)
+        if host is None:
+            return
+    (process,) = processes
+    reason = try_move(state, process, asked_for(event.by), now, host=host)
+    if reason:
+        _note_refused_move(state, process, reason, now)
+        refuse(state, event.request, reason)
+        return
+    name = state.runs[process.name].destination_host.name
+    state.emit(Reply(event.request, message=f"{process.name} moves to {name}", host=name))
+
+
+def _note_refused_move(state: MasterState, process: Process, reason: str, now: float) -> None:
+    """Record why a process was not moved, unless that is the newest record of it already."""
+    message = f"{process.name} is not moved: {reason}"
+    if not process.history or process.history[-1][2] != message:
+        state.record(now, "migration_refused", message, process=process.name)
+
+
+def checkpoint_requested(
+    state: MasterState, event: happened.CheckpointRequested, now: float
+) -> None:
+    """Begin to dump a process into an image."""
+    _begin(state, event, image_requests.begin_checkpoint, now)
+
+
+def restore_requested(state: MasterState, event: happened.RestoreRequested, now: float) -> None:
+    """Begin to restore a process from its image."""
+    _begin(state, event, image_requests.begin_restore, now)
+
+
+def _begin(
+    state: MasterState,
+    event: happened.CheckpointRequested | happened.RestoreRequested,
+    begin: Callable[[MasterState, Process, str, float], str],
+    now: float,
+) -> None:
+    processes = known_processes(state, event.request, [event.name])
+    if processes is None:
+        return
+    refusal = begin(state, processes[0], asked_for(event.by), now)
+    if refusal:
+        refuse(state, event.request, refusal)
+        return
+    run = state.runs[event.name]
+    message = f"{event.name}: {run.course}"
+    state.emit(Reply(event.request, message=message, host=run.source_host.name))
+
+
+def asked_for(by: str) -> str:
+    """Return the cause of what a client asked for."""
+    return f"asked for by {by}" if by else "asked for"
+
+
+def known_host(state: MasterState, request: int, name: str) -> Host | None:
+    """The host of a name; a name that no listed host has refuses the whole request."""
+    host = state.hosts.by_name.get(name)
+    if host is not None and not host.pruned:
+        return host
+    there = sorted(host.name for host in state.hosts.listed())
+    refuse(state, request, no_such("host", [name], there), "unknown")
+    return None
+
+
+def host_state_requested(
+    state: MasterState, event: happened.HostStateRequested, now: float
+) -> None:
+    """Cordon, uncordon or drain a host."""
+    host = known_host(state, event.request, event.host)
+    if host is None:
+        return
+    done = {"cordon": "cordoned", "uncordon": "uncordoned", "drain": "draining"}.get(event.action)
+    if done is None:
+        refuse(
+            state,
+            event.request,
+            f"unknown action {event.action!r}; there are: cordon, uncordon, drain",
+        )
+        return
+    state.hosts.set_closed(
+        host, cordoned=event.action != "uncordon", draining=event.action == "drain"
+    )
+    host.told.clear()
+    host.blocked.clear()
+    save_host(state, host)
+    state.record(now, f"host_{done}", f"{host.name} is {done}", host=host.name, by=event.by)
+    reconsider_set_aside(state, now)
+    said = f"{host.name} is {done}"
+    if host.draining:
+        said = f"{said}: {departures(state, host)}"
+    state.emit(Reply(event.request, message=said))

@@ -1,0 +1,1 @@
+"""On which host a process is placed: demand, filters, ranking, decision, assignment."""

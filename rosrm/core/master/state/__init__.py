@@ -1,0 +1,1 @@
+"""The state of the master's core: data, and the rules that keep it consistent."""

@@ -1,0 +1,55 @@
+"""What decides where a process may go."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from rosrm.model.values import EMPTY, ProcessSpec
+
+
+@dataclass(frozen=True, slots=True)
+class Demand:
+    """What decides where a process may go; equal demands share a ranking.
+
+    Attributes:
+        amounts: needs in base units by resource.
+        estimated: resources whose amount is a guess, not declared and not measured.
+        excluded: host name to the reason why it must not go there.
+        headroom: fraction by which a host must stay under each limit.
+        near: hosts that are preferred, as by one more preferred label: a state is kept there.
+        reads: fields of the spec that scoring policies read beyond the standard ones.
+        key: equal for processes that every host judges alike.
+    """
+
+    spec: ProcessSpec
+    amounts: Mapping[str, float]
+    estimated: frozenset[str] = frozenset()
+    excluded: Mapping[str, str] = field(default_factory=lambda: EMPTY)
+    headroom: float = 0.0
+    near: tuple[str, ...] = ()
+    reads: tuple[str, ...] = ()
+    key: tuple[Any, ...] = field(init=False, compare=False)
+
+    def __post_init__(self) -> None:
+        spec = self.spec
+        key = (
+            spec.package, spec.executable, spec.module, spec.command,
+            spec.namespace, spec.kind, spec.priority, _key(spec.needs),
+            _key(self.amounts), self.estimated, _key(self.excluded), self.headroom,
+            _key(spec.required_labels), _key(spec.preferred_labels), _key(spec.avoided_labels),
+            self.near,
+            # As text, because 1, 1.0 and True are equal and a policy can tell them apart.
+            *(repr(getattr(spec, name)) for name in self.reads),
+        )  # fmt: skip
+        object.__setattr__(self, "key", key)
+
+    @property
+    def declared(self) -> frozenset[str]:
+        """Resources that a host must have."""
+        return frozenset(name for name, much in self.amounts.items() if much > 0) - self.estimated
+
+
+def _key(mapping: Mapping[str, Any]) -> tuple[tuple[str, Any], ...]:
+    return tuple(sorted(mapping.items())) if mapping else ()

@@ -1,0 +1,134 @@
+"""The standing arrays of the hosts: one column a host, one row a resource.
+
+They grow by doubling and are never rebuilt; what is known of every host is one block of memory, so
+that a snapshot of a few hosts is one copy.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from rosrm.model.values import RESOURCE_SLOTS
+
+FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
+IntArray = npt.NDArray[np.int64]
+
+#: Planes of the block, and what stands there for a host that has no such resource.
+USAGE, LOAD, LIMIT, CAPACITY, BUSY = range(5)
+_ABSENT: Final = (np.nan, 0.0, 1.0, np.nan, np.nan)
+
+#: Stands for "no bound" where a number of processes is compared.
+NO_BOUND: Final = 2**62
+
+
+class HostColumns:
+    """Arrays are (R, H) or (H,): resources R, hosts H, in order of registration.
+
+    Attributes:
+        resources: names of the rows.
+        usage: (R, H) newest reading, fraction; NaN where a host has no such resource.
+        load: (R, H) promised to instances that do not show in the readings yet, fraction.
+        limit: (R, H) fraction; 1 where a host has no such resource.
+        capacity: (R, H) base units; NaN where a host has no such resource.
+        busy: (R, H) usage + load.
+        condition: (H,) HostCondition.
+        asking: (H,) it has asked for work since it came up.
+        accepting: (H,) its newest reading says that it is under all its limits.
+        closed: (H,) cordoned or draining.
+        untold: (H,) it was lost, and has not said yet what it holds.
+        stale: (H,) bit i: the reading of slot i, which has a limit, is stale.
+        heard, registered: (H,) time of the newest message; of the registration.
+        period: (H,) seconds between its readings.
+        processes, bound: (H,) held or promised; most of them.
+        incarnation, sequence: (H,) of the slave's run; of its newest reading.
+        reported: (H,) sequence of the newest status batch that it says it has sent.
+        status_sequence: (H,) sequence of the newest status batch that has come.
+        row_of_slot: (H, RESOURCE_SLOTS) slot of a message -> row here; -1: not in use.
+    """
+
+    def __init__(self) -> None:
+        self.resources: tuple[str, ...] = ()
+        self._count = 0
+        self._allocate(rows=0, columns=4)
+        self._trim()
+
+    def __len__(self) -> int:
+        return self._count
+
+    def _allocate(self, rows: int, columns: int) -> None:
+        self._cells = np.empty((len(_ABSENT), rows, columns))
+        self._cells[:] = np.reshape(_ABSENT, (-1, 1, 1))
+        self._lines: dict[str, Any] = {
+            "condition": np.zeros(columns, np.int8),
+            "asking": np.zeros(columns, np.bool_),
+            "accepting": np.zeros(columns, np.bool_),
+            "closed": np.zeros(columns, np.bool_),
+            "untold": np.zeros(columns, np.bool_),
+            "stale": np.zeros(columns, np.uint32),
+            "heard": np.zeros(columns),
+            "registered": np.full(columns, -np.inf),
+            "period": np.zeros(columns),
+            "processes": np.zeros(columns, np.int64),
+            "bound": np.full(columns, NO_BOUND, np.int64),
+            "incarnation": np.zeros(columns, np.uint64),
+            "sequence": np.zeros(columns, np.uint64),
+            "reported": np.zeros(columns, np.uint64),
+            "status_sequence": np.zeros(columns, np.uint64),
+            "row_of_slot": np.full((columns, RESOURCE_SLOTS), -1, np.int64),
+        }
+
+    def add_column(self) -> int:
+        """Room for one more host; returns its column."""
+        if self._count == self._cells.shape[2]:
+            cells, lines = self._cells, self._lines
+            self._allocate(len(self.resources), 2 * self._count)
+            self._cells[:, :, : self._count] = cells
+            for name, line in lines.items():
+                self._lines[name][: self._count] = line
+        self._count += 1
+        self._trim()
+        return self._count - 1
+
+    def add_resource(self, name: str) -> None:
+        """One more row; no host has this resource yet."""
+        self.resources = (*self.resources, name)
+        row = np.empty((len(_ABSENT), 1, self._cells.shape[2]))
+        row[:] = np.reshape(_ABSENT, (-1, 1, 1))
+        self._cells = np.concatenate([self._cells, row], axis=1)
+        self._trim()
+
+    def _trim(self) -> None:
+        """The arrays as views of the columns in use; made anew only when the shape changes."""
+        self.cells: FloatArray = self._cells[:, :, : self._count]
+        self.usage: FloatArray = self.cells[USAGE]
+        self.load: FloatArray = self.cells[LOAD]
+        self.limit: FloatArray = self.cells[LIMIT]
+        self.capacity: FloatArray = self.cells[CAPACITY]
+        self.busy: FloatArray = self.cells[BUSY]
+        used = {name: line[: self._count] for name, line in self._lines.items()}
+        self.condition: npt.NDArray[np.int8] = used["condition"]
+        self.asking: BoolArray = used["asking"]
+        self.accepting: BoolArray = used["accepting"]
+        self.closed: BoolArray = used["closed"]
+        self.untold: BoolArray = used["untold"]
+        self.stale: npt.NDArray[np.uint32] = used["stale"]
+        self.heard: FloatArray = used["heard"]
+        self.registered: FloatArray = used["registered"]
+        self.period: FloatArray = used["period"]
+        self.processes: IntArray = used["processes"]
+        self.bound: IntArray = used["bound"]
+        self.incarnation: npt.NDArray[np.uint64] = used["incarnation"]
+        self.sequence: npt.NDArray[np.uint64] = used["sequence"]
+        self.reported: npt.NDArray[np.uint64] = used["reported"]
+        self.status_sequence: npt.NDArray[np.uint64] = used["status_sequence"]
+        self.row_of_slot: IntArray = used["row_of_slot"]
+
+    def clear_column(self, column: int) -> None:
+        """The host of a column tells anew which resources it has; what is promised to it stays."""
+        for plane in (USAGE, LIMIT, CAPACITY, BUSY):
+            self.cells[plane, :, column] = _ABSENT[plane]
+        self.row_of_slot[column] = -1

@@ -1,0 +1,65 @@
+"""What a process will use: as declared, else as learned from earlier runs, else a default."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+from rosrm.model.values import ProcessSpec
+
+#: Weight of the newest run: a program that changed is known again after a few runs.
+_NEWEST: Final = 0.3
+#: The amount that counts follows the mean only when it is off by this part: so equal processes
+#: keep equal demands while runs of them end, and the journal is not told of every run.
+_NOTICEABLE: Final = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """Needs in base units, and which of them are mere estimates."""
+
+    amounts: Mapping[str, float]
+    estimated: frozenset[str]
+
+
+class LearnedNeeds:
+    """Peaks of earlier runs by program, as a moving mean.
+
+    Attributes:
+        version: grows whenever what counts for any program has changed.
+    """
+
+    def __init__(self) -> None:
+        self.version = 0
+        self._counts: dict[str, dict[str, float]] = {}
+        self._mean: dict[str, dict[str, float]] = {}
+
+    def restore(self, program: str, amounts: Mapping[str, float]) -> None:
+        """Take over what an earlier run of the master learned."""
+        self._counts[program] = dict(amounts)
+        self._mean[program] = dict(amounts)
+
+    def learn(self, program: str, amounts: Mapping[str, float]) -> Mapping[str, float] | None:
+        """Take in one run's peaks; returns what counts from now on, None: as before."""
+        mean = self._mean.setdefault(program, {})
+        counts = self._counts.setdefault(program, {})
+        changed = False
+        for resource, amount in amounts.items():
+            if amount > 0.0:
+                before = mean.get(resource, amount)
+                mean[resource] = before + _NEWEST * (amount - before)
+                counted = counts.get(resource, 0.0)
+                if abs(mean[resource] - counted) > _NOTICEABLE * counted:
+                    counts[resource] = mean[resource]
+                    changed = True
+        if not changed:
+            return None
+        self.version += 1
+        return dict(counts)
+
+    def estimate(self, spec: ProcessSpec, default: Mapping[str, float]) -> Estimate:
+        """What to count against a host for one instance of a process."""
+        guessed = {**default, **self._counts.get(spec.program, {})}
+        amounts = {**guessed, **spec.needs}
+        return Estimate(amounts, frozenset(guessed) - frozenset(spec.needs))

@@ -1,0 +1,157 @@
+"""The slave's reducer: (state, event, now) -> commands. Each kind of event is one row below.
+
+======================  =========================================================================
+what happened           what the core does
+======================  =========================================================================
+Registered              remembers the master's epoch; older ones are refused from now on; reports
+                        again, if something went unheard meanwhile
+MasterLost              forgets no end until a master has taken this host in again
+AssignmentsReceived     has them launched, once, or holds them until a slot is free and those that
+                        are being started are ready; one that was stopped before is refused
+LaunchRefused           reports that the host cannot run it, and why
+StopOrdered             has it stopped; one never heard of will never be started
+FenceOrdered            the same, but at once
+MasterHears             tells the supervisor, where there is a fence that this renews
+RestartOrdered          has it stopped and started again here
+RestartPolicySet        has the supervisor keep it, unless it has ended or is not known: settled
+RestartPolicyRecorded   the supervisor has it in its record: settled
+ReportRequested         reports everything
+SupervisorReported      follows the instance; a new run must become ready anew
+SupervisorReplaced      the same; what the new one does not know is gone; reports everything, and
+                        orders again what may have been lost with the former one
+SeenInGraph             the instance is ready; a later run of this slave shall know
+LookedAt                one that has been unhealthy for too long is ended as failed
+TimePassed              an instance that is not ready in time is stopped; one whose fence passed
+                        before its start is refused; old ends are forgotten
+======================  =========================================================================
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from rosrm.core.slave.events_and_commands import (
+    Amend,
+    AssignmentsReceived,
+    Awaited,
+    Command,
+    Event,
+    Fail,
+    Fence,
+    FenceOrdered,
+    Forget,
+    Launch,
+    LaunchRefused,
+    Look,
+    LookedAt,
+    MasterHears,
+    MasterLost,
+    Memo,
+    Registered,
+    Remember,
+    Renew,
+    Report,
+    ReportRequested,
+    Restart,
+    RestartOrdered,
+    RestartPolicyRecorded,
+    RestartPolicySet,
+    SeenInGraph,
+    Settle,
+    Stop,
+    StopOrdered,
+    SupervisorReplaced,
+    SupervisorReported,
+    TimePassed,
+    Watch,
+)
+from rosrm.core.slave.handlers import (
+    HANDLERS,
+    REMEMBER_END,
+)
+from rosrm.core.slave.health import LOOK_PERIOD
+from rosrm.core.slave.master_clock import BeatClock
+from rosrm.core.slave.state import (
+    Held,
+    SlaveState,
+    awaits_graph,
+    qualified_name,
+    under_limits,
+)
+
+__all__ = [
+    "HANDLERS",
+    "LOOK_PERIOD",
+    "REMEMBER_END",
+    "Amend",
+    "AssignmentsReceived",
+    "Awaited",
+    "BeatClock",
+    "Command",
+    "Event",
+    "Fail",
+    "Fence",
+    "FenceOrdered",
+    "Forget",
+    "Held",
+    "Launch",
+    "LaunchRefused",
+    "Look",
+    "LookedAt",
+    "MasterHears",
+    "MasterLost",
+    "Memo",
+    "Registered",
+    "Remember",
+    "Renew",
+    "Report",
+    "ReportRequested",
+    "Restart",
+    "RestartOrdered",
+    "RestartPolicyRecorded",
+    "RestartPolicySet",
+    "SeenInGraph",
+    "Settle",
+    "SlaveState",
+    "Stop",
+    "StopOrdered",
+    "SupervisorReplaced",
+    "SupervisorReported",
+    "TimePassed",
+    "Watch",
+    "awaits_graph",
+    "qualified_name",
+    "step",
+    "step_all",
+    "under_limits",
+]
+
+
+def step(state: SlaveState, event: Event, now: float) -> Sequence[Command]:
+    """Take one event in.
+
+    Args:
+        state: changed in place.
+        event: what happened.
+        now: seconds by the slave's monotonic clock; never less than before.
+    """
+    commands = HANDLERS[type(event)](state, event, now)
+    if not state.registered and any(isinstance(command, Report) for command in commands):
+        state.unheard = True
+    return commands
+
+
+def step_all(state: SlaveState, events: Iterable[Event], now: float) -> list[Command]:
+    """Take several events in, in order.
+
+    What one of them launches a later one may have lost sight of: then it is not launched.
+    """
+    commands = [command for event in events for command in step(state, event, now)]
+    return [
+        _still_held(state, command) if isinstance(command, Launch) else command
+        for command in commands
+    ]
+
+
+def _still_held(state: SlaveState, launch: Launch) -> Launch:
+    return Launch(tuple(one for one in launch.assignments if one.instance in state.held))

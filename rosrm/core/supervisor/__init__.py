@@ -1,0 +1,1 @@
+"""The supervisor's core: one state machine for each instance."""

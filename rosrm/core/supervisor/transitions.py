@@ -1,0 +1,366 @@
+"""The supervisor's table of transitions: each changes an instance and says what follows."""
+
+from __future__ import annotations
+
+import signal
+import zlib
+from collections.abc import Callable
+from typing import Final
+
+from rosrm.core.supervisor.events_and_commands import (
+    AmendOrdered,
+    Cleared,
+    Command,
+    Event,
+    Exited,
+    FailOrdered,
+    FenceOrdered,
+    FencePassed,
+    RestartOrdered,
+    RestartRule,
+    Resumed,
+    Signal,
+    Spawn,
+    Spawned,
+    SpawnFailed,
+    StopOrdered,
+    Tell,
+    TimePassed,
+    Unspawn,
+)
+from rosrm.core.supervisor.instance import (
+    BACKOFF,
+    EXITED,
+    FAILED,
+    FENCED,
+    KILL_AGAIN,
+    REFUSED,
+    RUNNING,
+    STARTING,
+    STEPS,
+    STOPPING,
+    THEN_END,
+    THEN_POLICY,
+    THEN_RESTART,
+    WITHDRAWN,
+    Instance,
+    end,
+    ending,
+    stopping,
+)
+from rosrm.wording import counted
+
+_KILL: Final = len(STEPS) - 1
+#: Part of a wait by which a restart may come sooner, so that what crashed together does not start
+#: together.
+_JITTER: Final = 0.2
+
+Transition = Callable[[Instance, "Event", float], list[Command]]
+
+
+def _spawned(instance: Instance, event: Event, now: float) -> list[Command]:
+    assert isinstance(event, Spawned)
+    instance.phase = RUNNING
+    instance.pid = event.pid
+    instance.started = now
+    instance.message = instance.fault = ""
+    if instance.then == THEN_END:
+        return _stop(instance, event, now)
+    return [Tell(instance.key)]
+
+
+def _spawn_failed(instance: Instance, event: Event, now: float) -> list[Command]:
+    assert isinstance(event, SpawnFailed)
+    instance.run_time = instance.cpu_time = instance.peak_memory = 0.0
+    if instance.then == THEN_END:
+        _end_as_meant(instance, "stopped before it was started")
+    elif event.transient:
+        _by_policy(instance, event.message, succeeded=False, now=now)
+    else:  # the program or its directory is missing here: the master tries another host
+        end(instance, REFUSED, event.message)
+    return [Tell(instance.key)]
+
+
+def _stop_before_spawn(instance: Instance, event: Event, now: float) -> list[Command]:
+    if instance.then == THEN_END:
+        return []
+    instance.then = THEN_END
+    return [Tell(instance.key), Unspawn(instance.key)]
+
+
+def _spawn(instance: Instance, event: Event, now: float) -> list[Command]:
+    return _start_again(instance)
+
+
+def _exited(instance: Instance, event: Event, now: float) -> list[Command]:
+    assert isinstance(event, Exited)
+    instance.pid = 0
+    instance.exit_code = event.code
+    instance.exit_signal = event.signal
+    instance.peak_memory = event.peak_memory
+    instance.cpu_time = event.cpu_time
+    instance.run_time = max(0.0, now - instance.started)
+    if not event.leftovers:
+        return _when_nothing_is_left(instance, now)
+    if instance.phase == STOPPING:
+        again: list[Command] = [Signal(instance.key, signal.SIGKILL)]
+        return [Tell(instance.key), *(again if instance.step >= _KILL else [])]
+    return _begin_stop(instance, THEN_POLICY, now)
+
+
+def _cleared(instance: Instance, event: Event, now: float) -> list[Command]:
+    return [] if instance.pid else _when_nothing_is_left(instance, now)
+
+
+def _stop(instance: Instance, event: Event, now: float) -> list[Command]:
+    return _begin_stop(instance, THEN_END, now)
+
+
+def _restart(instance: Instance, event: Event, now: float) -> list[Command]:
+    return _begin_stop(instance, THEN_RESTART, now)
+
+
+def _fail(instance: Instance, event: Event, now: float) -> list[Command]:
+    assert isinstance(event, FailOrdered)
+    if event.pid != instance.pid:
+        return []  # that run has ended meanwhile
+    instance.fault = event.reason
+    return _begin_stop(instance, THEN_POLICY, now, _KILL if event.kill else 0)
+
+
+def _mean_to_end(instance: Instance, event: Event, now: float) -> list[Command]:
+    if instance.then == THEN_END:
+        return []
+    instance.then = THEN_END
+    instance.message = stopping(instance)
+    return [Tell(instance.key)]
+
+
+def _mean_to_restart(instance: Instance, event: Event, now: float) -> list[Command]:
+    if instance.then != THEN_POLICY or instance.fenced:
+        return []  # it is meant to end, or to start again already
+    instance.then = THEN_RESTART
+    instance.message = stopping(instance)
+    return [Tell(instance.key)]
+
+
+def _escalate(instance: Instance, event: Event, now: float) -> list[Command]:
+    """The next step of a stop; after SIGKILL only that again."""
+    instance.step = _KILL if _must_be_gone(instance, now) else min(instance.step + 1, _KILL)
+    number = STEPS[instance.step]
+    after = f" after {now - instance.stop_began:.1f} s" if instance.trail else ""
+    if instance.step == _KILL:
+        instance.kills += 1
+    if instance.kills <= 1:
+        instance.trail += f"{', ' if instance.trail else ''}{number.name}{after}"
+    instance.message = stopping(instance)
+    instance.deadline = now + _grace(instance, now)
+    return [Tell(instance.key), Signal(instance.key, number)]
+
+
+def _restart_due(instance: Instance, event: Event, now: float) -> list[Command]:
+    instance.restarts += 1
+    instance.recent.append(now)
+    return _start_again(instance)
+
+
+def _restart_now(instance: Instance, event: Event, now: float) -> list[Command]:
+    instance.recent.clear()
+    return _start_again(instance)
+
+
+def _stop_in_backoff(instance: Instance, event: Event, now: float) -> list[Command]:
+    _end_as_meant(instance, f"stopped while it waited for its restart ({ending(instance)})")
+    return [Tell(instance.key)]
+
+
+def _fence_before_spawn(instance: Instance, event: Event, now: float) -> list[Command]:
+    _take_fence(instance, event, now)
+    return _stop_before_spawn(instance, event, now)
+
+
+def _fence(instance: Instance, event: Event, now: float) -> list[Command]:
+    _take_fence(instance, event, now)
+    return _begin_stop(instance, THEN_END, now)
+
+
+def _fence_while_it_stops(instance: Instance, event: Event, now: float) -> list[Command]:
+    _take_fence(instance, event, now)
+    if instance.then == THEN_RESTART:
+        instance.then = THEN_END
+    if instance.step < _KILL and _must_be_gone(instance, now):
+        return _escalate(instance, event, now)
+    assert instance.deadline is not None
+    instance.deadline = min(instance.deadline, now + _grace(instance, now))
+    instance.message = stopping(instance)
+    return [Tell(instance.key)]
+
+
+def _fence_in_backoff(instance: Instance, event: Event, now: float) -> list[Command]:
+    _take_fence(instance, event, now)
+    _end_as_meant(instance, f"it waited for its restart ({ending(instance)})")
+    return [Tell(instance.key)]
+
+
+def _amend(instance: Instance, event: Event, now: float) -> list[Command]:
+    assert isinstance(event, AmendOrdered)
+    if instance.restart == event.restart:
+        return []
+    instance.restart = event.restart
+    return [Tell(instance.key)]
+
+
+def _amend_in_backoff(instance: Instance, event: Event, now: float) -> list[Command]:
+    commands = _amend(instance, event, now)
+    rule = instance.restart
+    if commands and (rule.when == "never" or _recent_restarts(instance, now) >= rule.attempts):
+        end(instance, FAILED, f"{ending(instance)}; by its new policy it is not restarted")
+    return commands
+
+
+TRANSITIONS: Final[dict[tuple[str, type], Transition]] = {
+    (STARTING, Spawned): _spawned,
+    (STARTING, SpawnFailed): _spawn_failed,
+    (STARTING, StopOrdered): _stop_before_spawn,
+    (STARTING, FencePassed): _fence_before_spawn,
+    (STARTING, FenceOrdered): _fence_before_spawn,
+    (STARTING, Resumed): _spawn,
+    (STARTING, AmendOrdered): _amend,
+    (RUNNING, Exited): _exited,
+    (RUNNING, StopOrdered): _stop,
+    (RUNNING, FencePassed): _fence,
+    (RUNNING, FenceOrdered): _fence,
+    (RUNNING, RestartOrdered): _restart,
+    (RUNNING, AmendOrdered): _amend,
+    (RUNNING, FailOrdered): _fail,
+    (STOPPING, TimePassed): _escalate,
+    (STOPPING, Exited): _exited,
+    (STOPPING, Cleared): _cleared,
+    (STOPPING, StopOrdered): _mean_to_end,
+    (STOPPING, FencePassed): _fence_while_it_stops,
+    (STOPPING, FenceOrdered): _fence_while_it_stops,
+    (STOPPING, RestartOrdered): _mean_to_restart,
+    (STOPPING, AmendOrdered): _amend,
+    (BACKOFF, TimePassed): _restart_due,
+    (BACKOFF, RestartOrdered): _restart_now,
+    (BACKOFF, StopOrdered): _stop_in_backoff,
+    (BACKOFF, FencePassed): _fence_in_backoff,
+    (BACKOFF, FenceOrdered): _fence_in_backoff,
+    (BACKOFF, AmendOrdered): _amend_in_backoff,
+}
+
+
+# --- what the transitions are made of ---------------------------------------------------------
+
+
+def _start_again(instance: Instance) -> list[Command]:
+    instance.phase = STARTING
+    instance.deadline = None
+    instance.then = ""
+    instance.message = ""
+    return [Tell(instance.key), Spawn(instance.key)]
+
+
+def _begin_stop(instance: Instance, then: str, now: float, first: int = 0) -> list[Command]:
+    """Begin with the step `first`."""
+    instance.phase = STOPPING
+    instance.then = then
+    instance.step = first - 1
+    instance.kills = 0
+    instance.stop_began = now
+    instance.trail = ""
+    return _escalate(instance, TimePassed(), now)
+
+
+def _take_fence(instance: Instance, event: Event, now: float) -> None:
+    """From here on it is on its way out, and dead in time; what was to end anyway ends as meant."""
+    if isinstance(event, FenceOrdered) or instance.fence is None:
+        why, by = "it has a successor", now
+    else:
+        after, grace, alive = instance.fence
+        unknown = "whether its slave lives" if alive else "whether the master hears this host"
+        why = f"for {after:g} s it was not known here {unknown}"
+        by = instance.heard + after + grace
+    instance.kill_by = by if instance.kill_by is None else min(by, instance.kill_by)
+    if instance.then != THEN_END:
+        instance.fenced = f"fenced: {why}"
+
+
+def _must_be_gone(instance: Instance, now: float) -> bool:
+    return instance.kill_by is not None and now >= instance.kill_by
+
+
+def _grace(instance: Instance, now: float) -> float:
+    """Seconds until the next step; SIGINT and SIGTERM share what a fence leaves."""
+    if instance.step == _KILL:
+        return KILL_AGAIN
+    graces = (instance.stop.interrupt_grace, instance.stop.terminate_grace)
+    grace = graces[instance.step]
+    if instance.kill_by is None:
+        return grace
+    wanted = sum(graces[instance.step :])
+    left = max(0.0, instance.kill_by - now)
+    return grace if wanted <= left else left * grace / wanted
+
+
+def _end_as_meant(instance: Instance, how: str) -> None:
+    if instance.fenced:
+        end(instance, FENCED, f"{instance.fenced}; {how}")
+    else:
+        end(instance, WITHDRAWN if instance.withdrawn else EXITED, how)
+
+
+def _when_nothing_is_left(instance: Instance, now: float) -> list[Command]:
+    if instance.then == THEN_RESTART:
+        instance.recent.clear()
+        return _start_again(instance)
+    if instance.then == THEN_END:
+        _end_as_meant(instance, f"stopped by {instance.trail}")
+    else:
+        exited_well = instance.exit_code == 0 and instance.exit_signal == 0
+        succeeded = exited_well and not instance.fault
+        _by_policy(instance, ending(instance), succeeded=succeeded, now=now)
+    return [Tell(instance.key)]
+
+
+def _by_policy(instance: Instance, ending: str, *, succeeded: bool, now: float) -> None:
+    rule = instance.restart
+    if rule.when == "never" or (rule.when == "on-failure" and succeeded):
+        end(instance, EXITED if succeeded else FAILED, "" if succeeded else ending)
+        return
+    if instance.fenced:
+        end(instance, FENCED, f"{instance.fenced}; {ending}")
+        return
+    done = _recent_restarts(instance, now)
+    if done >= rule.attempts:
+        most = counted(rule.attempts, "restart")
+        limit = f"its restart policy allows {most} within {rule.window:g} s"
+        end(instance, FAILED, f"{ending}; {limit}")
+        return
+    wait = backoff(rule, done) * (1.0 - _JITTER * _chance(instance))
+    instance.phase = BACKOFF
+    instance.then = ""
+    instance.deadline = now + wait
+    instance.message = f"{ending}; restart {done + 1} of {rule.attempts} in {wait:.1f} s"
+
+
+def _recent_restarts(instance: Instance, now: float) -> int:
+    """How many restarts lie within the policy's window; older ones count no more."""
+    instance.recent = [at for at in instance.recent if now - at < instance.restart.window]
+    return len(instance.recent)
+
+
+def _chance(instance: Instance) -> float:
+    """From 0 to below 1, another one for each restart of each instance, and always the same."""
+    name, number = instance.key
+    return zlib.crc32(f"{name}#{number}/{instance.restarts}".encode()) / 2**32
+
+
+def backoff(rule: RestartRule, done: int) -> float:
+    """Seconds before the next restart, after `done` of them within the window."""
+    wait = rule.delay
+    for _ in range(done):
+        wait = min(wait * rule.factor, rule.max_delay)
+        if wait >= rule.max_delay:
+            break
+    return max(0.0, min(wait, rule.max_delay))

@@ -1,0 +1,257 @@
+"""Finds the installed plugins and calls their hooks, each by itself.
+
+A plugin that does not import, raises in a hook or misspells one is reported as broken, with its
+distribution, the hook and the place of its definition; the others go on.
+"""
+
+from __future__ import annotations
+
+import inspect
+import logging
+import threading
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import MISSING, dataclass, fields, is_dataclass
+from functools import partial
+from pkgutil import resolve_name
+from types import SimpleNamespace
+from typing import Any, Final, TypeAlias, TypeVar
+
+import pluggy
+
+from rosrm.errors import describe_plugin_fault
+from rosrm.extensions import hookspecs
+from rosrm.extensions.contracts import CheckpointOffer, MigrationOffer, ProbeOffer, ScoringOffer
+from rosrm.extensions.declared_fields import SPEC_FIELDS
+from rosrm.extensions.installed import GROUP, PluginAddress
+from rosrm.extensions.time_limit import limited
+from rosrm.wording import get_close_matches
+
+T = TypeVar("T")
+Offer: TypeAlias = "ProbeOffer | ScoringOffer | MigrationOffer | CheckpointOffer"
+
+#: What each hook registers, and of which type its offers are.
+HOOKS: Final[Mapping[str, tuple[str, type[Any]]]] = {
+    "register_probes": ("probe", ProbeOffer),
+    "register_scoring_policies": ("scoring", ScoringOffer),
+    "register_migration_strategies": ("migration", MigrationOffer),
+    "register_checkpoint_policies": ("checkpoint", CheckpointOffer),
+}
+
+#: Seconds after which a plugin that is still being loaded is named in the log.
+SLOW_LOADING: Final = 5.0
+#: Seconds for the import of a plugin, and for each of its hooks.
+LOADING_LIMIT: Final = 30.0
+
+#: What a plugin may do wrong; a plugin that calls `sys.exit` must not end the master.
+FAULTS: Final = (Exception, SystemExit)
+
+_log = logging.getLogger("rosrm.plugins")
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where a plugin comes from: its entry point's name, its distribution's name and version."""
+
+    plugin: str
+    distribution: str = ""
+
+    def __str__(self) -> str:
+        return f"plugin {self.plugin!r}" + (f" of {self.distribution}" if self.distribution else "")
+
+
+@dataclass(frozen=True)
+class Offered:
+    """One offer: its kind is "probe", "scoring", "migration" or "checkpoint"."""
+
+    kind: str
+    offer: Offer
+    source: Source
+
+
+@dataclass(frozen=True)
+class Broken:
+    """What cannot be used, and why; `kind` and `name` are "" where they are not known."""
+
+    source: Source
+    reason: str
+    kind: str = ""
+    name: str = ""
+
+
+@dataclass
+class Loaded:
+    """What the plugins bring."""
+
+    offers: list[Offered]
+    broken: list[Broken]
+
+
+def load_addresses(addresses: Iterable[PluginAddress]) -> Loaded:
+    """Load every plugin of an installation."""
+    loaded = Loaded([], [])
+    for address in addresses:
+        source = Source(address.name, address.distribution)
+        _load(loaded, source, address.target, partial(resolve_name, address.target))
+    return loaded
+
+
+def load_objects(plugins: Mapping[str, object]) -> Loaded:
+    """Take modules or objects as plugins, by name, without an installation (for tests)."""
+    loaded = Loaded([], [])
+    for name, plugin in plugins.items():
+        _load(loaded, Source(name), name, lambda plugin=plugin: plugin)  # type: ignore[misc]
+    return loaded
+
+
+def definition(function: object) -> str:
+    """Where a function or class is defined, for messages; "" where that is not known."""
+    try:
+        target: Any = inspect.unwrap(function)  # type: ignore[arg-type]
+        return f"{inspect.getsourcefile(target)}:{inspect.getsourcelines(target)[1]}"
+    except (TypeError, OSError):
+        return ""
+
+
+def _in_time(source: Source, what: str, call: Callable[[], T]) -> T:
+    """Return the answer of plugin code; name it in the log when it is slow, end it when it hangs.
+
+    Raises:
+        TimeoutError: it took longer than `LOADING_LIMIT`.
+    """
+
+    def say() -> None:
+        _log.warning(
+            "%s is still being loaded after %g s: %s has not returned; it is ended after %g s",
+            source, SLOW_LOADING, what, LOADING_LIMIT,
+        )  # fmt: skip
+
+    timer = threading.Timer(SLOW_LOADING, say)
+    timer.daemon = True
+    timer.start()
+    late = f"it did not return within {LOADING_LIMIT:g} s; do in `create` what takes long"
+    try:
+        return limited(LOADING_LIMIT, call, lambda: late)
+    finally:
+        timer.cancel()
+
+
+def _load(loaded: Loaded, source: Source, target: str, load: Callable[[], object]) -> None:
+    try:
+        plugin = _in_time(source, f"the import of {target}", load)
+        marked = _marked(plugin)
+    except FAULTS as fault:
+        loaded.broken.append(Broken(source, f"does not import: {describe_plugin_fault(fault)}"))
+        return
+    for reason in _misspelt(plugin, marked):
+        loaded.broken.append(Broken(source, reason))
+    for hook in HOOKS:
+        if hook in marked:
+            _take(loaded, source, hook, marked[hook])
+
+
+def _marked(plugin: object) -> Mapping[str, Callable[..., Any]]:
+    """The functions of a plugin that `@hookimpl` marks, by the hook that they implement."""
+    marked: dict[str, Callable[..., Any]] = {}
+    for name in dir(plugin):
+        function = getattr(plugin, name, None)
+        mark = getattr(function, f"{GROUP}_impl", None)
+        if callable(function) and isinstance(mark, Mapping):
+            marked[mark.get("specname") or name] = function
+    return marked
+
+
+def _misspelt(plugin: object, marked: Mapping[str, Callable[..., Any]]) -> Iterable[str]:
+    for hook, function in marked.items():
+        if hook not in HOOKS:
+            near = get_close_matches(hook, HOOKS, 1)
+            meant = f"; did you mean {near[0]!r}?" if near else "."
+            yield (
+                f"unknown hook {hook!r} ({definition(function)}){meant} Allowed: {', '.join(HOOKS)}"
+            )
+    for hook in HOOKS:
+        unmarked = getattr(plugin, hook, None)
+        if callable(unmarked) and hook not in marked:
+            where = definition(unmarked)
+            yield f"{hook} ({where}) lacks the mark @hookimpl of rosrm.extensions.hookspecs"
+
+
+def _take(loaded: Loaded, source: Source, hook: str, function: Callable[..., Any]) -> None:
+    kind, wanted = HOOKS[hook]
+    place = f"{hook} ({definition(function)})"
+    try:
+        answer = _in_time(source, place, partial(_call, hook, function))
+    except FAULTS as fault:
+        reason = f"{place} failed with {describe_plugin_fault(fault)}"
+        loaded.broken.append(Broken(source, reason, kind))
+        return
+    if isinstance(answer, str) or not isinstance(answer, Sequence):
+        given = "None" if answer is None else type(answer).__name__
+        reason = f"{place} returned {given}, not a list of {wanted.__name__}"
+        loaded.broken.append(Broken(source, reason, kind))
+        return
+    for offer in answer:
+        fault_found = _fault_of(offer, wanted)
+        if fault_found:
+            name = str(getattr(offer, "name", ""))
+            loaded.broken.append(Broken(source, f"{place}: {fault_found}", kind, name))
+        else:
+            loaded.offers.append(Offered(kind, offer, source))
+
+
+def _call(hook: str, function: Callable[..., Any]) -> Any:
+    """Through pluggy, which checks the arguments; alone: no plugin wraps the hooks of another."""
+    alone = pluggy.PluginManager(GROUP)
+    alone.add_hookspecs(hookspecs)
+    alone.register(SimpleNamespace(**{hook: function}))
+    answers = getattr(alone.hook, hook)()
+    return answers[0] if answers else None  # pluggy leaves an answer of None out
+
+
+def _fault_of(offer: object, wanted: type[Any]) -> str:
+    """Why an offer cannot be taken; "" where it can."""
+    if not isinstance(offer, wanted):
+        return f"offers {offer!r}, which is not a {wanted.__name__}"
+    name: object = getattr(offer, "name", None)
+    if not isinstance(name, str) or not name.strip():
+        return f"offers something without a name: {name!r}"
+    if not callable(getattr(offer, "create", None)):
+        return f"{name!r}: `create` cannot be called"
+    options: object = getattr(offer, "options", None)
+    if not (isinstance(options, type) and is_dataclass(options)):
+        return f"{name!r}: `options` is not a dataclass but {options!r}"
+    bare = [
+        f.name
+        for f in fields(options)
+        if f.init and f.default is MISSING and f.default_factory is MISSING
+    ]
+    if bare:
+        return f"{name!r}: option {bare[0]!r} has no default"
+    fault = _fault_of_reads(offer) if isinstance(offer, ScoringOffer) else ""
+    fault = _fault_of_executors(offer) if isinstance(offer, MigrationOffer) else fault
+    return f"{name!r}: {fault}" if fault else ""
+
+
+def _fault_of_executors(offer: MigrationOffer) -> str:
+    """Return why the executors of a migration strategy cannot be called; "": they can."""
+    executors: object = offer.executors
+    if not isinstance(executors, Mapping):
+        return f'`executors` is {executors!r}; a mapping is required, as {{"name": function}}'
+    wrong = [
+        f"executor {name!r} is {function!r}; a name and a function are required"
+        for name, function in executors.items()
+        if not isinstance(name, str) or not callable(function)
+    ]
+    return wrong[0] if wrong else ""
+
+
+def _fault_of_reads(offer: ScoringOffer) -> str:
+    """Return why the fields that a scoring policy declares to read cannot be; "": they can."""
+    reads: object = offer.reads
+    if isinstance(reads, str) or not isinstance(reads, Sequence):
+        return f'`reads` is {reads!r}; a tuple of field names is required, as ("name",)'
+    for field in reads:
+        if field not in SPEC_FIELDS:
+            near = get_close_matches(str(field), SPEC_FIELDS, 1)
+            meant = f"; did you mean {near[0]!r}?" if near else "."
+            return f"`reads` has no field {field!r}{meant} Allowed: {', '.join(SPEC_FIELDS)}"
+    return ""

@@ -1,0 +1,46 @@
+"""Every hook that a plugin may implement.
+
+A plugin is a module or object under the entry-point group `rosrm`. Its hooks are called once, at
+start, and return offers; after that the core calls the typed objects under its own guard and
+never goes through pluggy again. Example::
+
+    from rosrm.extensions.hookspecs import hookimpl
+    from rosrm.extensions.contracts import ScoringOffer
+
+    @hookimpl
+    def register_scoring_policies():
+        return [ScoringOffer(name="fewest", create=lambda options: FewestProcesses())]
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import pluggy
+
+from rosrm.extensions.contracts import CheckpointOffer, MigrationOffer, ProbeOffer, ScoringOffer
+from rosrm.extensions.installed import GROUP
+
+# The group of the entry points is the name of the pluggy project, too.
+hookspec = pluggy.HookspecMarker(GROUP)
+hookimpl = pluggy.HookimplMarker(GROUP)
+
+
+@hookspec
+def register_probes() -> Sequence[ProbeOffer]:  # type: ignore[empty-body]  # a specification
+    """Offer probes: what reads the utilisation of a host's resources (loaded by slaves)."""
+
+
+@hookspec
+def register_scoring_policies() -> Sequence[ScoringOffer]:  # type: ignore[empty-body]
+    """Offer scoring policies: what orders the hosts that fit a process (loaded by the master)."""
+
+
+@hookspec
+def register_migration_strategies() -> Sequence[MigrationOffer]:  # type: ignore[empty-body]
+    """Offer migration strategies: what plans a move (master), and its executors (slaves)."""
+
+
+@hookspec
+def register_checkpoint_policies() -> Sequence[CheckpointOffer]:  # type: ignore[empty-body]
+    """Offer checkpoint policies: when and where state is kept (loaded by the master)."""

@@ -1,0 +1,530 @@
+"""Chooses plugins by name, makes them, and says of each what became of it.
+
+Imports no pydantic: the runtimes of master and slave use it too. They get options that have been
+checked; `rosrm.config.options` checks those of a file against the same offers.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, partial
+from typing import Any, Final, TypeVar, cast
+
+from rosrm.errors import ConfigError, PluginError, SkipPlugin, describe_fault, describe_plugin_fault
+from rosrm.extensions.contracts import (
+    CheckpointPolicy,
+    HostChecking,
+    MigrationOffer,
+    MigrationStrategy,
+    PeriodicImaging,
+    Probe,
+    ProbeContext,
+    ProbeOffer,
+    ScoringOffer,
+    ScoringPolicy,
+)
+from rosrm.extensions.declared_fields import Declared
+from rosrm.extensions.discovery import (
+    FAULTS,
+    Broken,
+    Loaded,
+    Offer,
+    Offered,
+    Source,
+    definition,
+    load_addresses,
+    load_objects,
+)
+from rosrm.extensions.installed import PluginAddress, installed_plugins
+from rosrm.extensions.options import merged_options
+from rosrm.extensions.plugin_calls import TITLES, implements
+from rosrm.extensions.time_limit import limited
+from rosrm.model.codec import from_plain
+from rosrm.model.description_checks import resource_fault
+from rosrm.model.rows import PluginRow
+from rosrm.model.values import EMPTY, RESOURCE_SLOTS, ProcessSpec, Reading, ResourceDescription
+from rosrm.wording import counted, get_close_matches
+
+#: What the object of each kind must have.
+_METHODS: Final[Mapping[str, tuple[str, ...]]] = {
+    "probe": ("resources", "read", "close"),
+    "scoring": ("score",),
+    "migration": ("propose",),
+    "checkpoint": ("choose",),
+}
+
+#: Where rosrm's own plugins of a kind are, for who has none.
+_SHIPPED_IN: Final[Mapping[str, str]] = {
+    "probe": "rosrm-resources",
+    "scoring": "rosrm-scoring",
+    "migration": "rosrm-migration",
+    "checkpoint": "rosrm-checkpoint",
+}
+
+#: Seconds for a `create`, which may load a large library.
+CREATE_LIMIT: Final = 30.0
+
+#: Seconds between two reads of what stands for a probe that could not be made.
+_FAILED_PERIOD: Final = 10.0
+#: Broken plugins that a message names where none of them is certainly meant.
+_MOST_BROKEN: Final = 3
+
+Executor = Callable[[Mapping[str, Any]], Mapping[str, Any]]
+NameToOptions = Mapping[str, Mapping[str, Any]]
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class MadeProbe:
+    """A probe that is present on this host; period and deadline are of its offer, seconds."""
+
+    name: str
+    probe: Probe
+    resources: tuple[ResourceDescription, ...]
+    period: float
+    deadline: float
+
+
+@dataclass(frozen=True)
+class Probes:
+    """The probes of a host.
+
+    Attributes:
+        made: those present, and a `FailedProbe` for each that could not be made.
+        absent: name to the reason, of those that say that they are absent here.
+    """
+
+    made: tuple[MadeProbe, ...]
+    absent: Mapping[str, str]
+
+
+class FailedProbe:
+    """Stands for a chosen probe that could not be made: each read fails with the reason.
+
+    So its resources are stale, and a limit on one of them keeps work away as it does where a probe
+    fails in reading.
+
+    Attributes:
+        resources: declared by the offer and read by no other probe, of unknown capacity.
+        reason: why there is no probe, with the plugin and the place.
+    """
+
+    def __init__(self, resources: Sequence[ResourceDescription], reason: str) -> None:
+        self.resources = resources
+        self.reason = reason
+
+    def read(self) -> Iterable[Reading]:
+        """Raise `PluginError` with the reason."""
+        raise PluginError(self.reason)
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+@dataclass(frozen=True)
+class OfferedExecutor:
+    """An executor, and the name of the migration strategy whose offer has it."""
+
+    strategy: str
+    call: Executor
+
+
+class Registry:
+    """The plugins of this installation. `discover` is how to get one."""
+
+    def __init__(self, loaded: Loaded) -> None:
+        self._offers: dict[tuple[str, str], Offered] = {}
+        self._broken: list[Broken] = list(loaded.broken)
+        self._outcome: dict[tuple[str, str], tuple[str, str]] = {}
+        self._keep_single(loaded.offers)
+        self._refuse_shared_executors()
+
+    @classmethod
+    def discover(cls) -> Registry:
+        """Find and load the installed plugins.
+
+        What is broken is kept with its reason, and raises nothing.
+        """
+        return cls.load(installed_plugins())
+
+    @classmethod
+    def load(cls, addresses: Iterable[PluginAddress]) -> Registry:
+        """Load plugins that were found before; otherwise as `discover`."""
+        return cls(load_addresses(addresses))
+
+    @classmethod
+    def of(cls, **plugins: object) -> Registry:
+        """From modules or objects with hooks, without an installation (for tests)."""
+        return cls(load_objects(plugins))
+
+    # --- what there is ------------------------------------------------------------------------
+
+    @property
+    def broken(self) -> Sequence[Broken]:
+        """What cannot be used, and why."""
+        return tuple(self._broken)
+
+    def names(self, kind: str) -> tuple[str, ...]:
+        """The names on offer of one kind."""
+        return tuple(sorted(name for of_kind, name in self._offers if of_kind == kind))
+
+    def offer(self, kind: str, name: str) -> Offer:
+        """The offer of a name; raises `ConfigError` with what there is instead."""
+        return self._offered(kind, name).offer
+
+    def resources(self) -> tuple[str, ...]:
+        """Return the names of all resources that the installed probes may read."""
+        offers = [cast(ProbeOffer, self.offer("probe", name)) for name in self.names("probe")]
+        return tuple(sorted({name for offer in offers for name in offer.resources}))
+
+    def probes_of(self, resource: str) -> tuple[str, ...]:
+        """Return the names of the probes that may read a resource."""
+        return tuple(
+            name
+            for name in self.names("probe")
+            if resource in cast(ProbeOffer, self.offer("probe", name)).resources
+        )
+
+    def default_probes(self) -> NameToOptions:
+        """The probes that a host has where its configuration names none, without options."""
+        offers = [self.offer("probe", name) for name in self.names("probe")]
+        chosen = {o.name: EMPTY for o in offers if isinstance(o, ProbeOffer) and o.default}
+        if not chosen:
+            raise ConfigError(
+                "no probe is installed, so this host could not be measured. "
+                "Install rosrm-resources, or write `probes: {}` to run without."
+                + self._broken_note("probe")
+            )
+        return chosen
+
+    def rows(self, *kinds: str, host: str = "") -> list[PluginRow]:
+        """One row for each offer and each fault of these kinds (of all where none is given).
+
+        State and reason are as the calls below have left them: "available" until something was
+        made, then "selected", "absent" or "broken".
+        """
+        rows = []
+        for (kind, name), offered in sorted(self._offers.items()):
+            state, reason = self._outcome.get((kind, name), ("available", offered.offer.summary))
+            rows.append(PluginRow(kind, name, offered.source.distribution, state, reason, host))
+        for broken in self._broken:
+            kind, name = broken.kind or "plugin", broken.name or broken.source.plugin
+            rows.append(
+                PluginRow(kind, name, broken.source.distribution, "broken", broken.reason, host)
+            )
+        return [row for row in rows if not kinds or row.kind in (*kinds, "plugin")]
+
+    # --- what is made of it -------------------------------------------------------------------
+
+    def scoring(self, name: str, options: Mapping[str, Any] = EMPTY) -> ScoringPolicy:
+        """Make a scoring policy; raises `ConfigError` or `PluginError`."""
+        return cast(ScoringPolicy, self._required("scoring", name, options))
+
+    def checkpoint(
+        self, name: str | None, options: Mapping[str, Any] = EMPTY
+    ) -> CheckpointPolicy | None:
+        """Make a checkpoint policy, None for none; raises `ConfigError` or `PluginError`."""
+        if name is None:
+            return None
+        return cast(CheckpointPolicy, self._required("checkpoint", name, options))
+
+    def migrations(self, chosen: NameToOptions) -> dict[str, MigrationStrategy]:
+        """Make migration strategies by name, in this order; raises as `scoring` does."""
+        made = {
+            name: cast(MigrationStrategy, self._required("migration", name, options))
+            for name, options in chosen.items()
+        }
+        for name, strategy in made.items():
+            self._check_executors(name, strategy)
+        return made
+
+    def _check_executors(self, name: str, strategy: object) -> None:
+        """Refuse a strategy whose `ability` or `discard` is no executor of its own offer."""
+        own = cast(MigrationOffer, self.offer("migration", name)).executors
+        for kind, named in ((HostChecking, "ability"), (PeriodicImaging, "discard")):
+            fault = ""
+            try:
+                if implements(strategy, kind) and (executor := getattr(strategy, named)) not in own:
+                    there = ", ".join(sorted(own)) or "none"
+                    fault = f"its `{named}` is {executor!r}, no executor of its offer; "
+                    fault += f"there are: {there}"
+            except FAULTS as raised:
+                fault = f"its `{named}` raised {describe_plugin_fault(raised)}"
+            if fault:
+                raise self._fault("migration", name, fault)
+
+    def declared(self, scoring: str, chosen: NameToOptions) -> Declared:
+        """Return what the offers of a scoring policy and of migration strategies declare."""
+        offers = {name: cast(MigrationOffer, self.offer("migration", name)) for name in chosen}
+
+        def merged(strategy: str, own: Mapping[str, Any]) -> Any:
+            offer = offers[strategy]
+            return merged_options(offer.own_options or offer.options, chosen[strategy], own)
+
+        common = cache(partial(merged, own=EMPTY))  # most processes set no option of their own
+
+        def options(strategy: str, spec: ProcessSpec) -> Any:
+            own = spec.migration.options if spec.migration.strategy == strategy else EMPTY
+            return merged(strategy, own) if own else common(strategy)
+
+        return Declared(
+            reads=tuple(cast(ScoringOffer, self.offer("scoring", scoring)).reads),
+            options_of=options,
+            executors={name: frozenset(offer.executors) for name, offer in offers.items()},
+            brought_by={
+                name: self._offers["migration", name].source.distribution for name in offers
+            },
+        )
+
+    def executors(self) -> dict[str, OfferedExecutor]:
+        """Return what the open steps of plans may name on this host, from all migration offers."""
+        return {
+            executor: OfferedExecutor(name, function)
+            for name in self.names("migration")
+            for executor, function in self._executors_of(name).items()
+        }
+
+    def broken_strategies(self) -> dict[str, str]:
+        """Return the migration offers that are broken here, by name, and why."""
+        return {
+            broken.name or broken.source.plugin: f"{broken.source}: {broken.reason}"
+            for broken in self._broken
+            if broken.kind == "migration"
+        }
+
+    def _executors_of(self, name: str) -> Mapping[str, Executor]:
+        return cast(MigrationOffer, self.offer("migration", name)).executors
+
+    def probes(self, chosen: NameToOptions | None, context: ProbeContext) -> Probes:
+        """Make the probes of a host, the default ones for None.
+
+        One that says that it is absent here is left out with its reason. One that fails in any
+        other way is replaced by a `FailedProbe`.
+
+        Raises:
+            ConfigError: for an unknown name or option.
+        """
+        made: list[MadeProbe] = []
+        absent: dict[str, str] = {}
+        failed: dict[str, str] = {}
+        for name, options in (self.default_probes() if chosen is None else chosen).items():
+            try:
+                made.append(self._probe(name, options, context, made))
+            except SkipPlugin as skip:
+                absent[name] = str(skip)
+                self._outcome["probe", name] = ("absent", str(skip))
+            except PluginError:
+                source, (_, reason) = (
+                    self._offers["probe", name].source,
+                    self._outcome["probe", name],
+                )
+                failed[name] = f"{source}: {reason}"
+        for name, reason in failed.items():
+            made.append(self._failed_probe(name, reason, made))
+        return Probes(tuple(made), absent)
+
+    def _failed_probe(self, name: str, reason: str, others: Sequence[MadeProbe]) -> MadeProbe:
+        """Return what stands for a probe that could not be made."""
+        taken = {resource.name for other in others for resource in other.resources}
+        declared = cast(ProbeOffer, self.offer("probe", name)).resources
+        described = [
+            ResourceDescription(resource, "1", 1.0, "unknown")
+            for resource in dict.fromkeys(declared)
+            if resource not in taken
+        ]
+        valid = [one for one in described if not resource_fault(one)]
+        probe = FailedProbe(tuple(valid[: RESOURCE_SLOTS - len(taken)]), reason)
+        return MadeProbe(name, probe, tuple(probe.resources), _FAILED_PERIOD, 1.0)
+
+    def _probe(
+        self,
+        name: str,
+        options: Mapping[str, Any],
+        context: ProbeContext,
+        before: Sequence[MadeProbe],
+    ) -> MadeProbe:
+        offer = cast(ProbeOffer, self.offer("probe", name))
+        probe = self._make("probe", name, options, context)
+        try:
+            resources = tuple(probe.resources)
+            fault = _fault_of_resources(resources, offer, before)
+            fault = fault and f"{type(probe).__name__} ({definition(type(probe))}) {fault}"
+        except FAULTS as raised:
+            resources, fault = (), f"its `resources` raised {describe_plugin_fault(raised)}"
+        if fault:
+            close_quietly(probe)
+            raise self._fault("probe", name, fault)
+        return MadeProbe(name, probe, resources, offer.period, offer.deadline)
+
+    def _required(self, kind: str, name: str, options: Mapping[str, Any]) -> Any:
+        """Make what the master cannot do without: absent here is an error."""
+        try:
+            return self._make(kind, name, options)
+        except SkipPlugin as skip:
+            self._outcome[kind, name] = ("absent", str(skip))
+            raise ConfigError(f"{TITLES[kind]} {name!r} is absent here: {skip}") from skip
+
+    def _make(self, kind: str, name: str, options: Mapping[str, Any], *more: Any) -> Any:
+        offer = self.offer(kind, name)
+        try:
+            settings = from_plain(offer.options, options)
+        except ValueError as wrong:
+            raise ConfigError(f"options of {TITLES[kind]} {name!r}: {wrong}") from wrong
+        except FAULTS as fault:
+            reason = f"its options cannot be read: {describe_fault(fault)}"
+            raise self._fault(kind, name, reason) from fault
+        create = cast(Callable[..., Any], offer.create)
+
+        def late() -> str:
+            return (
+                f"it did not return within {CREATE_LIMIT:g} s; repair what it waits for, or leave "
+                f"{name!r} out of the configuration"
+            )
+
+        try:
+            thing = limited(CREATE_LIMIT, partial(create, settings, *more), late)
+        except (SkipPlugin, ConfigError):  # its own word on this host, or on its options
+            raise
+        except FAULTS as fault:
+            reason = f"`create` ({definition(create)}) raised {describe_plugin_fault(fault)}"
+            raise self._fault(kind, name, reason) from fault
+        lacks = _missing_method(kind, thing)
+        if lacks:
+            raise self._fault(kind, name, f"`create` ({definition(create)}) made {lacks}")
+        self._outcome[kind, name] = ("selected", offer.summary)
+        return thing
+
+    def _fault(self, kind: str, name: str, reason: str) -> PluginError:
+        self._outcome[kind, name] = ("broken", reason)
+        return PluginError(
+            f"{TITLES[kind]} {name!r} of {self._offers[kind, name].source}: {reason}"
+        )
+
+    # --- how a name is found ------------------------------------------------------------------
+
+    def _keep_single(self, offers: Sequence[Offered]) -> None:
+        """A name that two plugins offer belongs to neither: which one runs must not be chance."""
+        for offered in offers:
+            key = (offered.kind, offered.offer.name)
+            same = [other for other in offers if (other.kind, other.offer.name) == key]
+            if len(same) == 1:
+                self._offers[key] = offered
+            else:
+                sources = " and ".join(str(other.source) for other in same)
+                reason = f"offered twice, by {sources}: uninstall one"
+                self._broken.append(Broken(offered.source, reason, *key))
+
+    def _refuse_shared_executors(self) -> None:
+        """Break all offers of which an executor has the same name: orders name nothing else.
+
+        Offers that share one function may share its name.
+        """
+        owners: dict[str, list[str]] = {}
+        for name in self.names("migration"):
+            for executor in self._executors_of(name):
+                owners.setdefault(executor, []).append(name)
+        found: dict[str, str] = {}
+        for executor, names in owners.items():
+            for name in names:
+                function = self._executors_of(name)[executor]
+                others = [
+                    f"{other!r} of {self._offers['migration', other].source}"
+                    for other in names
+                    if self._executors_of(other)[executor] is not function
+                ]
+                if others:
+                    reason = f"its executor {executor!r} has the name of one of "
+                    reason += f"{' and '.join(others)}: uninstall one, or rename the executor"
+                    found.setdefault(name, reason)
+        for name, reason in found.items():
+            source = self._offers.pop(("migration", name)).source
+            self._broken.append(Broken(source, reason, "migration", name))
+
+    def _offered(self, kind: str, name: str) -> Offered:
+        if (kind, name) in self._offers:
+            return self._offers[kind, name]
+        title, names = TITLES[kind], self.names(kind)
+        near = get_close_matches(name, names, 1)
+        meant = f"; did you mean {near[0]!r}?" if near else "."
+        shipped = f"; {_SHIPPED_IN[kind]} brings rosrm's own" if kind in _SHIPPED_IN else ""
+        installed = f"Installed: {', '.join(names)}." if names else f"None is installed{shipped}."
+        raise ConfigError(
+            f"unknown {title} {name!r}{meant} {installed}{self._broken_note(kind, name)}"
+        )
+
+    def _broken_note(self, kind: str, name: str = "") -> str:
+        """Return the faults of the broken plugin that may be meant, and the number of the others.
+
+        A plugin is meant by the name of its offer or, where that is not known, by its own.
+        """
+        might = [b for b in self._broken if b.kind in ("", kind)]
+        meant = [b for b in might if not name or name == b.name]
+        if not meant:
+            meant = [b for b in might if not b.name and _is_named_like(b.source, name)]
+        if not meant:  # any of those without a name may be what is looked for
+            meant = [b for b in might if not b.name][:_MOST_BROKEN]
+        reasons = dict.fromkeys(f"{b.source}: {b.reason}" for b in meant)
+        note = " Broken: " + "; ".join(reasons) + "." if reasons else ""
+        others = len(might) - len(meant)
+        if not others:
+            return note
+        many = counted(others, "plugin is", "plugins are")
+        return f"{note} {many} broken{' besides' if note else ''}: see `rosrm plugins --local`."
+
+
+def _is_named_like(source: Source, name: str) -> bool:
+    """Return True if an offer of this name may be one of a plugin that did not get so far."""
+    words = {word for text in (source.plugin, source.distribution) for word in _words(text)}
+    return bool(words & set(_words(name))) or bool(get_close_matches(name, [source.plugin], 1))
+
+
+def _words(text: str) -> list[str]:
+    return [word for word in re.split(r"[^a-z]+", text.lower()) if word not in ("", "rosrm")]
+
+
+def _missing_method(kind: str, thing: object) -> str:
+    """Return what is wrong with an object that an offer made; "": it has all its methods."""
+    if thing is None:
+        wanted = " and ".join(f"`{name}`" for name in _METHODS[kind])
+        return f"None; an object with {wanted} is required (does it lack a `return`?)"
+    for name in _METHODS[kind]:
+        if not hasattr(type(thing), name) and not hasattr(thing, name):
+            has = [one for one in dir(thing) if not one.startswith("_")]
+            near = get_close_matches(name, has, 1)
+            misspelt = f"; is its `{near[0]}` misspelt?" if near else ""
+            return f"a {type(thing).__name__}, which has no `{name}`{misspelt}"
+    return ""
+
+
+def _fault_of_resources(
+    resources: Sequence[ResourceDescription], offer: ProbeOffer, before: Sequence[MadeProbe]
+) -> str:
+    """Why a host cannot take these resources, without its subject; "" where it can."""
+    taken = {resource.name: other.name for other in before for resource in other.resources}
+    if not resources:
+        return "describes no resource; raise SkipPlugin in `create` where there is nothing to read"
+    for resource in resources:
+        fault = resource_fault(resource)
+        if fault:
+            return fault
+        if resource.name in taken:
+            return f"reads {resource.name!r}, as {taken[resource.name]!r} does already"
+        if resource.name not in offer.resources:
+            declared = repr((*offer.resources, resource.name))
+            return (
+                f"reads {resource.name!r}, which its offer does not declare: "
+                f"say ProbeOffer(..., resources={declared})"
+            )
+    if len(taken) + len(resources) > RESOURCE_SLOTS:
+        return f"brings the resources of this host to more than {RESOURCE_SLOTS}"
+    return ""
+
+
+def close_quietly(probe: Probe) -> None:
+    """Close what is given up; that it fails to close as well adds nothing."""
+    try:
+        probe.close()
+    except FAULTS:
+        return

@@ -1,0 +1,74 @@
+"""What is wrong with a journal, and what to do about it, in words for people."""
+
+from __future__ import annotations
+
+import sqlite3
+from pathlib import Path
+
+from rosrm.errors import JournalBlocked, JournalError
+from rosrm.runtime.disk_space import room_for
+
+_OTHER_STATE = "give the master another `state:`"
+
+
+def fault_of(path: Path, error: sqlite3.Error | OSError) -> JournalError:
+    """The error for the user; a `JournalBlocked` where it may pass by itself."""
+    text = str(error)
+    said = f"the journal {path} cannot be used ({text}); "
+    if path.is_dir():
+        return JournalError(f"{said}it is a directory: move it away, or {_OTHER_STATE}")
+    if "full" in text or "No space" in text or "quota" in text:
+        where = room_for(path)
+        where = f" ({where})" if where else ""
+        return JournalBlocked(f"{said}the disk is full{where}: make room; {_NOTHING_LOST}")
+    if "I/O" in text:
+        return JournalBlocked(
+            f"{said}the disk does not take what is written: make room, look at quotas and at the "
+            f"disk itself; {_NOTHING_LOST}"
+        )
+    if "unable to open" in text or "readonly" in text or isinstance(error, OSError):
+        return JournalBlocked(
+            f"{said}look at the owner and permissions of it, of its folder and of what lies beside "
+            f"it (-wal, -shm), or {_OTHER_STATE}"
+        )
+    if "locked" in text:
+        return JournalBlocked(
+            f"{said}another program holds it: is a second master running on this state directory?"
+        )
+    return JournalError(said + DAMAGED)
+
+
+_NOTHING_LOST = "nothing that was answered is lost"
+
+
+def unreadable(path: Path, fault: Exception) -> JournalError:
+    """The file is whole, and what is written in it makes no sense."""
+    return JournalError(
+        f"the journal {path} cannot be used ({type(fault).__name__}: {fault}); it was not written "
+        f"by this rosrm: restore it from a backup, or move it away to start with an empty journal"
+    )
+
+
+#: What to do with a damaged file.
+DAMAGED = (
+    "the file is damaged: restore it from a backup, or start the master once with `--recover`, "
+    "which goes on with all that can still be read of it and keeps the damaged file, or move it "
+    "away to start with an empty journal. Nothing is stopped as long as no master runs; then the "
+    "processes that its journal does not know are stopped as their slaves register"
+)
+
+
+def other_version(path: Path, version: int, ours: int) -> JournalError:
+    """The file is of a later or earlier rosrm."""
+    return JournalError(
+        f"{path} was written by another version of rosrm (tables {version}, here {ours}); use that "
+        f"version, or move the file away to start with an empty journal"
+    )
+
+
+def no_journal(path: Path) -> JournalError:
+    """The file is a database, but none of ours."""
+    return JournalError(
+        f"the journal {path} cannot be used: it is a database of another program. Move it away, or "
+        f"{_OTHER_STATE}"
+    )

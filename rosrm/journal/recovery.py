@@ -1,0 +1,240 @@
+"""What can still be read of a damaged journal goes into a new one; the damaged one is kept aside.
+
+A page that is damaged takes the intents and events on it with it, so the new journal is one that
+has lost a part: what ran by a lost intent is stopped as its slave registers. What a lost intent
+could make run twice is put right here: hosts that processes are on, and the numbers of instances.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+import sqlite3
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from rosrm.errors import JournalBlocked, JournalError
+from rosrm.extensions.contracts import Intent, Record
+from rosrm.journal.sqlite import SqliteJournal
+from rosrm.runtime.disk_space import room_for
+from rosrm.wording import counted
+
+_BESIDE: Final = ("-wal", "-shm")
+#: A damaged page hides all that is behind it in a scan. So events are read by a few, and from the
+#: end; intents from both ends, then one by one by the names that the events know.
+_EVENTS: Final = "SELECT * FROM record WHERE sequence BETWEEN ? AND ? AND facts IS NOT NULL"
+_NEWEST_EVENTS: Final = "SELECT * FROM record WHERE facts IS NOT NULL ORDER BY sequence DESC"
+_FEW: Final = 50
+_MOST_EVENTS: Final = 2_000_000
+_INTENTS: Final = (
+    "SELECT tbl, key, value FROM intent ORDER BY tbl, key",
+    "SELECT tbl, key, value FROM intent ORDER BY tbl DESC, key DESC",
+)
+_INTENT: Final = "SELECT tbl, key, value FROM intent WHERE tbl = ? AND key = ?"
+#: Bytes, at most, by which a file that was cut short is filled up (sparsely).
+_MOST_EMPTY: Final = 2**30
+#: Numbers left free above the largest that is known.
+_FREE: Final = 1000
+#: Under these names events tell numbers of instances; no real one is as large as that.
+_NUMBERS: Final = ("number", "source", "destination")
+_NO_NUMBER: Final = 2**53
+
+
+@dataclass(slots=True)
+class _Found:
+    """What could be read: intents by table and key, events by sequence, as they are stored."""
+
+    intents: dict[tuple[str, str], dict[str, Any]] = field(default_factory=dict)
+    events: dict[int, tuple[Any, ...]] = field(default_factory=dict)
+    whole: bool = True
+
+
+def recover(path: Path, wall: Callable[[], float] = time.time) -> str:
+    """Make a new journal of what is left of a damaged one.
+
+    Args:
+        path: of the journal; no master may have it open.
+        wall: unix time, seconds.
+
+    Returns:
+        What was found and where the damaged file is now, for people.
+
+    Raises:
+        JournalError: it is not damaged, or nothing can be read of it, or there is no room, or a
+            right is missing; the journal is as it was.
+    """
+    _check_damaged(path)
+    try:
+        return _recover(path, wall)
+    except (OSError, sqlite3.Error) as error:
+        raise _not_recovered(path, error) from error
+    except JournalBlocked as blocked:  # of the new one
+        raise _not_recovered(path, blocked.__cause__ or blocked) from blocked
+
+
+def _recover(path: Path, wall: Callable[[], float]) -> str:
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix="recovery-") as place:
+        found = _salvage(path, Path(place))
+        new = Path(place) / "new.sqlite"
+        aside = path.with_name(f"{path.name}.damaged-{int(wall())}")
+        _write(new, found, aside)
+        # Killed at any point, there is a journal: to a master that finds none all are strangers.
+        os.link(path, aside)
+        for suffix in _BESIDE:
+            with contextlib.suppress(FileNotFoundError):
+                Path(f"{path}{suffix}").replace(f"{aside}{suffix}")
+        new.replace(path)
+    return _summary(found, aside)
+
+
+def _not_recovered(path: Path, error: BaseException) -> JournalError:
+    why = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+    room = room_for(path)
+    return JournalError(
+        f"the journal {path} was not recovered, and is as it was: {why}. A recovery needs room "
+        f"beside it for two more of its size{f' ({room})' if room else ''}, and the right to write "
+        f"into its folder"
+    )
+
+
+def _check_damaged(path: Path) -> None:
+    if not path.is_file():
+        raise JournalError(f"there is no journal to recover: {path} is no file")
+    try:
+        journal = SqliteJournal(path)
+        for table in ("cluster", "host", "process", "migration", "learned", "removed"):
+            journal.intents(table)
+        journal.close()
+    except JournalError as fault:
+        if "damaged" not in str(fault):
+            raise
+    else:
+        raise JournalError(f"the journal {path} is not damaged: start without `--recover`")
+
+
+def _salvage(path: Path, place: Path) -> _Found:
+    """Read a copy, as reading would write to the original (`-shm`, a checkpoint)."""
+    copy = place / "damaged.sqlite"
+    for suffix in ("", "-wal"):
+        with contextlib.suppress(FileNotFoundError):
+            shutil.copyfile(f"{path}{suffix}", f"{copy}{suffix}")
+    _fill_up(copy)
+    found = _Found()
+    with contextlib.closing(sqlite3.connect(copy)) as database:
+        database.text_factory = lambda raw: raw.decode(errors="replace")
+        _read_events(database, found)
+        _read_intents(database, found)
+    if not found.intents:
+        raise JournalError(
+            f"nothing can be read of the journal {path}: restore it from a backup, or move it away "
+            f"to start with an empty one"
+        )
+    return found
+
+
+def _fill_up(copy: Path) -> None:
+    """SQLite reads nothing of a file that is shorter than its head says: add empty pages."""
+    head = copy.read_bytes()[:32]
+    page, count = int.from_bytes(head[16:18], "big"), int.from_bytes(head[28:32], "big")
+    size = copy.stat().st_size
+    if head.startswith(b"SQLite format 3\0") and size < page * count < _MOST_EMPTY + size:
+        os.truncate(copy, page * count)
+
+
+def _read_events(database: sqlite3.Connection, found: _Found) -> None:
+    for row in _rows(database, found, _NEWEST_EVENTS):
+        found.events[int(row[0])] = row
+    newest = max(found.events, default=_MOST_EVENTS)
+    for first in range(max(0, newest - _MOST_EVENTS), newest, _FEW):
+        for row in _rows(database, found, _EVENTS, first, first + _FEW - 1):
+            found.events[int(row[0])] = row
+
+
+def _read_intents(database: sqlite3.Connection, found: _Found) -> None:
+    processes = sorted({str(event[4]) for event in found.events.values() if event[4]})
+    hosts = sorted({str(event[5]) for event in found.events.values() if event[5]})
+    known = [("cluster", "epoch"), ("cluster", "instances")]
+    known += [("host", name) for name in hosts]
+    known += [(table, name) for name in processes for table in ("process", "migration", "removed")]
+    rows = [row for query in _INTENTS for row in _rows(database, found, query)]
+    rows += [row for at in known for row in _rows(database, found, _INTENT, *at)]
+    for table, key, text in rows:
+        with contextlib.suppress(ValueError, TypeError):
+            found.intents[str(table), str(key)] = dict(json.loads(text))
+
+
+def _rows(
+    database: sqlite3.Connection, found: _Found, query: str, *values: object
+) -> Iterator[tuple[Any, ...]]:
+    """Rows up to the first that cannot be read."""
+    try:
+        yield from database.execute(query, values)
+    except sqlite3.Error:
+        found.whole = False
+
+
+def _write(path: Path, found: _Found, aside: Path) -> None:
+    _put_right(found)
+    SqliteJournal(path).close()
+    with contextlib.closing(sqlite3.connect(path)) as database, database:
+        database.executemany(
+            f"INSERT INTO record VALUES ({', '.join('?' * 8)})",  # noqa: S608 - fixed words
+            [found.events[sequence] for sequence in sorted(found.events)],
+        )
+    journal = SqliteJournal(path)
+    intents = [Intent(table, key, value) for (table, key), value in found.intents.items()]
+    journal.write([Record("journal_recovered", message=_summary(found, aside))], intents, 0.0)
+    journal.close()
+
+
+def _put_right(found: _Found) -> None:
+    """What the intents that are left presume of those that may be lost."""
+    hosts = {key for table, key in found.intents if table == "host"}
+    ids = [int(found.intents["host", name].get("host_id", 0)) for name in hosts]
+    largest = _largest_told(found)
+    for (table, _), process in list(found.intents.items()):
+        if table != "process":
+            continue
+        for number, host in process.get("instances", {}).items():
+            largest = max(largest, int(number))
+            if host not in hosts:
+                hosts.add(host)
+                ids.append(max(ids, default=0) + 1)
+                known = {"host_id": ids[-1], "cordoned": False, "draining": False}
+                found.intents["host", host] = known
+    found.intents.setdefault(("cluster", "instances"), {"next": largest + _FREE})
+    epoch = found.intents.setdefault(("cluster", "epoch"), {"epoch": 0})
+    epoch["boot"] = "recovered"  # as after a fall: all hosts are heard before work is given
+
+
+def _largest_told(found: _Found) -> int:
+    """The largest number that an instance had by the events, of those that have ended too.
+
+    A supervisor that has forgotten the end of a number starts none up to it any more.
+    """
+    largest = 0
+    for event in found.events.values():
+        with contextlib.suppress(ValueError, TypeError):
+            facts = dict(json.loads(event[7]))
+            told = [facts[name] for name in _NUMBERS if type(facts.get(name)) is int]
+            largest = max([largest, *(number for number in told if number < _NO_NUMBER)])
+    return largest
+
+
+def _summary(found: _Found, aside: Path) -> str:
+    processes = sum(table == "process" for table, _ in found.intents)
+    hosts = sum(table == "host" for table, _ in found.intents)
+    part = "all that was" if found.whole else "what could still be read:"
+    held = counted(processes, "process", "processes")
+    events = counted(len(found.events), "event")
+    return (
+        f"the journal was recovered from a damaged one, {part} {held}, {counted(hosts, 'host')} "
+        f"and {events}; the damaged file is {aside}. Look at `rosrm ps` "
+        f"for what is missing, and submit it again: it is stopped where it still runs"
+    )

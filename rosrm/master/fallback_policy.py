@@ -1,0 +1,24 @@
+"""The scoring policy that decides where the chosen one raises, hangs or answers nonsense."""
+
+from __future__ import annotations
+
+import logging
+
+from rosrm.config.settings import ScoringChoice
+from rosrm.errors import ConfigError, PluginError, SkipPlugin
+from rosrm.extensions.contracts import ScoringPolicy
+from rosrm.extensions.registry import Registry
+
+_log = logging.getLogger("rosrm.master")
+
+
+def fallback_of(registry: Registry, chosen: str) -> tuple[str, ScoringPolicy] | None:
+    """The default policy with its name; None: it is the chosen one, not installed, or broken."""
+    name = ScoringChoice().policy
+    if name == chosen or name not in registry.names("scoring"):
+        return None
+    try:
+        return name, registry.scoring(name, {})
+    except (ConfigError, PluginError, SkipPlugin) as fault:
+        _log.warning("scoring %r cannot stand in for %r: %s", name, chosen, fault)
+        return None

@@ -1,0 +1,123 @@
+"""What may be read of the master at any time, also while it decides nothing."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, Final
+
+from rosrm.core.master import listing
+from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.state.hosts import Host
+from rosrm.extensions.contracts import StoredRecord
+from rosrm.journal.sqlite import SqliteJournal
+from rosrm.model.rows import EventRow, PluginRow, Snapshot
+
+_DEFAULT_EVENTS: Final = 1000
+
+
+class Reading:
+    """Answers whoever asks how things are.
+
+    Args:
+        master: its name.
+        state: of its core.
+        journal: holds the event record.
+        plugins: what `rosrm plugins` shows of the master.
+        uptime: seconds since its start.
+        core_now: the time that it is for the core.
+        trouble: why it takes no new work; "": it does.
+    """
+
+    def __init__(
+        self, master: str, state: MasterState, journal: SqliteJournal, plugins: Sequence[PluginRow],
+        *, uptime: Callable[[], float], core_now: Callable[[], float], trouble: Callable[[], str],
+    ) -> None:  # fmt: skip
+        self._master = master
+        self._state = state
+        self._journal = journal
+        self._plugins = list(plugins)
+        self._uptime = uptime
+        self._core_now = core_now
+        self._trouble = trouble
+
+    def snapshot(self, request: Any) -> Snapshot:
+        """The listings that were asked for."""
+        now = self._core_now()
+        state = self._state
+        return Snapshot(
+            master=self._master,
+            uptime=self._uptime(),
+            last_sequence=self._journal.last_sequence,
+            trouble=self._trouble(),
+            hosts=listing.host_rows(state, now) if request.hosts else (),
+            processes=self._processes(request.process, now) if request.processes else (),
+            plugins=self._plugin_rows(request) if request.plugins else (),
+            events=self._events(request) if request.events else (),
+        )
+
+    def _processes(self, name: str, now: float) -> Sequence[Any]:
+        if not name:
+            return listing.process_rows(self._state, now)
+        process = self._state.processes.get(name)
+        return [listing.process_row(self._state, process, now)] if process is not None else []
+
+    def _events(self, request: Any) -> list[EventRow]:
+        stored = self._journal.records(
+            after=request.after_sequence, process=request.process, host=request.host,
+            newest=request.max_events or _DEFAULT_EVENTS,
+        )  # fmt: skip
+        return [_event_row(one) for one in stored]
+
+    def _plugin_rows(self, request: Any) -> list[PluginRow]:
+        if not request.failing:
+            return self._all_plugins()
+        rows = [row for row in self._own_plugins() if row.state == "failing"]
+        return rows + [row for host in self._state.hosts.hosts for row in _failing_rows(host)]
+
+    def _own_plugins(self) -> list[PluginRow]:
+        failing = self._state.plugins.failing
+        return [
+            replace(row, state="failing", reason=known.reason)
+            if (known := failing.get((row.kind, row.name))) is not None
+            else row
+            for row in self._plugins
+        ]
+
+    def _all_plugins(self) -> list[PluginRow]:
+        rows = self._own_plugins()
+        for host in self._state.hosts.hosts:
+            described = host.description
+            rows += [
+                PluginRow("probe", one.name, "", "selected", f"scope {one.scope}", host.name)
+                for one in described.resources
+                if ("probe", one.name) not in host.failing
+            ]
+            rows += _failing_rows(host)
+            rows += [
+                PluginRow("probe", name, "", "absent", reason, host.name)
+                for name, reason in described.absent.items()
+            ]
+        return rows
+
+    def explain(self, name: str) -> str | None:
+        """The story of a process as JSON."""
+        story = listing.explanation(self._state, name, self._core_now())
+        return None if story is None else json.dumps(story, default=dict)
+
+
+def _failing_rows(host: Host) -> list[PluginRow]:
+    """Return what fails on a host; a probe goes by the resource that it reads."""
+    return [
+        PluginRow(kind, name, "", "failing", known.error, host.name)
+        for (kind, name), known in host.failing.items()
+    ]
+
+
+def _event_row(stored: StoredRecord) -> EventRow:
+    record = stored.record
+    return EventRow(
+        stored.sequence, stored.wall_time, stored.elapsed, record.kind, record.process,
+        record.host, record.message, record.facts,
+    )  # fmt: skip

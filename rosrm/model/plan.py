@@ -1,0 +1,316 @@
+"""Plans as data: how a process moves, step by step, and the way back from each step.
+
+A strategy proposes a `Plan`; `moves.py` carries it out, and a `Run` holds how far it is. Before the
+commit a failure undoes the steps done so far, newest first, back to a running source; after it the
+plan is rolled forward. What can be neither is STUCK, and said loudly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from enum import Enum, IntEnum
+from math import inf
+from typing import Any, Final
+
+from rosrm.model.values import EMPTY, InstanceId, ProcessSpec, RestartPolicy
+
+
+@dataclass(frozen=True, slots=True)
+class Move:
+    """A process to be moved, for a strategy.
+
+    Attributes:
+        spec: as submitted.
+        source: the running instance.
+        source_host: where it runs.
+        destination: the instance to be, already numbered.
+        destination_host: where it goes.
+        fallback: an instance for starting again at the source, should a stop be undone.
+        now: unix time, whole seconds (the alias of a handoff carries it).
+        source_node: under which the node of the source runs: an alias, if it came by a handoff.
+        options: of the strategy for this process: those of the cluster with the process's own over
+            them, an object of the offer's `own_options` or `options`.
+    """
+
+    spec: ProcessSpec
+    source: InstanceId
+    source_host: str
+    destination: InstanceId
+    destination_host: str
+    fallback: InstanceId
+    now: int
+    source_node: str
+    options: Any = None
+
+
+class Aim(str, Enum):
+    """What a plan is to bring about.
+
+    Of a checkpoint the source ends in an image on its own host, and no destination is started; of a
+    restore the source is the instance that the image is of, which does not run any more.
+    """
+
+    MOVE = "move"
+    CHECKPOINT = "checkpoint"
+    RESTORE = "restore"
+
+
+class HandoffPhase(IntEnum):
+    """What the master says of a handoff, as in `StateConfig`."""
+
+    SHADOW = 1
+    SWITCH = 2
+    TAKE_OVER = 3
+    ABORT = 4
+    RESUME = 5
+    DONE = 6
+
+
+_FORWARD: Final = (HandoffPhase.SHADOW, HandoffPhase.SWITCH, HandoffPhase.DONE)
+
+
+class ReportPhase(IntEnum):
+    """How far the source or the destination of a handoff is, as in `HandoffReport`."""
+
+    ATTACHED = 1
+    SILENT = 2
+    RELEASED = 3
+    RESUMED = 4
+    SHADOWING = 11
+    READY = 12
+    SWITCHING = 13
+    ACTIVE = 14
+    ABORTED = 15
+    FAILED = 20
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """Start an instance on a host; done when the slave says that it runs.
+
+    A shadow is the destination of a handoff: it has an alias, stays silent, and is not restarted.
+    One that is restored goes on from an image of the source, which earlier steps have brought to
+    the host while the source stands still; nor is it restarted. `remappings` come beside those of
+    the process's spec.
+    """
+
+    instance: InstanceId
+    host: str
+    timeout: float
+    node_name: str = ""
+    undo: Step | None = None
+    shadow: bool = False
+    remappings: Mapping[str, str] = field(default_factory=dict)
+    restored: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class AwaitReady:
+    """Wait until an instance is ready; done when its slave says so, and `settle` seconds later."""
+
+    instance: InstanceId
+    host: str
+    timeout: float
+    undo: Step | None = None
+    settle: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class AwaitReleased:
+    """Wait until a silent source says that its last outputs have arrived, or for so long.
+
+    It never fails: its successor is active, and what was sent is sent.
+    """
+
+    instance: InstanceId
+    host: str
+    timeout: float
+    undo: Step | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Stop:
+    """Stop an instance; done when its slave says that it has ended."""
+
+    instance: InstanceId
+    host: str
+    timeout: float
+    undo: Step | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Configure:
+    """Publish `state_config` with this phase to the source and the destination of the move.
+
+    Each phase is done when they have answered as in the handoff protocol; DONE, and any phase that
+    is not `awaited`, at once.
+    """
+
+    phase: HandoffPhase
+    timeout: float
+    awaited: bool = True
+    undo: Step | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class SetRestart:
+    """Give an instance another restart policy; done when its slave has taken it."""
+
+    instance: InstanceId
+    host: str
+    restart: RestartPolicy
+    timeout: float
+    undo: Step | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Commit:
+    """From here on the destination owns the name; there is one in each plan.
+
+    In the plan of a checkpoint it is the image that does: no instance is the owner then. `image`
+    names the executor that removes one that nobody wants any more; "": this is no checkpoint.
+    """
+
+    timeout: float = 0.0
+    undo: Step | None = None
+    image: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Execute:
+    """The open step: run an executor that the strategy's plugin registered on a slave.
+
+    The executor is given the arguments and, as `results`, what the executors of earlier steps of
+    the same run have answered, by their names.
+    """
+
+    executor: str
+    host: str
+    arguments: Mapping[str, Any]
+    timeout: float
+    undo: Step | None = None
+
+
+Step = Start | AwaitReady | AwaitReleased | Stop | Configure | SetRestart | Commit | Execute
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """How one process moves.
+
+    Attributes:
+        steps: in order; exactly one is a `Commit`.
+        overlap: seconds that both instances may be active at once, declared; 0: never.
+        options: kept with the record of the migration.
+    """
+
+    steps: tuple[Step, ...]
+    overlap: float = 0.0
+    options: Mapping[str, Any] = field(default_factory=lambda: EMPTY)
+
+
+def plan_fault(plan: Plan, move: Move, aim: Aim = Aim.MOVE) -> str:
+    """What is wrong with a plan that a strategy proposed for an aim; "" for a sound one."""
+    given: object = plan
+    if not isinstance(given, Plan):
+        return f"it is {'None' if given is None else type(given).__name__}, not a Plan"
+    commits = sum(isinstance(step, Commit) for step in plan.steps)
+    if commits != 1:
+        return f"it has {commits} commit points, not one"
+    if not 0.0 <= plan.overlap < inf:
+        return f"its overlap is {plan.overlap:g} s"
+    for step in all_steps(plan.steps):
+        fault = _step_fault(step, move)
+        if fault:
+            return f"{type(step).__name__} {fault}"
+    for step in plan.steps:
+        fault = _handoff_fault(step)
+        if fault:
+            return fault
+    return _commit_fault(plan, move, aim)
+
+
+def _commit_fault(plan: Plan, move: Move, aim: Aim) -> str:
+    """Whether what owns the name after the commit is there before it."""
+    at = next(at for at, step in enumerate(plan.steps) if isinstance(step, Commit))
+    before, commit, after = plan.steps[:at], plan.steps[at], plan.steps[at + 1 :]
+    if isinstance(commit, Commit) and bool(commit.image) != (aim is Aim.CHECKPOINT):
+        return f"the plan of a {aim.value} commits to {'an image' if commit.image else 'no image'}"
+    if aim is Aim.CHECKPOINT:
+        return _checkpoint_fault(plan, after, move)
+    begun = [
+        step for step in before
+        if isinstance(step, (Start, AwaitReady)) and step.instance == move.destination
+    ]  # fmt: skip
+    if not begun:
+        return "it commits to a destination that it never starts or awaits"
+    if aim is Aim.RESTORE and not any(isinstance(one, Start) and one.restored for one in begun):
+        return "a restore starts the destination without its image"
+    return ""
+
+
+def _checkpoint_fault(plan: Plan, after: Iterable[Step], move: Move) -> str:
+    """The source must never run again beside its image, and nothing else is begun."""
+    if any(isinstance(step, Start) for step in all_steps(plan.steps)):
+        return "a checkpoint starts an instance"
+    if not any(isinstance(step, Stop) and step.instance == move.source for step in after):
+        return "a checkpoint does not stop its source after the commit"
+    return ""
+
+
+def _step_fault(step: Step, move: Move) -> str:
+    if isinstance(step, Commit):
+        return ""
+    if not 0.0 < step.timeout < inf:
+        return "has no time-out"
+    if isinstance(step, Configure):
+        return ""
+    hosts = {move.source_host, move.destination_host}
+    if step.host not in hosts:
+        return f"names the host {step.host!r}, not one of {sorted(hosts)}"
+    numbered = (move.source, move.destination, move.fallback)
+    if not isinstance(step, Execute) and step.instance not in numbered:
+        return f"names the instance {step.instance}, which is not of this move"
+    if isinstance(step, Start) and step.restored and step.instance != move.destination:
+        return "restores an instance that is not the destination"
+    if isinstance(step, Start) and step.shadow:
+        return _shadow_fault(step, move)
+    return ""
+
+
+def _shadow_fault(step: Start, move: Move) -> str:
+    if step.instance != move.destination:
+        return "starts a shadow that is not the destination"
+    if step.node_name in ("", move.spec.name, move.source_node):
+        return "starts a shadow without an alias"
+    return ""
+
+
+def _handoff_fault(step: Step) -> str:
+    """A source that has fallen silent is told to go on only when the destination never will."""
+    if not isinstance(step, Configure):
+        return ""
+    if step.phase not in _FORWARD:
+        return f"it says {step.phase.name} on the way forward"
+    undo = step.undo
+    aborts = isinstance(undo, Configure) and undo.phase is HandoffPhase.ABORT and undo.awaited
+    if step.phase is HandoffPhase.SWITCH and not aborts:
+        return "it says SWITCH, and its undo is not ABORT"
+    return ""
+
+
+def executors_of(plan: Plan) -> Iterator[tuple[str, str]]:
+    """Return the executors that a plan names, those of its undo too, with their hosts."""
+    for step in all_steps(plan.steps):
+        if isinstance(step, Execute):
+            yield step.executor, step.host
+
+
+def all_steps(steps: Iterable[Step]) -> Iterator[Step]:
+    """Steps with their undo, the undo of that, and so on."""
+    for step in steps:
+        current: Step | None = step
+        while current is not None:
+            yield current
+            current = current.undo

@@ -1,0 +1,375 @@
+"""The shadow: it follows the source's state, and becomes active when the source is silent."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from functools import partial
+from math import inf
+from typing import Any, Final
+
+from rosrm.node.entities import waiting
+from rosrm.node.handoff import channel as topics
+from rosrm.node.handoff.channel import Channel
+from rosrm.node.handoff.snapshot_assembler import Cut, CutAssembler
+from rosrm.node.handoff.state_parts import Part, StateError
+from rosrm.node.managed_node import Member
+from rosrm.node.steady_timer import steady_timer
+from rosrm.version import PROTOCOL_VERSION
+from rosrm_msgs.msg import HandoffReport, StateConfig, StateMark
+
+#: Seconds without a message after which an input counts as idle.
+_IDLE: Final = 1.0
+#: Seconds without a part or mark after which nothing more of an ended source is to come.
+_QUIET: Final = 0.2
+#: Seconds for which all readers have to be matched. A reader learns of a writer after the writer
+#: of it: 0.4 s later on a busy machine, and where the word of it got lost, as late as Fast DDS says
+#: it again (with 0.5 s here, outputs came 1.3 to 1.9 s late in 5 of 200 moves beside other load).
+_MATCHED: Final = 1.5
+#: Seconds between two looks at what is still waited for.
+_REVIEW: Final = 0.1
+
+
+class Destination:
+    """What a shadow does until it is active.
+
+    Args:
+        member: the node.
+        parts: of its state.
+        mark_topic: fully qualified.
+        activated: called when the node is active.
+    """
+
+    def __init__(
+        self, member: Member, parts: list[Part], mark_topic: str, activated: Callable[[], None]
+    ) -> None:
+        self._member = member
+        self._parts = parts
+        self._mark_topic = mark_topic
+        self._activated = activated
+        self._channel: Channel | None = None
+        self._assembler: CutAssembler | None = None
+        self._followed: list[tuple[Any, Callable[[Any], None]]] = []
+        self._timer: Any = None
+        self._cut: Cut | None = None
+        self._run = 0
+        self._attached = False
+        self._silent_at: int | None = None
+        self._alone = False
+        self._active = False
+        self._heard_at = 0.0
+        self._matched_at = inf
+        self._was_ready = False
+        self._may_switch = False
+        self._over = False
+        self._fault = ""
+        member.on_overflow = self._overflowed
+
+    # --- the master's word -----------------------------------------------------------------
+
+    def configure(self, config: StateConfig) -> None:
+        """The master says something of the handoff to here."""
+        channel = self._channel
+        if channel is None:
+            channel = self._open(config)
+        else:
+            channel.repeat()  # perhaps another master asks, after the first was lost
+        if config.phase == StateConfig.DONE:
+            self.close()
+        elif self._over:
+            if config.phase == StateConfig.ABORT and not self._active:
+                channel.say(HandoffReport.ABORTED, self._sequence(), self._fault)
+        elif config.phase == StateConfig.SWITCH:
+            self._may_switch = True
+            self._review()
+        elif config.phase == StateConfig.TAKE_OVER:
+            self._alone = True
+            self._review()
+        elif config.phase in (StateConfig.ABORT, StateConfig.RESUME):
+            self._end(HandoffReport.ABORTED, "the master called it off")
+
+    def _open(self, config: StateConfig) -> Channel:
+        member = self._member
+        channel = self._channel = Channel(
+            member.plain, config.channel, config.destination, member.identity.instance,
+            config.source, self._heard,
+        )  # fmt: skip
+        if self._over:
+            channel.say(HandoffReport.FAILED, 0, self._fault)
+            return channel
+        self._assembler = CutAssembler()
+        # Marks first, also in catching up: they say which parts are worth keeping.
+        self._follow(StateMark, self._mark_topic, self._take_mark, topics.MARK)
+        for part in self._parts:
+            self.follow_part(part)
+        if not self._over:
+            self._timer = steady_timer(member.plain, _REVIEW, self._look)
+            self._review()
+        return channel
+
+    def follow_part(self, part: Part) -> None:
+        """A part of the state, perhaps one that the author names later than the others."""
+        if self._assembler is not None:
+            take = partial(self._assembler.add_part, part.topic)
+            self._assembler.expect(part.topic)
+            self._follow(part.message_type, part.topic, take, topics.STATE_FOLLOWED, raw=True)
+
+    def _follow(
+        self, message_type: Any, topic: str, take: Callable[[Any], None], qos: Any, *,
+        raw: bool = False,
+    ) -> None:  # fmt: skip
+        if self._over:
+            return
+        subscribe = self._member.plain.create_subscription
+        try:
+            subscription = subscribe(
+                message_type, topic, partial(self._came, take), qos, raw=raw,
+                event_callbacks=topics.NO_SUBSCRIPTION_EVENTS,
+            )  # fmt: skip
+            self._followed.append((subscription, take))
+        except Exception as error:  # noqa: BLE001 - rclpy raises what the middleware says
+            # An entity of the author's may have another type on that topic.
+            self._end(HandoffReport.FAILED, f"{topic} cannot be followed: {error}")
+
+    # --- the source's word -----------------------------------------------------------------
+
+    def _heard(self, report: HandoffReport) -> None:
+        with self._member.turn:
+            if self._over:
+                return
+            if report.phase == HandoffReport.ATTACHED:
+                self._attached = True
+            elif report.phase == HandoffReport.SILENT:
+                self._silent_at = report.sequence
+            elif report.phase == HandoffReport.FAILED:
+                self._end(HandoffReport.FAILED, f"the source cannot go on: {report.message}")
+            self._go_on()
+
+    def _came(self, take: Callable[[Any], None], message: Any) -> None:
+        with self._member.turn:
+            if self._over:
+                return
+            take(message)
+            self._catch_up()
+            self._heard_at = time.monotonic()
+            self._go_on()
+
+    def _catch_up(self) -> None:
+        """Take all that has come: one by one, a source of many cycles would always be ahead."""
+        for subscription, take in self._followed:
+            for message, _ in waiting(subscription):
+                if self._over:
+                    return
+                take(message)
+
+    def _take_mark(self, mark: StateMark) -> None:
+        fault = self._fault_of(mark)
+        if fault:
+            self._end(HandoffReport.FAILED, fault)
+        elif self._assembler is not None:
+            self._run = mark.run
+            self._assembler.add_mark(mark, time.monotonic())
+
+    def _fault_of(self, mark: StateMark) -> str:
+        """Why the source's state cannot be this node's; "": it can."""
+        if mark.protocol_version != PROTOCOL_VERSION:
+            return (
+                f"the source speaks protocol version {mark.protocol_version}, this node "
+                f"{PROTOCOL_VERSION}: both need the same version of rosrm"
+            )
+        if self._run and mark.run != self._run:
+            return "the source was started again, and its state is a new one"
+        theirs = {part.topic: part.type for part in mark.parts}
+        ours = {part.topic: part.type_name for part in self._parts}
+        for topic in sorted(ours.keys() | theirs.keys()):
+            if theirs.get(topic) != ours.get(topic):
+                return (
+                    f"the state on {topic} is {theirs.get(topic, 'none')} at the source, and "
+                    f"{ours.get(topic, 'none')} here: both must be the same program"
+                )
+        return ""
+
+    # --- following -------------------------------------------------------------------------
+
+    def _look(self) -> None:
+        with self._member.turn:
+            if not self._over:
+                self._review()
+
+    def _go_on(self) -> None:
+        """Restore the newest state, if there is a new one, and see what follows."""
+        if self._over or self._assembler is None:
+            return
+        cut = self._assembler.take()
+        if cut is not None and not self._restore(cut):
+            return
+        self._review()
+
+    def _restore(self, cut: Cut) -> bool:
+        try:
+            for part in self._parts:
+                part.restore_changed(cut.parts[part.topic])
+        except StateError as error:
+            self._end(HandoffReport.FAILED, str(error))
+            return False
+        self._cut = cut
+        now = time.monotonic()
+        for mark in (*cut.passed, cut.mark):
+            for covered in mark.inputs:
+                self._member.buffer.cover(
+                    covered.topic, covered.covered, single=covered.publishers <= 1, now=now
+                )
+        return True
+
+    def _review(self) -> None:
+        """Say how far it is, ask for silence when it may, and become active on it."""
+        if self._channel is None or self._over:
+            return
+        if self._alone:
+            self._take_over_when_quiet()
+            return
+        if not self._was_ready:
+            missing = self._still_missing()
+            if missing:
+                self._channel.say(HandoffReport.SHADOWING, 0, f"waits {missing}")
+                return
+            self._was_ready = True
+            self._channel.say(HandoffReport.READY, self._sequence())
+        if not self._may_switch:
+            return
+        if self._cut is not None and self._is_last(self._cut):
+            self._activate_if_complete()
+        else:
+            self._channel.say(HandoffReport.SWITCHING, self._sequence())
+
+    def _is_last(self, cut: Cut) -> bool:
+        """Of this handoff: what an earlier one ended with is latched too."""
+        return bool(cut.mark.last) and cut.mark.sequence == self._silent_at
+
+    def _sequence(self) -> int:
+        return int(self._cut.mark.sequence) if self._cut is not None else 0
+
+    def _still_missing(self) -> str:
+        """What keeps this node from being ready, in words; "": nothing."""
+        if not self._attached:
+            return "for the source to answer: is it up, and does it use rosrm.node?"
+        if self._cut is None:
+            return self._missing_state()
+        now = time.monotonic()
+        missing = self._missing_peers(self._cut.mark)
+        if missing:
+            self._matched_at = inf
+            return missing
+        self._matched_at = min(self._matched_at, now)
+        if now - self._matched_at < _MATCHED:
+            return "a moment: its peers may not know it yet"
+        for covered in self._cut.mark.inputs:
+            if not self._follows(covered.topic, now):
+                return f"until a message on {covered.topic} has been here and in the state"
+        lossy = self._member.input_with_gap()
+        if lossy:
+            return f"until the state covers a message on {lossy} that did not come here"
+        return ""
+
+    def _missing_peers(self, mark: StateMark) -> str:
+        """Who is matched with the source, and not with this node."""
+        readers = {one.topic_name: one.get_subscription_count() for one in self._member.outputs}
+        for output in mark.outputs:
+            if readers.get(output.topic, output.subscriptions) < output.subscriptions:
+                return (
+                    f"for the readers of {output.topic}: {readers[output.topic]} of "
+                    f"{output.subscriptions} matched"
+                )
+        writers = {one.key: one.subscription.get_publisher_count() for one in self._member.inputs}
+        for covered in mark.inputs:
+            if writers.get(covered.topic, covered.publishers) < covered.publishers:
+                return (
+                    f"for the publishers of {covered.topic}: {writers[covered.topic]} of "
+                    f"{covered.publishers} matched"
+                )
+        return ""
+
+    def _missing_state(self) -> str:
+        missing = self._assembler.missing() if self._assembler is not None else []
+        if missing:
+            return f"for the state on {', '.join(missing)}"
+        return f"for the first state, marked on {self._mark_topic}"
+
+    def _follows(self, topic: str, now: float) -> bool:
+        """Whether no message of an input can be missing both here and in the state."""
+        buffer = self._member.buffer
+        if all(one.key != topic for one in self._member.inputs) or buffer.overlaps(topic):
+            return True
+        return buffer.is_idle(topic, now, self._matched_at, _IDLE)
+
+    # --- the end ---------------------------------------------------------------------------
+
+    def _take_over_when_quiet(self) -> None:
+        """The source is no more: what of its state is on its way still counts."""
+        if time.monotonic() - self._heard_at < _QUIET:
+            return
+        if self._cut is None:
+            self._end(HandoffReport.FAILED, "the source ended before a state of it was here")
+        else:
+            self._activate()
+
+    def _activate_if_complete(self) -> None:
+        self._member.catch_up()
+        lossy = self._member.input_with_gap()
+        if lossy:
+            self._end(
+                HandoffReport.FAILED,
+                f"a message on {lossy} did not come here, and the source has not processed it: "
+                f"its subscription needs a greater depth, or this host is too busy",
+            )
+        elif not self._over:
+            self._activate()
+
+    def _activate(self) -> None:
+        member, cut = self._member, self._cut
+        if cut is None:
+            return
+        self._over = self._active = True
+        member.sequence = self._sequence()
+        for covered in cut.mark.inputs:
+            member.inherit(covered.topic, covered.covered)
+        passed = time.monotonic() - cut.arrived
+        due = [None if ns < 0 else ns / 1e9 - passed for ns in cut.mark.timers_due]
+        # What waits is served first: to let go of the source, and to become one, takes its time.
+        member.become_active(due, self._say_active, (self._unfollow, self._activated))
+
+    def _say_active(self) -> None:
+        if self._channel is not None:
+            self._channel.say(HandoffReport.ACTIVE, self._sequence())
+
+    def _end(self, phase: int, message: str) -> None:
+        """It will never be active; only its slave ends it."""
+        self._over, self._fault = True, message
+        self._member.node.get_logger().warning(f"will not take over: {message}")
+        if self._channel is not None:
+            self._channel.say(phase, self._sequence(), message)
+        self._unfollow()
+
+    def _overflowed(self, topic: str) -> None:
+        if not self._over:
+            self._end(
+                HandoffReport.FAILED,
+                f"more came on {topic} than can be kept until the source's state covers it",
+            )
+
+    def _unfollow(self) -> None:
+        destroy = self._member.plain.destroy_subscription
+        for subscription, _ in self._followed:
+            destroy(subscription)
+        self._followed = []
+        if self._timer is not None:
+            self._member.plain.destroy_timer(self._timer)
+            self._timer = None
+        self._assembler = None
+        self._cut = None
+
+    def close(self) -> None:
+        """The handoff is over."""
+        if self._channel is not None:
+            self._channel.close()
+            self._channel = None

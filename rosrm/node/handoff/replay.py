@@ -1,0 +1,83 @@
+"""Serves what was kept for a node that goes on, in slices: its timers go on meanwhile."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from typing import Any, Final
+
+from rosrm.node.steady_timer import steady_timer
+
+#: Seconds of one slice; a callback that is begun is finished.
+_SLICE: Final = 0.02
+#: There is no further step.
+_OVER: Final = object()
+
+
+class Replay:
+    """What was kept is served by the executor, as all else: what a callback raises is the author's.
+
+    Args:
+        plain: rclpy's own methods of the node.
+        turn: held while a callback runs.
+        serve_next: serves what was kept longest; False: nothing is left.
+    """
+
+    def __init__(self, plain: Any, turn: Any, serve_next: Callable[[], bool]) -> None:
+        self._plain = plain
+        self._turn = turn
+        self._serve_next = serve_next
+        self._timer: Any = None
+        self._beside: Iterator[None] = iter(())
+        self._then: Callable[[], None] = _nothing
+        self._counted = 0
+
+    @property
+    def is_on(self) -> bool:
+        """There is, or may be, something that was kept: what comes now has to wait behind it."""
+        return self._timer is not None
+
+    def begin(self, beside: Iterator[None]) -> None:
+        """Serve all that is kept, from the executor's next round on.
+
+        Args:
+            beside: does what else there is to be done; it is taken a step further after each slice.
+        """
+        self._beside = beside
+        self._start()
+
+    def serve(self, count: int, then: Callable[[], None]) -> None:
+        """Serve so many, then call; what is left, and comes meanwhile, is served after it."""
+        self._counted, self._then = count, then
+        self._start()
+
+    def _start(self) -> None:
+        if self._timer is None:
+            self._timer = steady_timer(self._plain, 0.0, self._serve_slice)
+
+    def _serve_slice(self) -> None:
+        with self._turn:
+            if self._timer is None:
+                return
+            try:
+                more = self._serve_until(time.monotonic() + _SLICE)
+            finally:
+                steps = next(self._beside, _OVER) is not _OVER
+            if not more or self._counted <= 0:
+                then, self._then = self._then, _nothing
+                then()
+            if not (more or steps):
+                self._plain.destroy_timer(self._timer)
+                self._timer = None
+
+    def _serve_until(self, end: float) -> bool:
+        """Whether there may be more."""
+        while self._serve_next():
+            self._counted -= 1
+            if self._counted == 0 or time.monotonic() >= end:
+                return True
+        return False
+
+
+def _nothing() -> None:
+    """Nobody waits for it."""

@@ -1,0 +1,129 @@
+"""What a node that can be moved hears of the master, and which role it has."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Final
+
+from rosrm.node.handoff import channel as topics
+from rosrm.node.handoff.destination import Destination
+from rosrm.node.handoff.source import Source
+from rosrm.node.handoff.state_parts import ParametersPart, Part
+from rosrm.node.identity import Identity
+from rosrm.node.managed_node import Member
+from rosrm.node.snapshots.restore import Revival, kept_state
+from rosrm.version import PROTOCOL_VERSION
+from rosrm_msgs.msg import StateConfig
+
+_MARK: Final = "_rosrm/mark"
+_PARAMETERS: Final = "_rosrm/parameters"
+
+
+class Handoff:
+    """One node in its handoffs: first perhaps as a destination, later as a source.
+
+    Args:
+        node: the author's.
+        plain: rclpy's own methods of it.
+        identity: that rosrm gave this process.
+    """
+
+    def __init__(self, node: Any, plain: Any, identity: Identity) -> None:
+        self._kept, self._damaged = kept_state(identity)
+        resting = identity.shadow or self._kept is not None
+        self.member = Member(node, plain, identity, resting=resting)
+        self.identity = identity
+        self._epoch = identity.epoch
+        self._parts: list[Part] = []
+        self._source: Source | None = None
+        self._destination: Destination | None = None
+        self._refused: set[str] = set()
+        self._subscription: Any = None
+
+    def begin(self) -> None:
+        """The node is made; its author's constructor may go on."""
+        node = self.member.node
+        for fault in self._damaged:
+            node.get_logger().warning(f"a kept state is damaged, and left alone: {fault}")
+        self._parts.append(ParametersPart(self._own(_PARAMETERS), node))
+        if self.identity.shadow:
+            self._destination = Destination(
+                self.member, self._parts, self._own(_MARK), self._become_source
+            )
+        elif self._kept is not None:
+            Revival(self.member, self._parts, self._kept, self._become_source)
+        else:
+            self._become_source()
+        self._subscription = self.member.plain.create_subscription(
+            StateConfig, self.identity.state_config, self._configured, topics.STATE_CONFIG
+        )
+
+    def _own(self, path: str) -> str:
+        return f"{self.member.visible_node}/{path}"
+
+    def _become_source(self) -> None:
+        self._kept = None
+        self._source = Source(self.member, self._parts, self._own(_MARK))
+
+    def keep_state(
+        self, topic: str, message_type: Any, save: Callable[[], Any], restore: Callable[[Any], None]
+    ) -> None:
+        """The author names a topic of the state."""
+        resolve = self.member.node.resolve_topic_name
+        full = resolve(self.member.visible(topic, resolve))
+        if any(part.topic == full for part in self._parts):
+            raise ValueError(f"keep_state: {full} is named twice; each part has a topic of its own")
+        part = Part(full, message_type, save, restore)
+        self._parts.append(part)
+        if self._source is not None:
+            self._source.add_part(part)
+        elif self._destination is not None:
+            self._destination.follow_part(part)
+
+    # --- state_config ----------------------------------------------------------------------
+
+    def _configured(self, config: StateConfig) -> None:
+        own = self.identity
+        if config.process != own.process or own.instance not in (config.source, config.destination):
+            return
+        fault = self._fault_of(config)
+        if fault:
+            self._refuse(fault)
+            return
+        self._epoch = config.epoch
+        role = self._destination if own.instance == config.destination else self._source
+        if role is None:
+            return
+        with self.member.turn:
+            try:
+                role.configure(config)
+            except Exception as error:  # noqa: BLE001 - no word of the master ends the author's node
+                what = f"{type(error).__name__}: {error}"
+                self.member.node.get_logger().error(f"a state_config cannot be followed: {what}")
+
+    def _fault_of(self, config: StateConfig) -> str:
+        """Why this is not our master's word; "": it is."""
+        if config.protocol_version != PROTOCOL_VERSION:
+            return (
+                f"its protocol version is {config.protocol_version}, this node's {PROTOCOL_VERSION}"
+            )
+        if config.cluster != self.identity.cluster:
+            return f"it is of {config.cluster!r}, and {self.identity.cluster!r} started this node"
+        if config.epoch < self._epoch:
+            return f"it is of epoch {config.epoch}, and this is epoch {self._epoch}"
+        if not config.channel:
+            return "it names no channel"
+        return ""
+
+    def _refuse(self, fault: str) -> None:
+        if fault not in self._refused:
+            self._refused.add(fault)
+            self.member.node.get_logger().warning(f"a state_config is left alone: {fault}")
+
+    def close(self) -> None:
+        """The node is destroyed."""
+        for role in (self._source, self._destination):
+            if role is not None:
+                role.close()
+        if self._source is not None:
+            self._source.end()

@@ -1,0 +1,259 @@
+"""The active node: it shows its state to whoever follows, and falls silent when it is asked to."""
+
+from __future__ import annotations
+
+import random
+import time
+from array import array
+from collections.abc import Callable
+from typing import Any, Final
+
+from rclpy.duration import Duration
+
+from rosrm.node.handoff import channel as topics
+from rosrm.node.handoff.channel import Channel
+from rosrm.node.handoff.state_parts import Part, StateError
+from rosrm.node.managed_node import Member, Mode
+from rosrm.node.snapshots.writer import LARGEST_PART, Keeper
+from rosrm.node.steady_timer import steady_timer
+from rosrm.version import PROTOCOL_VERSION
+from rosrm_msgs.msg import CoveredInput, HandoffReport, MatchedOutput, StateConfig, StateMark
+
+#: Seconds that a silent source waits for its last outputs to be acknowledged: readers are asked
+#: every 3 s by Fast DDS's default.
+_LAST_WORDS: Final = 4.0
+#: Seconds between two looks.
+_LOOK: Final = 0.05
+_AT_ONCE: Final = Duration(nanoseconds=0)
+
+
+class Source:
+    """What the active node does for a successor.
+
+    Args:
+        member: the node.
+        parts: of its state.
+        mark_topic: fully qualified.
+    """
+
+    def __init__(self, member: Member, parts: list[Part], mark_topic: str) -> None:
+        self._member = member
+        self._parts = parts
+        self._run = random.getrandbits(63) | 1
+        self._channel: Channel | None = None
+        self._attached = False
+        self._may_switch = False
+        self._asked = False
+        self._finishing = False
+        self._fault = ""
+        self._timers_due: list[int] = []
+        self._silent_since = 0.0
+        self._look_again: Any = None
+        plain = member.plain
+        self._marks = plain.create_publisher(StateMark, mark_topic, topics.MARK)
+        for part in parts:
+            part.publisher = plain.create_publisher(part.message_type, part.topic, topics.STATE)
+            part.retained = bool(member.identity.keep)
+        self._keeper = Keeper(member, parts, self._run) if member.identity.keep else None
+        member.on_cycle = self._after_cycle
+        member.on_overflow = self._overflowed
+
+    def add_part(self, part: Part) -> None:
+        """The author names another topic of the state."""
+        part.publisher = self._member.plain.create_publisher(
+            part.message_type, part.topic, topics.STATE
+        )
+        part.retained = self._keeper is not None
+
+    # --- the state -------------------------------------------------------------------------
+
+    def _after_cycle(self) -> None:
+        if not self._fault:
+            self._show_to_followers()
+        if self._keeper is not None:
+            self._keeper.after_cycle()
+
+    def _show_to_followers(self) -> None:
+        if self._attached or self._marks.get_subscription_count():
+            self._show()
+        else:
+            self._show_single_parts()
+
+    def _show(self, *, last: bool = False) -> bool:
+        """Publish the state between two cycles, and the mark that says what it covers.
+
+        Returns:
+            False: it cannot be shown; the master has been told why.
+        """
+        try:
+            for part in self._parts:
+                part.publish(LARGEST_PART)
+        except StateError as error:
+            self._failed(str(error))
+            return False
+        self._marks.publish(self._mark(last=last))
+        return True
+
+    def _show_single_parts(self) -> None:
+        for part in self._parts:
+            if part.has_reader():
+                try:
+                    part.publish(LARGEST_PART)
+                except StateError as error:
+                    self._member.node.get_logger().error(str(error), throttle_duration_sec=10.0)
+
+    def _failed(self, fault: str) -> None:
+        """The state cannot be shown: this handoff fails, the node goes on."""
+        if not self._fault:
+            self._member.node.get_logger().error(f"{fault}. This node stays where it is")
+        self._fault = fault
+        if self._channel is not None:
+            self._channel.say(HandoffReport.FAILED, self._member.sequence, fault)
+
+    def _mark(self, *, last: bool) -> StateMark:
+        member = self._member
+        due = self._still_due() if last else member.timers_due()
+        return StateMark(
+            protocol_version=PROTOCOL_VERSION, run=self._run, sequence=member.sequence, last=last,
+            parts=[part.described() for part in self._parts],
+            inputs=[
+                CoveredInput(
+                    topic=one.key, publishers=one.subscription.get_publisher_count(),
+                    covered=array("q", one.covered),
+                )
+                for one in member.inputs if one.buffered
+            ],
+            outputs=[
+                MatchedOutput(
+                    topic=one.topic_name, subscriptions=one.get_subscription_count()
+                )
+                for one in member.outputs
+            ],
+            timers_due=array("q", due),
+        )  # fmt: skip
+
+    def _still_due(self) -> list[int]:
+        """To save a large state takes its time."""
+        passed = int((time.monotonic() - self._silent_since) * 1e9)
+        return [due if due < 0 else max(0, due - passed) for due in self._timers_due]
+
+    # --- a handoff -------------------------------------------------------------------------
+
+    def configure(self, config: StateConfig) -> None:
+        """The master says something of a handoff away from here."""
+        if self._channel is None or self._channel.topic != config.channel:
+            if config.phase not in (StateConfig.SHADOW, StateConfig.SWITCH, StateConfig.RESUME):
+                return
+            self._open(config)
+        else:
+            self._channel.repeat()
+        if config.phase == StateConfig.SWITCH:
+            self._may_switch = True
+            self._switch()
+        elif config.phase == StateConfig.RESUME:
+            self._resume()
+        elif config.phase == StateConfig.DONE:
+            self.close()
+
+    def _open(self, config: StateConfig) -> None:
+        self.close()
+        self._fault = ""
+        self._channel = Channel(
+            self._member.plain, config.channel, config.destination,
+            self._member.identity.instance, config.destination, self._heard,
+        )  # fmt: skip
+
+    def _heard(self, report: HandoffReport) -> None:
+        with self._member.turn:
+            if report.phase == HandoffReport.SHADOWING:
+                self._attach()
+            elif report.phase == HandoffReport.SWITCHING:
+                self._asked = True
+                self._switch()
+            elif report.phase == HandoffReport.ACTIVE and self._member.mode is Mode.SILENT:
+                self._member.close_services()
+
+    def _attach(self) -> None:
+        if self._channel is None or self._attached or self._member.mode is not Mode.ACTIVE:
+            return
+        self._attached = True
+        if self._show():
+            self._channel.say(HandoffReport.ATTACHED, self._member.sequence)
+
+    def _switch(self) -> None:
+        """Fall silent, once both the master and the destination want it."""
+        if self._channel is None or not (self._may_switch and self._asked) or self._fault:
+            return
+        if self._member.mode is Mode.ACTIVE and not self._finishing:
+            self._finishing = True
+            self._member.serve_what_has_come(self._fall_silent)
+
+    def _fall_silent(self) -> None:
+        member, wanted = self._member, self._finishing
+        self._finishing = False
+        if self._channel is None or not wanted or self._fault:
+            return  # called off meanwhile
+        self._timers_due = member.fall_silent()
+        self._silent_since = time.monotonic()
+        if not self._show(last=True):
+            self._go_on(_nothing)
+            return
+        self._channel.say(HandoffReport.SILENT, member.sequence)
+        self._look_again = steady_timer(member.plain, _LOOK, self._release_when_heard)
+
+    def _release_when_heard(self) -> None:
+        """What is not acknowledged is lost when this node is stopped."""
+        with self._member.turn:
+            heard = all(one.wait_for_all_acked(_AT_ONCE) for one in self._member.outputs)
+            if heard or time.monotonic() - self._silent_since >= _LAST_WORDS:
+                self._look_no_more()
+                if self._channel is not None:
+                    self._channel.say(HandoffReport.RELEASED, self._member.sequence)
+
+    def _look_no_more(self) -> None:
+        if self._look_again is not None:
+            self._member.plain.destroy_timer(self._look_again)
+            self._look_again = None
+
+    def _resume(self) -> None:
+        self._may_switch = self._asked = self._attached = self._finishing = False
+        self._look_no_more()
+        if self._member.mode is Mode.SILENT:
+            # A shadow of a later handoff must not take the last mark for its own.
+            self._marks.publish(self._mark(last=False))
+            self._go_on(self._say_resumed)
+        else:
+            self._say_resumed()
+
+    def _say_resumed(self) -> None:
+        if self._channel is not None:
+            self._channel.say(HandoffReport.RESUMED, self._member.sequence)
+
+    def _go_on(self, announce: Callable[[], None]) -> None:
+        passed = time.monotonic() - self._silent_since
+        due = [None if ns < 0 else ns / 1e9 - passed for ns in self._timers_due]
+        self._member.become_active(due, announce)
+
+    def _overflowed(self, topic: str) -> None:
+        self._member.node.get_logger().error(
+            f"silent for its successor, and the buffer of {topic} is full: a message is lost",
+            throttle_duration_sec=1.0,
+        )
+
+    def close(self) -> None:
+        """The handoff is over."""
+        self._fault = ""
+        self._look_no_more()
+        self._may_switch = self._asked = self._attached = self._finishing = False
+        if self._channel is not None:
+            self._channel.close()
+            self._channel = None
+
+    def end(self) -> None:
+        """The node is destroyed."""
+        if self._keeper is not None:
+            self._keeper.close()
+
+
+def _nothing() -> None:
+    """The failure has been told."""

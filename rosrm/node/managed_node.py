@@ -1,0 +1,398 @@
+"""A node that rosrm may move: what stands between the author's callbacks and ROS.
+
+At any time it is active (everything goes straight through), a shadow (its inputs are kept, nothing
+of it is heard), or silent (the same, of a source whose successor may be active). Each callback of
+the author is one cycle, and cycles never overlap, so that a state always lies between two of them.
+"""
+
+from __future__ import annotations
+
+import itertools
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from enum import Enum
+from typing import Any, Final
+
+from rclpy.executors import MultiThreadedExecutor
+
+from rosrm.node.entities import (
+    Gate,
+    GatedPublisher,
+    Held,
+    Input,
+    OpeningOf,
+    ServiceOf,
+    TimerOf,
+    refuse_coroutine,
+    size_of,
+    waiting,
+    wants_all,
+    wants_info,
+)
+from rosrm.node.handoff.buffer import InputBuffer, Sent
+from rosrm.node.handoff.replay import Replay
+from rosrm.node.identity import Identity
+
+#: Most messages of one input, and most bytes of all, that are kept for a successor: a silent source
+#: whose destination is stuck may have to keep half a minute of a fast sensor.
+BUFFER_LIMIT: Final = 100_000
+BUFFER_BYTES: Final = 512 << 20
+#: rclpy's own, which every node has for itself.
+_INTERNAL: Final = frozenset({"/parameter_events", "/clock", "/rosout"})
+#: Seconds after becoming active in which a message may still come that the source has processed.
+#: Not longer: the clock of a publisher may be set back.
+_LATE: Final = 10.0
+
+
+class Mode(Enum):
+    """What a node does."""
+
+    ACTIVE = "active"
+    SHADOW = "shadow"
+    SILENT = "silent"
+
+
+class Member:
+    """The author's entities of one node.
+
+    Args:
+        node: the author's.
+        plain: rclpy's own methods of it.
+        identity: that rosrm gave this process.
+        resting: it is not active yet: a shadow, or it goes on from a kept state first.
+
+    Attributes:
+        turn: held while a callback runs.
+        sequence: cycles so far.
+        in_cycle: a callback of the author has begun and not ended; still so where it raised.
+        on_cycle: called after each cycle.
+        on_overflow: called with the topic of an input for which there was no more room.
+    """
+
+    def __init__(self, node: Any, plain: Any, identity: Identity, *, resting: bool) -> None:
+        self.node = node
+        self.plain = plain
+        self.identity = identity
+        self.turn = threading.RLock()
+        self.mode = Mode.SHADOW if resting else Mode.ACTIVE
+        self.sequence = 0
+        self.in_cycle = False
+        self._late_until = 0.0
+        self.inputs: list[Input] = []
+        self.outputs: list[Any] = []
+        self.timers: list[TimerOf] = []
+        self.on_cycle: Callable[[], None] = _nothing
+        self.on_overflow: Callable[[str], None] = _ignore
+        self._gate = Gate(self.mode is Mode.ACTIVE)
+        self._openings: list[ServiceOf | OpeningOf] = []
+        self._replay = Replay(plain, self.turn, self._serve_next)
+        self.buffer = self._new_buffer()
+
+    @property
+    def visible_node(self) -> str:
+        """Fully qualified name under which others know this node."""
+        return self.identity.node or str(self.node.get_fully_qualified_name())
+
+    def visible(self, name: str, resolve: Callable[[str], str]) -> str:
+        """A name as the author gave it, freed of the alias that this node may run under."""
+        own = f"{self.node.get_fully_qualified_name()}/"
+        resolved = resolve(name)
+        if not resolved.startswith(own) or own == f"{self.visible_node}/":
+            return name
+        return f"{self.visible_node}/{resolved[len(own) :]}"
+
+    def _new_buffer(self) -> InputBuffer:
+        return InputBuffer(BUFFER_LIMIT, BUFFER_BYTES, time.monotonic())
+
+    # --- what the author creates -----------------------------------------------------------
+
+    def create_publisher(self, message_type: Any, topic: str, qos: Any, **rest: Any) -> Any:
+        """Create a publisher that can fall silent."""
+        wanted = rest.pop("publisher_class", GatedPublisher)
+        if not issubclass(wanted, GatedPublisher):
+            wanted = type(wanted.__name__, (GatedPublisher, wanted), {})
+        topic = self.visible(topic, self.node.resolve_topic_name)
+        publisher = self.plain.create_publisher(
+            message_type, topic, qos, publisher_class=wanted, **rest
+        )
+        publisher.gate = self._gate
+        if topic not in _INTERNAL:
+            self.outputs.append(publisher)
+        return publisher
+
+    def create_subscription(
+        self, message_type: Any, topic: str, callback: Callable[..., Any], qos: Any, *,
+        buffer: bool, **rest: Any,
+    ) -> Any:  # fmt: skip
+        """Create an input, whose messages are kept while this node is not active."""
+        if topic in _INTERNAL:
+            return self.plain.create_subscription(message_type, topic, callback, qos, **rest)
+        refuse_coroutine(callback, topic)
+        one = Input(callback, wants_info(callback), buffer, wants_all(qos))
+
+        def take(message: Any, info: Any) -> None:
+            self._received(one, message, info)
+
+        topic = self.visible(topic, self.node.resolve_topic_name)
+        one.subscription = self.plain.create_subscription(message_type, topic, take, qos, **rest)
+        one.topic = one.subscription.topic_name
+        one.key = self._new_key(one.topic)
+        self.inputs.append(one)
+        return one.subscription
+
+    def _new_key(self, topic: str) -> str:
+        """A node may subscribe to a topic twice, and each of its inputs has every message."""
+        taken = {one.key for one in self.inputs}
+        numbered = (f"{topic}#{number}" for number in itertools.count(2))
+        return next(key for key in itertools.chain([topic], numbered) if key not in taken)
+
+    def create_timer(
+        self,
+        period: float,
+        callback: Callable[..., Any] | None,
+        *rest: Any,
+        autostart: bool,
+        **named: Any,
+    ) -> Any:
+        """Create a timer that runs while this node is active."""
+        if callback is None:  # rclpy's Rate puts its own in later, and is no cycle
+            return self.plain.create_timer(period, None, *rest, autostart=autostart, **named)
+        refuse_coroutine(callback, f"a timer of {period} s")
+
+        def tick(*arguments: Any) -> None:
+            one.taken += 1
+            with self.turn:
+                one.taken -= 1
+                if self.mode is Mode.ACTIVE:
+                    one.back_in_step()
+                    self._cycle(callback, *arguments)
+
+        active = self.mode is Mode.ACTIVE
+        one = TimerOf(None, autostart)
+        one.timer = self.plain.create_timer(
+            period, tick, *rest, autostart=autostart and active, **named
+        )
+        self.timers.append(one)
+        return one.timer
+
+    def create_service(
+        self, service_type: Any, name: str, callback: Callable[..., Any], **rest: Any
+    ) -> ServiceOf:
+        """Create a service that is open while this node is active."""
+        refuse_coroutine(callback, f"the service {name}")
+        name = self.visible(name, self.node.resolve_service_name)
+
+        def serve(request: Any, response: Any) -> Any:
+            with self.turn:
+                if self.mode is not Mode.ACTIVE:
+                    return Held(request, response)
+                return self._cycle(callback, request, response)
+
+        service = ServiceOf(
+            lambda answer: self.plain.create_service(service_type, name, answer, **rest),
+            self.plain.destroy_service, name, serve,
+        )  # fmt: skip
+        self._add_opening(service)
+        return service
+
+    def when_active(self, create: Callable[[], Any]) -> None:
+        """Have something made that may exist only while this node is active."""
+        self._add_opening(OpeningOf(create))
+
+    def _add_opening(self, opening: ServiceOf | OpeningOf) -> None:
+        self._openings.append(opening)
+        if self.mode is Mode.ACTIVE:
+            opening.open()
+
+    def destroyed(self, entity: Any) -> None:
+        """The author destroyed a publisher, an input, a timer or a service."""
+        self.outputs = [one for one in self.outputs if one is not entity]
+        self.inputs = [one for one in self.inputs if one.subscription is not entity]
+        self.timers = [one for one in self.timers if one.timer is not entity]
+        self._openings = [one for one in self._openings if one is not entity]
+
+    # --- cycles ----------------------------------------------------------------------------
+
+    def _cycle(self, callback: Callable[..., Any], *arguments: Any) -> Any:
+        self.in_cycle = True
+        result = callback(*arguments)
+        self.in_cycle = False
+        self.sequence += 1
+        self.on_cycle()
+        return result
+
+    def _received(self, one: Input, message: Any, info: Any) -> None:
+        with self.turn:
+            if one.buffered and (self.mode is not Mode.ACTIVE or self._replay.is_on):
+                self._keep(one, message, info)
+                if self._may_catch_up(one):
+                    self._catch_up(one)
+            elif self.mode is Mode.ACTIVE and not self._is_late(one, info):
+                self._cycle(one.serve, message, info)
+
+    def _is_late(self, one: Input, info: Any) -> bool:
+        """It was on its way when this node became active, and the source had processed it."""
+        if not self._late_until:
+            return False
+        if time.monotonic() >= self._late_until:
+            self._late_until = 0.0
+            return False
+        return self.buffer.is_marked(one.key, info["source_timestamp"])
+
+    # --- what is kept ----------------------------------------------------------------------
+
+    def _keep(self, one: Input, message: Any, info: Any) -> None:
+        """For who goes on: this node when it becomes active, or again."""
+        sent = Sent(info["source_timestamp"], info["publication_sequence_number"] or None)
+        if not one.is_ordered():
+            self.buffer.mix(one.key)
+        item, now = (one, message, info), time.monotonic()
+        if not self.buffer.add(one.key, sent, item, now, size_of(message)):
+            self.on_overflow(one.topic)
+
+    def _may_catch_up(self, one: Input) -> bool:
+        """No other thread holds an older message; and no node of too much work is given more."""
+        busy = self.mode is Mode.ACTIVE and time.monotonic() >= self._late_until
+        return not busy and (self._is_one_thread() or one.is_ordered())
+
+    def _is_one_thread(self) -> bool:
+        return not isinstance(self.node.executor, MultiThreadedExecutor)
+
+    def _catch_up(self, one: Input) -> None:
+        """Keep what has come: a reader has less room than the buffer, and drops the oldest."""
+        for message, info in waiting(one.subscription):
+            self._keep(one, message, info)
+
+    def catch_up(self) -> None:
+        """Keep what has come on every input that is kept at all, as far as that is known."""
+        if self._is_one_thread():
+            for one in self.inputs:
+                if one.buffered:
+                    self._catch_up(one)
+
+    def input_with_gap(self) -> str:
+        """An input that is to have every message, and misses one for good; "": there is none."""
+        wanting = (one for one in self.inputs if one.buffered and one.wants_all)
+        return next((one.topic for one in wanting if self.buffer.misses_one(one.key)), "")
+
+    def serve_what_has_come(self, then: Callable[[], None]) -> None:
+        """Before falling silent: a shadow that joined later never had what waits here since.
+
+        Args:
+            then: called when it is served.
+        """
+        if not self._replay.is_on:
+            self.catch_up()
+        if self.buffer:
+            self._replay.serve(len(self.buffer), then)
+        else:
+            then()
+
+    def _serve_next(self) -> bool:
+        if self.mode is not Mode.ACTIVE:
+            return False
+        if time.monotonic() < self._late_until:
+            self.catch_up()  # later on, a reader's depth is what it is for a busy node
+        kept = self.buffer.take()
+        if kept is not None:
+            one, message, info = kept.item
+            self._cycle(one.serve, message, info)
+            return True
+        return any(one.serve_held() for one in self._openings if isinstance(one, ServiceOf))
+
+    # --- changes of the mode ---------------------------------------------------------------
+
+    def fall_silent(self) -> list[int]:
+        """Stop all that can be heard; returns what `timers_due` was (ns)."""
+        due = self.timers_due()
+        self.mode = Mode.SILENT
+        self._gate.is_open = False
+        if not self.buffer:  # what came while the last was served is for who goes on
+            self.buffer = self._new_buffer()
+        for timer in self.timers:
+            timer.started = not timer.timer.is_canceled()
+            timer.stop()
+        self._close_all(OpeningOf)
+        return due
+
+    def close_services(self) -> None:
+        """The successor answers: what is still sent here would be lost."""
+        self._close_all(ServiceOf)
+
+    def _close_all(self, kind: type[ServiceOf | OpeningOf]) -> None:
+        for opening in self._openings:
+            if isinstance(opening, kind):
+                self._close(opening)
+
+    def _close(self, opening: ServiceOf | OpeningOf) -> None:
+        try:
+            opening.close()
+        except Exception as error:  # noqa: BLE001 - the author's code: anything may come
+            what = f"{type(error).__name__}: {error}"
+            self.node.get_logger().error(f"falling silent, and closing raised {what}")
+
+    def inherit(self, key: str, covered: Iterable[int]) -> None:
+        """What the source had processed of an input is processed here too."""
+        for one in self.inputs:
+            if one.key == key:
+                one.covered.extend(covered)
+
+    def timers_due(self) -> list[int]:
+        """Nanoseconds until each timer is due, in the order of creation; -1: cancelled."""
+        return [timer.due_ns() for timer in self.timers]
+
+    def become_active(
+        self, timers_due: list[float | None], announce: Callable[[], None],
+        settle: Sequence[Callable[[], None]] = (),
+    ) -> None:  # fmt: skip
+        """Go on: first say so, then serve what was kept.
+
+        Args:
+            timers_due: seconds until each timer is due, negative where it is late; None: it was
+                cancelled. Timers beyond the list start now.
+            announce: called at once, as serving may take long.
+            settle: called after the first slices of what was kept, when timers and services go on.
+        """
+        self.mode = Mode.ACTIVE
+        self._gate.is_open = True
+        self._late_until = time.monotonic() + _LATE
+        announce()
+        self._replay.begin(self._go_on(timers_due, time.monotonic(), settle))
+
+    def _go_on(
+        self, timers_due: list[float | None], begun: float, settle: Sequence[Callable[[], None]]
+    ) -> Iterator[None]:
+        """Timers and services, in steps of some ms: what comes meanwhile is served between them."""
+        self._start_timers(timers_due, time.monotonic() - begun)
+        for opening in list(self._openings):
+            yield
+            if self.mode is not Mode.ACTIVE:
+                return
+            if opening in self._openings:
+                opening.open()
+        for call in settle:
+            yield
+            call()
+
+    def _start_timers(self, due: list[float | None], passed: float) -> None:
+        for index, timer in enumerate(list(self.timers)):
+            if index >= len(due):
+                if timer.started:
+                    timer.timer.reset()
+                continue
+            seconds = due[index]
+            if seconds is None:
+                timer.timer.cancel()
+            elif timer.follows_ros_time():
+                timer.timer.reset()  # its seconds are not ours
+            else:
+                timer.start_in(seconds - passed)
+
+
+def _nothing() -> None:
+    """Nobody follows."""
+
+
+def _ignore(_topic: str) -> None:
+    """Nobody follows."""

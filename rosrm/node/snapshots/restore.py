@@ -1,0 +1,128 @@
+"""A node that goes on from the state that was kept of its process, before its first cycle."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Final
+
+from rclpy.serialization import deserialize_message
+
+from rosrm.node.handoff.state_parts import Part, StateError
+from rosrm.node.identity import Identity
+from rosrm.node.managed_node import Member
+from rosrm.node.steady_timer import steady_timer
+from rosrm.snapshots import Kept, newest
+from rosrm.version import PROTOCOL_VERSION
+from rosrm_msgs.msg import StateMark
+
+#: Seconds in which the author's constructor names all parts, should it spin before; between looks.
+_PATIENCE: Final = 10.0
+_LOOK: Final = 0.02
+_REMEDY: Final = (
+    "This node does not start, so that what is kept stays as it is. To begin from nothing, cancel "
+    "the process and submit it again"
+)
+
+
+def kept_state(identity: Identity) -> tuple[Kept | None, list[str]]:
+    """What a process is to go on from, None for nothing; and which files of it are damaged."""
+    if identity.shadow or not identity.keep:
+        return None, []
+    return newest(Path(identity.keep), up_to=identity.instance)
+
+
+class Revival:
+    """Restores a kept state in the executor's first round; until then the node is like a shadow.
+
+    The author's constructor is over by then (or has named all parts), and no callback of the author
+    has run.
+
+    Args:
+        member: the node, at rest.
+        parts: of its state; those that the author names later are added to this very list.
+        kept: the state.
+        done: called when the node is active.
+    """
+
+    def __init__(
+        self, member: Member, parts: Sequence[Part], kept: Kept, done: Callable[[], None]
+    ) -> None:
+        self._member = member
+        self._parts = parts
+        self._kept = kept
+        self._done = done
+        self._give_up = time.monotonic() + _PATIENCE
+        self._timer = steady_timer(member.plain, 0.0, self._restore)
+
+    def _restore(self) -> None:
+        with self._member.turn:
+            plain = self._member.plain
+            plain.destroy_timer(self._timer)
+            if self._is_incomplete() and time.monotonic() < self._give_up:
+                self._timer = steady_timer(plain, _LOOK, self._restore)
+                return
+            try:
+                mark = self._restored()
+            except StateError as fault:
+                message = f"the state kept in {self._kept.path} cannot be restored: {fault}"
+                self._member.node.get_logger().error(f"{message}. {_REMEDY}")
+                raise StateError(message) from fault
+            self._go_on(mark)
+
+    def _is_incomplete(self) -> bool:
+        """The author's constructor spins, and has not named all parts yet."""
+        return len(self._parts) < len(self._kept.blocks) - 1
+
+    def _restored(self) -> StateMark:
+        try:
+            mark = deserialize_message(self._kept.blocks[0], StateMark)
+        except Exception as error:
+            raise StateError(f"its mark cannot be read: {error}") from error
+        fault = self._fault_of(mark)
+        if fault:
+            raise StateError(fault)
+        topics = [part.topic for part in mark.parts]
+        data = dict(zip(topics, self._kept.blocks[1:], strict=True))
+        for part in self._parts:
+            part.restore_changed(data[part.topic])
+        return mark
+
+    def _fault_of(self, mark: StateMark) -> str:
+        if mark.protocol_version != PROTOCOL_VERSION:
+            return (
+                f"it is of protocol version {mark.protocol_version}, and this node speaks "
+                f"{PROTOCOL_VERSION}"
+            )
+        if len(mark.parts) != len(self._kept.blocks) - 1:
+            return f"it has {len(self._kept.blocks) - 1} parts, and says {len(mark.parts)}"
+        theirs = {part.topic: part.type for part in mark.parts}
+        ours = {part.topic: part.type_name for part in self._parts}
+        for topic in sorted(ours.keys() | theirs.keys()):
+            if theirs.get(topic) != ours.get(topic):
+                return (
+                    f"its part on {topic} is {theirs.get(topic, 'none')}, and this program's "
+                    f"{ours.get(topic, 'none')}: it is of another version of the program"
+                )
+        return ""
+
+    def _go_on(self, mark: StateMark) -> None:
+        member = self._member
+        member.sequence = int(mark.sequence)
+        for covered in mark.inputs:
+            member.buffer.cover(
+                covered.topic, covered.covered, single=covered.publishers <= 1, now=time.monotonic()
+            )
+            member.inherit(covered.topic, covered.covered)
+        due = [None if ns < 0 else ns / 1e9 for ns in mark.timers_due]
+        try:
+            member.become_active(due, self._say)
+        finally:
+            self._done()
+
+    def _say(self) -> None:
+        head = self._kept.head
+        self._member.node.get_logger().info(
+            f"goes on from the state kept of {head.process}#{head.instance}, cycle {head.sequence}"
+        )

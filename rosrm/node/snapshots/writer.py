@@ -1,0 +1,231 @@
+"""Keeps the newest state of an active node in a file, for the next start of its process.
+
+In the author's cycle the state is only saved, as for a successor that follows; a thread writes it.
+"""
+
+from __future__ import annotations
+
+import atexit
+import threading
+import time
+import zlib
+from array import array
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from rclpy.serialization import serialize_message
+
+from rosrm.node.handoff.state_parts import Part, StateError
+from rosrm.node.managed_node import Member, Mode
+from rosrm.node.steady_timer import steady_timer
+from rosrm.snapshots import LARGEST, Block, SlotWriter
+from rosrm.version import PROTOCOL_VERSION
+from rosrm_msgs.msg import CoveredInput, StateMark
+
+#: Most bytes of one part. Fast DDS carried 400 MB, but a node takes 3 s to make 200 MB of them.
+LARGEST_PART: Final = 256 << 20
+#: Of a node's time that saving its state may take, where it is kept as often as that allows.
+_SHARE: Final = 0.02
+#: Seconds in which the last state is written at the end.
+_LAST_WORDS: Final = 5.0
+#: Seconds between two words about the same trouble.
+_TOLD_EVERY: Final = 60.0
+
+
+class Keeper:
+    """Saves the state between two cycles: as often as costs little, and every so many seconds.
+
+    Args:
+        member: the node, whose identity names the directory.
+        parts: of its state; those that the author names later are added to this very list.
+        run: random number of this run of the node.
+    """
+
+    def __init__(self, member: Member, parts: list[Part], run: int) -> None:
+        self._member = member
+        self._parts = parts
+        self._run = run
+        self._every = member.identity.keep_every
+        self._next = 0.0
+        self._kept = -1
+        self._closed = False
+        self._due: list[int] = []
+        self._publishers: dict[str, int] = {}
+        self._writer = _Writer(member)
+        # What is not saved after its cycle is saved later, though no cycle follows.
+        self._late = steady_timer(
+            member.plain, max(self._every, 1e-3), self._keep_late, autostart=False
+        )
+        self._armed = False
+        atexit.register(self.close)
+        if member.sequence:  # it went on from another's state, which lies elsewhere
+            self._arm()
+
+    def after_cycle(self) -> None:
+        """A cycle has ended: save the state, or see to it that it is saved later."""
+        now = time.monotonic()
+        if now >= self._next:
+            self._keep(now)
+        elif not self._armed:
+            self._arm()
+
+    def _arm(self) -> None:
+        self._armed = True
+        self._late.reset()
+
+    def _keep_late(self) -> None:
+        with self._member.turn:
+            self._armed = False
+            self._late.cancel()
+            if self._may_keep():
+                self._keep(time.monotonic())
+
+    def _may_keep(self) -> bool:
+        """There is something new, and it lies between two cycles of an active node."""
+        member = self._member
+        new = member.sequence != self._kept
+        return new and member.mode is Mode.ACTIVE and not member.in_cycle
+
+    def _keep(self, now: float) -> None:
+        try:
+            blocks = self._blocks()
+        except StateError as error:
+            self._next = now + self._every
+            self._member.node.get_logger().error(
+                f"the state is not kept: {error}", throttle_duration_sec=_TOLD_EVERY
+            )
+            return
+        self._kept = self._member.sequence
+        self._writer.put(self._kept, blocks)
+        cost = time.monotonic() - now
+        self._next = now + min(self._every, cost / _SHARE)
+
+    def _blocks(self) -> list[Block]:
+        for part in self._parts:
+            part.refresh(LARGEST_PART)
+        mark = bytes(serialize_message(self._mark()))
+        blocks = [Block(mark, zlib.crc32(mark)), *(part.block() for part in self._parts)]
+        size = sum(len(block.data) for block in blocks)
+        if size > LARGEST - (1 << 20):
+            raise StateError(f"it has {size} bytes; at most {LARGEST} are kept")
+        return blocks
+
+    def _mark(self) -> StateMark:
+        member = self._member
+        return StateMark(
+            protocol_version=PROTOCOL_VERSION, run=self._run, sequence=member.sequence, last=False,
+            parts=[part.described() for part in self._parts],
+            inputs=[
+                CoveredInput(
+                    topic=one.key, publishers=self._publishers_of(one),
+                    covered=array("q", one.covered),
+                )
+                for one in member.inputs if one.buffered
+            ],
+            timers_due=array("q", self._timers_due()),
+        )  # fmt: skip
+
+    def _publishers_of(self, one: Any) -> int:
+        try:
+            self._publishers[one.key] = one.subscription.get_publisher_count()
+        except Exception:  # noqa: BLE001 - at the end ROS may be gone already
+            self._publishers.setdefault(one.key, 1)
+        return self._publishers[one.key]
+
+    def _timers_due(self) -> list[int]:
+        try:
+            self._due = self._member.timers_due()
+        except Exception:  # noqa: BLE001 - at the end ROS may be gone already
+            return self._due
+        return self._due
+
+    def close(self) -> None:
+        """An orderly end: keep the last state."""
+        if self._closed:
+            return
+        self._closed = True
+        atexit.unregister(self.close)
+        # Another thread of the executor may be stuck in a callback: that is no reason to stay.
+        if self._member.turn.acquire(timeout=_LAST_WORDS):
+            try:
+                if self._may_keep():
+                    self._keep(time.monotonic())
+            finally:
+                self._member.turn.release()
+        self._writer.close()
+
+
+class _Writer:
+    """A thread that writes the newest state it was given; older ones that wait are passed over."""
+
+    def __init__(self, member: Member) -> None:
+        self._member = member
+        self._slots: SlotWriter | None = None
+        self._waiting: tuple[int, Sequence[Block]] | None = None
+        self._ending = False
+        self._fault = ""
+        self._changed = threading.Condition()
+        self._thread: threading.Thread | None = None
+
+    def put(self, sequence: int, blocks: Sequence[Block]) -> None:
+        """Have a state written; returns at once."""
+        with self._changed:
+            self._waiting = sequence, blocks
+            self._changed.notify()
+        if self._thread is None:  # not sooner: a successor has no time for it before it speaks
+            self._thread = threading.Thread(target=self._work, name="rosrm keeper", daemon=True)
+            self._thread.start()
+
+    def close(self) -> None:
+        """Write what waits, and end."""
+        if self._thread is None:
+            return
+        with self._changed:
+            self._ending = True
+            self._changed.notify()
+        self._thread.join(_LAST_WORDS)
+
+    def _work(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._waiting is not None or self._ending)
+                waiting, self._waiting = self._waiting, None
+            if waiting is None:
+                break
+            if not self._write(*waiting):
+                break
+        if self._slots is not None:
+            self._slots.close()
+
+    def _write(self, sequence: int, blocks: Sequence[Block]) -> bool:
+        """False: a newer instance keeps its state there, and this one has no business any more."""
+        identity = self._member.identity
+        try:
+            if self._slots is None:
+                self._slots = SlotWriter(Path(identity.keep), identity.process, identity.instance)
+            if self._slots.write(sequence, blocks):
+                self._written(sequence)
+                return True
+        except OSError as error:
+            self._not_written(error)
+            return True
+        self._warn(f"not kept any more: {identity.keep} is a newer instance's")
+        return False
+
+    def _written(self, sequence: int) -> None:
+        if self._fault:
+            self._fault = ""
+            # A line of code of its own: rclpy takes one severity from each, and raises at another.
+            self._member.node.get_logger().info(f"its state is kept again, up to cycle {sequence}")
+
+    def _not_written(self, error: OSError) -> None:
+        if self._fault != str(error):
+            self._fault = str(error)
+            self._warn(
+                f"not kept: {error.strerror}, in {self._member.identity.keep}. This node goes on, "
+                f"and tries again with each newer state"
+            )
+
+    def _warn(self, message: str) -> None:
+        self._member.node.get_logger().warning(f"its state is {message}")

@@ -1,0 +1,1 @@
+"""The master's subscriptions, services and links to slaves."""

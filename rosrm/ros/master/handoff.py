@@ -1,0 +1,91 @@
+"""The master's side of handoffs on the wire: `state_config`, and what the nodes answer to it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from rosrm.core.master.commands import PublishStateConfig
+from rosrm.core.master.events import Event, HandoffReported
+from rosrm.model.plan import HandoffPhase, ReportPhase
+from rosrm.ros import names, qos
+from rosrm.ros.control import version_refusal
+from rosrm.ros.participant import Participant
+from rosrm.version import PROTOCOL_VERSION
+from rosrm_msgs import msg
+
+
+class HandoffEndpoint:
+    """Speaks to the nodes of a handoff, and listens to them until it is done.
+
+    Args:
+        participant: of the master.
+        cluster: the master's name.
+        epoch: of this run of it.
+        take: called with each event.
+        refuse: called with who was turned away, and why.
+    """
+
+    def __init__(
+        self,
+        participant: Participant,
+        cluster: str,
+        epoch: int,
+        take: Callable[[Event], None],
+        refuse: Callable[[str, str], None],
+    ) -> None:
+        self._participant = participant
+        self._names = names.Names(participant.settings.namespace)
+        self._cluster = cluster
+        self._epoch = epoch
+        self._take = take
+        self._refuse = refuse
+        self._configs = participant.node.create_publisher(
+            msg.StateConfig, self._names(names.STATE_CONFIG), qos.STATE_CONFIG
+        )
+        self._channels: dict[str, Any] = {}
+
+    def publish(self, command: PublishStateConfig) -> None:
+        """Say where a handoff stands; from the first word to DONE its channel is listened to."""
+        channel = self._names.of_handoff(command.process, command.destination)
+        if command.phase is HandoffPhase.DONE:
+            self._leave(channel)
+        elif channel not in self._channels:
+            self._join(channel, command.process, command.destination)
+        self._configs.publish(
+            msg.StateConfig(
+                protocol_version=PROTOCOL_VERSION, cluster=self._cluster, epoch=self._epoch,
+                phase=int(command.phase), process=command.process, source=command.source,
+                destination=command.destination, source_node=command.source_node,
+                destination_node=command.destination_node, channel=channel,
+            )
+        )  # fmt: skip
+
+    def _join(self, channel: str, process: str, destination: int) -> None:
+        def take(report: msg.HandoffReport) -> None:
+            if report.destination == destination:
+                self._take_report(process, report)
+
+        self._channels[channel] = self._participant.node.create_subscription(
+            msg.HandoffReport, channel, self._participant.counted(take), qos.HANDOFF
+        )
+
+    def _leave(self, channel: str) -> None:
+        subscription = self._channels.pop(channel, None)
+        if subscription is not None:
+            self._participant.node.destroy_subscription(subscription)
+
+    def _take_report(self, process: str, report: msg.HandoffReport) -> None:
+        who = f"{process}#{report.instance} in a handoff"
+        fault = version_refusal(report.protocol_version, who)
+        if not fault and report.phase not in set(ReportPhase):
+            fault = f"unknown phase {report.phase}"
+        if fault:
+            self._refuse(who, fault)
+            return
+        self._take(
+            HandoffReported(
+                process, report.destination, report.instance, ReportPhase(report.phase),
+                report.sequence, report.message,
+            )
+        )  # fmt: skip

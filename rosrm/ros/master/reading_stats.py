@@ -1,0 +1,89 @@
+"""What has come of every slave's cycles: accounted for, missed, and how old the oldest reading is.
+
+A slave counts its cycles (`sequence`), and each message says for how many of them it stands. So
+what was lost shows in the next message that comes, and is told apart from quiet cycles; a message
+that comes late after all is no longer missed.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from rosrm.ros.reading_codec import Runs
+
+#: Seconds of silence after which a host's reading no longer counts as one that is awaited.
+_GONE: Final = 10.0
+_FIRST_ROOM: Final = 16
+
+
+class Ledger:
+    """The books of the readings, by host id.
+
+    Attributes:
+        cycles: of all slaves, accounted for since the start.
+        missed: of all slaves, that were never heard of.
+        beat: (H,) newest beat of the run that registered last, ns; 0: none was heard yet.
+    """
+
+    def __init__(self) -> None:
+        self.cycles = 0
+        self.missed = 0
+        self._room(_FIRST_ROOM)
+
+    def _room(self, hosts: int) -> None:
+        self.beat: npt.NDArray[np.uint64] = np.zeros(hosts, np.uint64)
+        self._incarnation: npt.NDArray[np.uint64] = np.zeros(hosts, np.uint64)
+        self._sequence: npt.NDArray[np.int64] = np.zeros(hosts, np.int64)
+        self._heard: npt.NDArray[np.float64] = np.full(hosts, -np.inf)
+
+    def begin(self, host_id: int, incarnation: int) -> None:
+        """A run of a slave registered: its counting begins with its first message."""
+        if host_id >= len(self.beat):
+            self._grow(2 * host_id)
+        self._incarnation[host_id] = incarnation
+        self._sequence[host_id] = self.beat[host_id] = 0
+        self._heard[host_id] = -np.inf
+
+    def _grow(self, hosts: int) -> None:
+        kept: tuple[npt.NDArray[Any], ...] = (
+            self.beat, self._incarnation, self._sequence, self._heard
+        )  # fmt: skip
+        self._room(hosts)
+        into = (self.beat, self._incarnation, self._sequence, self._heard)
+        for line, before in zip(into, kept, strict=True):
+            line[: len(before)] = before
+
+    def forget(self, host_id: int) -> None:
+        """A host left: nothing of it is awaited."""
+        if host_id < len(self.beat):
+            self._heard[host_id] = -np.inf
+
+    def take(self, runs: Runs, now: float) -> npt.NDArray[np.int64]:
+        """Enter a batch; of runs that are not registered nothing is entered.
+
+        Returns:
+            The host ids that were heard.
+        """
+        known = (runs.host_id > 0) & (runs.host_id < len(self.beat))
+        at = np.where(known, runs.host_id, 0)
+        known &= self._incarnation[at] == runs.incarnation
+        at, sequence, cycles = at[known], runs.sequence[known], runs.cycles[known]
+        before = self._sequence[at]
+        # Of a run that is heard for the first time nothing was expected before.
+        expected = np.maximum(sequence - np.where(before, before, runs.first[known] - 1), 0)
+        self.cycles += int(cycles.sum())
+        self.missed += int((expected - cycles).sum())
+        newer = sequence > before
+        self._sequence[at[newer]] = sequence[newer]
+        self.beat[at] = runs.beat[known]
+        self._heard[at] = now
+        return at
+
+    def ages(self, now: float) -> tuple[int, float]:
+        """How many hosts are heard, and the age of the oldest of their newest readings, seconds."""
+        age = now - self._heard
+        age = age[age < _GONE]
+        return (len(age), float(age.max())) if len(age) else (0, 0.0)

@@ -1,0 +1,279 @@
+"""What slaves and clients ask of the master: requests become events, replies become answers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from rosrm.config.settings import ControlSettings
+from rosrm.core.master import events as happened
+from rosrm.core.master.commands import Reply
+from rosrm.errors import JournalError, Refused
+from rosrm.model.rows import Snapshot
+from rosrm.ros import convert, names
+from rosrm.ros.control import ControlServer, Gate, accepted, refused, version_refusal
+from rosrm.ros.master.slave_links import HostLink, HostLinks
+from rosrm.ros.participant import OpenRequest, Participant
+from rosrm.version import PROTOCOL_VERSION, __version__
+from rosrm_msgs import srv
+
+_Respond = Callable[[Any], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """Which master this is."""
+
+    name: str
+    hostname: str
+    pid: int
+    epoch: int
+    incarnation: int
+
+
+class Queries(Protocol):
+    """What may be read of the master at any time."""
+
+    def snapshot(self, request: srv.List.Request) -> Snapshot:
+        """The listings that were asked for."""
+
+    def explain(self, name: str) -> str | None:
+        """The story of a process as JSON; None: there is none of that name."""
+
+
+class MasterServices:
+    """All services of the master.
+
+    Args:
+        participant: where they are offered.
+        links: to the slaves.
+        identity: of this master.
+        queries: what may be read.
+        beat: this master's clock, ns.
+        control: how old a request may be, and what slaves are told of beats.
+        tell: takes in what happened.
+        refuse: takes in who was turned away, and why.
+    """
+
+    def __init__(
+        self, participant: Participant, links: HostLinks, identity: Identity, queries: Queries,
+        *, beat: Callable[[], int], control: ControlSettings,
+        tell: Callable[[happened.Event], None], refuse: Callable[[str, str], None],
+    ) -> None:  # fmt: skip
+        self._participant = participant
+        self._server = ControlServer(participant, Gate(beat, control.max_age))
+        self._identity = identity
+        self._queries = queries
+        self._beat = beat
+        self._beat_period = control.beat_period
+        self._links = links
+        self._tell = tell
+        self._refuse = refuse
+        self._open: dict[int, Callable[[Reply], None]] = {}
+        self._next_request = 1
+        self._offer(names.Names(participant.settings.namespace))
+
+    def _offer(self, path: names.Names) -> None:
+        serve, offer = self._participant.serve, self._server.offer
+        serve(srv.List, path(names.LIST), self._take_list)
+        serve(srv.Explain, path(names.EXPLAIN), self._take_explain)
+        offer(srv.RequestProcess, path(names.REQUEST_PROCESS), self._take_poll, remember=False)
+        offer(srv.RegisterHost, path(names.REGISTER_HOST), self._take_registration)
+        for kind, name, event in (
+            (srv.Leave, names.LEAVE, self._left),
+            (srv.Submit, names.SUBMIT, _submitted),
+            (srv.Cancel, names.CANCEL, _cancelled),
+            (srv.Restart, names.RESTART, _restarted),
+            (srv.Migrate, names.MIGRATE, _migrated),
+            (srv.Checkpoint, names.CHECKPOINT, _checkpointed),
+            (srv.Restore, names.RESTORE, _restored),
+            (srv.SetHostState, names.SET_HOST_STATE, _host_set),
+            (srv.Prune, names.PRUNE, _pruned),
+        ):
+            offer(kind, path(name), self._as_event(kind, event))
+        # Last, as DDS tells of them in this order: who can shake hands can ask for all the others.
+        serve(srv.Handshake, path(names.HANDSHAKE), self._take_handshake)
+
+    # --- answers -------------------------------------------------------------------------
+
+    def reply(self, command: Reply) -> None:
+        """Answer a request, if it is still open."""
+        answer = self._open.pop(command.request, None)
+        if answer is not None:
+            self._participant.guard.call(answer, command)
+
+    def _keep(self, answer: Callable[[Reply], None]) -> int:
+        """Keep the way to answer a request; returns the number of the request."""
+        token = self._next_request
+        self._next_request += 1
+        self._open[token] = answer
+        return token
+
+    def _as_event(
+        self, kind: Any, make: Callable[[Any, int], happened.Event]
+    ) -> Callable[[Any, _Respond], None]:
+        """A handler that turns a request into an event and keeps the way to answer it."""
+
+        def take(request: Any, respond: _Respond) -> None:
+            token = self._keep(lambda reply: respond(self._response(kind, reply)))
+            try:
+                event = make(request, token)
+            except Refused as refusal:
+                del self._open[token]
+                respond(kind.Response(answer=refused(refusal.code, str(refusal))))
+                return
+            self._tell(event)
+
+        return take
+
+    def _response(self, kind: Any, reply: Reply) -> Any:
+        epoch = self._identity.epoch
+        answer = (
+            accepted(reply.message, epoch)
+            if reply.accepted
+            else refused(reply.code, reply.message, epoch)
+        )
+        response = kind.Response(answer=answer)
+        if kind is srv.Migrate:
+            response.host = reply.host
+        return response
+
+    # --- slaves --------------------------------------------------------------------------
+
+    def _take_handshake(self, request: srv.Handshake.Request, open_request: OpenRequest) -> None:
+        who = f"{request.role} {request.name}"
+        fault = version_refusal(request.protocol_version, who)
+        if fault:
+            self._refuse(who, fault)
+        open_request.answer(
+            srv.Handshake.Response(
+                protocol_version=PROTOCOL_VERSION, software_version=__version__,
+                accepted=not fault, message=fault, master=self._identity.name,
+                hostname=self._identity.hostname, pid=self._identity.pid,
+                epoch=self._identity.epoch, beat=self._beat(),
+            )
+        )  # fmt: skip
+
+    def _take_registration(self, request: srv.RegisterHost.Request, respond: _Respond) -> None:
+        try:
+            description = convert.host_from_msg(request.host)
+            statuses = tuple(convert.status_from_msg(status) for status in request.instances)
+            kept = tuple(convert.kept_from_msg(state) for state in request.kept)
+        except Refused as refusal:
+            respond(srv.RegisterHost.Response(answer=refused(refusal.code, str(refusal))))
+            return
+
+        def answer(reply: Reply) -> None:
+            response = self._response(srv.RegisterHost, reply)
+            if reply.accepted:
+                response.host_id, response.beat_period = reply.host_id, self._beat_period
+                self._links.renew(reply.host_id, description)
+            respond(response)
+
+        token, seen = self._keep(answer), int(request.journal_seen)
+        self._tell(happened.HostRegistered(token, description, statuses, seen, kept))
+
+    def _left(self, request: srv.Leave.Request, token: int) -> happened.Event:
+        kept = tuple(convert.status_from_msg(status) for status in request.kept)
+        link = self._links.find(request.host_id, request.incarnation)
+        if link is not None:
+            self._links.left(link)
+        return happened.HostLeft(token, request.host_id, request.incarnation, kept)
+
+    def _take_poll(self, request: srv.RequestProcess.Request, respond: _Respond) -> None:
+        link = self._links.find(request.host_id, request.incarnation)
+        if link is None:
+            answer = refused("unknown", "register first", self._identity.epoch)
+            respond(srv.RequestProcess.Response(answer=answer))
+            return
+        # Before its first reading its limits are not known, and so not what it may be given.
+        self._links.when_heard(link, lambda: self._open_poll(link, request, respond))
+
+    def _open_poll(
+        self, link: HostLink, request: srv.RequestProcess.Request, respond: _Respond
+    ) -> None:
+        def turn_away(reply: Reply) -> None:
+            link.close_poll()
+            respond(self._response(srv.RequestProcess, reply))
+
+        token = self._keep(turn_away)
+        self._links.open_poll(link, respond, lambda: self._drop(token))
+        self._tell(happened.ProcessRequested(token, request.host_id, request.incarnation))
+
+    def _drop(self, token: int) -> None:
+        self._open.pop(token, None)
+
+    # --- what may be read ----------------------------------------------------------------
+
+    def _take_list(self, request: srv.List.Request, open_request: OpenRequest) -> None:
+        fault = version_refusal(request.protocol_version, "a listing")
+        if fault:
+            open_request.answer(srv.List.Response(answer=refused("version", fault)))
+            return
+        try:
+            view = self._queries.snapshot(request)
+        except JournalError as trouble:
+            open_request.answer(srv.List.Response(answer=refused("journal", str(trouble))))
+            return
+        open_request.answer(
+            srv.List.Response(
+                answer=accepted(epoch=self._identity.epoch), master=view.master,
+                uptime=view.uptime, last_sequence=view.last_sequence, trouble=view.trouble,
+                host_list=[convert.host_row_to_msg(row) for row in view.hosts],
+                process_list=[convert.process_row_to_msg(row) for row in view.processes],
+                plugin_list=[convert.plugin_row_to_msg(row) for row in view.plugins],
+                event_list=[convert.event_to_msg(row) for row in view.events],
+            )
+        )  # fmt: skip
+
+    def _take_explain(self, request: srv.Explain.Request, open_request: OpenRequest) -> None:
+        fault = version_refusal(request.protocol_version, "explain")
+        text = None if fault else self._queries.explain(request.process)
+        if text is None:
+            reason = fault or f"no such process: {request.process}; see `rosrm ps`"
+            answer = refused("version" if fault else "unknown", reason)
+            open_request.answer(srv.Explain.Response(answer=answer))
+            return
+        open_request.answer(srv.Explain.Response(answer=accepted(), explanation=text))
+
+
+def _submitted(request: srv.Submit.Request, token: int) -> happened.Event:
+    specs = tuple(convert.spec_from_msg(spec) for spec in request.processes)
+    return happened.SubmissionReceived(token, specs, _requester(request))
+
+
+def _cancelled(request: srv.Cancel.Request, token: int) -> happened.Event:
+    return happened.CancelRequested(token, tuple(request.processes), _requester(request))
+
+
+def _restarted(request: srv.Restart.Request, token: int) -> happened.Event:
+    return happened.RestartRequested(token, tuple(request.processes), _requester(request))
+
+
+def _migrated(request: srv.Migrate.Request, token: int) -> happened.Event:
+    host = request.host or None
+    return happened.MigrationRequested(token, request.process, host, _requester(request))
+
+
+def _checkpointed(request: srv.Checkpoint.Request, token: int) -> happened.Event:
+    return happened.CheckpointRequested(token, request.process, _requester(request))
+
+
+def _restored(request: srv.Restore.Request, token: int) -> happened.Event:
+    return happened.RestoreRequested(token, request.process, _requester(request))
+
+
+def _host_set(request: srv.SetHostState.Request, token: int) -> happened.Event:
+    by = _requester(request)
+    return happened.HostStateRequested(token, request.host, request.action, by)
+
+
+def _pruned(request: srv.Prune.Request, token: int) -> happened.Event:
+    names, hosts = tuple(request.processes), tuple(request.hosts)
+    return happened.PruneRequested(token, names, hosts, _requester(request))
+
+
+def _requester(request: Any) -> str:
+    """The name of the client that sent a request, for records."""
+    return str(request.envelope.sender).removeprefix("client ")

@@ -1,0 +1,300 @@
+"""The master's link to each slave: orders and work on their way to it, and its newest beat.
+
+A slave judges the age of an order by its own clock, so nothing can be ordered before its first beat
+is received; what is meant for it waits until then. An order also waits until DDS has discovered the
+service of the slave, because it would be lost otherwise.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from rosrm.core.master import events as happened
+from rosrm.core.master.commands import Assign, Order, Redeliver, Withdraw
+from rosrm.errors import Refused
+from rosrm.model.values import Assignment, HostDescription
+from rosrm.ros import convert, names, qos
+from rosrm.ros.control import ControlClient, accepted, version_refusal
+from rosrm.ros.master.reading_stats import Ledger
+from rosrm.ros.participant import Participant
+from rosrm_msgs import srv
+
+_ACTIONS: Final = {
+    "stop": srv.ControlHost.Request.STOP,
+    "fence": srv.ControlHost.Request.FENCE,
+    "restart": srv.ControlHost.Request.RESTART,
+    "start": srv.ControlHost.Request.START,
+    "execute": srv.ControlHost.Request.EXECUTE,
+    "report": srv.ControlHost.Request.REPORT,
+    "set_restart": srv.ControlHost.Request.SET_RESTART,
+    "keep": srv.ControlHost.Request.KEEP,
+    "drop_kept": srv.ControlHost.Request.DROP_KEPT,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class _Unheard:
+    """An order for a slave, or a request of one, that waits for its next reading.
+
+    Attributes:
+        deadline: monotonic seconds.
+        send: carries it out.
+        done: called with None when the deadline has passed.
+    """
+
+    deadline: float
+    send: Callable[[], None]
+    done: Callable[[None], None] = lambda _: None
+
+
+@dataclass(slots=True)
+class HostLink:
+    """What is kept of one slave.
+
+    Attributes:
+        incarnation: of the run that registered last; what a former run says is not heard.
+        unheard: what waits for its first beat.
+        outbox: assignments for the answer to its open request.
+        poll: answers that request; None: none is open.
+        forget_poll: takes the open request out of those that may be turned away.
+    """
+
+    host_id: int
+    control: Any
+    incarnation: int
+    unheard: list[_Unheard] = field(default_factory=list)
+    outbox: list[Assignment] = field(default_factory=list)
+    poll: Callable[[Any], None] | None = None
+    forget_poll: Callable[[], None] = lambda: None
+
+    def close_poll(self) -> None:
+        """The open request is answered, or its answer can reach nobody."""
+        self.forget_poll()
+        self.poll, self.forget_poll = None, lambda: None
+
+
+class HostLinks:
+    """The links to all slaves that have registered.
+
+    Args:
+        participant: from which orders are sent.
+        sender: of the orders, for people.
+        epoch: of this master.
+        order_timeout: seconds beyond an order's own time for its answer.
+        tell: takes in what happened.
+    """
+
+    def __init__(
+        self,
+        participant: Participant,
+        sender: str,
+        epoch: int,
+        order_timeout: float,
+        tell: Callable[[happened.Event], None],
+    ) -> None:
+        self._participant = participant
+        self._epoch = epoch
+        self._order_timeout = order_timeout
+        self._tell = tell
+        self._names = names.Names(participant.settings.namespace)
+        self._client = ControlClient(participant, sender)
+        self._links: dict[int, HostLink] = {}
+        # Of a thousand links few have something under way: only those are looked at.
+        self._waiting: set[int] = set()
+        self._with_work: set[int] = set()
+        self.ledger = Ledger()
+
+    # --- who is there --------------------------------------------------------------------
+
+    def find(self, host_id: int, incarnation: int) -> HostLink | None:
+        """The link of a host, if this is the run of it that registered last."""
+        link = self._links.get(host_id)
+        return link if link is not None and link.incarnation == incarnation else None
+
+    def renew(self, host_id: int, description: HostDescription) -> None:
+        """A slave registered: what waited for its former run is void."""
+        link = self._links.get(host_id)
+        if link is None:
+            path = self._names.of_host(description.name, names.CONTROL)
+            control = self._participant.node.create_client(
+                srv.ControlHost, path, qos_profile=qos.SERVICE
+            )
+            link = self._links[host_id] = HostLink(host_id, control, 0)
+        link.close_poll()
+        if link.incarnation == description.incarnation:
+            # The same run once more: what it has not fetched is still meant for it. But it has
+            # been out of reach: with the beat that was heard before, an order would be stale.
+            self.ledger.beat[host_id] = 0
+            return
+        link.incarnation = description.incarnation
+        self.ledger.begin(host_id, description.incarnation)
+        link.outbox.clear()
+        waiting, link.unheard = link.unheard, []
+        for order in waiting:
+            order.done(None)
+
+    def left(self, link: HostLink) -> None:
+        """A slave stops in good order: it asks for nothing more."""
+        link.close_poll()
+        self.ledger.forget(link.host_id)
+
+    def heard(self, host_ids: Iterable[int]) -> None:
+        """Readings of these hosts have come: what waited for them goes out."""
+        for host_id in self._waiting.intersection(host_ids) if self._waiting else ():
+            self._waiting.discard(host_id)
+            link = self._links[host_id]
+            waiting, link.unheard = link.unheard, []
+            for order in waiting:
+                order.send()
+
+    def when_heard(
+        self,
+        link: HostLink,
+        send: Callable[[], None],
+        deadline: float = math.inf,
+        done: Callable[[None], None] = lambda _: None,
+    ) -> None:
+        """Carry something out now, or when the first beat of a slave has come.
+
+        Args:
+            deadline: monotonic seconds.
+            done: called with None when the deadline has passed before.
+        """
+        if self.ledger.beat[link.host_id]:
+            send()
+        else:
+            self._wait(link, _Unheard(deadline, send, done))
+
+    def _wait(self, link: HostLink, order: _Unheard) -> None:
+        link.unheard.append(order)
+        self._waiting.add(link.host_id)
+
+    # --- work ----------------------------------------------------------------------------
+
+    def assign(self, command: Assign) -> None:
+        """Keep an assignment for the answer to the host's request."""
+        self._links[command.host_id].outbox.append(command.assignment)
+        self._with_work.add(command.host_id)
+
+    def open_poll(
+        self, link: HostLink, respond: Callable[[Any], None], forget: Callable[[], None]
+    ) -> None:
+        """A slave asks for work; a request of it that was open is never answered."""
+        link.close_poll()
+        link.poll, link.forget_poll = respond, forget
+        if link.outbox:
+            self._with_work.add(link.host_id)
+
+    def flush(self, journal: int) -> None:
+        """Answer the open requests of hosts for which there are assignments.
+
+        Args:
+            journal: sequence of the newest record that is written.
+        """
+        while self._with_work:
+            link = self._links[self._with_work.pop()]
+            if not link.outbox or link.poll is None:
+                continue
+            respond = link.poll
+            link.close_poll()
+            batch, link.outbox = link.outbox, []
+            respond(
+                srv.RequestProcess.Response(
+                    answer=accepted(epoch=self._epoch),
+                    journal=journal,
+                    slave_beat=int(self.ledger.beat[link.host_id]),
+                    assignments=[convert.assignment_to_msg(one) for one in batch],
+                )
+            )
+
+    def withdraw(self, command: Withdraw, now: float) -> None:
+        """Take an assignment back, or order its end."""
+        link = self._links.get(command.host_id)
+        waiting = link.outbox if link is not None else []
+        kept = [one for one in waiting if one.instance != command.instance]
+        if link is not None and len(kept) < len(waiting):
+            link.outbox = kept
+            self._tell(happened.AssignmentWithdrawn(command.instance))
+            return
+        self.order(Order(command.order, command.host_id, "stop", command.instance), now)
+
+    def redeliver(self, command: Redeliver, now: float) -> None:
+        """Order the start of an assignment, unless it waits to be fetched."""
+        link, assignment = self._links.get(command.host_id), command.assignment
+        if link is None or all(one.instance != assignment.instance for one in link.outbox):
+            self.order(
+                Order(command.order, command.host_id, "start", assignment.instance, assignment), now
+            )
+
+    # --- orders --------------------------------------------------------------------------
+
+    def order(self, command: Order, now: float) -> None:
+        """Ask a slave for something; the answer, or none in time, comes back as an event."""
+        link = self._links.get(command.host_id)
+        if link is None:  # expected from the journal, not heard yet
+            self._tell(
+                happened.OrderAnswered(command.order, False, "timeout", "the host does not report")
+            )
+            return
+        request = _order_request(command)
+        deadline = now + command.timeout + self._order_timeout
+
+        def done(response: srv.ControlHost.Response | None) -> None:
+            self._tell(_order_answered(command.order, response))
+
+        def send() -> None:
+            if not link.control.service_is_ready():
+                self._wait(link, _Unheard(deadline, send, done))
+                return
+            beat = int(self.ledger.beat[link.host_id])
+            request.envelope = self._client.envelope(beat, self._epoch)
+            self._client.call(link.control, request, deadline, done)
+
+        self.when_heard(link, send, deadline, done)
+
+    def expire(self, now: float) -> None:
+        """End what was not answered in time."""
+        self._client.expire(now)
+        for host_id in list(self._waiting):
+            link = self._links[host_id]
+            late = [order for order in link.unheard if now >= order.deadline]
+            link.unheard = [order for order in link.unheard if now < order.deadline]
+            if not link.unheard:
+                self._waiting.discard(host_id)
+            for order in late:
+                order.done(None)
+
+
+def _order_request(command: Order) -> srv.ControlHost.Request:
+    """An order as a message, its envelope still to be filled in."""
+    request = srv.ControlHost.Request(
+        action=_ACTIONS[command.action], executor=command.executor, timeout=float(command.timeout),
+        keep_on=list(command.keep_on), keep_every=float(command.keep_every),
+    )  # fmt: skip
+    if command.instance is not None:
+        request.instance = convert.instance_to_msg(command.instance)
+    if command.assignment is not None:
+        request.assignment = convert.assignment_to_msg(command.assignment)
+    if command.restart is not None:
+        request.restart = convert.restart_to_msg(command.restart)
+    if command.executor:
+        request.arguments = json.dumps(dict(command.arguments))
+    return request
+
+
+def _order_answered(order: int, response: srv.ControlHost.Response | None) -> happened.Event:
+    if response is None:
+        return happened.OrderAnswered(order, False, "timeout", "no answer in time")
+    answer = response.answer
+    fault = version_refusal(answer.protocol_version, "a slave")
+    if fault:
+        return happened.OrderAnswered(order, False, "version", fault)
+    try:
+        result = convert.json_object(response.result, "a result") if response.result else None
+    except Refused as fault:
+        return happened.OrderAnswered(order, False, happened.BAD_RESULT, str(fault))
+    return happened.OrderAnswered(order, answer.accepted, answer.code, answer.message, result)

@@ -1,0 +1,151 @@
+"""What slaves say without being asked: readings, statuses, usages, as events for the core."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+
+from rosrm.core.master import events as happened
+from rosrm.errors import Refused
+from rosrm.ros import convert, names, qos
+from rosrm.ros.control import version_refusal
+from rosrm.ros.master.slave_links import HostLinks
+from rosrm.ros.participant import Participant
+from rosrm.ros.reading_codec import decode
+from rosrm_msgs import msg
+
+#: Seconds between two records of the same refusal, and refusals that are told apart.
+_REFUSED_EVERY: Final = 10.0
+_REFUSED_KEPT: Final = 1000
+
+
+class Refusals:
+    """Peers that were turned away: recorded, but not ten times a second.
+
+    Args:
+        tell: takes in what happened.
+    """
+
+    def __init__(self, tell: Callable[[happened.Event], None]) -> None:
+        self._tell = tell
+        self._told: dict[tuple[str, str], float] = {}
+
+    def __call__(self, who: str, reason: str) -> None:
+        """Record a refusal, unless it was recorded a moment ago."""
+        now = time.monotonic()
+        if now - self._told.get((who, reason), -_REFUSED_EVERY) < _REFUSED_EVERY:
+            return
+        if len(self._told) >= _REFUSED_KEPT:
+            self._told.clear()
+        self._told[who, reason] = now
+        self._tell(happened.PeerRefused(who, reason))
+
+
+class Hearing:
+    """The subscriptions to what slaves say.
+
+    Args:
+        participant: where they are made.
+        links: told who was heard.
+        tell: takes in what happened.
+        refuse: takes in who was turned away, and why.
+    """
+
+    def __init__(
+        self,
+        participant: Participant,
+        links: HostLinks,
+        tell: Callable[[happened.Event], None],
+        refuse: Callable[[str, str], None],
+    ) -> None:
+        self._links = links
+        self._tell = tell
+        self._refuse = refuse
+        node, path = participant.node, names.Names(participant.settings.namespace)
+        # Readings come by the thousand: they are taken raw, in batches, past the executor.
+        intake = participant.unwatched_node(f"{node.get_name()}_intake")
+        self._readings = intake.create_subscription(
+            msg.ResourceInfo, path(names.RESOURCE_INFO), _never_called, qos.READINGS, raw=True
+        )
+        for kind, topic, take in (
+            (msg.ProcessStatusBatch, names.PROCESS_STATUS, self._take_statuses),
+            (msg.ProcessUsage, names.PROCESS_USAGE, self._take_usage),
+            (msg.KeptStates, names.KEPT_STATES, self._take_kept),
+        ):
+            node.create_subscription(kind, path(topic), participant.counted(take), qos.STATUSES)
+
+    def poll_readings(self) -> happened.ReadingsReceived | None:
+        """Take all readings that have come; None: none has."""
+        handle, kind = self._readings.handle, self._readings.msg_type
+        taken = []
+        with handle:
+            take = handle.take_message
+            while (message := take(kind, True)) is not None:
+                taken.append(message[0])
+        if not taken:
+            return None
+        batch = decode(taken)
+        if batch.runs is not None:
+            heard = self._links.ledger.take(batch.runs, time.monotonic())
+            self._links.heard(heard.tolist())
+        for stranger in batch.strangers:
+            self._refuse("resource_info", stranger)
+        return batch.readings
+
+    def _take_statuses(self, message: msg.ProcessStatusBatch) -> None:
+        who = f"process_status of host {message.host_id}"
+        fault = version_refusal(message.protocol_version, who)
+        if fault:
+            self._refuse(who, fault)
+            return
+        try:
+            statuses = tuple(convert.status_from_msg(status) for status in message.statuses)
+            failing = {one: _failing(message, one) for one in ("probe", "migration")}
+        except Refused as refusal:
+            self._refuse(who, str(refusal))
+            return
+        self._tell(
+            happened.StatusesReceived(
+                message.host_id,
+                message.incarnation,
+                message.sequence,
+                message.complete,
+                statuses,
+                failing["probe"],
+                failing["migration"],
+            )
+        )
+
+    def _take_usage(self, message: msg.ProcessUsage) -> None:
+        sizes = {len(message.numbers), len(message.cpu), len(message.memory)}
+        who = f"process_usage of host {message.host_id}"
+        fault = version_refusal(message.protocol_version, who)
+        if fault or len(sizes) > 1:
+            self._refuse(who, fault or "arrays of different lengths")
+            return
+        self._tell(
+            happened.UsagesReceived(
+                message.host_id, message.incarnation, np.asarray(message.numbers, np.uint64),
+                np.asarray(message.cpu, np.float64), np.asarray(message.memory, np.float64),
+            )
+        )  # fmt: skip
+
+    def _take_kept(self, message: msg.KeptStates) -> None:
+        who = f"kept_states of host {message.host_id}"
+        fault = version_refusal(message.protocol_version, who)
+        if fault:
+            self._refuse(who, fault)
+            return
+        states = tuple(convert.kept_from_msg(one) for one in message.states)
+        self._tell(happened.KeptStatesReceived(message.host_id, message.incarnation, states))
+
+
+def _failing(message: msg.ProcessStatusBatch, kind: str) -> dict[str, str]:
+    return {row.name: row.reason for row in message.failing if row.kind == kind}
+
+
+def _never_called(_message: object) -> None:
+    raise AssertionError("readings are polled, never called back")

@@ -1,0 +1,1 @@
+"""The slave's publishers, services and view of the ROS graph."""

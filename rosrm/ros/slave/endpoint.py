@@ -1,0 +1,436 @@
+"""The slave's side of the wire: it finds the master, registers, asks, reports."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from enum import Enum
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+from rclpy.duration import Duration
+
+from rosrm.core.slave import reducer as core
+from rosrm.errors import Refused
+from rosrm.extensions.plugin_calls import Plugin
+from rosrm.model.values import HostDescription, InstanceStatus, KeptState
+from rosrm.ros import convert, names, qos
+from rosrm.ros.control import Call, ControlClient, Gate, version_refusal
+from rosrm.ros.participant import Participant
+from rosrm.ros.slave.journal_watermark import JournalSeen, Seen
+from rosrm.ros.slave.reporter import Reporter
+from rosrm.ros.slave.services import Host, LogQuery, LogSlice, SlaveServices
+from rosrm.version import PROTOCOL_VERSION, __version__
+from rosrm_msgs import msg, srv
+
+__all__ = ["Host", "Link", "LogQuery", "LogSlice", "SlaveEndpoint"]
+
+#: Seconds for one request to the master.
+_PATIENCE: Final = 3.0
+#: A long poll is asked anew after this, so that one that was lost does not last, seconds. The first
+#: after a registration sooner, as it may have gone out before DDS knew its way, then ever later.
+_POLL_ANEW: Final = 30.0
+_FIRST_POLL_ANEW: Final = 1.0
+#: Seconds after a request for work that was refused until the next one.
+_ASK_AGAIN: Final = 0.2
+#: Seconds for which a name that is taken is asked for again: the former run of this slave may
+#: have been killed a moment ago.
+_NAME_TAKEN: Final = 5.0
+#: The same where that run has left processes behind: they are not given up before a master with a
+#: long `liveness.suspect` has noticed that it is gone.
+_NAME_TAKEN_BY_FORMER: Final = 60.0
+#: Seconds for the last statuses to reach the master.
+_LAST_WORDS: Final = 2.0
+#: Beats of a master in its silence before it counts as gone; and before another run of a master
+#: that has no newer epoch is believed: of two at once the younger gives way.
+_MISSED_BEATS: Final = 10
+_MISSED_BY_ANOTHER: Final = 3
+
+
+class Link(Enum):
+    """How far this slave is with its master."""
+
+    SEARCHING = "searching"
+    GREETING = "greeting"
+    LISTENING = "listening"  # for a beat of who greeted us: it alone tells which run that is
+    REGISTERING = "registering"
+    REGISTERED = "registered"
+
+
+class SlaveEndpoint:
+    """Everything that a slave says and hears.
+
+    Attributes:
+        link: how far it is with its master.
+        failure: why it must give up; "" while it need not.
+        superseded: it must because another slave lives under its name.
+        cluster: name of the master that greeted us last; "" before the first one.
+        failing: kind and name of each plugin that fails here, and why; goes with the statuses. A
+            probe goes by the resource that it reads.
+    """
+
+    def __init__(
+        self, participant: Participant, host: Host, description: HostDescription, max_age: float,
+        seen: JournalSeen | None = None,
+    ) -> None:  # fmt: skip
+        self._participant = participant
+        self._host = host
+        self._description = description
+        self._seen = seen or JournalSeen()
+        self.link = Link.SEARCHING
+        self.failure = ""
+        self.superseded = False
+        self.cluster = ""
+        self.failing: dict[Plugin, str] = {}
+        self.host_id = 0
+        self._epoch = 0
+        self._master_beat = 0
+        self._beat_at = 0.0
+        self._beat_period = 1.0
+        self._greeting = srv.Handshake.Response()
+        self._greeted_at = 0.0
+        self._asked_at = 0.0
+        self._beat_clock = core.BeatClock()
+        self._newest_beat: msg.MasterBeat | None = None
+        self._incarnation = 0  # of the master that we are registered with, or about to be
+        self._registered_with = 0  # the incarnation of the newest that took us in
+        self._taken_since: float | None = None
+        self._waits_since: float | None = None
+        self._leaves: Sequence[InstanceStatus] | None = None  # what it keeps running as it leaves
+        self._poll: Call | None = None
+        self._poll_at = 0.0
+        self._poll_anew = _FIRST_POLL_ANEW
+        self._status_sequence = 0
+        self._control = ControlClient(participant, f"slave {description.name}")
+        self._names = names.Names(participant.settings.namespace)
+        self._join(max_age)
+
+    def _join(self, max_age: float) -> None:
+        node, path = self._participant.node, self._names
+        self._clients = {
+            kind: node.create_client(kind, path(name), qos_profile=qos.SERVICE)
+            for kind, name in (
+                (srv.Handshake, names.HANDSHAKE),
+                (srv.RegisterHost, names.REGISTER_HOST),
+                (srv.RequestProcess, names.REQUEST_PROCESS),
+                (srv.Leave, names.LEAVE),
+            )
+        }
+        readings = node.create_publisher(
+            msg.ResourceInfo, path(names.RESOURCE_INFO), qos.READING_OUT
+        )
+        description = self._description
+        self._reporter = Reporter(readings.publish, description.incarnation, description.period)
+        self._statuses = node.create_publisher(
+            msg.ProcessStatusBatch, path(names.PROCESS_STATUS), qos.STATUSES
+        )
+        self._usages = node.create_publisher(
+            msg.ProcessUsage, path(names.PROCESS_USAGE), qos.STATUSES
+        )
+        self._kept = node.create_publisher(msg.KeptStates, path(names.KEPT_STATES), qos.STATUSES)
+        node.create_subscription(
+            msg.MasterBeat, path(names.MASTER_BEAT),
+            self._participant.counted(self._take_beat), qos.BEAT_IN,
+        )  # fmt: skip
+        gate = Gate(time.monotonic_ns, max_age)
+        SlaveServices(self._participant, self._host, description.name, gate, lambda: self._epoch)
+
+    # --- finding the master --------------------------------------------------------------
+
+    def go_on(self, now: float) -> None:
+        """Take the next step towards a registration; called in every cycle."""
+        self._control.expire(now)
+        if self.link is Link.SEARCHING and self._clients[srv.Handshake].service_is_ready():
+            self._greet(now)
+        if self.link is Link.LISTENING and now - self._greeted_at >= _PATIENCE:
+            self.link = Link.SEARCHING
+        if self.link is Link.REGISTERED and self._missed(_MISSED_BEATS, now):
+            silence = now - self._beat_at
+            keep = "; processes keep running" if self._leaves is None else ""
+            self._lose_master(f"the master has been silent for {silence:.1f} s{keep}")
+
+    def _greet(self, now: float) -> None:
+        self.link = Link.GREETING
+        self._asked_at = now
+        request = srv.Handshake.Request(
+            protocol_version=PROTOCOL_VERSION, software_version=__version__, role="slave",
+            name=self._description.name,
+        )  # fmt: skip
+        self._control.call(
+            self._clients[srv.Handshake], request, now + _PATIENCE, self._take_greeting
+        )
+
+    def _take_greeting(self, answer: srv.Handshake.Response | None) -> None:
+        now = time.monotonic()
+        if answer is None or now - self._asked_at >= _PATIENCE:  # we were stopped meanwhile
+            self.link = Link.SEARCHING
+            return
+        fault = version_refusal(answer.protocol_version, f"the master on {answer.hostname}")
+        if fault or not answer.accepted:
+            self.failure = fault or answer.message
+            return
+        self.cluster = answer.master
+        self._greeting, self._greeted_at = answer, now
+        self._beat_clock.restart()
+        self._note_beat(answer.beat, now)
+        self.link = Link.LISTENING
+        self._register_if_known()
+
+    def _register_if_known(self) -> None:
+        """Register as soon as a beat has told which run of the master it was that greeted us."""
+        beat = self._newest_beat
+        if beat is None or _speaker(beat) != _speaker(self._greeting):
+            return
+        request = srv.RegisterHost.Request(
+            envelope=self._control.envelope(self._master_beat, self._greeting.epoch),
+            host=convert.host_to_msg(self._description),
+            instances=[convert.status_to_msg(status) for status in self._host.statuses()],
+            kept=[convert.kept_to_msg(one) for one in self._host.kept_states()],
+            journal_seen=self._seen.of_former_run(self.cluster, beat.incarnation),
+        )
+        self._incarnation = beat.incarnation
+        self._asked_at = time.monotonic()
+        self.link = Link.REGISTERING
+        self._poll_at = 0.0
+        self._control.call(
+            self._clients[srv.RegisterHost], request, time.monotonic() + _PATIENCE,
+            self._take_registration,
+        )  # fmt: skip
+
+    def _take_registration(self, response: srv.RegisterHost.Response | None) -> None:
+        now = time.monotonic()
+        if response is None or response.answer.code == "stale":
+            self.link = Link.SEARCHING
+            return
+        answer = response.answer
+        if answer.code in ("journal", "failed"):
+            self._wait_for_journal(answer.message, now)
+            return
+        self._waits_since = None
+        if not answer.accepted:
+            self._turned_down(answer, now)
+            return
+        self._taken_since = None
+        self.host_id = response.host_id
+        another = self._registered_with not in (0, self._incarnation)
+        renumbers = another and answer.epoch <= self._epoch
+        self._registered_with, self._epoch = self._incarnation, answer.epoch
+        self._beat_period = response.beat_period
+        self._beat_at = now
+        self._poll_anew = _FIRST_POLL_ANEW
+        self._reporter.begin(self.host_id, self._beat_period)
+        self.link = Link.REGISTERED
+        self._host.take(core.MasterHears(self._asked_at))
+        self._host.take(core.Registered(answer.epoch, renumbers))
+        greeting = self._greeting
+        self._host.say(
+            f"registered with master {greeting.master} (pid {greeting.pid} on {greeting.hostname}) "
+            f"as host {self.host_id}"
+        )
+        if self._leaves is not None:  # the former master was gone before it took note
+            self._send_leave(self._leaves, lambda: None)
+
+    def _wait_for_journal(self, why: str, now: float) -> None:
+        """The master can take nobody in just now: ask again, and say so once."""
+        self.link = Link.SEARCHING
+        if self._waits_since is None:
+            self._waits_since = now
+            self._host.say(f"the master takes no host in, asking on: {why}")
+
+    def _turned_down(self, answer: msg.Answer, now: float) -> None:
+        """A name may still be held by a former run of this very slave: ask again for a moment."""
+        if self._taken_since is None:
+            self._taken_since = now
+            if answer.code == "name_taken":
+                self._host.say(
+                    f"{answer.message}. Asking again for {self._patience():g} s, as that slave may "
+                    f"have been killed a moment ago"
+                )
+        if answer.code != "name_taken" or now - self._taken_since >= self._patience():
+            self.failure = answer.message
+            self.superseded = answer.code == "name_taken"
+            return
+        self.link = Link.SEARCHING
+
+    def _patience(self) -> float:
+        found = any(not status.state.ended for status in self._host.statuses())
+        return _NAME_TAKEN_BY_FORMER if found and not self.host_id else _NAME_TAKEN
+
+    def _lose_master(self, reason: str) -> None:
+        self.link = Link.SEARCHING
+        self._poll_at = 0.0
+        self._newest_beat = None
+        self._control.forget()
+        self._host.take(core.MasterLost())
+        self._host.say(reason)
+
+    def _take_beat(self, beat: msg.MasterBeat) -> None:
+        if version_refusal(beat.protocol_version, "the master"):
+            return  # the handshake says it clearly
+        now = time.monotonic()
+        if self.link is Link.REGISTERED and beat.incarnation != self._incarnation:
+            if beat.epoch <= self._epoch and not self._missed(_MISSED_BY_ANOTHER, now):
+                return
+            self._lose_master(f"the master has started again (epoch {beat.epoch})")
+        self._newest_beat = beat
+        said_at = self._note_beat(beat.beat, now)
+        if self.link is Link.REGISTERED:
+            self._seen.note(Seen(beat.journal, beat.incarnation, self.cluster))
+        if self.link is Link.REGISTERED and self.host_id not in beat.unheard:
+            self._host.take(core.MasterHears(said_at))
+        if self.link is Link.LISTENING:
+            self._register_if_known()
+
+    def _missed(self, beats: int, now: float) -> bool:
+        """Whether our master has been silent for longer than so many beats."""
+        return now - self._beat_at > beats * self._beat_period
+
+    def _note_beat(self, beat: int, now: float) -> float:
+        """Remember it; returns when it was said, by our clock."""
+        self._master_beat, self._beat_at = beat, now
+        self._reporter.note_master(beat)
+        return self._beat_clock.said_at(beat / 1e9, now)
+
+    # --- asking for work -----------------------------------------------------------------
+
+    def ask(self, now: float) -> None:
+        """Ask for work, unless a request is open already.
+
+        When the request is renewed, the answer to the former one may be on its way. The slave
+        takes that answer as well, because the master repeats assignments that were lost only
+        after `control.order_retry`.
+        """
+        if now < self._poll_at or self.link is not Link.REGISTERED:
+            return
+        self._poll_at = now + self._poll_anew
+        self._poll_anew = min(2.0 * self._poll_anew, _POLL_ANEW)
+        if self._poll is not None:
+            self._poll.deadline = now + _PATIENCE
+        request = srv.RequestProcess.Request(
+            envelope=self._control.envelope(self._master_beat, self._epoch),
+            host_id=self.host_id, incarnation=self._description.incarnation,
+        )  # fmt: skip
+        self._poll = self._control.call(
+            self._clients[srv.RequestProcess], request, math.inf, self._take_work
+        )
+
+    def _take_work(self, response: srv.RequestProcess.Response | None) -> None:
+        if response is None:
+            return  # the request was renewed, and the former one was lost
+        self._poll_at, self._poll_anew = 0.0, _POLL_ANEW
+        answer = response.answer
+        if not answer.accepted:
+            self._poll_at = time.monotonic() + _ASK_AGAIN  # not with every turn of the loop
+            if answer.code in ("unknown", "stale"):
+                self._lose_master(f"the master does not know this host any more: {answer.message}")
+            return
+        self._seen.note(Seen(response.journal, self._incarnation, self.cluster))
+        try:
+            work = tuple(convert.assignment_from_msg(one) for one in response.assignments)
+        except Refused as refusal:
+            self._host.say(f"an assignment that makes no sense was refused: {refusal}")
+            return
+        given_at = response.slave_beat / 1e9 if response.slave_beat else None
+        self._host.take(core.AssignmentsReceived(work, given_at))
+
+    # --- what is said --------------------------------------------------------------------
+
+    def publish_reading(
+        self, usage: npt.NDArray[np.float32], limit: npt.NDArray[np.float32], present: int,
+        stale: int, *, accepting: bool, processes: int,
+    ) -> None:  # fmt: skip
+        """Say the utilisation and limits of this host, (slots,) fractions, once in every cycle.
+
+        What brings nothing new goes out with a later cycle (`rosrm.ros.slave.reporter`).
+        """
+        if self.link is Link.REGISTERED:
+            facts = (accepting, processes, present, stale, self._status_sequence)
+            self._reporter.cycle(usage, limit, facts)
+
+    def publish_statuses(self, statuses: Sequence[InstanceStatus], *, complete: bool) -> None:
+        """Say what became of instances."""
+        if self.link is not Link.REGISTERED:
+            return  # all of it goes with the registration
+        self._status_sequence += 1
+        self._statuses.publish(
+            msg.ProcessStatusBatch(
+                protocol_version=PROTOCOL_VERSION, host_id=self.host_id,
+                incarnation=self._description.incarnation, sequence=self._status_sequence,
+                complete=complete, statuses=[convert.status_to_msg(one) for one in statuses],
+                failing=[
+                    msg.PluginState(kind=kind, name=name, state="failing", reason=reason)
+                    for (kind, name), reason in self.failing.items()
+                ],
+            )
+        )  # fmt: skip
+
+    def publish_usage(
+        self, numbers: Sequence[int], cpu: Sequence[float], memory: Sequence[int]
+    ) -> None:
+        """Say what each instance uses: cores and bytes, in parallel.
+
+        The newest reading goes first: a need that is met must show in the readings.
+        """
+        if self.link is Link.REGISTERED:
+            self._reporter.tell()
+            self._usages.publish(
+                msg.ProcessUsage(
+                    protocol_version=PROTOCOL_VERSION, host_id=self.host_id,
+                    incarnation=self._description.incarnation, numbers=numbers, cpu=cpu,
+                    memory=memory,
+                )
+            )  # fmt: skip
+
+    def publish_kept(self, states: Sequence[KeptState]) -> bool:
+        """Say all the states that this host keeps; False: there is no master to hear it."""
+        if self.link is not Link.REGISTERED:
+            return False
+        self._kept.publish(
+            msg.KeptStates(
+                protocol_version=PROTOCOL_VERSION, host_id=self.host_id,
+                incarnation=self._description.incarnation,
+                states=[convert.kept_to_msg(one) for one in states],
+            )
+        )  # fmt: skip
+        return True
+
+    def wait_until_heard(self) -> None:
+        """Give the last words time to arrive: what is not acknowledged is lost when we leave."""
+        if self.link is not Link.REGISTERED:
+            return
+        if not self._statuses.wait_for_all_acked(Duration(seconds=_LAST_WORDS)):
+            self._host.say(
+                f"the master did not acknowledge the last statuses within {_LAST_WORDS:g} s"
+            )
+
+    def leave(self, done: Callable[[], None], kept: Sequence[InstanceStatus] = ()) -> None:
+        """Report that this slave stops; `done` is called when the master knows, or is silent.
+
+        A master that this slave finds after that is informed as well.
+
+        Args:
+            done: called once.
+            kept: all instances, where the slave leaves them running; (): it stops them.
+        """
+        self._leaves = kept
+        if self.link is Link.REGISTERED:
+            self._send_leave(kept, done)
+        else:
+            done()
+
+    def _send_leave(self, kept: Sequence[InstanceStatus], done: Callable[[], None]) -> None:
+        request = srv.Leave.Request(
+            envelope=self._control.envelope(self._master_beat, self._epoch),
+            host_id=self.host_id, incarnation=self._description.incarnation,
+            kept=[convert.status_to_msg(status) for status in kept],
+        )  # fmt: skip
+        self._control.call(
+            self._clients[srv.Leave], request, time.monotonic() + 1.0, lambda _: done()
+        )
+
+
+def _speaker(said: msg.MasterBeat | srv.Handshake.Response) -> tuple[str, int, int]:
+    """Which master said something, as far as a greeting tells."""
+    return said.hostname, said.pid, said.epoch

@@ -1,0 +1,207 @@
+"""Looks whether nodes do what their health asks for: publish a topic, be in a lifecycle state.
+
+All of it is polled from a node outside the executor, a few times a second: messages of a topic cost
+the slave no callback each, and of those that come faster than is asked for DDS keeps the newest.
+What it drops, and what best effort loses of large messages, the publisher's numbers tell.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Iterable, Sequence
+from importlib import import_module
+from typing import Any, Final
+
+from rclpy.node import Node
+from rclpy.qos import (
+    DurabilityPolicy,
+    HistoryPolicy,
+    QoSProfile,
+    ReliabilityPolicy,
+    qos_profile_services_default,
+)
+
+from rosrm.core.slave.reducer import Watch
+from rosrm.ros.slave.graph import GraphWatch
+
+#: Seconds between two looks at the graph while a topic is listened to.
+_GRAPH_PERIOD: Final = 1.0
+#: Seconds between two questions for a lifecycle state, and for which one may stay unanswered.
+_ASK_PERIOD: Final = 1.0
+_PATIENCE: Final = 1.0
+#: A state is asked for at least so often within the time for which it may be amiss.
+_ASKS: Final = 4
+#: Seconds' worth of messages that are kept between two looks, and the most of them.
+_KEPT: Final = 1.0
+_MOST_KEPT: Final = 1000
+
+
+class HealthEar:
+    """Listens to one run of one instance.
+
+    Args:
+        node: outside every executor.
+        graph: tells whose a publisher is.
+        watch: what is asked of it.
+        now: monotonic seconds.
+    """
+
+    def __init__(self, node: Node, graph: GraphWatch, watch: Watch, now: float) -> None:
+        self._topic = _TopicEar(node, graph, watch) if watch.topics else None
+        self._state = _StateEar(node, watch, now) if watch.services else None
+
+    def topic(self, pids: Iterable[int], now: float) -> tuple[int | None, str]:
+        """Messages since the look before, or None and why it cannot be listened to.
+
+        Args:
+            pids: of the instance.
+            now: monotonic seconds.
+        """
+        return (None, "") if self._topic is None else self._topic.look(pids, now)
+
+    def state(self, now: float) -> str | None:
+        """The lifecycle state; "": it does not answer; None: that is not known yet."""
+        return None if self._state is None else self._state.look(now)
+
+    def close(self) -> None:
+        """Listen no more."""
+        for ear in (self._topic, self._state):
+            if ear is not None:
+                ear.close()
+
+
+class _TopicEar:
+    def __init__(self, node: Node, graph: GraphWatch, watch: Watch) -> None:
+        self._node, self._graph = node, graph
+        self._names = watch.topics
+        kept = math.ceil(_KEPT * watch.wanted.rate) + 1
+        self._qos = QoSProfile(
+            history=HistoryPolicy.KEEP_LAST, depth=min(kept, _MOST_KEPT),
+            reliability=ReliabilityPolicy.BEST_EFFORT, durability=DurabilityPolicy.VOLATILE,
+        )  # fmt: skip
+        self._subscription: Any = None
+        self._source = ("", "")  # topic and type that are listened to
+        self._kind: Any = None
+        self._last = 0
+        self._looked_at_graph = -math.inf
+        self._trouble = ""
+
+    def look(self, pids: Iterable[int], now: float) -> tuple[int | None, str]:
+        if not self._is_matched() or now - self._looked_at_graph >= _GRAPH_PERIOD:
+            self._looked_at_graph = now
+            self._trouble = self._follow_graph(pids)
+        if self._trouble or not self._is_matched():
+            return None, self._trouble or "not found by discovery yet"
+        return self._take(), ""
+
+    def _is_matched(self) -> bool:
+        return self._subscription is not None and self._subscription.get_publisher_count() > 0
+
+    def _follow_graph(self, pids: Iterable[int]) -> str:
+        """Listen to what the instance publishes by the graph; why that cannot be, or ""."""
+        try:
+            name, types = self._published(pids)
+            if len(types) == 1:
+                self._listen(name, types[0])
+                return ""
+        except Exception as error:  # noqa: BLE001 - whatever a package or the middleware raises
+            return f"cannot be listened to on this host ({type(error).__name__}: {error})"
+        self.close()
+        if types:
+            return f"published as {' and '.join(types)}"
+        return f"not published as {' or '.join(self._names)}"
+
+    def _listen(self, name: str, type_name: str) -> None:
+        if (name, type_name) == self._source:
+            return
+        self.close()
+        self._kind = _message_type(type_name)
+        self._subscription = self._node.create_subscription(
+            self._kind, name, _never_called, self._qos, raw=True
+        )
+        self._source = (name, type_name)
+
+    def _published(self, pids: Iterable[int]) -> tuple[str, Sequence[str]]:
+        """The first of the names that is published, and as what; others count if it is not."""
+        for name in self._names:
+            found: list[Any] = self._node.get_publishers_info_by_topic(name)
+            own = [info for info in found if self._graph.is_of(bytes(info.endpoint_gid), pids)]
+            if found:
+                return name, sorted({str(info.topic_type) for info in own or found})
+        return "", ()
+
+    def _take(self) -> int:
+        """Messages since the last look, with those that were lost where numbers tell of them."""
+        alone = self._subscription.get_publisher_count() == 1
+        count, handle = 0, self._subscription.handle
+        with handle:
+            for _ in range(self._qos.depth):
+                taken = handle.take_message(self._kind, True)
+                if taken is None:
+                    break
+                count += self._since_last(int(taken[1]["publication_sequence_number"]), alone)
+        return count
+
+    def _since_last(self, number: int, alone: bool) -> int:
+        """By the publisher's own numbers; those of several would be mixed up."""
+        lost = number - self._last - 1 if alone and 0 < self._last < number else 0
+        self._last = number if alone else 0
+        return 1 + lost
+
+    def close(self) -> None:
+        if self._subscription is not None:
+            self._node.destroy_subscription(self._subscription)
+            self._subscription, self._source, self._last = None, ("", ""), 0
+
+
+class _StateEar:
+    def __init__(self, node: Node, watch: Watch, now: float) -> None:
+        self._node = node
+        self._clients: list[Any] = []
+        self._state: str | None = None
+        self._period = min(_ASK_PERIOD, watch.wanted.timeout / _ASKS)
+        self._asked = -math.inf
+        self._answered = now
+        self._kind = import_module("lifecycle_msgs.srv").GetState
+        for name in watch.services:
+            with contextlib.suppress(Exception):  # no name of a service: it does not answer
+                client = node.create_client(
+                    self._kind, name, qos_profile=qos_profile_services_default
+                )
+                self._clients.append(client)
+
+    def look(self, now: float) -> str | None:
+        for client in self._clients:
+            self._hear(client, now)
+        if now - self._answered > self._period + _PATIENCE:
+            self._state = ""
+        if now - self._asked >= self._period:
+            self._asked = now
+            for client in self._clients:
+                with client.handle:
+                    client.handle.send_request(self._kind.Request())
+        return self._state
+
+    def _hear(self, client: Any, now: float) -> None:
+        """Every answer that has come; the newest counts, to whichever question."""
+        while True:
+            with client.handle:
+                header, response = client.handle.take_response(self._kind.Response)
+            if header is None:
+                return
+            self._state, self._answered = str(response.current_state.label), now
+
+    def close(self) -> None:
+        for client in self._clients:
+            self._node.destroy_client(client)
+        self._clients.clear()
+
+
+def _message_type(name: str) -> Any:
+    package, _, kind = name.partition("/msg/")
+    return getattr(import_module(f"{package}.msg"), kind)
+
+
+def _never_called(_message: object) -> None:
+    raise AssertionError("the topic is polled, never called back")

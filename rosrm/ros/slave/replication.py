@@ -1,0 +1,180 @@
+"""How slaves give each other kept states: two services of each, and clients of those of others."""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Final, Protocol
+
+from rosrm.ros import names, qos
+from rosrm.ros.control import ControlClient, accepted, refused, version_refusal
+from rosrm.ros.participant import OpenRequest, Participant
+from rosrm.snapshots import Part
+from rosrm.version import PROTOCOL_VERSION
+from rosrm_msgs import srv
+
+#: Seconds after which a client that was not used is given up.
+_IDLE: Final = 60.0
+#: Most bytes that are given in one answer.
+MOST: Final = 256 << 10
+
+
+class KeptHost(Protocol):
+    """What the endpoint asks of the slave."""
+
+    def take_part(self, part: Part, answer: Callable[[str, str], None]) -> None:
+        """A part of a state came; `answer` with a code and a message, both "" when it is taken."""
+
+    def read_part(
+        self, process: str, age: tuple[int, int], offset: int, size: int,
+        answer: Callable[[Part | None], None],
+    ) -> None:  # fmt: skip
+        """A part of a state is wanted; `answer` with it, or with None."""
+
+
+@dataclass(slots=True)
+class _Peer:
+    client: Any
+    used: float
+
+
+class KeptEndpoint:
+    """The services of one slave, and its clients.
+
+    Args:
+        participant: where they are made.
+        name: of the host.
+    """
+
+    def __init__(self, participant: Participant, name: str) -> None:
+        self._participant = participant
+        self._name = name
+        self._names = names.Names(participant.settings.namespace)
+        self._client = ControlClient(participant, f"slave {name}")
+        self._peers: dict[tuple[Any, str], _Peer] = {}
+
+    def serve(self, host: KeptHost) -> None:
+        """Offer the services."""
+
+        def take(request: srv.KeepState.Request, open_request: OpenRequest) -> None:
+            fault = version_refusal(request.protocol_version, f"the slave of {request.sender}")
+
+            def answer(code: str, message: str) -> None:
+                answer = refused(code, message) if code else accepted()
+                open_request.answer(srv.KeepState.Response(answer=answer))
+
+            if fault:
+                answer("version", fault)
+                return
+            part = Part(
+                request.process, request.number, request.sequence, request.offset, request.total,
+                request.digest, bytes(request.data),
+            )  # fmt: skip
+            host.take_part(part, answer)
+
+        def read(request: srv.ReadKept.Request, open_request: OpenRequest) -> None:
+            fault = version_refusal(request.protocol_version, "a reader of kept states")
+
+            def answer(part: Part | None) -> None:
+                open_request.answer(_read_answer(part))
+
+            if fault:
+                open_request.answer(srv.ReadKept.Response(answer=refused("version", fault)))
+                return
+            age = (request.number, request.sequence)
+            size = min(request.max_bytes or MOST, MOST)
+            host.read_part(request.process, age, request.offset, size, answer)
+
+        own = self._names.of_host
+        self._participant.serve(srv.KeepState, own(self._name, names.KEEP_STATE), take)
+        self._participant.serve(srv.ReadKept, own(self._name, names.READ_KEPT), read)
+
+    # --- what is asked of others ---------------------------------------------------------
+
+    def finds_keeper(self, host: str, now: float) -> bool:
+        """Whether the slave of a host is there to be given a state."""
+        return bool(self._peer(srv.KeepState, names.KEEP_STATE, host, now).service_is_ready())
+
+    def finds_source(self, host: str, now: float) -> bool:
+        """Whether the slave of a host is there to be asked for a state."""
+        return bool(self._peer(srv.ReadKept, names.READ_KEPT, host, now).service_is_ready())
+
+    def _peer(self, kind: Any, name: str, host: str, now: float) -> Any:
+        peer = self._peers.get((kind, host))
+        if peer is None:
+            client = self._participant.node.create_client(
+                kind, self._names.of_host(host, name), qos_profile=qos.SERVICE
+            )
+            peer = self._peers[kind, host] = _Peer(client, now)
+        peer.used = now
+        return peer.client
+
+    def give(
+        self, host: str, part: Part, now: float, timeout: float,
+        done: Callable[[str, str], None],
+    ) -> None:  # fmt: skip
+        """Give a part to another slave; `done` with a code and a message, both "" when taken."""
+        request = srv.KeepState.Request(
+            protocol_version=PROTOCOL_VERSION, sender=self._name, process=part.process,
+            number=part.number, sequence=part.sequence, offset=part.offset, total=part.total,
+            digest=part.digest, data=array("B", part.data),
+        )  # fmt: skip
+
+        def answered(response: srv.KeepState.Response | None) -> None:
+            if response is None:
+                done("timeout", f"no answer within {timeout:g} s")
+            else:
+                answer = response.answer
+                done("" if answer.accepted else answer.code or "refused", answer.message)
+
+        client = self._peer(srv.KeepState, names.KEEP_STATE, host, now)
+        self._client.call(client, request, now + timeout, answered)
+
+    def ask(
+        self, host: str, wanted: Part, now: float, timeout: float,
+        done: Callable[[Part | str], None],
+    ) -> None:  # fmt: skip
+        """Ask another slave for a part; `done` with it, or with why there is none.
+
+        `wanted` has no data; with number 0 it is the newest state.
+        """
+        request = srv.ReadKept.Request(
+            protocol_version=PROTOCOL_VERSION, process=wanted.process, number=wanted.number,
+            sequence=wanted.sequence, offset=wanted.offset, max_bytes=MOST,
+        )  # fmt: skip
+
+        def answered(response: srv.ReadKept.Response | None) -> None:
+            done(
+                f"no answer within {timeout:g} s"
+                if response is None
+                else _part_of(response, wanted)
+            )
+
+        client = self._peer(srv.ReadKept, names.READ_KEPT, host, now)
+        self._client.call(client, request, now + timeout, answered)
+
+    def expire(self, now: float) -> None:
+        """End what was not answered in time, and clients of which nothing is wanted any more."""
+        self._client.expire(now)
+        for key in [key for key, peer in self._peers.items() if now - peer.used >= _IDLE]:
+            self._participant.node.destroy_client(self._peers.pop(key).client)
+
+
+def _part_of(response: srv.ReadKept.Response, wanted: Part) -> Part | str:
+    answer = response.answer
+    if not answer.accepted:
+        return str(answer.message)
+    return Part(
+        wanted.process, response.number, response.sequence, wanted.offset, response.total,
+        response.digest, bytes(response.data),
+    )  # fmt: skip
+
+
+def _read_answer(part: Part | None) -> srv.ReadKept.Response:
+    if part is None:
+        return srv.ReadKept.Response(answer=refused("unknown", "no such state is kept here"))
+    return srv.ReadKept.Response(
+        answer=accepted(), number=part.number, sequence=part.sequence, total=part.total,
+        digest=part.digest, data=array("B", part.data),
+    )  # fmt: skip

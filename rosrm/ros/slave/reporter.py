@@ -1,0 +1,106 @@
+"""What a slave says of its cycles: at once what decides something, the rest before long.
+
+A reading goes out in the cycle in which it brings something new: a limit is reached or left, work
+is taken or no longer, a probe is late, a process more or less, a batch of statuses, or a usage that
+has moved by `RESOLUTION`. Cycles that bring nothing new are told with the next message, after at
+most one beat period of the master: so both sides are heard that often.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from rosrm.ros.reading_codec import LAYOUT, MOST_QUIET, encode, flags
+from rosrm.version import PROTOCOL_VERSION
+
+#: Part of a resource's capacity by which a usage must have moved to be said at once.
+RESOLUTION: Final = 0.01
+
+#: What is compared as one with the message before: accepting, processes, present, stale, statuses.
+_Facts = tuple[bool, int, int, int, int]
+
+
+class Reporter:
+    """The readings of one slave.
+
+    Args:
+        send: publishes a serialised `ResourceInfo`.
+        incarnation: of this run of the slave.
+        period: seconds from one cycle to the next.
+    """
+
+    def __init__(self, send: Callable[[bytes], None], incarnation: int, period: float) -> None:
+        self._send = send
+        self._period = period
+        self._every = 1
+        self._untold = 0
+        self._row = np.zeros((), LAYOUT)
+        self._row["protocol_version"] = PROTOCOL_VERSION
+        self._row["incarnation"] = incarnation
+        self._facts: _Facts = (False, 0, 0, 0, 0)
+        self._told: _Facts | None = None
+        self._told_usage = self._told_limit = np.zeros(0, np.float32)
+        self._told_over = np.zeros(0, np.bool_)
+
+    def begin(self, host_id: int, beat_period: float) -> None:
+        """A master took this host in: the next reading goes out whatever it says.
+
+        Args:
+            host_id: the number under which this host reports.
+            beat_period: seconds, of that master.
+        """
+        self._row["host_id"] = host_id
+        # A little more than a quotient: three periods of 0.1 s are not quite 0.3 s.
+        self._every = min(max(1, int(beat_period / self._period + 1e-6)), MOST_QUIET + 1)
+        self._told = None
+
+    def note_master(self, beat: int) -> None:
+        """The newest beat of the master that was heard, ns."""
+        self._row["master_beat"] = beat
+
+    def cycle(
+        self, usage: npt.NDArray[np.float32], limit: npt.NDArray[np.float32], facts: _Facts
+    ) -> None:
+        """One cycle of the slave.
+
+        Args:
+            usage, limit: (slots,) fractions.
+            facts: accepting, processes, present, stale, newest status sequence.
+        """
+        row = self._row
+        row["sequence"] += 1
+        row["usage"], row["limit"] = usage, limit
+        self._facts = facts
+        self._untold += 1
+        if self._untold >= self._every or self._tells_more(usage, limit):
+            self.tell()
+
+    def _tells_more(self, usage: npt.NDArray[np.float32], limit: npt.NDArray[np.float32]) -> bool:
+        """Whether somebody may decide otherwise by this reading than by the one before."""
+        if self._facts != self._told:
+            return True
+        return bool(
+            (np.abs(usage - self._told_usage) >= RESOLUTION).any()
+            or ((usage >= limit) != self._told_over).any()
+            or (limit != self._told_limit).any()
+        )
+
+    def tell(self) -> None:
+        """Send the newest reading, unless it has gone out."""
+        if not self._untold:
+            return
+        row = self._row
+        accepting, row["processes"], row["present"], row["stale"], statuses = self._facts
+        row["status_sequence"] = statuses
+        row["flags"] = flags(accepting=accepting, quiet=self._untold - 1)
+        row["beat"] = time.monotonic_ns()
+        self._untold = 0
+        self._told = self._facts
+        self._told_usage, self._told_limit = row["usage"].copy(), row["limit"].copy()
+        self._told_over = self._told_usage >= self._told_limit
+        self._send(encode(row))

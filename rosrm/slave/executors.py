@@ -1,0 +1,179 @@
+"""Executors: what plugins have done on this host in the open step of a plan."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+from rosrm.core.master.events import BAD_RESULT
+from rosrm.errors import Refused, RosrmError, describe_fault, describe_plugin_fault
+from rosrm.extensions.discovery import definition
+from rosrm.extensions.plugin_calls import WORKS_AFTER, Plugin, given
+from rosrm.extensions.registry import Executor, OfferedExecutor
+
+#: Told of the outcome: "" or the code of a failure, why it failed, and the result as JSON.
+Done = Callable[[str, str, str], None]
+#: Code of a failure that the executor states by a `ValueError` or an error of rosrm: it is an
+#: answer, and no fault of the plugin.
+UNABLE: Final = "unable"
+
+
+@dataclass(frozen=True, slots=True)
+class Here:
+    """What an executor is told of its host, as `here`.
+
+    Attributes:
+        host: its name.
+        state: the slave's directory.
+        pids: of the leaders of the instances, by `process#number`; 0 of one that is to be started,
+            at first or again.
+    """
+
+    host: str
+    state: Path
+    pids: Mapping[str, int]
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values."""
+        live = {instance: pid for instance, pid in self.pids.items() if pid}
+        return {
+            "host": self.host, "state": str(self.state), "pids": live,
+            "instances": list(self.pids),
+        }  # fmt: skip
+
+
+class Executors:
+    """The executors of a host, and which migration strategies fail by them.
+
+    Args:
+        offered: by name.
+        broken: strategies whose offers are broken here, and why.
+        post: has something called in the loop.
+        changed: called in the loop when `failing` has changed, with what to say about it.
+        clock: monotonic seconds.
+
+    Attributes:
+        failing: strategy to its last error. One whose offer is broken fails for good. Any other is
+            taken out by a good answer that comes `WORKS_AFTER` seconds after its last failure.
+    """
+
+    def __init__(
+        self, offered: Mapping[str, OfferedExecutor], broken: Mapping[str, str], *,
+        post: Callable[[Callable[[], None]], None], changed: Callable[[str], None],
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:  # fmt: skip
+        self._offered = offered
+        self._post = post
+        self._changed = changed
+        self._clock = clock
+        self._failed_at: dict[str, float] = {}
+        self.failing = dict(broken)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of all executors."""
+        return tuple(self._offered)
+
+    def failing_plugins(self) -> dict[Plugin, str]:
+        """Return what fails by kind and name, and why."""
+        return {("migration", strategy): error for strategy, error in self.failing.items()}
+
+    def execute(
+        self, name: str, arguments: Mapping[str, Any], timeout: float, *, here: Here, done: Done
+    ) -> None:
+        """Run an executor in a thread of its own.
+
+        Args:
+            name: of the executor.
+            arguments: a JSON object.
+            timeout: seconds, after which its strategy counts as failing.
+            here: where it runs.
+            done: called in the loop with the outcome.
+
+        Raises:
+            Refused: there is none of this name.
+        """
+        offered = self._offered.get(name)
+        if offered is None:
+            there = ", ".join(sorted(self._offered)) or "none"
+            raise Refused(f"no executor {name!r} on {here.host}; there are: {there}")
+        strategy, function = offered.strategy, offered.call
+        place = definition(function)
+        late = f"executor {name} did not return within {timeout:g} s ({place})"
+        timer = threading.Timer(
+            min(timeout, threading.TIMEOUT_MAX), self._post, [partial(self._fail, strategy, late)]
+        )
+        timer.daemon = True
+        told = {**arguments, "here": here.as_json()}
+
+        def settle(code: str, message: str, result: str) -> None:
+            if code and code != UNABLE:
+                where = f" ({place})" if code == BAD_RESULT else ""
+                self._fail(strategy, f"executor {message}{where}")
+            else:
+                self._work(strategy)
+            done(code, message, result)
+
+        def work() -> None:
+            outcome = _outcome(name, function, told)
+            timer.cancel()
+            self._post(partial(settle, *outcome))
+
+        threading.Thread(target=work, name=f"executor {name}", daemon=True).start()
+        if timeout > 0.0:
+            timer.start()
+
+    def _fail(self, strategy: str, error: str) -> None:
+        self._failed_at[strategy] = self._clock()
+        if self.failing.get(strategy) != error:
+            self.failing[strategy] = error
+            self._changed(f"migration strategy {strategy} fails: {error}")
+
+    def _work(self, strategy: str) -> None:
+        failed_at = self._failed_at.get(strategy)
+        if failed_at is not None and self._clock() - failed_at >= WORKS_AFTER:
+            del self.failing[strategy], self._failed_at[strategy]
+            self._changed(f"migration strategy {strategy} works again")
+
+
+def _outcome(name: str, function: Executor, arguments: Mapping[str, Any]) -> tuple[str, str, str]:
+    """Run an executor; returns as `Done` is called."""
+    try:
+        result: object = function(arguments)
+        if not isinstance(result, Mapping):
+            return BAD_RESULT, f"{name} answered {given(result)}; a JSON object is required", ""
+        strange = _no_json(result, "")
+        if strange:
+            return BAD_RESULT, f"{name} answered something that is no JSON: {strange}", ""
+        return "", "", json.dumps(result, default=dict)
+    except RosrmError as error:
+        return UNABLE, str(error), ""
+    except ValueError as error:
+        return UNABLE, f"{name}: {describe_fault(error)}", ""
+    except BaseException as error:  # noqa: BLE001 - a third party's code, which may call sys.exit
+        return "failed", f"{name} raised {describe_plugin_fault(error)}", ""
+
+
+def _no_json(value: object, path: str) -> str:
+    """Return where an answer holds what JSON cannot, and its type; "" if it does nowhere."""
+    if isinstance(value, Mapping):
+        for key, item in value.items():
+            if not _is_plain(key):
+                return f"the key {key!r}: {type(key).__name__}"
+            if strange := _no_json(item, f"{path}.{key}" if path else key):
+                return strange
+        return ""
+    if isinstance(value, list | tuple):
+        found = (_no_json(item, f"{path}[{index}]") for index, item in enumerate(value))
+        return next(filter(None, found), "")
+    return "" if _is_plain(value) else f"{path}: {type(value).__name__}"
+
+
+def _is_plain(value: object) -> bool:
+    return value is None or isinstance(value, (str, int, float))

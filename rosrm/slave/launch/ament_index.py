@@ -1,0 +1,80 @@
+"""Finds the executable of a ROS package, by the files of the ament index.
+
+The index is a folder of marker files, so it is read here directly: `ament_index_python` knows only
+this process's AMENT_PREFIX_PATH, while a process may be given one of its own, and the ROS wheels
+set none at all (their packages lie in the prefix of their Python).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Final
+
+from rosrm.errors import LaunchError
+from rosrm.wording import get_close_matches, listed
+
+_PACKAGES = "share/ament_index/resource_index/packages"
+#: As many names are listed where none is similar.
+_FEW: Final = 8
+
+
+def search_path(environment: Mapping[str, str], python: str) -> list[Path]:
+    """Prefixes to search: AMENT_PREFIX_PATH, then the prefix of this Python."""
+    named = [Path(part) for part in environment.get("AMENT_PREFIX_PATH", "").split(":") if part]
+    own = Path(python).absolute().parent.parent  # not resolved: a venv's python is a link
+    return named if own in named else [*named, own]
+
+
+def find_executable(package: str, executable: str, prefixes: Sequence[Path]) -> Path:
+    """The file PREFIX/lib/PACKAGE/EXECUTABLE.
+
+    Raises:
+        LaunchError: naming what was looked for, where, and what is there with a similar name.
+    """
+    prefix = _find_package(package, prefixes)
+    path = prefix / "lib" / package / executable
+    if not path.is_file():
+        near = _near(executable, _executables(path.parent))
+        raise LaunchError(
+            f"the package {package!r} has no executable {executable!r}: "
+            f"looked for {path}{near or '; the package has none at all'}"
+        )
+    if not os.access(path, os.X_OK):
+        raise LaunchError(f"{path} of the package {package!r} is there, but is not executable")
+    return path
+
+
+def _find_package(package: str, prefixes: Sequence[Path]) -> Path:
+    for prefix in prefixes:
+        if (prefix / _PACKAGES / package).is_file():
+            return prefix
+    where = ", ".join(str(prefix) for prefix in prefixes)
+    known = {name for prefix in prefixes for name in _listed(prefix / _PACKAGES)}
+    near = _near(package, sorted(known))
+    raise LaunchError(
+        f"the ROS package {package!r} was not found{near or '; no package was found at all'}\n"
+        f"searched: {where} (AMENT_PREFIX_PATH and the prefix of this Python)"
+    )
+
+
+def _executables(folder: Path) -> list[str]:
+    return [name for name in _listed(folder) if os.access(folder / name, os.X_OK)]
+
+
+def _listed(folder: Path) -> list[str]:
+    return sorted(entry.name for entry in folder.iterdir()) if folder.is_dir() else []
+
+
+def _near(name: str, known: Sequence[str]) -> str:
+    """What the user may have meant; "" where nothing is known."""
+    if not known:
+        return ""
+    close = get_close_matches(name, known, n=3, cutoff=0.5)
+    close = close or [other for other in known if name in other][:3]
+    if close:
+        return f"; did you mean {listed(close, 'or')}?"
+    if len(known) > _FEW:
+        return f"; none of the {len(known)} that are there has a similar name"
+    return f"; there: {listed(known)}"

@@ -1,0 +1,149 @@
+"""Starts what a slave has taken on: its kept state comes first, then it, then its node."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from rosrm.config.settings import HostConfig
+from rosrm.core.slave import reducer as core
+from rosrm.criu import periodic, places
+from rosrm.errors import LaunchError
+from rosrm.model.values import Assignment, InstanceId, InstanceState
+from rosrm.portable import control_root
+from rosrm.ros.names import STATE_CONFIG, Names
+from rosrm.ros.slave.endpoint import SlaveEndpoint
+from rosrm.ros.slave.graph import GraphWatch
+from rosrm.slave.launch.command import launch_order
+from rosrm.slave.launch.environment import Whereabouts
+from rosrm.slave.memos import to_memo
+from rosrm.slave.replication.service import Keeping
+from rosrm.slave.sessions import SessionTable
+from rosrm.slave.supervisor_client import SupervisorLink
+from rosrm.wording import one_line
+
+
+@dataclass
+class Starter:
+    """From assignments to orders for the supervisor.
+
+    Attributes:
+        config: of the host.
+        incarnation: of this run of the slave.
+        kept: directory of the kept states.
+        state: what the slave holds; it is only looked at here.
+        supervisor: carries the orders out.
+        endpoint: tells the master.
+        keeping: has the kept states.
+        graph: where nodes are seen.
+        sessions: which processes an instance has.
+        take: is told what has happened.
+        say: tells the user.
+    """
+
+    config: HostConfig
+    incarnation: int
+    kept: Path
+    state: core.SlaveState
+    supervisor: SupervisorLink
+    endpoint: SlaveEndpoint
+    keeping: Keeping
+    graph: GraphWatch
+    sessions: SessionTable
+    take: Callable[[core.Event], None]
+    say: Callable[[str], None]
+    _environment: Mapping[str, str] = field(init=False)
+    _graph_before: dict[InstanceId, frozenset[bytes]] = field(init=False, default_factory=dict)
+    _closed: bool = field(init=False, default=False)
+
+    def __post_init__(self) -> None:
+        self._environment = {**os.environ, **self.config.ros.environment()}
+
+    def launch(self, assignments: Sequence[Assignment]) -> None:
+        """Start them, each as soon as its kept state is here."""
+        # Of several events at once the last may have been that its supervisor is gone.
+        wanted = [one for one in assignments if one.instance in self.state.held]
+        ready = [one for one in wanted if self.keeping.prepare(one, self._prepared)]
+        if ready:
+            self._start(ready)
+        # A state may take its time to come. Until it runs nobody else says so, and the master would
+        # take it back.
+        waiting = [
+            self.state.held[one.instance].status
+            for one in wanted if one not in ready and one.kept_on
+        ]  # fmt: skip
+        if waiting:
+            self.endpoint.publish_statuses(waiting, complete=False)
+
+    def call_off(self, command: core.Command) -> bool:
+        """Do not begin what still waits for its state; False: that is not what is to be done."""
+        if not isinstance(command, core.Stop | core.Fence | core.Restart):
+            return False
+        if not self.keeping.is_preparing(command.instance):
+            return False
+        if not isinstance(command, core.Restart):  # what that wants comes with the start
+            self.keeping.forget(command.instance)
+            refusal = "it was stopped before it was started"
+            self.take(core.LaunchRefused(command.instance, refusal))
+        return True
+
+    def begin_anew(self, instance: InstanceId) -> None:
+        """It is about to be restarted by hand: not from an image."""
+        periodic.begin_anew(places.periodic(self.config.state, instance.number))
+
+    def close(self) -> None:
+        """Nothing more is started."""
+        self._closed = True
+
+    def has_begun(self, instance: InstanceId) -> bool:
+        """Return True if the supervisor has the instance, or had it."""
+        return instance not in self.state.waiting and not self.keeping.is_preparing(instance)
+
+    def look_at_graph(self, awaited: Mapping[InstanceId, core.Held]) -> None:
+        """See whether nodes that were started have come up."""
+        for instance, held in awaited.items():
+            before = self._graph_before.get(instance, frozenset())
+            pids = self.sessions.known_as(held.status.pid)
+            if held.awaited and self.graph.sees(held.awaited.node_name, pids, before):
+                self.take(core.SeenInGraph(instance))
+
+    def ended(self, instance: InstanceId) -> None:
+        """It is awaited no more."""
+        self._graph_before.pop(instance, None)
+
+    def _prepared(self, assignment: Assignment) -> None:
+        held = self.state.held.get(assignment.instance)
+        wanted = held is not None and held.status.state is InstanceState.STARTING
+        if wanted and not self._closed:
+            self._start([assignment])
+
+    def _start(self, assignments: Sequence[Assignment]) -> None:
+        orders = []
+        where = self._whereabouts()
+        for assignment in assignments:
+            held = self.state.held[assignment.instance]
+            if held.awaited is not None:
+                before = self.graph.endpoints(held.awaited.node_name)
+                self._graph_before[assignment.instance] = before
+            try:
+                order = launch_order(
+                    assignment, self._environment, sys.executable, where=where,
+                    state_directory=self.supervisor.state, images=self.config.state,
+                    heard=self.state.heard_at,
+                )  # fmt: skip
+                orders.append(replace(order, memo=to_memo(held.memo)))
+            except LaunchError as error:
+                self.say(f"{assignment.instance} cannot be started here: {one_line(str(error))}")
+                self.take(core.LaunchRefused(assignment.instance, str(error)))
+        if orders:
+            self.supervisor.start(orders)
+
+    def _whereabouts(self) -> Whereabouts:
+        config = self.config
+        return Whereabouts(
+            config.host, self.endpoint.cluster, Names(config.ros.namespace)(STATE_CONFIG),
+            self.kept, config.keep.every, control_root(os.geteuid()), self.incarnation,
+        )  # fmt: skip

@@ -1,0 +1,184 @@
+"""Parts of what an instance wrote, over the rotations of its log, for `rosrm logs`."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from rosrm.errors import Refused
+from rosrm.model.values import InstanceId
+from rosrm.ros.slave.endpoint import LogQuery, LogSlice
+from rosrm.supervisor import log_index
+from rosrm.supervisor.client import log_path, logged_instances, newest_log
+
+#: Most bytes in one answer.
+_MOST: Final = 1 << 20
+#: Most marks in one answer; with more of them the answer ends sooner.
+_MOST_MARKS: Final = 4096
+#: Bytes between two looks for the beginnings of lines.
+_BLOCK: Final = 1 << 16
+#: How often a read that a rotation crossed is tried again.
+_TRIES: Final = 5
+
+
+class _Segment(NamedTuple):
+    """A file of a log: its first byte and the one behind its last, from the instance's first."""
+
+    path: Path
+    begin: int
+    end: int
+
+
+def read_log(state_directory: Path, query: LogQuery, *, ended: bool) -> LogSlice:
+    """Read a part of what an instance wrote.
+
+    Args:
+        state_directory: of the supervisor.
+        query: with the number of the instance.
+        ended: the instance has ended.
+
+    Raises:
+        Refused: there is no log of it.
+    """
+    instance = InstanceId(query.process, query.number)
+    path = log_path(state_directory, instance)
+    numbers = tuple(logged_instances(state_directory, query.process))
+    for _ in range(_TRIES):
+        before = log_index.base(str(path))
+        try:
+            part = _read(path, _segments(path), query, numbers, ended=ended)
+        except FileNotFoundError:
+            if not path.exists():
+                break
+            continue  # rotated between two looks
+        if log_index.base(str(path)) == before:
+            return part
+    raise Refused(f"this host has no log of {instance} (any more): {path}", "unknown")
+
+
+def newest_instance(state_directory: Path, process: str) -> InstanceId:
+    """Return the newest instance of a process that has a log here; raises `Refused`."""
+    newest = newest_log(state_directory, process)
+    if newest is None:
+        raise Refused(f"this host has no log of {process}", "unknown")
+    return newest
+
+
+def nothing_yet(query: LogQuery) -> LogSlice:
+    """Return the answer for an instance that is being started: its file is opened with it."""
+    return LogSlice(query.number, (), b"", query.offset, query.offset, False, ())
+
+
+def _segments(path: Path) -> list[_Segment]:
+    """Return the files of a log, the oldest first."""
+    files, number = [path], 1
+    while (older := path.with_name(f"{path.name}.{number}")).exists():
+        files.append(older)
+        number += 1
+    segments: list[_Segment] = []
+    for file in reversed(files):
+        size = file.stat().st_size
+        begin = log_index.base(str(file))
+        if begin is None:  # written before there were indices
+            begin = segments[-1].end if segments else 0
+        segments.append(_Segment(file, begin, begin + size))
+    return segments
+
+
+def _read(
+    path: Path, segments: Sequence[_Segment], query: LogQuery, numbers: Sequence[int], *,
+    ended: bool,
+) -> LogSlice:  # fmt: skip
+    last = segments[-1].end
+    offset = min(_start(segments, query), last)
+    found = next((one for one in segments if one.end > offset), segments[-1])
+    if offset < found.begin:
+        offset = _whole_line(found)
+    with found.path.open("rb") as log:
+        log.seek(offset - found.begin)
+        content = log.read(min(query.max_bytes or _MOST, _MOST))
+    marks, end = _marks(found, offset, offset + len(content), now=found.path == path)
+    content = content[: end - offset]
+    return LogSlice(query.number, numbers, content, offset, end, ended and end >= last, marks)
+
+
+def _start(segments: Sequence[_Segment], query: LogQuery) -> int:
+    """Return where a query begins."""
+    if query.tail:
+        return _before_lines(segments, query.tail)
+    if query.since:
+        return _written_since(segments, query.since)
+    return query.offset
+
+
+def _whole_line(segment: _Segment) -> int:
+    """Return where the first whole line of a file begins, if what lies before it was dropped.
+
+    A line that is the only one stays, whole or not.
+    """
+    with log_index.Index(str(segment.path)) as index:
+        first = index.marks(0, 2)  # of the file, and of a program that was started there
+    if segment.begin == 0 or any(mark.pid and mark.offset == segment.begin for mark in first):
+        return segment.begin
+    with segment.path.open("rb") as log:
+        end = log.read(_BLOCK).find(b"\n") + 1
+    return segment.begin + (end if segment.begin + end < segment.end else 0)
+
+
+def _before_lines(segments: Sequence[_Segment], lines: int) -> int:
+    """Return where the last lines begin; an unfinished one counts."""
+    wanted, at_end = lines, True
+    for segment in reversed(segments):
+        with segment.path.open("rb") as log:
+            end = segment.end - segment.begin
+            while end > 0:
+                begin = max(0, end - _BLOCK)
+                block = os.pread(log.fileno(), end - begin, begin)
+                wanted += at_end and block.endswith(b"\n")
+                at_end = False
+                at = len(block)
+                while (at := block.rfind(b"\n", 0, at)) >= 0:
+                    wanted -= 1
+                    if wanted == 0:
+                        return segment.begin + begin + at + 1
+                end = begin
+    return _whole_line(segments[0])
+
+
+def _written_since(segments: Sequence[_Segment], since: float) -> int:
+    """Return where that begins which was written at a time or later."""
+    for segment in segments:
+        with log_index.Index(str(segment.path)) as index:
+            late = index.find(lambda mark: mark.time >= since)
+            if 0 < late < index.count:
+                return index.mark(late - 1).offset
+            if late < index.count:
+                return _whole_line(segment) if segment is segments[0] else segment.begin
+    # The last look at a log that grows may be older than its newest bytes.
+    with log_index.Index(str(segments[-1].path)) as index:
+        return index.mark(index.count - 1).offset if index.count else segments[-1].begin
+
+
+def _marks(
+    segment: _Segment, begin: int, end: int, *, now: bool
+) -> tuple[list[tuple[float, int, int]], int]:
+    """Return the marks of a part, one behind its end included, and where the part has to end.
+
+    Args:
+        segment: that the part lies in.
+        begin: offset of the part.
+        end: offset behind it.
+        now: the file is written to: what no look has found yet was written just now.
+    """
+    with log_index.Index(str(segment.path)) as index:
+        first = index.find(lambda mark: mark.offset >= begin)
+        last = index.find(lambda mark: mark.offset >= end)
+        found = index.marks(first, min(last + 1 - first, _MOST_MARKS))
+    if len(found) == _MOST_MARKS:
+        return list(found), min(end, found[-1].offset)
+    if now and (not found or found[-1].offset < end):
+        found.append(log_index.Mark(time.time(), end, 0))
+    return list(found), end

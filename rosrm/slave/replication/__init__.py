@@ -1,0 +1,1 @@
+"""Replicas of snapshots: kept for other hosts, sent, and fetched."""

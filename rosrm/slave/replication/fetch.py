@@ -1,0 +1,112 @@
+"""Fetches the kept state of a process from where it lies, before an instance of it starts here."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Final
+
+from rosrm.model.values import Assignment
+from rosrm.ros.slave.replication import KeptEndpoint
+from rosrm.snapshots import Head, Part
+
+#: Seconds in which a slave must be found, or answer; then the next host is asked.
+PATIENCE: Final = 3.0
+#: Seconds after which a process starts from what is here by then, whatever is still on its way.
+LONGEST: Final = 60.0
+
+
+class Fetch:
+    """One state on its way to here.
+
+    Args:
+        assignment: that waits for it.
+        hosts: that keep a state, the newest first.
+        endpoint: speaks with their slaves.
+        here: the newest state that is here already; None: there is none.
+        take: writes a part, and calls back with a code and a message.
+        ended: called once, with a word for the user.
+    """
+
+    def __init__(
+        self, assignment: Assignment, hosts: tuple[str, ...], endpoint: KeptEndpoint, *,
+        here: Head | None, take: Callable[[Part, Callable[[tuple[str, str]], None]], None],
+        ended: Callable[[str], None],
+    ) -> None:  # fmt: skip
+        self._assignment = assignment
+        self._hosts = list(hosts)
+        self._endpoint = endpoint
+        self._here = here
+        self._take = take
+        self._ended = ended
+        self._over = self._waits = False
+        self._failures: list[str] = []
+        self._wanted = Part(assignment.spec.name, 0, 0, 0, 0, 0, b"")
+        now = time.monotonic()
+        self._deadline, self._host_by = now + LONGEST, now + PATIENCE
+
+    def go_on(self, now: float) -> None:
+        """Ask for the next part, or give up who does not answer."""
+        if self._over:
+            return
+        if now >= self._deadline:
+            self._next_host(f"it takes longer than {LONGEST:g} s", now, last=True)
+        elif not self._hosts:
+            self._end("")
+        elif not self._waits:
+            host = self._hosts[0]
+            if self._endpoint.finds_source(host, now):
+                self._waits = True
+                self._endpoint.ask(host, self._wanted, now, PATIENCE, self._answered)
+            elif now >= self._host_by:
+                self._next_host(f"its slave was not found within {PATIENCE:g} s", now)
+
+    def _answered(self, part: Part | str) -> None:
+        if self._over:
+            return
+        now = time.monotonic()
+        if isinstance(part, str):
+            self._next_host(part, now)
+        elif part.number < self._assignment.kept_from or not part.data:
+            self._next_host("what it keeps is of no use", now)
+        elif part.offset == 0 and self._here is not None and self._here.age >= part.age:
+            self._next_host("what it keeps is not newer than what is here", now)
+        else:
+            self._take(part, partial(self._taken, part))
+
+    def _taken(self, part: Part, outcome: tuple[str, str]) -> None:
+        if self._over:
+            return
+        code, message = outcome
+        now = time.monotonic()
+        if code:
+            self._next_host(message, now)
+        elif part.is_last:
+            self._end(
+                f"the state of {part.process}#{part.number}, cycle {part.sequence}, was fetched "
+                f"from {self._hosts[0]} for {self._assignment.instance}"
+            )
+        else:
+            self._wanted = part._replace(offset=part.offset + len(part.data), data=b"")
+            self._waits = False
+            self.go_on(now)
+
+    def _next_host(self, why: str, now: float, *, last: bool = False) -> None:
+        self._failures.append(f"{self._hosts.pop(0)}: {why}" if self._hosts else why)
+        self._wanted = Part(self._assignment.spec.name, 0, 0, 0, 0, 0, b"")
+        self._waits = False
+        self._host_by = now + PATIENCE
+        if last or not self._hosts:
+            self._end("")
+        else:
+            self.go_on(now)
+
+    def _end(self, good: str) -> None:
+        self._over = True
+        here = self._here
+        start = "from nothing" if here is None else f"from cycle {here.sequence}, which is here"
+        why = "; ".join(self._failures) or "no other host keeps one"
+        self._ended(
+            good or f"no newer state for {self._assignment.instance}, it starts {start}: {why}"
+        )

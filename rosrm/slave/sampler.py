@@ -1,0 +1,437 @@
+"""Reads the probes of a host without ever waiting for one.
+
+The slave's 10 Hz loop is the only clock: each call of `Sampler.latest` hands the probes that are
+due to a thread and returns what earlier reads have brought, so it takes microseconds whatever the
+probes do. The rules:
+
+- A probe begins in a thread of its own. Ten quick reads in a row earn it a place in the thread that
+  all quick probes share (one wake-up a cycle, not one a probe); one slow read loses it again.
+- A read that is slow while others queue behind it keeps the thread it hangs in; the others get a
+  fresh one at the next cycle. A probe is never read twice at a time, so a hanging probe costs one
+  thread, however long it hangs.
+- A probe that is late, raises or answers nonsense makes its readings *stale*: they keep their last
+  value, never zero. Why is reported once, and so is the recovery. A probe that changes often stays
+  stale until its changes are rarer, so the mark and the newest report always agree. Recoveries are
+  held back so, failures never. Another error of a stale probe is reported at most every 10 s.
+- Before its first reading a resource counts as full and stale, so that no work is drawn to a host
+  that has not been measured.
+
+Readings are one cycle old. A read in the loop itself would cost some 30 us a cycle less, but then a
+probe that was quick a thousand times could still hang the loop at the next read.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from queue import SimpleQueue
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from rosrm.errors import PluginError, describe_plugin_fault
+from rosrm.extensions.plugin_calls import given, required
+from rosrm.model.values import ABSURD_USAGE, RESOURCE_SLOTS, Reading
+
+if TYPE_CHECKING:
+    from rosrm.extensions.contracts import Probe
+    from rosrm.extensions.registry import MadeProbe
+
+#: A read that takes longer, in seconds, is too slow to share a thread.
+QUICK: Final = 0.05
+#: As many quick reads in a row earn a probe its place in the shared thread.
+TRUSTED_AFTER: Final = 10
+#: At most this many reports of one probe in REPORT_WINDOW seconds: a flapping probe floods nothing.
+REPORTS: Final = 6
+REPORT_WINDOW: Final = 60.0
+#: Seconds after a report before another error of a probe that is still stale is reported.
+ANOTHER_ERROR: Final = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class ProbeReport:
+    """The readings of a probe went stale, or came back.
+
+    Attributes:
+        resources: names of the readings concerned; none of a probe that could not be made and
+            whose resources others read.
+        reason: why they are stale; "" on recovery.
+    """
+
+    probe: str
+    resources: tuple[str, ...]
+    stale: bool
+    reason: str
+
+    def __str__(self) -> str:
+        """One sentence for the event record."""
+        names = ", ".join(self.resources)
+        if self.stale and not names:
+            return f"probe {self.probe} fails: {self.reason}"
+        if self.stale:
+            return f"probe {self.probe}: {names} stale: {self.reason}"
+        return f"probe {self.probe}: {names} read again"
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """The newest readings of all probes.
+
+    Attributes:
+        usage: (RESOURCE_SLOTS,) float32 fractions of the capacity, by slot; 0 where not in use.
+        stale: bit i: the reading of slot i is older than its deadline.
+        reports: what has changed since the sample before.
+    """
+
+    usage: npt.NDArray[np.float32]
+    stale: int
+    reports: tuple[ProbeReport, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class _Outcome:
+    """What a read brought: values in the order of the probe's resources, or why there are none.
+
+    Attributes:
+        seconds: that the read took.
+        age: seconds since it was asked for, which a busy machine can make much longer.
+    """
+
+    values: tuple[float, ...]
+    reason: str
+    seconds: float
+    age: float
+
+
+class Sampler:
+    """Reads probes in the background; `latest` is called by one loop, never waits.
+
+    Args:
+        probes: as the registry made and checked them; the order of their resources gives the
+            slots.
+        clock: monotonic seconds, the same as the `now` of `latest`.
+    """
+
+    def __init__(
+        self, probes: Sequence[MadeProbe], *, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self.resources: Final = tuple(resource for made in probes for resource in made.resources)
+        self._clock = clock
+        self._progress = threading.Event()
+        self._shared = _Lane("rosrm-probes")
+        self._left: list[_Lane] = []
+        self._watched: list[_Watched] = []
+        self._usage = [0.0] * RESOURCE_SLOTS
+        first = 0
+        for made in probes:
+            watched = _Watched(made, first, clock, self._progress)
+            self._watched.append(watched)
+            first += len(watched.names)
+        self._usage[:first] = [1.0] * first
+
+    @property
+    def present(self) -> int:
+        """Bit i: slot i is in use."""
+        return (1 << len(self.resources)) - 1
+
+    def latest(self, now: float) -> Sample:
+        """The newest readings, and a new read of each probe that is due. Never waits.
+
+        Args:
+            now: monotonic seconds.
+        """
+        reports: list[ProbeReport] = []
+        for watched in self._watched:
+            if watched.busy:
+                self._mind_running(watched, now)
+            elif watched.outcome is not None:
+                self._take_outcome(watched, watched.outcome)
+            reports += watched.report(now)
+            if now >= watched.due and not watched.busy:
+                watched.lane.put(watched.prepare(now))
+        stale = sum(watched.mask for watched in self._watched if watched.is_stale)
+        return Sample(np.array(self._usage, np.float32), stale, tuple(reports))
+
+    def settle(self, timeout: float) -> bool:
+        """Wait until no read is under way.
+
+        Args:
+            timeout: seconds.
+
+        Returns:
+            False: it passed and a read still runs.
+        """
+        end = time.monotonic() + timeout
+        while any(watched.busy for watched in self._watched):
+            if not self._progress.wait(max(0.0, end - time.monotonic())):
+                return False
+            self._progress.clear()
+        return True
+
+    def first(self, timeout: float = 2.0) -> Sample:
+        """Read every probe once and wait for the answers: the sample to register with.
+
+        Args:
+            timeout: seconds; a probe that has not answered by then stays stale.
+        """
+        reports = self.latest(self._clock()).reports
+        self.settle(timeout)
+        sample = self.latest(self._clock())
+        return Sample(sample.usage, sample.stale, reports + sample.reports)
+
+    def close(self, timeout: float = 2.0) -> tuple[str, ...]:
+        """Close every probe, each in the thread that reads it; no further call may follow.
+
+        Args:
+            timeout: seconds for all of them together.
+
+        Returns:
+            Names of the probes that hang or raised, and so were left unclosed.
+        """
+        for watched in self._watched:
+            # One that hangs in a thread it took with it must not be closed under its own read.
+            if watched.lane.alive() or not watched.busy:
+                watched.lane.put(watched.close)
+        lanes = {id(lane): lane for lane in [*(w.lane for w in self._watched), self._shared]}
+        end = time.monotonic() + timeout
+        for lane in lanes.values():
+            lane.end()
+        for lane in [*lanes.values(), *self._left]:
+            lane.join(max(0.0, end - time.monotonic()))
+        return tuple(watched.name for watched in self._watched if not watched.closed)
+
+    def _mind_running(self, watched: _Watched, now: float) -> None:
+        """A read is under way: free those behind it when it is slow, mark it when it is late."""
+        if watched.running(now) > QUICK and watched.lane is self._shared:
+            stuck, self._shared = self._shared, self._shared.succeed()
+            for other in self._watched:
+                if other.lane is stuck:
+                    other.lane = self._shared
+            watched.lane = _Lane(f"rosrm-probe-{watched.name}")
+        if now - watched.asked > watched.deadline:
+            watched.reason = f"no answer within {watched.deadline:g} s"
+
+    def _take_outcome(self, watched: _Watched, outcome: _Outcome) -> None:
+        """A read has ended: publish its values, and choose the thread of the next."""
+        watched.outcome, watched.measured = None, True
+        if outcome.values:
+            self._usage[watched.slots] = outcome.values
+        late = outcome.age > watched.deadline
+        watched.reason = f"answered after {outcome.age:.3g} s" if late else outcome.reason
+        self._choose_lane(watched, outcome.seconds)
+
+    def _choose_lane(self, watched: _Watched, seconds: float) -> None:
+        if seconds > QUICK:
+            watched.quick_reads = 0
+            if watched.lane is self._shared:
+                watched.lane = _Lane(f"rosrm-probe-{watched.name}")
+            return
+        watched.quick_reads += 1
+        if watched.quick_reads >= TRUSTED_AFTER and watched.lane is not self._shared:
+            watched.lane.end()
+            self._left = [lane for lane in self._left if lane.alive()] + [watched.lane]
+            watched.lane = self._shared
+
+
+class _Lane:
+    """A thread that carries out one call after another; it starts with the first."""
+
+    def __init__(
+        self, name: str, queue: SimpleQueue[Callable[[], None] | None] | None = None
+    ) -> None:
+        self._name = name
+        self._queue: SimpleQueue[Callable[[], None] | None] = queue or SimpleQueue()
+        self._thread: threading.Thread | None = None
+        self._dismissed = False
+
+    def put(self, call: Callable[[], None]) -> None:
+        """Queue a call."""
+        if self._thread is None:
+            self._start()
+        self._queue.put(call)
+
+    def succeed(self) -> _Lane:
+        """Leave the thread to the call that it hangs in; a new one takes over the queue."""
+        self._dismissed = True
+        lane = _Lane(self._name, self._queue)
+        lane._start()
+        return lane
+
+    def end(self) -> None:
+        """End the thread when it has carried out what is queued."""
+        self._queue.put(None)
+
+    def alive(self) -> bool:
+        """Its thread still runs."""
+        return self._thread is not None and self._thread.is_alive()
+
+    def join(self, timeout: float) -> None:
+        """Wait for the end of the thread, at most `timeout` seconds."""
+        if self._thread is not None:
+            self._thread.join(timeout)
+
+    def _start(self) -> None:
+        # A daemon: a probe that hangs in the kernel must not keep the slave from ending.
+        self._thread = threading.Thread(target=self._serve, name=self._name, daemon=True)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        # Without a time-out, as it waits for orders alone: `end` is always among them.
+        while (call := self._queue.get()) is not None:
+            call()
+            if self._dismissed:
+                return
+        if self._dismissed:  # it was free after all, and has taken the end meant for its successor
+            self._queue.put(None)
+
+
+class _Watched:
+    """One probe under watch.
+
+    Handed to and fro by `busy`: while it is True only the reading thread writes `started` and
+    `outcome`, and clears `busy` last; while it is False only the loop writes.
+    """
+
+    def __init__(
+        self,
+        made: MadeProbe,
+        first: int,
+        clock: Callable[[], float],
+        progress: threading.Event,
+    ) -> None:
+        self.name = made.name
+        self.names = tuple(resource.name for resource in made.resources)
+        self.deadline = made.deadline
+        self.slots = slice(first, first + len(self.names))
+        self.mask = ((1 << len(self.names)) - 1) << first
+        self.lane = _Lane(f"rosrm-probe-{made.name}")
+        self.quick_reads = 0
+        self.reason = ""
+        self.busy = False
+        self.asked = -math.inf
+        self.closed = False
+        self.outcome: _Outcome | None = None
+        self._started: float | None = None
+        self._probe = made.probe
+        self._period = made.period
+        self._clock = clock
+        self._progress = progress
+        self.due = self._nominal = -math.inf
+        self.measured = False
+        self._reported_stale = False
+        self._reported = ""
+        self._reported_at = -math.inf
+        self._report_times: list[float] = []
+
+    def prepare(self, now: float) -> Callable[[], None]:
+        """The read to carry out, counted as under way from now on."""
+        following = self._nominal + self._period
+        self._nominal = following if following > now else now + self._period
+        # A quarter of a period early is due as well, so that jitter skips no cycle.
+        self.due = self._nominal - self._period / 4
+        self._started = None
+        self.asked = now
+        self.busy = True
+        return self._read
+
+    def running(self, now: float) -> float:
+        """Seconds since the read under way began; 0 while it is queued."""
+        return 0.0 if self._started is None else now - self._started
+
+    @property
+    def is_stale(self) -> bool:
+        """The readings are old by the newest report, or there are none yet."""
+        return self._reported_stale or not self.measured
+
+    def report(self, now: float) -> list[ProbeReport]:
+        """The readings went stale or came back: what there is to say, bounded in number.
+
+        A recovery is put off where no report would be left for the next failure.
+        """
+        if self.reason and self._reported_stale:
+            return self._report_another_error(now)
+        if bool(self.reason) == self._reported_stale:
+            return []
+        self._report_times = [t for t in self._report_times if now - t < REPORT_WINDOW]
+        if not self.reason and len(self._report_times) >= REPORTS - 1:
+            return []
+        self._report_times.append(now)
+        self._reported_at = now
+        self._reported_stale, self._reported = bool(self.reason), self.reason
+        reason = self.reason
+        if reason and len(self._report_times) >= REPORTS - 1:
+            reason += f"; it changes often, so it counts as stale for up to {REPORT_WINDOW:g} s"
+        return [ProbeReport(self.name, self.names, self._reported_stale, reason)]
+
+    def _report_another_error(self, now: float) -> list[ProbeReport]:
+        if self.reason == self._reported or now - self._reported_at < ANOTHER_ERROR:
+            return []
+        self._reported, self._reported_at = self.reason, now
+        return [ProbeReport(self.name, self.names, True, self.reason)]
+
+    def close(self) -> None:
+        """Close the probe, in the thread that reads it."""
+        try:
+            self._probe.close()
+        except BaseException:  # noqa: BLE001 - a plugin's fault must not stop the slave's end
+            return
+        self.closed = True
+
+    def _read(self) -> None:
+        started = self._clock()
+        self._started = started
+        values: tuple[float, ...] = ()
+        reason = ""
+        try:
+            values = read_values(self._probe, self.names)
+        except PluginError as nonsense:
+            reason = str(nonsense)
+        except BaseException as error:  # noqa: BLE001 - the guard: whatever a plugin raises, even
+            # SystemExit, makes its readings stale and harms nothing else.
+            reason = f"read() raised {describe_plugin_fault(error)}"
+        ended = self._clock()
+        self.outcome = _Outcome(values, reason, ended - started, ended - self.asked)
+        self.busy = False
+        self._progress.set()
+
+
+def read_values(probe: Probe, names: tuple[str, ...]) -> tuple[float, ...]:
+    """Return one usage for each resource of a probe, in the order of `names`.
+
+    Raises:
+        PluginError: the answer is not one reading of each resource; the text says why.
+    """
+    values: dict[str, float] = {}
+    answers: object = probe.read()
+    if not isinstance(answers, Iterable):
+        raise PluginError(f"answered {given(answers)}; a list of Readings is required")
+    for answer in answers:
+        reading = required(answer, Reading)
+        if reading.resource not in names:
+            raise PluginError(f"a reading of {reading.resource!r}, which it did not announce")
+        if reading.resource in values:
+            raise PluginError(f"two readings of {reading.resource!r}")
+        usage = _fraction(reading)
+        values[reading.resource] = usage
+    missing = [name for name in names if name not in values]
+    if missing:
+        raise PluginError(f"no reading of {', '.join(missing)}")
+    return tuple(values[name] for name in names)
+
+
+def _fraction(reading: Reading) -> float:
+    """Return the usage of a reading; raise `PluginError` where it is none."""
+    try:
+        usage = float(reading.usage)
+    except (TypeError, ValueError, OverflowError):
+        usage = math.nan
+    if not 0.0 <= usage <= ABSURD_USAGE:  # also where it is NaN
+        raise PluginError(
+            f"usage {reading.usage!r} of {reading.resource!r}; a fraction of its capacity is "
+            f"required, 1.0 where it is full and at most {ABSURD_USAGE:g}"
+        )
+    return usage

@@ -1,0 +1,194 @@
+"""The end of a slave: the master is informed, then the processes are stopped or left running."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+from rosrm.config.settings import HostConfig
+from rosrm.core.slave import reducer as core
+from rosrm.model.values import InstanceState, InstanceStatus, StopPolicy
+from rosrm.ros.slave.endpoint import SlaveEndpoint
+from rosrm.slave.launch.starter import Starter
+from rosrm.slave.supervisor_client import SupervisorLink
+from rosrm.wording import counted, listed
+
+_log = logging.getLogger("rosrm.slave")
+
+#: The option of `rosrm slave`, and the cause of the end that it brings.
+STOP_ALL: Final = "--stop-all"
+#: Seconds for the master to take note that this slave ends.
+_LEAVE_PATIENCE: Final = 2.0
+#: Seconds for a re-adopted process to end: this run of the slave does not know its `stop`.
+_LONGEST_STOP: Final = 600.0
+
+
+@dataclass
+class Ending:
+    """Ends one slave, whatever happens to its master and its supervisor on the way.
+
+    Attributes:
+        config: of the host.
+        state: what the slave holds; it is only looked at here.
+        starter: starts processes.
+        supervisor: stops them.
+        endpoint: informs the master.
+        serve: runs the loop of the slave while its argument returns True.
+        say: tells the user.
+        has_begun: the slave accepts no work any more.
+        keeps: no process is started any more, because the master knows those that are left running.
+        supervisor_left: there is no supervisor any more.
+    """
+
+    config: HostConfig
+    state: core.SlaveState
+    starter: Starter
+    supervisor: SupervisorLink
+    endpoint: SlaveEndpoint
+    serve: Callable[[Callable[[], bool]], None]
+    say: Callable[[str], None]
+    has_begun: bool = False
+    keeps: bool = False
+    supervisor_left: bool = False
+    _supervisor_fault: str = field(init=False, default="")
+    _is_informed: bool = field(init=False, default=False)
+    _kill_at: float = field(init=False, default=0.0)  # monotonic; 0.0: nothing is stopped
+
+    def note_supervisor_left(self, fault: str) -> None:
+        """Note that there is no supervisor any more; without a fault it has stopped everything."""
+        self.supervisor_left, self._supervisor_fault = True, fault
+        self.endpoint.failure = self.endpoint.failure or fault
+
+    def carry_out(self, cause: str) -> int:
+        """Inform the master, then stop the processes or leave them running.
+
+        Args:
+            cause: a signal or `--stop-all`; "": the endpoint has failed.
+
+        Returns:
+            The exit code of the slave.
+        """
+        self.has_begun = True
+        failure = self.endpoint.failure
+        if failure:
+            _log.error("%s", failure)
+        if self.supervisor_left:
+            return self._fail_without_supervisor()
+        begun = self._begun()
+        running = _live(begun)
+        if running and self.config.on_stop == "keep":
+            self.keeps = True
+            self._inform_master(begun)
+            keep = counted(len(running), "process keeps", "processes keep")
+            self.say(
+                f"slave of {self.config.host} ended ({cause or 'refused'}); {keep} running "
+                f"(supervisor pid {self.supervisor.pid}). Start the slave again to manage what "
+                f"runs, or end it by `rosrm slave {STOP_ALL}` with the same --config"
+            )
+            return 1 if failure else 0
+        live = self.state.live()
+        if live and failure and not self.endpoint.superseded and cause != STOP_ALL:
+            count = counted(live, "process keeps", "processes keep")
+            _log.error("%s running; correct the error and start the slave again", count)
+            return 1
+        if live:
+            count = counted(live, "process", "processes")
+            self._kill_at = self._next_kill()
+            self.say(f"stopping {count} ({cause or 'refused'}){self._kill_after()}")
+        self.starter.close()
+        self._inform_master()
+        return self._stop_processes(1 if failure else 0, live, cause)
+
+    def say_progress(self) -> None:
+        """Log what is still being stopped and how long that may take: the user signals again."""
+        left = _live(self._begun())
+        if self._kill_at and left:
+            names = listed(str(one.instance) for one in left)
+            self.say(f"still stopping {names}{self._kill_after()}")
+
+    def _fail_without_supervisor(self) -> int:
+        left = _live(self._begun())
+        if left:
+            _log.error(
+                "%s may still run: %s. Start the slave again, or end what runs by `rosrm slave %s` "
+                "with the same --config",
+                listed(str(one.instance) for one in left), self._supervisor_fault, STOP_ALL,
+            )  # fmt: skip
+        return 1
+
+    def _stop_processes(self, code: int, live: int, cause: str) -> int:
+        longest = self._longest_stop()
+        self._kill_at = self._next_kill()  # the answer of the master may have taken a while
+        self.supervisor.shut_down()
+        deadline = time.monotonic() + longest
+        self.serve(lambda: not self.supervisor_left and time.monotonic() < deadline)
+        if not self.supervisor_left:
+            _log.error("not ended within %g s: %s", longest, self._unfinished())
+            return 1
+        if self._supervisor_fault:
+            _log.error("%s", self._supervisor_fault)
+            return self._fail_without_supervisor()
+        self.endpoint.wait_until_heard()
+        part = "supervisor" if cause == STOP_ALL else "slave"
+        count = counted(live, "process was stopped", "processes were stopped")
+        self.say(f"{part} of {self.config.host} ended; {count}")
+        return code
+
+    def _inform_master(self, kept: Sequence[InstanceStatus] = ()) -> None:
+        """Report the end of this slave, and wait until the master knows or is silent."""
+
+        def informed() -> None:
+            self._is_informed = True
+
+        self.endpoint.leave(informed, kept)
+        deadline = time.monotonic() + _LEAVE_PATIENCE
+        self.serve(lambda: not self._is_informed and time.monotonic() < deadline)
+
+    def _begun(self) -> list[InstanceStatus]:
+        """All instances, without those that still wait for their start."""
+        return [one for one in self.state.statuses() if self.starter.has_begun(one.instance)]
+
+    def _longest_stop(self) -> float:
+        longest = [_LONGEST_STOP if stop is None else stop.timeout for stop in self._stops()]
+        return max(longest, default=StopPolicy().timeout)
+
+    def _next_kill(self) -> float:
+        """Return when SIGKILL is sent at the latest; infinite: the `stop` of one is not known."""
+        graces = [
+            math.inf if stop is None else stop.interrupt_grace + stop.terminate_grace
+            for stop in self._stops()
+        ]
+        return time.monotonic() + max(graces, default=0.0)
+
+    def _stops(self) -> list[StopPolicy | None]:
+        live = [held for held in self.state.held.values() if not held.status.state.ended]
+        return [None if held.spec is None else held.spec.stop for held in live]
+
+    def _kill_after(self) -> str:
+        """Return the end of a sentence: when SIGKILL follows; "": unknown, or it was sent."""
+        left = self._kill_at - time.monotonic()
+        if not 0.0 < left < math.inf:
+            return ""
+        return f"; what has not ended within {math.ceil(left)} s is killed (SIGKILL)"
+
+    def _unfinished(self) -> str:
+        """Return what the supervisor has reported last of each process that has not ended."""
+        left = _live(self._begun())
+        supervisor = f"the supervisor (pid {self.supervisor.pid})"
+        stopping = [str(one.instance) for one in left if one.state is InstanceState.STOPPING]
+        running = [str(one.instance) for one in left if one.state is not InstanceState.STOPPING]
+        if running:
+            also = f"still stops {listed(stopping)} and " if stopping else ""
+            return (
+                f"{supervisor} {also}has not begun to stop {listed(running)}. End what runs by "
+                f"`rosrm slave {STOP_ALL}` with the same --config"
+            )
+        return f"{supervisor} still stops {listed(stopping or ['what they left'])}"
+
+
+def _live(statuses: Sequence[InstanceStatus]) -> list[InstanceStatus]:
+    return [one for one in statuses if not one.state.ended]

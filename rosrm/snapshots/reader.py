@@ -1,0 +1,99 @@
+"""Finds the newest whole state in the directory of a process."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Final
+
+from rosrm.snapshots.format import LARGEST, Damaged, Head, Kept, checked, decoded, decoded_head
+
+#: Written by the node, in turn.
+SLOTS: Final = ("state.0", "state.1")
+#: Written by the slave.
+COPY: Final = "copy"
+#: With every file that is opened.
+OPEN: Final = os.O_CLOEXEC | os.O_NOFOLLOW
+#: More than any head of ours.
+HEAD_ROOM: Final = 64 << 10
+
+
+def peek(path: Path) -> Head | None:
+    """The head of a file alone, its content unseen; None: there is no such file, or no head."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY | OPEN)
+    except OSError:
+        return None
+    try:
+        return decoded_head(os.read(descriptor, HEAD_ROOM))[0]
+    except (OSError, Damaged):
+        return None
+    finally:
+        os.close(descriptor)
+
+
+def files(directory: Path) -> list[tuple[Path, Head]]:
+    """Files with a sound head, the newest first."""
+    found = [(path, head) for path in paths_of(directory) if (head := peek(path)) is not None]
+    return sorted(found, key=lambda one: one[1].age, reverse=True)
+
+
+def paths_of(directory: Path) -> Iterable[Path]:
+    """The files that may hold a state."""
+    return (directory / name for name in (*SLOTS, COPY))
+
+
+def newest_head(directory: Path) -> Head | None:
+    """What the newest file says of itself; None: there is none."""
+    found = files(directory)
+    return found[0][1] if found else None
+
+
+def read(path: Path) -> Kept:
+    """A whole state; raises `Damaged`."""
+    return decoded(content_of(path), path)
+
+
+def content_of(path: Path) -> bytes:
+    """All bytes of a file; raises `Damaged`."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY | OPEN)
+        with os.fdopen(descriptor, "rb") as file:
+            return file.read(min(os.fstat(descriptor).st_size, LARGEST))
+    except OSError as error:
+        raise Damaged(f"it cannot be read: {error.strerror}") from None
+
+
+def newest(directory: Path, up_to: int) -> tuple[Kept | None, list[str]]:
+    """The newest whole state of a directory, and what is wrong with those that are not whole.
+
+    Args:
+        up_to: highest number of an instance whose state counts.
+    """
+    found = files(directory)
+    sound = {path for path, _ in found}
+    faults = [
+        f"{path}: its head is damaged"
+        for path in paths_of(directory)
+        if path not in sound and path.is_file() and path.stat().st_size
+    ]
+    for path, head in found:
+        if head.instance > up_to:
+            continue
+        try:
+            return read(path), faults
+        except Damaged as fault:
+            faults.append(f"{path}: {fault}")
+    return None, faults
+
+
+def newest_content(directory: Path) -> tuple[Head, bytes] | None:
+    """The newest whole state as it lies in its file; None: there is none."""
+    for path, _ in files(directory):
+        with contextlib.suppress(Damaged):
+            data = content_of(path)
+            head, _ = checked(data)
+            return head, data[: head.size]
+    return None

@@ -1,0 +1,262 @@
+"""The durable record of one host's instances: `instances.jsonl`, append-only, one JSON a line.
+
+    {"record": "header", "version": 1, "boot": ID}
+    {"record": "environment", "id": ID, "variables": {...}}
+    {"record": "order", "instance": ..., "argv": ...}       as in the protocol's `start`
+    {"record": "spawning", "instances": [...]}              their spawns are about to be tried
+    {"record": "state", "key": [process, number], "phase": ..., ...}   the fields of `Instance`
+    {"record": "dead", "process": NAME, "number": N}        up to N they never start again
+
+The last line about a thing counts. What was written survives the supervisor's own SIGKILL, as one
+`write` hands it to the kernel; it is not forced to the disk, since after a loss of power none of
+the processes is left anyway. A tail torn by a full disk, or a damaged line, is left out and said.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, Final
+
+from rosrm.core.supervisor.reducer import Instance, Key, Supervision
+from rosrm.supervisor import json_lines, messages, paths, procfs
+from rosrm.supervisor.messages import Launch
+
+VERSION: Final = 1
+#: The file is written anew when it has grown to this, and to as many times what it then held.
+COMPACT_BYTES: Final = 1 << 20
+COMPACT_FACTOR: Final = 4
+
+
+_APPEND: Final = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC
+
+
+class RecordError(Exception):
+    """The record is there, but cannot be read."""
+
+
+class Recorded:
+    """What a record holds.
+
+    Attributes:
+        spawning: instances whose last spawn may have been tried, with no outcome recorded.
+        same_boot: it was written since this machine's start.
+        notes: what was wrong with it, for people.
+    """
+
+    def __init__(self) -> None:
+        self.environments: dict[str, dict[str, str]] = {}
+        self.launches: dict[Key, Launch] = {}
+        self.instances: dict[Key, Instance] = {}
+        self.dead: dict[str, int] = {}
+        self.births: dict[Key, int] = {}
+        self.spawning: set[Key] = set()
+        self.same_boot = False
+        self.notes: list[str] = []
+
+
+def read(state: str) -> Recorded:
+    """What the record of a state directory holds; nothing where there is none."""
+    recorded = Recorded()
+    path = os.path.join(state, paths.RECORD)
+    try:
+        with open(path, "rb") as file:
+            *written, tail = file.read().split(b"\n")
+    except FileNotFoundError:
+        return recorded
+    except OSError as error:
+        raise RecordError(f"{path} cannot be read: {error.strerror}") from None
+    if tail:
+        recorded.notes.append(f"{path}: the last {len(tail)} bytes, a torn line, were left out")
+    for number, line in enumerate(written, 1):
+        if not line:
+            continue
+        try:
+            _take(recorded, json_lines.parse(line))
+        except (json_lines.ProtocolError, KeyError, TypeError, ValueError) as error:
+            recorded.notes.append(f"{path}:{number}: left out, it cannot be read: {error}")
+    return recorded
+
+
+def _take(recorded: Recorded, fields: Mapping[str, Any]) -> None:
+    kind = fields["record"]
+    if kind == "state":
+        _take_state(recorded, fields)
+    elif kind == "order":
+        launch = messages.read_launch(fields)
+        recorded.launches[launch.instance] = launch
+    elif kind == "spawning":
+        recorded.spawning.update(messages.read_key(key) for key in fields["instances"])
+    elif kind == "environment":
+        recorded.environments[fields["id"]] = dict(fields["variables"])
+    elif kind == "dead":
+        recorded.dead[fields["process"]] = int(fields["number"])
+        for key in [key for key in recorded.instances if _dead(key, fields)]:
+            del recorded.instances[key]
+            recorded.launches.pop(key, None)
+    elif kind == "header":
+        if fields["version"] != VERSION:
+            raise ValueError(f"version {fields['version']}, not {VERSION}")
+        recorded.same_boot = fields["boot"] == procfs.boot_id()
+    else:
+        raise ValueError(f"unknown record {kind!r}")
+
+
+def _dead(key: Key, fields: Mapping[str, Any]) -> bool:
+    return key == messages.read_key(fields["key"])
+
+
+def _take_state(recorded: Recorded, fields: Mapping[str, Any]) -> None:
+    instance = Instance(
+        messages.read_key(fields["key"]),
+        messages.read_restart(fields["restart"]),
+        messages.read_stop(fields["stop"]),
+    )
+    for name in _PLAIN_FIELDS:
+        if name in fields or name not in _NEW_FIELDS:
+            setattr(instance, name, fields[name])
+    instance.fence = messages.read_fence(fields.get("fence"))
+    recorded.instances[instance.key] = instance
+    recorded.births[instance.key] = fields["birth"]
+    recorded.spawning.discard(instance.key)
+    if instance.ended:
+        recorded.launches.pop(instance.key, None)
+
+
+_PLAIN_FIELDS: Final = tuple(
+    name for name in Instance.__slots__ if name not in ("key", "restart", "stop", "fence")
+)
+#: Older records have not all of these.
+_NEW_FIELDS: Final = frozenset({"fault", "fenced", "heard", "kill_by", "withdrawn"})
+
+
+class Record:
+    """Appends to the record; nothing is lost while the disk is full, only late.
+
+    Attributes:
+        trouble: why the last write failed; "": it did not.
+    """
+
+    def __init__(self, state: str) -> None:
+        self.trouble = ""
+        self._path = os.path.join(state, paths.RECORD)
+        self._file = -1
+        self._size = 0
+        self._compact_at = COMPACT_BYTES
+        self._waiting: list[bytes] = []
+
+    def environment(self, identity: str, variables: Mapping[str, str]) -> None:
+        """A base environment that launches refer to."""
+        self._add({"record": "environment", "id": identity, "variables": dict(variables)})
+
+    def launch(self, launch: Launch) -> None:
+        """An order to start."""
+        self._add({"record": "order", **messages.launch_fields(launch)})
+
+    def spawning(self, keys: Iterable[Key]) -> None:
+        """These spawns will be tried next."""
+        self._add({"record": "spawning", "instances": list(keys)})
+
+    def state(self, instance: Instance, birth: int) -> None:
+        """All that is known of an instance; `birth`: see `members.was_born`."""
+        self._add(_state(instance, birth))
+
+    def dead(self, key: Key, number: int) -> None:
+        """An instance was forgotten; its process starts no number up to `number` any more."""
+        self._add({"record": "dead", "key": key, "process": key[0], "number": number})
+
+    def flush(self) -> bool:
+        """Hand everything to the kernel in one write; False, with `trouble`, where it failed."""
+        if not self._waiting:
+            return True
+        text = b"".join(self._waiting)
+        try:
+            written = os.write(self._file, text)
+        except OSError as error:
+            self._fail(error.strerror or str(error))
+            return False
+        self._size += written
+        if written < len(text):
+            self._waiting = [text[written:]]
+            self._fail("No space left on device, after a part of it")
+            return False
+        self._waiting.clear()
+        self.trouble = ""
+        return True
+
+    def is_large(self) -> bool:
+        """It is time to `rewrite` it."""
+        return self._size >= self._compact_at
+
+    def rewrite(
+        self,
+        supervision: Supervision,
+        launches: Mapping[Key, Launch],
+        environments: Mapping[str, Mapping[str, str]],
+        birth: Callable[[Key], int],
+    ) -> None:
+        """Replace the record by one that holds only what counts now, if the disk has room.
+
+        Args:
+            environments: all that launches refer to now or may later; one may be missing, where a
+                line was damaged.
+        """
+        waiting = self._waiting
+        self._waiting = []
+        self._add({"record": "header", "version": VERSION, "boot": procfs.boot_id()})
+        for process, number in supervision.dead.items():
+            self._add(
+                {"record": "dead", "key": [process, -1], "process": process, "number": number}
+            )
+        for identity, variables in environments.items():
+            self.environment(identity, variables)
+        for launch in launches.values():
+            self.launch(launch)
+        for instance in supervision.instances.values():
+            self.state(instance, birth(instance.key))
+        text = b"".join(self._waiting)
+        self._compact_at = max(COMPACT_BYTES, COMPACT_FACTOR * max(self._size, len(text)))
+        try:
+            self._replace(text)
+        except OSError as error:
+            self._fail(error.strerror or str(error))
+            self._waiting = waiting
+            self._open_old()
+            return
+        self._waiting = []
+        self._size = len(text)
+        self._compact_at = max(COMPACT_BYTES, COMPACT_FACTOR * self._size)
+
+    def _replace(self, text: bytes) -> None:
+        new = f"{self._path}.new"
+        file = os.open(new, _APPEND | os.O_TRUNC, 0o600)
+        try:
+            view = memoryview(text)
+            while view:
+                view = view[os.write(file, view) :]
+            os.replace(new, self._path)
+        except OSError:
+            os.close(file)
+            raise
+        if self._file >= 0:
+            os.close(self._file)
+        self._file = file
+
+    def _open_old(self) -> None:
+        """Go on with the record as it is, behind a tail that may be torn."""
+        if self._file < 0:
+            self._file = os.open(self._path, _APPEND, 0o600)
+            self._waiting.insert(0, b"\n")
+
+    def _add(self, fields: Mapping[str, Any]) -> None:
+        self._waiting.append(json_lines.line(fields))
+
+    def _fail(self, why: str) -> None:
+        self.trouble = f"{self._path} cannot be written: {why}"
+
+
+def _state(instance: Instance, birth: int) -> dict[str, Any]:
+    fields: dict[str, Any] = {"record": "state", "birth": birth}
+    for name in Instance.__slots__:
+        fields[name] = getattr(instance, name)
+    return fields

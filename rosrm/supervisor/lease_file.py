@@ -1,0 +1,57 @@
+"""When the master last heard this host, and the slave was at work: for one that has to take over.
+
+The file `heard` of the state directory holds one line of fixed length, which is overwritten: the
+id of this boot, and the two times by its CLOCK_MONOTONIC. So it needs no room on a full disk, and
+no compaction. Where it is missing, what the record says of each instance counts: its start.
+"""
+
+from __future__ import annotations
+
+import os
+
+from rosrm.core.supervisor.reducer import Heard
+from rosrm.supervisor import own_log, paths, procfs
+
+
+class LastHeard:
+    """Keeps the newest time."""
+
+    def __init__(self, state: str) -> None:
+        self._path = os.path.join(state, paths.HEARD)
+        self._boot = procfs.boot_id()
+        self._file = -1
+        self._newest = Heard(0.0)
+        self._trouble = ""
+
+    def keep(self, heard: Heard) -> None:
+        """Hand it to the kernel, so that it survives this process."""
+        newest = Heard(*map(max, heard, self._newest))
+        if newest == self._newest:
+            return
+        self._newest = newest
+        try:
+            if self._file < 0:
+                flags = os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC
+                self._file = os.open(self._path, flags, 0o600)
+            os.pwrite(self._file, _line(self._boot, newest), 0)
+            self._trouble = ""
+        except OSError as error:
+            trouble = error.strerror or str(error)
+            if trouble != self._trouble:
+                own_log.say(f"{self._path} cannot be written: {trouble}")
+            self._trouble = trouble
+
+
+def _line(boot: str, newest: Heard) -> bytes:
+    return f"{boot} {newest.at:020.6f} {newest.alive:020.6f}\n".encode()
+
+
+def read(state: str) -> Heard:
+    """The times that were kept since this machine's start; 0.0: none."""
+    try:
+        with open(os.path.join(state, paths.HEARD), encoding="ascii") as file:
+            boot, at, alive = file.read(100).split()
+        newest = Heard(float(at), float(alive))
+    except (OSError, ValueError):
+        return Heard(0.0)
+    return newest if boot == procfs.boot_id() else Heard(0.0)

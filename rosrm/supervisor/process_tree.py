@@ -1,0 +1,230 @@
+"""Who belongs to which instance while the supervisor runs: parenthood, adoption, reaping.
+
+The supervisor is a subreaper: a process whose parent ends becomes its child. So the last member of
+an instance always dies as its child, and SIGCHLD says so. Only after a take-over (an earlier
+supervisor was killed) are members nobody's children here; then a pidfd tells their end.
+"""
+
+from __future__ import annotations
+
+import os
+import selectors
+import signal
+from collections.abc import Callable, Iterable
+
+from rosrm.core.supervisor.reducer import UNKNOWN_EXIT, Cleared, Event, Exited, Key
+from rosrm.supervisor import own_log, procfs
+from rosrm.supervisor.procfs import Stat
+
+
+class Family:
+    """The living processes of all instances.
+
+    Args:
+        state: the state directory: the supervisor's mark.
+        selector: where pidfds are watched; the data of each is a function to call.
+        happened: is told what has happened to an instance.
+    """
+
+    def __init__(
+        self, state: str, selector: selectors.BaseSelector, happened: Callable[[Event], None]
+    ) -> None:
+        self._state = state
+        self._selector = selector
+        self._happened = happened
+        self._sessions: dict[Key, int] = {}
+        self._owners: dict[int, Key] = {}
+        self._births: dict[Key, int] = {}
+        self._children: dict[int, Key] = {}
+        self._taken_over: dict[int, int] = {}
+        self._adopted: dict[int, Key | None] = {}
+        self._strays: dict[Key, dict[int, int]] = {}
+
+    # --- a leader's life ----------------------------------------------------------------------
+
+    def add_child(self, key: Key, pid: int, birth: int) -> None:
+        """A session leader that was spawned here, at `birth` in clock ticks or a little later."""
+        self._children[pid] = key
+        self._add(key, pid, birth)
+
+    def take_over(self, key: Key, leader: Stat) -> None:
+        """A session leader that an earlier supervisor spawned."""
+        pidfd = os.pidfd_open(leader.pid)
+        self._taken_over[leader.pid] = pidfd
+        self._add(key, leader.pid, leader.start)
+        self._watch(pidfd, lambda: self._taken_over_ended(key, leader.pid))
+
+    def birth(self, key: Key) -> int:
+        """Start time of its leader in clock ticks; 0: not known."""
+        return self._births.get(key, 0)
+
+    def release(self, key: Key) -> None:
+        """The instance has ended, or starts anew."""
+        session = self._sessions.pop(key, 0)
+        self._owners.pop(session, None)
+        self._births.pop(key, None)
+
+    def _add(self, key: Key, pid: int, birth: int) -> None:
+        self.release(key)
+        self._sessions[key] = pid
+        self._owners[pid] = key
+        self._births[key] = birth
+
+    def _taken_over_ended(self, key: Key, pid: int) -> None:
+        self._unwatch(self._taken_over.pop(pid))
+        left = procfs.find_members(pid, mark(key), self._state)
+        self.watch_strays(key, left)
+        self._happened(Exited(key, UNKNOWN_EXIT, leftovers=bool(left)))
+
+    # --- reaping ------------------------------------------------------------------------------
+
+    def reap(self) -> None:
+        """Take the exit status of every child that has ended."""
+        ended = []
+        while True:
+            try:
+                pid, status, usage = os.wait4(-1, os.WNOHANG)
+            except ChildProcessError:
+                break
+            if pid == 0:
+                break
+            self._adopted.pop(pid, None)
+            key = self._children.pop(pid, None)
+            if key is not None:
+                code = os.waitstatus_to_exitcode(status)
+                exited = Exited(
+                    key,
+                    max(code, 0),
+                    max(-code, 0),
+                    usage.ru_maxrss * 1024.0,
+                    usage.ru_utime + usage.ru_stime,
+                    # Asked at once: until its group is empty the pid is not used again.
+                    procfs.group_is_alive(pid),
+                )
+                ended.append((pid, exited))
+        if ended:
+            self._look_at_adopted()
+            owners = set(self._adopted.values())
+            for pid, exited in ended:
+                self._leader_ended(pid, exited, exited.instance in owners)
+
+    def _leader_ended(self, pid: int, exited: Exited, adopted: bool) -> None:
+        if not exited.leftovers and not adopted:
+            self._happened(exited)
+            return
+        left = procfs.find_members(pid, mark(exited.instance), self._state)
+        self.watch_strays(exited.instance, left)
+        self._happened(exited._replace(leftovers=bool(left)))
+
+    def _look_at_adopted(self) -> None:
+        """Find out whose the children are that were not spawned here."""
+        for pid in procfs.own_children():
+            if pid not in self._children and pid not in self._adopted:
+                key = self._owner(pid)
+                self._adopted[pid] = key
+                if key is not None and key not in self._sessions:
+                    own_log.say(f"killed {pid}, left over by {mark(key)}")
+                    send_signal(pid, signal.SIGKILL)
+
+    def _owner(self, pid: int) -> Key | None:
+        stat = procfs.read_stat(pid)
+        if stat is None or not stat.alive:
+            return None
+        if stat.session in self._owners:
+            return self._owners[stat.session]
+        instance, supervisor = procfs.read_marks(pid)
+        process, _, number = instance.rpartition("#")
+        return (process, int(number)) if supervisor == self._state and number.isdigit() else None
+
+    # --- strays: members whose leader is gone -------------------------------------------------
+
+    def watch_strays(self, key: Key, found: Iterable[Stat]) -> None:
+        """Report `Cleared` when none of them, and of those that they fork, is left."""
+        watched = self._strays.setdefault(key, {})
+        for stat in found:
+            if stat.pid not in watched:
+                self._watch_stray(key, stat.pid, watched)
+        if not watched:
+            del self._strays[key]
+
+    def _watch_stray(self, key: Key, pid: int, watched: dict[int, int]) -> None:
+        try:
+            pidfd = os.pidfd_open(pid)
+        except ProcessLookupError:
+            return
+        watched[pid] = pidfd
+        self._watch(pidfd, lambda: self._stray_ended(key, pid))
+
+    def _stray_ended(self, key: Key, pid: int) -> None:
+        watched = self._strays[key]
+        self._unwatch(watched.pop(pid))
+        if watched:
+            return
+        self.watch_strays(key, self._find(key))
+        if key not in self._strays:
+            self._happened(Cleared(key))
+
+    def _find(self, key: Key) -> list[Stat]:
+        session = self._sessions.get(key)
+        if session is None:  # its leader ended before this supervisor began
+            return procfs.find_marked(self._state).get(mark(key), [])
+        return procfs.find_members(session, mark(key), self._state)
+
+    # --- signals ------------------------------------------------------------------------------
+
+    def signal(self, key: Key, number: int) -> None:
+        """To every process of the instance."""
+        session = self._sessions.get(key, 0)
+        if session in self._children or session in self._taken_over:
+            _send_to_group(session, number)
+        if key in self._strays:
+            self.watch_strays(key, self._find(key))
+            for pidfd in self._strays.get(key, {}).values():
+                _send_by_pidfd(pidfd, number)
+
+    def kill(self, found: Iterable[Stat]) -> None:
+        """SIGKILL to processes that belong to no instance any more."""
+        for stat in found:
+            send_signal(stat.pid, signal.SIGKILL)
+
+    # --- the selector -------------------------------------------------------------------------
+
+    def _watch(self, pidfd: int, ended: Callable[[], None]) -> None:
+        self._selector.register(pidfd, selectors.EVENT_READ, ended)
+
+    def _unwatch(self, pidfd: int) -> None:
+        self._selector.unregister(pidfd)
+        os.close(pidfd)
+
+
+def mark(key: Key) -> str:
+    """An instance as the environment of its processes names it."""
+    return f"{key[0]}#{key[1]}"
+
+
+def send_signal(pid: int, number: int) -> None:
+    """To one process; one that is gone already is no trouble, nor is one of another user."""
+    try:
+        os.kill(pid, number)
+    except ProcessLookupError:
+        return
+    except PermissionError as error:
+        own_log.say(f"signal {number} to {pid}: {error.strerror}")
+
+
+def _send_to_group(session: int, number: int) -> None:
+    try:
+        os.killpg(session, number)
+    except ProcessLookupError:
+        return
+    except PermissionError as error:
+        own_log.say(f"signal {number} to the group {session}: {error.strerror}")
+
+
+def _send_by_pidfd(pidfd: int, number: int) -> None:
+    try:
+        signal.pidfd_send_signal(pidfd, number)
+    except ProcessLookupError:
+        return
+    except PermissionError as error:
+        own_log.say(f"signal {number} to a left-over process: {error.strerror}")

@@ -1,0 +1,114 @@
+"""Bytes to a peer that may not read just now: whoever sends them never waits for it."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import socket
+import threading
+import time
+from typing import Final
+
+from rosrm.supervisor.discovery import writable
+
+#: Bytes that may wait for the peer, beside what its socket holds.
+MOST_UNSENT: Final = 8 << 20
+#: Seconds for a thread that was woken to end.
+_LAST_WORDS: Final = 5.0
+_FLAGS: Final = socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL
+
+
+class Overfull(Exception):
+    """Too much waits for the peer; nothing was added."""
+
+
+class Outgoing:
+    """What a socket does not take at once a thread sends, in order, when it does.
+
+    Args:
+        peer: the connected socket; it is closed with this.
+    """
+
+    def __init__(self, peer: socket.socket) -> None:
+        self._peer = peer
+        self._lock = threading.Lock()
+        self._unsent = bytearray()
+        self._thread: threading.Thread | None = None
+        self._took_at = 0.0
+        self._gone = False
+
+    @property
+    def waits(self) -> float:
+        """Seconds for which the peer has taken nothing of what waits for it; 0.0: nothing waits."""
+        with self._lock:
+            return time.monotonic() - self._took_at if self._unsent else 0.0
+
+    @property
+    def is_free(self) -> bool:
+        """What is sent now goes out at once; or the peer is gone, and sending tells that."""
+        return not self.waits and (self._gone or writable(self._peer, 0.0))
+
+    def send(self, data: bytes) -> None:
+        """Send now what the peer takes, and the rest when it takes it.
+
+        Raises:
+            Overfull: the peer has not read for so long that too much waits for it.
+            OSError: it is gone.
+        """
+        with self._lock:
+            if self._gone:
+                raise BrokenPipeError(errno.EPIPE, os.strerror(errno.EPIPE))
+            if not self._unsent:
+                self._send_first(data)
+            elif len(self._unsent) + len(data) > MOST_UNSENT:
+                raise Overfull
+            else:
+                self._unsent += data
+
+    def _send_first(self, data: bytes) -> None:
+        view = memoryview(data)
+        try:
+            while view:
+                view = view[self._peer.send(view, _FLAGS) :]
+        except BlockingIOError:
+            self._unsent += view
+            self._took_at = time.monotonic()
+            self._thread = threading.Thread(target=self._send_rest, name="orders", daemon=True)
+            self._thread.start()
+
+    def _send_rest(self) -> None:
+        """Runs in a thread of its own, until nothing waits."""
+        while writable(self._peer, None):
+            with self._lock:
+                if not self._send_some():
+                    return
+
+    def _send_some(self) -> bool:
+        """Whether something is left to be sent."""
+        try:
+            sent = 0 if self._gone else self._peer.send(self._unsent, _FLAGS)
+        except BlockingIOError:
+            return True
+        except OSError:  # whoever reads from it, or sends next, hears of that
+            self._gone = True
+        else:
+            del self._unsent[:sent]
+            self._took_at = time.monotonic()
+        if self._gone:
+            self._unsent.clear()
+        return bool(self._unsent)
+
+    def drop(self) -> None:
+        """Break the connection, and wake whoever waits for it; the peer can read what was sent."""
+        with self._lock:
+            self._gone = True
+            with contextlib.suppress(OSError):  # it may be broken already
+                self._peer.shutdown(socket.SHUT_RDWR)
+
+    def close(self) -> None:
+        """Break the connection, and release the socket."""
+        self.drop()
+        if self._thread is not None:
+            self._thread.join(_LAST_WORDS)
+        self._peer.close()

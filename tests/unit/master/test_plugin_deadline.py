@@ -1,0 +1,98 @@
+"""A plugin that does not come back is ended, named, and left alone for a while."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+
+import pytest
+
+from rosrm.errors import PluginError
+from rosrm.extensions.plugin_calls import PluginCalls
+from rosrm.master.plugin_deadline import Deadlines
+
+SLOW = ("migration", "slow")
+
+
+def deadlines(**options):
+    return Deadlines(**{"seconds": 0.1, "pause": 0.3, **options})
+
+
+def spin():
+    while True:
+        pass
+
+
+def swallow():
+    """Takes no notice of what ends it, at first."""
+    for _ in range(3):
+        with contextlib.suppress(Exception):
+            spin()
+    spin()
+
+
+def test_one_that_answers_is_passed_on() -> None:
+    """With its answer or its error, and no alarm rings afterwards."""
+    ask = deadlines()
+    assert ask(SLOW, lambda: "scores") == "scores"
+    with pytest.raises(ZeroDivisionError):
+        ask(SLOW, lambda: 1 / 0)
+    time.sleep(0.15)
+
+
+@pytest.mark.parametrize("act", [spin, lambda: time.sleep(100), swallow])
+def test_one_that_hangs_is_ended(act) -> None:
+    """Also one that sleeps, and one that swallows the error."""
+    ask = deadlines()
+    began = time.monotonic()
+    with pytest.raises(TimeoutError, match=r"longer than 0\.1 s"):
+        ask(SLOW, act)
+    assert time.monotonic() - began < 30.0
+    time.sleep(0.15)  # no alarm is left
+
+
+def test_one_that_hung_is_left_alone_for_a_while() -> None:
+    """It costs its deadline once, not once for every reading that comes."""
+    ask, asked = deadlines(pause=1.0), []
+
+    def hangs():
+        asked.append(1)
+        spin()
+
+    with pytest.raises(TimeoutError, match="not asked again"):
+        ask(SLOW, hangs)
+    for _ in range(4):
+        with pytest.raises(PluginError, match="not asked again"):
+            ask(SLOW, hangs)
+    assert len(asked) == 1
+    time.sleep(1.05)
+    assert ask(SLOW, lambda: "scores") == "scores"
+
+
+def test_each_plugin_has_its_own_deadline() -> None:
+    """One that was late does not keep another from being asked, or from being ended."""
+    ask = deadlines(pause=30.0)
+    for late in (("scoring", "a"), ("checkpoint", "b"), ("migration", "a")):
+        with pytest.raises(TimeoutError):
+            ask(late, spin)
+        assert ask(("scoring", "good"), lambda: "choice") == "choice"
+
+
+def test_the_place_at_which_a_plugin_hung_is_said_also_in_the_pause() -> None:
+    """The first message and the later ones have the plugin's own line."""
+    calls = PluginCalls(deadlines(pause=30.0))
+    first = spin.__code__.co_firstlineno
+    place = rf"test_plugin_deadline\.py:({first + 1}|{first + 2})\)"
+    for _ in range(2):
+        with pytest.raises(PluginError, match=place):
+            calls.ask(*SLOW, "propose", spin)
+
+
+def test_a_plugin_cannot_end_the_master_by_an_interrupt() -> None:
+    """In a master Ctrl-C raises nothing, so a KeyboardInterrupt is the plugin's."""
+
+    def interrupts():
+        raise KeyboardInterrupt("mine")
+
+    with pytest.raises(PluginError, match="KeyboardInterrupt: mine"):
+        deadlines()(SLOW, interrupts)
