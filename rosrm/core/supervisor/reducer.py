@@ -59,36 +59,26 @@ This package is imported by the supervisor, which must stay small: so nothing of
 
 from __future__ import annotations
 
-from rosrm.core.supervisor.events_and_commands import (
+from rosrm.core.supervisor.commands import Command, Drop, Leave, Signal, Spawn, Tell, Unspawn
+from rosrm.core.supervisor.events import (
     AmendOrdered,
     Cleared,
     ClientLost,
-    Command,
-    Drop,
     Event,
     Exited,
     FailOrdered,
     FenceOrdered,
     FencePassed,
-    FenceRule,
     Forgotten,
     Heard,
-    Key,
-    Leave,
     RestartOrdered,
-    RestartRule,
     Resumed,
     ShutdownOrdered,
-    Signal,
-    Spawn,
     Spawned,
     SpawnFailed,
     StartOrdered,
     StopOrdered,
-    StopRule,
-    Tell,
     TimePassed,
-    Unspawn,
 )
 from rosrm.core.supervisor.instance import (
     BACKOFF,
@@ -112,6 +102,7 @@ from rosrm.core.supervisor.instance import (
     signal_name,
 )
 from rosrm.core.supervisor.instances import MOST_TOMBSTONES, Supervision
+from rosrm.core.supervisor.rules import FenceRule, Key, RestartRule, StopRule
 from rosrm.core.supervisor.transitions import TRANSITIONS, Transition, backoff
 
 __all__ = [
