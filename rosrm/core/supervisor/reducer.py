@@ -49,6 +49,8 @@ here, whatever its policy and whatever is ordered afterwards.
 `ShutdownOrdered` stops every instance as `StopOrdered` does. What no order had stopped before ends
 as withdrawn, not exited: the master must know that neither the process nor the master ended it.
 
+`ClientLost` changes nothing: each instance keeps running as long as its fence allows.
+
 Whatever is not in the table changes nothing; an order that changes nothing has its status told
 again, as DDS may repeat it. Every change of an instance is told (`Tell`). A signal goes to every
 process that is left of an instance, and none is sent after its end.
