@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 class EventKind(str, Enum):
-    """What an event of the record tells.
+    """Kind of an event.
 
     Attributes:
         meaning: one line for the reference page.
@@ -62,7 +62,7 @@ class EventKind(str, Enum):
     INSTANCE_ENDED = "instance_ended", "an instance that does not own the name of its process ended"
     UNASSIGNED_STOPPED = "unassigned_stopped", "a host runs an instance that the master stops"
     FENCED = "fenced", "a host runs an instance that has a successor: it is killed"
-    GIVEN_UP = "given_up", "the host of the instance is lost, and the process goes on without it"
+    GIVEN_UP = "given_up", "the host of the instance is lost, and the instance is written off"
     READOPTED = "readopted", "the lost host is back, and the instance on it owns the name again"
 
     # --- hosts ---------------------------------------------------------------------------

@@ -130,7 +130,7 @@ def test_records_of_an_older_master_are_read_as_they_were_written(path: Path) ->
 
 
 def test_every_process_has_its_phase_and_its_owner(state: MasterState) -> None:
-    """What ran is unreachable until its host registers; what waited, waits; what moved, moves."""
+    """A running process is unreachable until its host registers; the queue and moves continue."""
     found = {name: (one.phase.value, one.owner) for name, one in state.processes.items()}
     assert found == PHASES
     assert list(state.queue) == ["queued"]

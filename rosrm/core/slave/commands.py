@@ -50,11 +50,11 @@ class Restart:
 
 @dataclass(frozen=True, slots=True)
 class Fail:
-    """Have the supervisor end a run as failed, and go on by its restart policy.
+    """Have the supervisor end a run as failed, and apply its restart policy.
 
     Attributes:
         pid: of the run.
-        kill: it is stopped, and cannot end in good order.
+        kill: SIGKILL at once, because the process is stopped by a signal.
     """
 
     instance: InstanceId

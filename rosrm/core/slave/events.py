@@ -23,7 +23,7 @@ class Registered:
 
 @dataclass(frozen=True, slots=True)
 class MasterLost:
-    """No master is heard, or another one: what ends now it may not have been told."""
+    """The contact with the master is lost: it may not learn of an end that follows."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +112,7 @@ class SupervisorReplaced:
 
     Attributes:
         statuses: all that it knows.
-        memos: what it was told to remember of instances.
+        memos: what earlier runs of this slave had it remember of instances.
         fenced: which of them have a fence.
     """
 

@@ -1,4 +1,4 @@
-"""What a slave watches of an instance: its readiness and its health."""
+"""Readiness and health of an instance, as a slave watches them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from rosrm.model.values import Health
 
 @dataclass(frozen=True, slots=True)
 class Awaited:
-    """How an instance becomes ready by being seen in the ROS graph.
+    """Readiness of an instance that must be seen in the ROS graph.
 
     Attributes:
         node_name: fully qualified name of its node.
@@ -24,7 +24,7 @@ class Awaited:
 
 @dataclass(frozen=True, slots=True)
 class Watch:
-    """What is watched of the health of an instance that is ready.
+    """Health checks of an instance that is ready.
 
     Attributes:
         wanted: by its spec.
@@ -43,7 +43,7 @@ class Watch:
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """What was seen of an instance since the look before.
+    """Observation of an instance since the previous look.
 
     Attributes:
         stopped: its session leader is, by a signal.
@@ -60,7 +60,7 @@ class Look:
 
 @dataclass(frozen=True, slots=True)
 class Memo:
-    """What a later run of this slave must know of an instance; its spec it does not know.
+    """Facts about an instance for a later run of this slave, which does not know its spec.
 
     Attributes:
         awaited: None: it is ready as soon as it runs.
