@@ -147,16 +147,16 @@ __all__ = [
     "PROTOCOL_VERSION", "Amount", "AwaitReady", "AwaitReleased", "BoolArray", "Bytes",
     "CheckpointChoice", "CheckpointOffer", "CheckpointPolicy", "CheckpointView", "Client",
     "Commit", "ConfigError", "Configure", "Count", "EventRow", "Execute", "FloatArray",
-    "Fraction", "HandoffPhase", "Health", "HostChecking", "HostDescription", "HostLossPolicy", "HostRow",
-    "HostView", "Imaging", "InstanceId", "IsolationPolicy", "Kind", "LogChunk", "MemoryPacing",
-    "MemoryView", "MigrationOffer", "MigrationPolicy", "MigrationStrategy", "Move", "NoMaster",
-    "NoOptions", "PeriodicImaging", "Plan", "PluginError", "PluginRow", "PositiveCount",
-    "PositiveSeconds", "Probe", "ProbeContext", "ProbeOffer", "ProcessRow", "ProcessSpec",
-    "ProcessView", "Readiness", "Reading", "Refused", "ResourceDescription", "ResourceName",
-    "ResourceRow", "RestartPolicy", "RosSettings", "RosrmError", "Scores", "ScoringOffer",
-    "ScoringPolicy", "Seconds", "Sessions", "SetRestart", "SkipPlugin", "Snapshot",
-    "SpecChecking", "StandbyPolicy", "Start", "Step", "Stop", "StopPolicy", "WaitResult",
-    "__version__", "hookimpl", "load_work", "options_of",
+    "Fraction", "HandoffPhase", "Health", "HostChecking", "HostDescription", "HostLossPolicy",
+    "HostRow", "HostView", "Imaging", "InstanceId", "IsolationPolicy", "Kind", "LogChunk",
+    "MemoryPacing", "MemoryView", "MigrationOffer", "MigrationPolicy", "MigrationStrategy",
+    "Move", "NoMaster", "NoOptions", "PeriodicImaging", "Plan", "PluginError", "PluginRow",
+    "PositiveCount", "PositiveSeconds", "Probe", "ProbeContext", "ProbeOffer", "ProcessRow",
+    "ProcessSpec", "ProcessView", "Readiness", "Reading", "Refused", "ResourceDescription",
+    "ResourceName", "ResourceRow", "RestartPolicy", "RosSettings", "RosrmError", "Scores",
+    "ScoringOffer", "ScoringPolicy", "Seconds", "Sessions", "SetRestart", "SkipPlugin",
+    "Snapshot", "SpecChecking", "StandbyPolicy", "Start", "Step", "Stop", "StopPolicy",
+    "WaitResult", "__version__", "hookimpl", "load_work", "options_of",
 ]  # fmt: skip
 
 #: The public names of each module below `rosrm`.
@@ -184,8 +184,8 @@ _NAMES: Final = {
     "model.ros_settings": "RosSettings",
     "model.rows": "EventRow HostRow PluginRow ProcessRow ResourceRow Snapshot",
     "model.values": (
-        "Health HostDescription HostLossPolicy InstanceId IsolationPolicy Kind MigrationPolicy ProcessSpec "
-        "Readiness Reading ResourceDescription RestartPolicy StandbyPolicy StopPolicy"
+        "Health HostDescription HostLossPolicy InstanceId IsolationPolicy Kind MigrationPolicy "
+        "ProcessSpec Readiness Reading ResourceDescription RestartPolicy StandbyPolicy StopPolicy"
     ),
 }
 _MODULES: Final = {
