@@ -12,7 +12,8 @@ A mark in the line above a console block says what is different about it:
     <!-- sample: REASON -->       it is run, and of its answers only the first line is compared
     <!-- until: TEXT -->          it is followed by waiting for TEXT in the terminal opened last
 
-A `pycon` block is a Python session, compared by doctest; one marked `<!-- cluster -->` needs a cluster.
+A `pycon` block is a Python session, which doctest compares; those with the mark `<!-- cluster -->`
+need a cluster.
 """
 
 from __future__ import annotations

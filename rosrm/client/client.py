@@ -10,7 +10,7 @@ from functools import partial
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final, Literal, Union, cast
 
-from rosrm.client.connecting import check_name, connect, ros_settings
+from rosrm.client.connecting import connect, ros_settings, row_of
 from rosrm.client.retrying import PERIOD, Notify, ask_until_answered, deadline_after
 from rosrm.errors import Refused
 from rosrm.model.ros_settings import RosSettings
@@ -168,15 +168,11 @@ class Client:
 
     def get_process(self, name: str) -> ProcessRow:
         """Return a process; raise `Refused` if there is none of that name."""
-        rows = {row.name: row for row in self.list_processes()}
-        check_name("process", name, rows)
-        return rows[name]
+        return row_of("process", name, {row.name: row for row in self.list_processes()})
 
     def get_host(self, name: str) -> HostRow:
         """Return a host; raise `Refused` if there is none of that name."""
-        rows = {row.description.name: row for row in self.list_hosts()}
-        check_name("host", name, rows)
-        return rows[name]
+        return row_of("host", name, {row.description.name: row for row in self.list_hosts()})
 
     def explain(self, process: str) -> Mapping[str, Any]:
         """Return why a process is where it is, or why it waits: JSON as of `rosrm explain`."""
@@ -240,12 +236,10 @@ class Client:
         selection = logs.LogSelection(tail, since, host, follow)
         (reader,) = self.log_readers([process], selection)
         yield from reader.read()
-        while follow and not reader.over:
+        while follow and not reader.over and time.monotonic() < deadline:
             chunk = reader.poll()
             if chunk is not None:
                 yield chunk
-            elif time.monotonic() >= deadline:
-                return
             elif not reader.over:
                 time.sleep(logs.PERIOD)
 

@@ -7,7 +7,7 @@ import os
 import socket
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeVar
 
 from rosrm.errors import Refused, RosrmError
 from rosrm.model.ros_settings import RosSettings
@@ -16,6 +16,8 @@ from rosrm.wording import no_such
 if TYPE_CHECKING:
     from rosrm.ros.client import MasterClient
     from rosrm.ros.participant import Participant
+
+Row = TypeVar("Row")
 
 #: Environment variable with the path of a cluster.yaml, whose `ros` section holds the settings.
 CLUSTER_VARIABLE: Final = "ROSRM_CLUSTER"
@@ -71,15 +73,20 @@ def connect(
     return MasterClient.connect(settings, name=name, timeout=timeout, joined=joined, begun=begun)
 
 
-def check_name(kind: str, name: str, known: Iterable[str]) -> None:
-    """Refuse a name that is not among the known ones, and name the nearest; "" is no name.
+def row_of(kind: str, name: str, rows: Mapping[str, Row]) -> Row:
+    """Return the row of a name; refuse a name that has none, and name the nearest.
 
     Args:
         kind: "process" or "host".
         name: from the user.
-        known: names that the master has.
+        rows: those of the master, by their names.
     """
-    names = list(known)
-    if not name or name in names:
-        return
-    raise Refused(no_such(kind, [name], names), "unknown")
+    if name not in rows:
+        raise Refused(no_such(kind, [name], rows), "unknown")
+    return rows[name]
+
+
+def check_name(kind: str, name: str, known: Iterable[str]) -> None:
+    """Refuse a name that is not known, as `row_of` does; "" stands for no name."""
+    if name:
+        row_of(kind, name, dict.fromkeys(known))

@@ -12,6 +12,7 @@ from io import StringIO
 
 import pytest
 
+from rosrm import Client
 from rosrm.cli import log_copies
 from rosrm.errors import NoMaster, Refused
 from rosrm.model.values import InstanceId
@@ -457,3 +458,24 @@ def test_a_host_that_is_lost_ends_only_its_own_log(rosrm, client, slaves, monkey
         "ear    | a", "talker | half", "ear    | b",
     ]  # fmt: skip
     assert (result.code, result.err) == (3, "rosrm: talker: no slave answers on alpha\n")
+
+
+# --- in a program -----------------------------------------------------------------------------
+
+
+def test_the_client_yields_what_was_written_with_host_and_instance(client, slaves):
+    client.events = [event(1, host="beta"), event(2, host="alpha")]
+    slaves.write("beta", 1, b"on beta\n")
+    slaves.write("alpha", 2, b"on alpha\n")
+    chunks = Client(connection=client).logs("talker")
+    assert [(one.host, one.number, one.content) for one in chunks] == [
+        ("beta", 1, b"on beta\n"), ("alpha", 2, b"on alpha\n"),
+    ]  # fmt: skip
+
+
+def test_the_client_follows_until_its_time_out(client, slaves, monkeypatch):
+    slaves.write("alpha", 1, b"one\n")
+    slaves.live.add(("alpha", 1))
+    monkeypatch.setattr("time.sleep", lambda seconds: slaves.write("alpha", 1, b"two\n"))
+    following = Client(connection=client).logs("talker", follow=True, timeout=0.2)
+    assert {one.content for one in following} >= {b"one\n", b"two\n"}
