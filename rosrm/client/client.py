@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Final, Literal, Union, cast
+from typing import TYPE_CHECKING, Any, Literal, Union, cast
 
 from rosrm.client.connecting import connect, ros_settings, row_of
 from rosrm.client.retrying import PERIOD, Notify, ask_until_answered, deadline_after
@@ -29,7 +28,12 @@ Work = Union[str, "os.PathLike[str]", Mapping[str, Any], ProcessSpec]
 #: One name or several.
 Names = str | Iterable[str]
 
-_log: Final = logging.getLogger("rosrm.client")
+
+def _warn(text: str) -> None:
+    """Log a sentence as a warning."""
+    import logging  # noqa: PLC0415 - the command line, which must be quick, has no use for it
+
+    logging.getLogger("rosrm.client").warning(text)
 
 
 class Client:
@@ -60,7 +64,7 @@ class Client:
 
     def __init__(
         self, *, domain: int | None = None, cluster: str | os.PathLike[str] | None = None,
-        ros: RosSettings | None = None, timeout: float = 3.0, notify: Notify = _log.warning,
+        ros: RosSettings | None = None, timeout: float = 3.0, notify: Notify = _warn,
         connection: MasterClient | None = None,
     ) -> None:  # fmt: skip
         self._master = connection or connect(ros or ros_settings(domain, cluster), timeout=timeout)
