@@ -13,10 +13,10 @@ from rosrm.cli import early
 from rosrm.cli.options import Common
 from rosrm.cli.process import BEGUN
 from rosrm.client import connecting
-from rosrm.client.client import Client
 from rosrm.model.ros_settings import RosSettings
 
 if TYPE_CHECKING:
+    from rosrm.client.client import Client
     from rosrm.model.rows import Snapshot
     from rosrm.ros.client import MasterClient
 
@@ -36,7 +36,9 @@ def ros_settings(ctx: typer.Context, domain: int | None) -> RosSettings:
 
 @contextmanager
 def master(ctx: typer.Context, domain: int | None) -> Iterator[Client]:
-    """A connection to the master for one command."""
+    """A client of the master for one command."""
+    from rosrm.client.client import Client  # noqa: PLC0415 - `rosrm --help` has no use for it
+
     with Client(connection=connect(ros_settings(ctx, domain)), notify=note) as client:
         yield client
 
