@@ -1,7 +1,8 @@
-"""rosrm: a resource manager for ROS 2.
+"""A resource manager for ROS 2: its Python client, and the names for plugins.
 
-It decides on which host each process of a ROS 2 application runs, starts it there, watches it, and
-moves it with its state. All that a Python program or a plugin needs comes from `rosrm` itself::
+rosrm decides on which host each process of a ROS 2 application runs, starts the process there,
+watches it, and moves it with its state. All that a Python program or a plugin needs comes from
+`rosrm` itself::
 
     import rosrm
 

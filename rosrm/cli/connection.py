@@ -1,4 +1,4 @@
-"""How a command reaches the master. ROS is imported here, and not before a command needs it."""
+"""The connection of a command to the master."""
 
 from __future__ import annotations
 
@@ -28,7 +28,10 @@ LEAST: Final = 1.5
 
 
 def ros_settings(ctx: typer.Context, domain: int | None) -> RosSettings:
-    """How to join ROS: the command's own option, before the common ones, before the file."""
+    """Return the settings with which to join ROS.
+
+    The option of the command comes before the common options, and these before the file.
+    """
     common = ctx.obj if isinstance(ctx.obj, Common) else Common()
     chosen = common.domain if domain is None else domain
     return connecting.ros_settings(chosen, common.cluster)
@@ -36,7 +39,7 @@ def ros_settings(ctx: typer.Context, domain: int | None) -> RosSettings:
 
 @contextmanager
 def master(ctx: typer.Context, domain: int | None) -> Iterator[Client]:
-    """A client of the master for one command."""
+    """Make a client of the master for one command."""
     from rosrm.client.client import Client  # noqa: PLC0415 - `rosrm --help` has no use for it
 
     with Client(connection=connect(ros_settings(ctx, domain)), notify=note) as client:
