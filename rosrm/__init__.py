@@ -1,5 +1,209 @@
-"""rosrm: decides on which host each process of a ROS 2 application runs, and keeps it running."""
+"""A resource manager for ROS 2: its Python client, and the names for plugins.
+
+rosrm decides on which host each process of a ROS 2 application runs, starts the process there,
+watches it, and moves it with its state. All that a Python program or a plugin needs comes from
+`rosrm` itself::
+
+    import rosrm
+
+    with rosrm.Client() as client:                 # a running `rosrm master`
+        client.submit({"name": "talker", "command": ["ros2", "run", "demo_nodes_py", "talker"]})
+        client.wait("talker", timeout=30.0)
+        for row in client.list_processes():
+            print(row.name, row.state, row.host)
+
+A plugin marks its hooks with `hookimpl` and returns offers::
+
+    from rosrm import ScoringOffer, hookimpl
+
+    @hookimpl
+    def register_scoring_policies():
+        return [ScoringOffer(name="fewest", create=Fewest, options=FewestOptions)]
+
+The public names, by what they are for:
+
+Client          Client, load_work, RosSettings; its answers: Snapshot, ProcessRow, HostRow,
+                HostDescription, ResourceRow, PluginRow, EventRow, LogChunk, WaitResult
+Processes       ProcessSpec, Kind, RestartPolicy, Readiness, StopPolicy, MigrationPolicy,
+                HostLossPolicy, IsolationPolicy, StandbyPolicy, Health
+Plugins         hookimpl, NoOptions, SkipPlugin
+  probes        ProbeOffer, Probe, ProbeContext, Sessions, ResourceDescription, Reading
+  scoring       ScoringOffer, ScoringPolicy, HostView, ProcessView, Scores, FloatArray, BoolArray
+  migration     MigrationOffer, MigrationStrategy, SpecChecking, HostChecking, Imaging,
+                PeriodicImaging, options_of
+  plans         Move, Plan, Step, Start, AwaitReady, AwaitReleased, Stop, Configure, SetRestart,
+                Commit, Execute, HandoffPhase, InstanceId
+  checkpoints   CheckpointOffer, CheckpointPolicy, CheckpointView, CheckpointChoice, MemoryPacing,
+                MemoryView
+  options       Seconds, PositiveSeconds, Bytes, Fraction, Count, PositiveCount, Amount,
+                ResourceName
+Errors          RosrmError, ConfigError, PluginError, Refused, NoMaster
+Version         __version__, PROTOCOL_VERSION
+
+Seconds, bytes and fractions from 0 to 1 are the units everywhere. docs/reference/python.md shows
+the client at work, docs/reference/plugins.md has each hook and offer. Two packages have public
+names of their own: `rosrm.node` for authors of nodes that move with their state, and
+`rosrm.testing` for tests of plugins. All other modules are private and may change.
+
+A name is imported when it is first used: `import rosrm` loads none of them.
+"""
+
+from typing import TYPE_CHECKING, Any, Final
 
 from rosrm.version import PROTOCOL_VERSION, __version__
 
-__all__ = ["PROTOCOL_VERSION", "__version__"]
+if TYPE_CHECKING:
+    from rosrm.client.client import Client
+    from rosrm.client.logs import LogChunk
+    from rosrm.client.waiting import WaitResult
+    from rosrm.config.work import load_work
+    from rosrm.errors import (
+        ConfigError,
+        NoMaster,
+        PluginError,
+        Refused,
+        RosrmError,
+        SkipPlugin,
+    )
+    from rosrm.extensions.contracts import (
+        BoolArray,
+        CheckpointChoice,
+        CheckpointOffer,
+        CheckpointPolicy,
+        CheckpointView,
+        FloatArray,
+        HostChecking,
+        HostView,
+        Imaging,
+        MemoryPacing,
+        MemoryView,
+        MigrationOffer,
+        MigrationStrategy,
+        NoOptions,
+        PeriodicImaging,
+        Probe,
+        ProbeContext,
+        ProbeOffer,
+        ProcessView,
+        Scores,
+        ScoringOffer,
+        ScoringPolicy,
+        Sessions,
+        SpecChecking,
+    )
+    from rosrm.extensions.hookspecs import hookimpl
+    from rosrm.extensions.options import options_of
+    from rosrm.extensions.units import (
+        Amount,
+        Bytes,
+        Count,
+        Fraction,
+        PositiveCount,
+        PositiveSeconds,
+        ResourceName,
+        Seconds,
+    )
+    from rosrm.model.plan import (
+        AwaitReady,
+        AwaitReleased,
+        Commit,
+        Configure,
+        Execute,
+        HandoffPhase,
+        Move,
+        Plan,
+        SetRestart,
+        Start,
+        Step,
+        Stop,
+    )
+    from rosrm.model.ros_settings import RosSettings
+    from rosrm.model.rows import (
+        EventRow,
+        HostRow,
+        PluginRow,
+        ProcessRow,
+        ResourceRow,
+        Snapshot,
+    )
+    from rosrm.model.values import (
+        Health,
+        HostDescription,
+        HostLossPolicy,
+        InstanceId,
+        IsolationPolicy,
+        Kind,
+        MigrationPolicy,
+        ProcessSpec,
+        Readiness,
+        Reading,
+        ResourceDescription,
+        RestartPolicy,
+        StandbyPolicy,
+        StopPolicy,
+    )
+
+# Written out, for the tools that read this file and do not run it. A test compares the three lists.
+__all__ = [
+    "PROTOCOL_VERSION", "Amount", "AwaitReady", "AwaitReleased", "BoolArray", "Bytes",
+    "CheckpointChoice", "CheckpointOffer", "CheckpointPolicy", "CheckpointView", "Client",
+    "Commit", "ConfigError", "Configure", "Count", "EventRow", "Execute", "FloatArray",
+    "Fraction", "HandoffPhase", "Health", "HostChecking", "HostDescription", "HostLossPolicy",
+    "HostRow", "HostView", "Imaging", "InstanceId", "IsolationPolicy", "Kind", "LogChunk",
+    "MemoryPacing", "MemoryView", "MigrationOffer", "MigrationPolicy", "MigrationStrategy",
+    "Move", "NoMaster", "NoOptions", "PeriodicImaging", "Plan", "PluginError", "PluginRow",
+    "PositiveCount", "PositiveSeconds", "Probe", "ProbeContext", "ProbeOffer", "ProcessRow",
+    "ProcessSpec", "ProcessView", "Readiness", "Reading", "Refused", "ResourceDescription",
+    "ResourceName", "ResourceRow", "RestartPolicy", "RosSettings", "RosrmError", "Scores",
+    "ScoringOffer", "ScoringPolicy", "Seconds", "Sessions", "SetRestart", "SkipPlugin",
+    "Snapshot", "SpecChecking", "StandbyPolicy", "Start", "Step", "Stop", "StopPolicy",
+    "WaitResult", "__version__", "hookimpl", "load_work", "options_of",
+]  # fmt: skip
+
+#: The public names of each module below `rosrm`.
+_NAMES: Final = {
+    "client.client": "Client",
+    "client.logs": "LogChunk",
+    "client.waiting": "WaitResult",
+    "config.work": "load_work",
+    "errors": "ConfigError NoMaster PluginError Refused RosrmError SkipPlugin",
+    "extensions.contracts": (
+        "BoolArray CheckpointChoice CheckpointOffer CheckpointPolicy CheckpointView "
+        "FloatArray HostChecking HostView Imaging MemoryPacing MemoryView MigrationOffer "
+        "MigrationStrategy NoOptions PeriodicImaging Probe ProbeContext ProbeOffer "
+        "ProcessView Scores ScoringOffer ScoringPolicy Sessions SpecChecking"
+    ),
+    "extensions.hookspecs": "hookimpl",
+    "extensions.options": "options_of",
+    "extensions.units": (
+        "Amount Bytes Count Fraction PositiveCount PositiveSeconds ResourceName Seconds"
+    ),
+    "model.plan": (
+        "AwaitReady AwaitReleased Commit Configure Execute HandoffPhase Move Plan "
+        "SetRestart Start Step Stop"
+    ),
+    "model.ros_settings": "RosSettings",
+    "model.rows": "EventRow HostRow PluginRow ProcessRow ResourceRow Snapshot",
+    "model.values": (
+        "Health HostDescription HostLossPolicy InstanceId IsolationPolicy Kind MigrationPolicy "
+        "ProcessSpec Readiness Reading ResourceDescription RestartPolicy StandbyPolicy StopPolicy"
+    ),
+}
+_MODULES: Final = {
+    name: module for module, names in _NAMES.items() for name in names.split()
+}  # fmt: skip
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name when it is first used."""
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from importlib import import_module  # noqa: PLC0415 - `import rosrm` has no use for it
+
+    value = getattr(import_module(f"rosrm.{_MODULES[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -121,3 +121,18 @@ def amount(value: float, unit: str) -> str:
     if unit in ("B", "B/s"):
         return size(value) + unit[1:]
     return f"{value:.3g}" + {"core": " cores", "1": "", "": ""}.get(unit, f" {unit}")
+
+
+def duration(seconds: float) -> str:
+    """Return a span of time in at most two units: "0.4 s", "3 min", "2 h 5 min"."""
+    if not math.isfinite(seconds):
+        return "?"
+    if seconds < 9.95:
+        return f"{max(seconds, 0.0):.1f} s"
+    if seconds < 120:
+        return f"{seconds:.0f} s"
+    minutes = int(seconds // 60)
+    if minutes < 120:
+        return f"{minutes} min"
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes} min" if hours < 48 else f"{hours // 24} d"

@@ -11,11 +11,16 @@ A mark in the line above a console block says what is different about it:
     <!-- not run: REASON -->      a reader follows it elsewhere: another machine, root, a long time
     <!-- sample: REASON -->       it is run, and of its answers only the first line is compared
     <!-- until: TEXT -->          it is followed by waiting for TEXT in the terminal opened last
+
+A `pycon` block is a Python session, which doctest compares; those with the mark `<!-- cluster -->`
+need a cluster.
 """
 
 from __future__ import annotations
 
 import contextlib
+import doctest
+import io
 import os
 import re
 import signal
@@ -63,6 +68,8 @@ RUN: Final[Mapping[str, Page]] = {
 }
 #: The pages that are run on virtual hosts, where root is.
 RUN_IN_LAB: Final = "docs/how-to/lab.md"
+#: The page whose examples are Python; those marked `cluster` need one.
+PYTHON: Final = "docs/reference/python.md"
 #: The pages whose commands no test here runs, and why.
 NOT_RUN: Final[Mapping[str, str]] = {
     "docs/tutorials/your-own-scoring-plugin.md": "tests/integration/plugins/test_tutorial.py does",
@@ -81,7 +88,7 @@ _BLOCK: Final = re.compile(
     re.MULTILINE | re.DOTALL,
 )
 _PROMPT: Final = re.compile(r"^[$#] ", re.MULTILINE)
-_MARKS: Final = ("not run", "sample", "until")
+_MARKS: Final = ("not run", "sample", "until", "cluster")
 
 
 @dataclass(frozen=True)
@@ -121,6 +128,16 @@ def pages_with_commands() -> set[str]:
     every = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *ROOT.glob("*/README.md")]
     names = (str(page.relative_to(ROOT)) for page in every)
     return {name for name in names if any(one.language == "console" for one in blocks(name))}
+
+
+def run_examples(page: str, mark: str) -> None:
+    """Run the Python examples of a page that have a mark, in its order, in one session."""
+    shown = [one.text for one in blocks(page) if one.language == "pycon" and one.mark == mark]
+    assert shown, f"{page} has no example with the mark {mark!r}"
+    report = io.StringIO()
+    test = doctest.DocTestParser().get_doctest("\n".join(shown), {}, page, page, 0)
+    result = doctest.DocTestRunner(verbose=False).run(test, out=report.write)
+    assert not result.failed, report.getvalue()
 
 
 # --- answers ----------------------------------------------------------------------------------

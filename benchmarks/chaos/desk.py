@@ -10,10 +10,7 @@ import json
 import sys
 from typing import Any
 
-from rosrm.config.work import load_work
-from rosrm.errors import NoMaster, RosrmError
-from rosrm.model.ros_settings import RosSettings
-from rosrm.ros.client import MasterClient
+from rosrm import Client, NoMaster, RosrmError
 
 #: Seconds for finding a master; a request is given 10.
 _PATIENCE = 3.0
@@ -21,10 +18,10 @@ _PATIENCE = 3.0
 
 def main() -> None:
     """Answer until the input ends."""
-    client: MasterClient | None = None
+    client: Client | None = None
     for line in sys.stdin:
         try:
-            client = client or MasterClient.connect(RosSettings(), name="chaos", timeout=_PATIENCE)
+            client = client or Client(timeout=_PATIENCE)
             answer = _answer(client, json.loads(line))
         except NoMaster as error:
             answer = {"no_master": str(error)}
@@ -36,9 +33,9 @@ def main() -> None:
         print(json.dumps(answer), flush=True)
 
 
-def _answer(client: MasterClient, request: dict[str, Any]) -> dict[str, Any]:
+def _answer(client: Client, request: dict[str, Any]) -> dict[str, Any]:
     if request["do"] == "submit":
-        return {"message": client.submit(load_work(request["work"]))}
+        return {"message": client.submit(request["work"])}
     if request["do"] == "cancel":
         return {"message": client.cancel(request["names"])}
     if request["do"] == "migrate":

@@ -14,11 +14,7 @@ import math
 import sys
 from typing import Any
 
-from rosrm.config.work import load_work
-from rosrm.errors import RosrmError
-from rosrm.model.ros_settings import RosSettings
-from rosrm.model.rows import HostRow
-from rosrm.ros.client import MasterClient
+from rosrm import Client, HostRow, RosrmError
 
 #: Seconds for a master that is coming up on a busy machine.
 _PATIENCE = 60.0
@@ -26,7 +22,7 @@ _PATIENCE = 60.0
 
 def main() -> None:
     """Answer until the input ends."""
-    with MasterClient.connect(RosSettings(), name="desk", timeout=_PATIENCE) as client:
+    with Client(timeout=_PATIENCE) as client:
         print(json.dumps({"connected": True}), flush=True)
         for line in sys.stdin:
             try:
@@ -36,9 +32,9 @@ def main() -> None:
             print(json.dumps(answer), flush=True)
 
 
-def _answer(client: MasterClient, request: dict[str, Any]) -> dict[str, Any]:
+def _answer(client: Client, request: dict[str, Any]) -> dict[str, Any]:
     if request["do"] == "submit":
-        return {"message": client.submit(load_work(request["work"]))}
+        return {"message": client.submit(request["work"])}
     view = client.list(hosts=True, processes=True, events=True, after=request["after"])
     return {
         "elapsed": view.uptime,

@@ -27,7 +27,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from rosrm.model.rows import ProcessRow
+from rosrm import ProcessRow
 from rosrm.testing.local_cluster import LocalCluster
 from rosrm_examples.demo_frame import (
     CLUSTER,

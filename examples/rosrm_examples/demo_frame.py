@@ -14,7 +14,7 @@ from typing import Final, TextIO
 import psutil
 from rich.console import Console
 
-from rosrm.errors import RosrmError
+from rosrm import RosrmError
 from rosrm_examples.demo_run import DemoFailed, Stopped, StopSignals
 from rosrm_examples.errors import ExampleError
 from rosrm_resources.memory import CgroupMemory

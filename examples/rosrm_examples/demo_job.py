@@ -12,13 +12,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from rosrm import Kind, MigrationPolicy, ProcessSpec
 from rosrm.config.settings import (
     ClusterConfig,
     HostConfig,
     MigrationSettings,
     ScoringChoice,
 )
-from rosrm.model.values import Kind, MigrationPolicy, ProcessSpec
 
 HOSTS: Final = ("host1", "host2", "host3")
 MEMORY_LIMIT: Final = 0.8

@@ -34,7 +34,7 @@ from typing import Any, Final
 import numpy as np
 from matplotlib.colors import to_rgb
 
-from rosrm.model.rows import Snapshot
+from rosrm import Snapshot
 from rosrm.testing.local_cluster import LocalCluster
 from rosrm_examples.demo_frame import (
     CLUSTER,

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from rosrm.model.rows import EventRow, ProcessRow, Snapshot
+from rosrm import EventRow, ProcessRow, Snapshot
 
 SAMPLES_FILE: Final = "samples.json"
 EVENTS_FILE: Final = "events.jsonl"

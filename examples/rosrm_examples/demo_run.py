@@ -11,10 +11,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Final, Protocol
 
-from rosrm.errors import RosrmError
-from rosrm.model.rows import ProcessRow, Snapshot
-from rosrm.model.values import InstanceId
-from rosrm.ros.client import MasterClient
+from rosrm import Client, InstanceId, ProcessRow, RosrmError, Snapshot
 from rosrm.supervisor.client import log_path
 from rosrm.testing.local_cluster import LocalCluster, Part
 from rosrm_examples.demo_job import Arrival
@@ -66,7 +63,7 @@ class StopSignals:
 class Script(Protocol):
     """What a demo does, and when it is over."""
 
-    def act(self, client: MasterClient, elapsed: float) -> None:
+    def act(self, client: Client, elapsed: float) -> None:
         """Do what is due, `elapsed` seconds after the beginning; called again and again."""
 
     def is_over(self, view: Snapshot) -> bool:
@@ -79,7 +76,7 @@ class Arrivals:
     def __init__(self, coming: Sequence[Arrival]) -> None:
         self._left = list(coming)
 
-    def act(self, client: MasterClient, elapsed: float) -> None:
+    def act(self, client: Client, elapsed: float) -> None:
         """Submit what is due."""
         while self._left and self._left[0].at <= elapsed:
             client.submit(self._left.pop(0).specs)
@@ -136,11 +133,12 @@ class Demo:
     def _run(self, script: Script) -> Sequence[ProcessRow]:
         began = time.monotonic()
         next_look = 0.0
+        client = Client(connection=self._cluster.client)
         while True:
             self._signals.check()
             self._check_parts()
             elapsed = time.monotonic() - began
-            script.act(self._cluster.client, elapsed)
+            script.act(client, elapsed)
             if elapsed >= next_look:
                 view = self._look(elapsed)
                 if script.is_over(view):

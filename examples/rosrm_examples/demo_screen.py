@@ -10,8 +10,8 @@ from typing import Final, Protocol, TypeAlias
 from rich.console import Console
 from rich.live import Live
 
+from rosrm import EventRow, ProcessRow, Snapshot
 from rosrm.cli.output.top import render
-from rosrm.model.rows import EventRow, ProcessRow, Snapshot
 from rosrm_examples.demo_job import count_by_kind
 from rosrm_examples.demo_record import RUNNING, sample_of
 

@@ -13,10 +13,8 @@ from typing import Final
 
 import numpy as np
 
+from rosrm import Client, Kind, MigrationPolicy, ProcessRow, ProcessSpec, Snapshot
 from rosrm.config.settings import ClusterConfig, HostConfig, MigrationSettings, ScoringChoice
-from rosrm.model.rows import ProcessRow, Snapshot
-from rosrm.model.values import Kind, MigrationPolicy, ProcessSpec
-from rosrm.ros.client import MasterClient
 from rosrm_examples.demo_job import MEMORY_LIMIT
 from rosrm_examples.drives import Drive
 from rosrm_examples.observer import Observer
@@ -168,7 +166,7 @@ class MigrationScript:
         self._heard = 0
         self._elapsed = 0.0
 
-    def act(self, client: MasterClient, elapsed: float) -> None:
+    def act(self, client: Client, elapsed: float) -> None:
         """Submit what is due."""
         self._elapsed = elapsed
         heard = len(self._observer.heard)

@@ -13,7 +13,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from rosrm.model.ros_settings import RosSettings
+from rosrm import RosSettings
 from rosrm_examples.clouds import SCANS_QOS
 from rosrm_examples.odometry import pose_of
 from rosrm_examples.poses import Pose

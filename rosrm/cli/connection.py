@@ -1,14 +1,10 @@
-"""How a command reaches the master. ROS is imported here, and not before a command needs it."""
+"""The connection of a command to the master."""
 
 from __future__ import annotations
 
-import getpass
-import os
-import socket
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 import typer
@@ -16,11 +12,11 @@ import typer
 from rosrm.cli import early
 from rosrm.cli.options import Common
 from rosrm.cli.process import BEGUN
-from rosrm.errors import Refused, RosrmError
+from rosrm.client import connecting
 from rosrm.model.ros_settings import RosSettings
-from rosrm.wording import no_such
 
 if TYPE_CHECKING:
+    from rosrm.client.client import Client
     from rosrm.model.rows import Snapshot
     from rosrm.ros.client import MasterClient
 
@@ -32,58 +28,36 @@ LEAST: Final = 1.5
 
 
 def ros_settings(ctx: typer.Context, domain: int | None) -> RosSettings:
-    """How to join ROS: the command's own option, before the common ones, before the file."""
-    common = ctx.obj if isinstance(ctx.obj, Common) else Common()
-    settings = RosSettings()
-    if common.cluster is not None:
-        from rosrm.config import load_cluster  # noqa: PLC0415 - pydantic only where a file is read
+    """Return the settings with which to join ROS.
 
-        settings = load_cluster(common.cluster).ros
+    The option of the command comes before the common options, and these before the file.
+    """
+    common = ctx.obj if isinstance(ctx.obj, Common) else Common()
     chosen = common.domain if domain is None else domain
-    return settings if chosen is None else replace(settings, domain=chosen)
+    return connecting.ros_settings(chosen, common.cluster)
 
 
 @contextmanager
-def master(ctx: typer.Context, domain: int | None) -> Iterator[MasterClient]:
-    """A connection to the master for one command."""
-    with connect(ros_settings(ctx, domain)) as client:
+def master(ctx: typer.Context, domain: int | None) -> Iterator[Client]:
+    """Make a client of the master for one command."""
+    from rosrm.client.client import Client  # noqa: PLC0415 - `rosrm --help` has no use for it
+
+    with Client(connection=connect(ros_settings(ctx, domain)), notify=note) as client:
         yield client
+
+
+def note(text: str) -> None:
+    """Print a sentence about the progress of the command to standard error."""
+    typer.echo(f"rosrm: {text}", err=True)
 
 
 def say_trouble(snapshot: Snapshot) -> None:
     """Tell people beside the listing that the master takes no new work, and why."""
     if snapshot.trouble:
-        typer.echo(f"rosrm: {snapshot.trouble}", err=True)
-
-
-def check_name(kind: str, name: str, known: Iterable[str]) -> None:
-    """Refuse a name that is not among the known ones, with those meant; "" is no name.
-
-    Args:
-        kind: "process" or "host".
-        name: from the command line.
-        known: names that the master has.
-    """
-    names = list(known)
-    if not name or name in names:
-        return
-    raise Refused(no_such(kind, [name], names), "unknown")
+        note(snapshot.trouble)
 
 
 def connect(settings: RosSettings) -> MasterClient:
-    """Find the master; raises `NoMaster`, or `RosrmError` where there is no ROS 2."""
-    try:
-        from rosrm.ros.client import MasterClient  # noqa: PLC0415 - the first import of ROS
-    except ImportError as error:
-        if (error.name or "").split(".")[0] == "rosrm":
-            raise
-        reason = str(error).splitlines()[0]
-        raise RosrmError(
-            f"ROS 2 cannot be imported ({reason}). Source your ROS 2 (and the workspace with "
-            "rosrm_msgs), or install the wheels: pip install 'rosrm[ros]'"
-        ) from None
+    """Find the master within the time that a user is willing to wait."""
     timeout = max(LEAST, SAID_WITHIN - (time.monotonic() - BEGUN))
-    who = f"{getpass.getuser()}@{socket.gethostname()}:{os.getpid()}"
-    return MasterClient.connect(
-        settings, name=who, timeout=timeout, joined=early.take(settings), begun=BEGUN
-    )
+    return connecting.connect(settings, timeout=timeout, joined=early.take(settings), begun=BEGUN)

@@ -144,6 +144,27 @@ def parse(text: str, file: str) -> Node:
         raise ConfigError(f"{file}: unreadable YAML: nested too deeply") from None
 
 
+def node_of(value: object, place: Place) -> Node:
+    """Return a document for values of a Python program; raises `ConfigError` for other types.
+
+    Args:
+        value: mappings with text as keys, sequences, text, paths, numbers, booleans and None.
+        place: for messages, of all values.
+    """
+    if isinstance(value, Mapping) and all(isinstance(key, str) for key in value):
+        return Node({key: node_of(item, place) for key, item in value.items()}, place, place)
+    if isinstance(value, (list, tuple)):
+        return Node(tuple(node_of(item, place) for item in value), place, place)
+    if isinstance(value, Path):
+        return Node(str(value), place, place)
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return Node(value, place, place)
+    raise ConfigError(
+        f"{place}: {value!r} is a {type(value).__name__}. Allowed: mappings with text as keys, "
+        f"lists, text, numbers, booleans and None"
+    )
+
+
 def _text(path: Path) -> str:
     try:
         content = sys.stdin.buffer.read() if str(path) == "-" else path.read_bytes()

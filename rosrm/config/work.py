@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from rosrm.config.checking import near, salvaged
-from rosrm.config.documents import Node, Problems, read
+from rosrm.config.documents import Node, Place, Problems, node_of, read
 from rosrm.config.foreach import rows_of, substituted
 from rosrm.config.kinds import check_kind
 from rosrm.config.merging import merged, written_out
@@ -33,7 +33,23 @@ def load_work(path: str | Path, registry: Registry | None = None) -> tuple[Proce
         registry: the installed plugins, to check the migration strategies against; without it they
             are taken as they are (the master checks them).
     """
-    root, problems = read(path), Problems()
+    return _specs(read(path), path, registry)
+
+
+def processes_of(work: Mapping[str, Any]) -> tuple[ProcessSpec, ...]:
+    """Return the processes of a mapping, which is one process or a whole work file.
+
+    Relative paths start at the current directory. Raises one `ConfigError` for everything that is
+    wrong.
+    """
+    if "processes" in work:
+        return _specs(node_of(work, Place("work", 0, 0)), "work", None)
+    place = Place(f"process {work.get('name')!r}", 0, 0)
+    return _specs(node_of({"processes": [work]}, place), "work", None)
+
+
+def _specs(root: Node, path: str | Path, registry: Registry | None) -> tuple[ProcessSpec, ...]:
+    problems = Problems()
     check_kind(root, "work")
     entries = _entries(root, problems)
     defaults = _defaults(root, problems)

@@ -2,7 +2,7 @@
 
 hookspecs.py         every hook, in one list
 contracts.py         what a probe, policy, strategy or port implements, and what it offers
-plans.py             the steps of a migration plan, for authors of strategies
+options.py           the options of a process, merged over those of the cluster
 units.py             numbers with units in options
 discovery.py         loads the installed plugins, and calls their hooks
 registry.py          selects plugins by name, and checks their options

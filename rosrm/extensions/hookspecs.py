@@ -4,8 +4,7 @@ A plugin is a module or object under the entry-point group `rosrm`. Its hooks ar
 start, and return offers; after that the core calls the typed objects under its own guard and
 never goes through pluggy again. Example::
 
-    from rosrm.extensions.hookspecs import hookimpl
-    from rosrm.extensions.contracts import ScoringOffer
+    from rosrm import ScoringOffer, hookimpl
 
     @hookimpl
     def register_scoring_policies():

@@ -1,4 +1,4 @@
-"""The master as its clients see it: what the command line, the demo and the benchmarks use."""
+"""The connection to the master: requests and listings as ROS services; `rosrm.Client` uses it."""
 
 from __future__ import annotations
 

@@ -14,6 +14,7 @@ has the time limit that rosrm grants, and a failure says in a sentence what is w
 says that it is absent (`SkipPlugin`), its contract is skipped with that reason.
 """
 
+from rosrm.extensions.registry import Registry
 from rosrm.testing.checkpoints import CheckpointContract
 from rosrm.testing.journals import JournalContract, MemoryJournal
 from rosrm.testing.migrations import MigrationContract, before_commit, with_options
@@ -36,6 +37,7 @@ __all__ = [
     "MemoryJournal",
     "MigrationContract",
     "ProbeContract",
+    "Registry",
     "ScoringContract",
     "before_commit",
     "host_view",

@@ -19,9 +19,8 @@ from rosrm.extensions.contracts import (
     Scores,
     ScoringOffer,
 )
-from rosrm.extensions.plans import Plan, Start
 from rosrm.extensions.units import Bytes, PositiveSeconds
-from rosrm.model.plan import Execute
+from rosrm.model.plan import Execute, Plan, Start
 from rosrm.testing import (
     CheckpointContract,
     FakeProbe,

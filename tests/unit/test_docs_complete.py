@@ -13,10 +13,11 @@ from typing import Annotated, get_args, get_origin, get_type_hints
 import pytest
 import typer.main
 
+import rosrm
 from rosrm.cli.commands import app
 from rosrm.config import ClusterConfig, HostConfig, load_cluster, load_host, load_work
 from rosrm.config.process import ProcessInFile
-from rosrm.extensions import contracts, hookspecs, installed, plans
+from rosrm.extensions import contracts, hookspecs, installed
 from rosrm.extensions.declared_fields import SPEC_FIELDS
 from rosrm.extensions.discovery import HOOKS
 from rosrm.model import plan
@@ -205,8 +206,8 @@ def test_every_step_of_a_plan_is_documented():
 def test_every_step_of_a_plan_is_public_and_its_arguments_are_documented():
     text = " ".join(section(page("plugins.md"), "`MigrationOffer`").split())
     for step in get_args(plan.Step):
-        assert getattr(plans, step.__name__) is step
-        assert step.__name__ in plans.__all__
+        assert getattr(rosrm, step.__name__) is step
+        assert step.__name__ in rosrm.__all__
         shown = re.search(rf"`{step.__name__}\(([^`]*)\)`", text)
         names = [f.name for f in fields(step) if (step, f.name) not in _OF_NO_USE]
         assert re.findall(r"(\w+)(?:=[^,]+)?(?:,|$)", shown[1]) == names

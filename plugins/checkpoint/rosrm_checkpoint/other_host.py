@@ -5,8 +5,14 @@ from __future__ import annotations
 import zlib
 from dataclasses import dataclass
 
-from rosrm.extensions.contracts import CheckpointChoice, CheckpointView, MemoryView
-from rosrm.extensions.units import Fraction, PositiveCount, PositiveSeconds
+from rosrm import (
+    CheckpointChoice,
+    CheckpointView,
+    Fraction,
+    MemoryView,
+    PositiveCount,
+    PositiveSeconds,
+)
 
 
 @dataclass(frozen=True)

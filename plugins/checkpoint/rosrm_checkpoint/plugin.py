@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from rosrm.extensions.contracts import CheckpointOffer
-from rosrm.extensions.hookspecs import hookimpl
+from rosrm import CheckpointOffer, hookimpl
 from rosrm_checkpoint.other_host import OtherHost, OtherHostOptions
 
 

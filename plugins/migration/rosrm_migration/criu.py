@@ -12,8 +12,7 @@ from dataclasses import dataclass
 from math import inf
 from typing import Any, Final
 
-from rosrm.criu.fitting import mismatch
-from rosrm.extensions.plans import (
+from rosrm import (
     Commit,
     Execute,
     InstanceId,
@@ -25,6 +24,7 @@ from rosrm.extensions.plans import (
     Stop,
     options_of,
 )
+from rosrm.criu.fitting import mismatch
 from rosrm.extensions.units import Bytes, PositiveSeconds, Seconds
 from rosrm_migration.criu_building import execute, suspend
 from rosrm_migration.criu_kept import checkpoint_plan, restore_plan

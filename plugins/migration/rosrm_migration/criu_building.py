@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-from rosrm.extensions.plans import Execute, Move, RestartPolicy, SetRestart, Step
+from rosrm import Execute, Move, RestartPolicy, SetRestart, Step
 
 #: Seconds that the master waits longer than an executor, which knows what it waited for.
 LONGER: Final = 5.0

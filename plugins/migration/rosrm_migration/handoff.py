@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
-from rosrm.extensions.plans import (
+from rosrm import (
     AwaitReleased,
     Commit,
     Configure,
@@ -21,6 +21,7 @@ from rosrm.extensions.plans import (
     HandoffPhase,
     Move,
     Plan,
+    PositiveSeconds,
     ProcessSpec,
     RestartPolicy,
     SetRestart,
@@ -28,7 +29,6 @@ from rosrm.extensions.plans import (
     Stop,
     options_of,
 )
-from rosrm.extensions.units import PositiveSeconds
 
 #: Name of the executor that hears when a destination of the paper's protocol speaks.
 WATCH: Final = "handoff_watch"

@@ -6,8 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from typing import Any, Final
 
-from rosrm.extensions.contracts import MigrationOffer
-from rosrm.extensions.hookspecs import hookimpl
+from rosrm import MigrationOffer, hookimpl
 from rosrm_migration import criu, criu_kept, criu_periodic
 from rosrm_migration.criu import Criu, CriuOptions, OwnCriuOptions
 from rosrm_migration.handoff import WATCH, Handoff, HandoffOptions, watch

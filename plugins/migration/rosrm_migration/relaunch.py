@@ -10,8 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from rosrm.extensions.plans import AwaitReady, Commit, Move, Plan, Start, Stop
-from rosrm.extensions.units import PositiveSeconds
+from rosrm import AwaitReady, Commit, Move, Plan, PositiveSeconds, Start, Stop
 
 
 @dataclass(frozen=True)

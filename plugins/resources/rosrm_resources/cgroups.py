@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from rosrm.errors import ConfigError
+from rosrm import ConfigError
 
 
 @dataclass(frozen=True)

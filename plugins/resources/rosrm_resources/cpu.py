@@ -11,7 +11,7 @@ from typing import Annotated, Final
 
 from annotated_types import Gt, Le
 
-from rosrm.extensions.contracts import ProbeContext, Sessions
+from rosrm import ProbeContext, Sessions
 from rosrm_resources.cgroups import Group, count_cpus, find_group, read_number
 from rosrm_resources.files import KeptFile, ProcessFiles
 from rosrm_resources.gauge import Gauge, GaugeProbe, Scope, budget, check_group

@@ -11,7 +11,7 @@ from typing import Annotated, Final
 
 from annotated_types import Gt
 
-from rosrm.extensions.contracts import ProbeContext
+from rosrm import ProbeContext
 from rosrm_resources.gauge import Gauge, GaugeProbe, Scope, budget
 
 #: A walk through the directory takes at most this fraction of the time.

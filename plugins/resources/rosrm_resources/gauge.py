@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final, Literal, Protocol
 
-from rosrm.errors import ConfigError
-from rosrm.extensions.contracts import ProbeContext
-from rosrm.model.values import Reading, ResourceDescription
+from rosrm import ConfigError, ProbeContext, Reading, ResourceDescription
 
 #: What is measured: the whole machine; the control group the slave runs in (what a container
 #: needs); or the slave's own process tree against a budget.

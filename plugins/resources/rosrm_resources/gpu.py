@@ -10,9 +10,7 @@ from typing import Annotated, Any, Final, Literal
 
 from annotated_types import Ge
 
-from rosrm.errors import ConfigError, SkipPlugin
-from rosrm.extensions.contracts import ProbeContext
-from rosrm.model.values import Reading, ResourceDescription
+from rosrm import ConfigError, ProbeContext, Reading, ResourceDescription, SkipPlugin
 
 _LIBRARY: Final = "libnvidia-ml.so.1"
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from rosrm.extensions.contracts import ProbeContext, Sessions
+from rosrm import ProbeContext, Sessions
 from rosrm_resources.cgroups import Group, find_group, read_number
 from rosrm_resources.files import KeptFile, ProcessFiles
 from rosrm_resources.gauge import Gauge, GaugeProbe, Scope, budget, check_group

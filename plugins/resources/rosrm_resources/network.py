@@ -10,9 +10,7 @@ from typing import Annotated, Any, Final
 
 from annotated_types import Gt, Le
 
-from rosrm.errors import ConfigError, SkipPlugin
-from rosrm.extensions.contracts import ProbeContext
-from rosrm.model.values import Reading, ResourceDescription
+from rosrm import ConfigError, ProbeContext, Reading, ResourceDescription, SkipPlugin
 from rosrm_resources.rate import Rate
 
 _BYTES_PER_MEGABIT: Final = 1e6 / 8

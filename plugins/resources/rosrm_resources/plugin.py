@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from rosrm.extensions.contracts import ProbeOffer
-from rosrm.extensions.hookspecs import hookimpl
+from rosrm import ProbeOffer, hookimpl
 from rosrm_resources import cpu, disk, gpu, memory, network
 
 

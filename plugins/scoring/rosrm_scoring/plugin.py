@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from rosrm.extensions.contracts import ScoringOffer
-from rosrm.extensions.hookspecs import hookimpl
+from rosrm import ScoringOffer, hookimpl
 from rosrm_scoring.threshold import Threshold, ThresholdOptions
 from rosrm_scoring.weighted import Weighted, WeightedOptions
 

@@ -22,8 +22,7 @@ from typing import Annotated, Final
 import numpy as np
 from annotated_types import Ge, Gt, Le
 
-from rosrm.extensions.contracts import FloatArray, HostView, ProcessView, Scores
-from rosrm.extensions.units import ResourceName
+from rosrm import FloatArray, HostView, ProcessView, ResourceName, Scores
 from rosrm_scoring.weighted import DEFAULT_WEIGHTS, Missing, Weight, WeightedSum
 
 #: Stands for a limit of 0, which nothing can be divided by.

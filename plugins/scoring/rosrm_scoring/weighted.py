@@ -20,8 +20,7 @@ from typing import Annotated, Final, Literal
 import numpy as np
 from annotated_types import Ge, Le
 
-from rosrm.extensions.contracts import FloatArray, HostView, ProcessView, Scores
-from rosrm.extensions.units import ResourceName
+from rosrm import FloatArray, HostView, ProcessView, ResourceName, Scores
 
 Weight = Annotated[float, Ge(0), Le(1)]
 Missing = Literal["worst", "ignore"]

@@ -16,8 +16,8 @@ from rosrm.errors import ConfigError
 from rosrm.wording import counted
 
 if TYPE_CHECKING:
+    from rosrm.client.client import Client
     from rosrm.model.values import ProcessSpec
-    from rosrm.ros.client import MasterClient
 
 Wait = Annotated[
     bool, typer.Option("--wait", help="Wait for the result; exit 1 with the reason if it failed.")
@@ -52,7 +52,7 @@ def submit(
 
     If one process cannot be queued, none is.
     """
-    from rosrm.cli.waiting import interruptible, longest, wait_for
+    from rosrm.cli.waiting import interruptible, longest, show_change, show_processes
     from rosrm.config import load_work
 
     limit = longest(timeout)
@@ -61,12 +61,8 @@ def submit(
         typer.echo(client.submit(specs))
         if wait:
             with interruptible("what was submitted stays queued or runs (`rosrm ps`)"):
-                _exit_unless(wait_for(client, [spec.name for spec in specs], limit))
-
-
-def _exit_unless(done: bool) -> None:
-    if not done:
-        raise typer.Exit(1)
+                names = [spec.name for spec in specs]
+                show_processes(client.wait(names, timeout=limit, on_change=show_change))
 
 
 def cancel(
@@ -86,7 +82,8 @@ def cancel(
 
     A work file stands for those of its processes that have not ended.
     """
-    from rosrm.cli.waiting import interruptible, longest, over, wait_for
+    from rosrm.cli.waiting import interruptible, longest, show_change, show_processes
+    from rosrm.client.waiting import ENDED
 
     limit, chosen = longest(timeout), words or []
     if everything == bool(chosen):
@@ -95,8 +92,7 @@ def cancel(
     filed = [spec.name for word in chosen if _is_file(word) for spec in _load(word)]
     with connection.master(ctx, domain) as client:
         if everything or filed:
-            rows = client.list(processes=True).processes
-            live = [row.name for row in rows if over(row) != "done"]
+            live = [row.name for row in client.list_processes() if row.state not in ENDED]
             named += [name for name in live if everything or name in filed]
         names = list(dict.fromkeys(named))
         if not names:
@@ -107,7 +103,9 @@ def cancel(
         # The reply of the master has the end of each already, where all of them waited.
         if wait and outcome != f"{counted(len(names), 'process', 'processes')} cancelled":
             with interruptible("the processes are still being cancelled (`rosrm ps`)"):
-                _exit_unless(wait_for(client, names, limit, over, missing="done"))
+                show_processes(
+                    client.wait(names, until="ended", timeout=limit, on_change=show_change)
+                )
 
 
 def _is_file(word: str) -> bool:
@@ -131,16 +129,17 @@ def restart(
 
     A running process is restarted on its host; one that has ended is queued again.
     """
-    from rosrm.cli.waiting import identity, interruptible, longest, over, restarted, wait_for
+    from rosrm.cli.waiting import interruptible, longest, show_change, show_processes
 
     limit = longest(timeout)
     with connection.master(ctx, domain) as client:
-        rows = client.list(processes=True).processes if wait else ()
+        rows = client.list_processes() if wait else ()
         typer.echo(client.restart(names))
         if wait:
-            judge = restarted({row.name: identity(row) for row in rows if over(row) != "done"})
             with interruptible("the processes are still being restarted (`rosrm ps`)"):
-                _exit_unless(wait_for(client, names, limit, judge))
+                show_processes(
+                    client.wait(names, timeout=limit, previous=rows, on_change=show_change)
+                )
 
 
 def migrate(
@@ -179,11 +178,11 @@ def restore(
 
 
 def _with_ending(
-    ctx: typer.Context, name: str, ask: Callable[[MasterClient], str], domain: int | None,
+    ctx: typer.Context, name: str, ask: Callable[[Client], str], domain: int | None,
     wait: bool, timeout: str,
 ) -> None:  # fmt: skip
     """Send a request whose end is an event; wait for the event if asked to."""
-    from rosrm.cli.waiting import interruptible, longest, wait_for_ending
+    from rosrm.cli.waiting import interruptible, longest, show_change, show_end
 
     limit = longest(timeout)
     with connection.master(ctx, domain) as client:
@@ -191,17 +190,23 @@ def _with_ending(
         typer.echo(ask(client))
         if wait:
             with interruptible(f"what was begun with {name} continues (`rosrm events --process`)"):
-                _exit_unless(wait_for_ending(client, name, since, limit))
+                show_end(
+                    client.wait_for_migration(
+                        name, after=since, timeout=limit, on_change=show_change
+                    )
+                )
 
 
 def cordon(ctx: typer.Context, host: Host, domain: Domain = None) -> None:
     """Give a host no new work."""
-    _set_host(ctx, host, "cordon", domain)
+    with connection.master(ctx, domain) as client:
+        typer.echo(client.cordon(host))
 
 
 def uncordon(ctx: typer.Context, host: Host, domain: Domain = None) -> None:
     """Give a host work again."""
-    _set_host(ctx, host, "uncordon", domain)
+    with connection.master(ctx, domain) as client:
+        typer.echo(client.uncordon(host))
 
 
 def drain(
@@ -221,20 +226,15 @@ def drain(
     The master says which can and which cannot; when no process is left that can, the host is
     `drained`.
     """
-    from rosrm.cli.waiting import interruptible, longest, wait_until_drained
+    from rosrm.cli.waiting import interruptible, longest, show_end
 
     limit = longest(timeout)
     with connection.master(ctx, domain) as client:
         since = client.list().last_sequence if wait else 0
-        typer.echo(client.set_host_state(host, "drain"))
+        typer.echo(client.drain(host))
         if wait:
             with interruptible(f"{host} is still draining (`rosrm uncordon {host}` ends that)"):
-                _exit_unless(wait_until_drained(client, host, since, limit))
-
-
-def _set_host(ctx: typer.Context, host: str, action: str, domain: int | None) -> None:
-    with connection.master(ctx, domain) as client:
-        typer.echo(client.set_host_state(host, action))
+                show_end(client.wait_for_drain(host, after=since, timeout=limit))
 
 
 def prune(

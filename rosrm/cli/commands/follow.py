@@ -5,18 +5,17 @@
 
 from __future__ import annotations
 
-import time
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
 from rosrm.cli import connection
 from rosrm.cli.options import AsJson, Domain, Names
-from rosrm.cli.patience import PERIOD, ask_until_answered
+from rosrm.client.connecting import check_name
 
 if TYPE_CHECKING:
-    from rosrm.model.rows import Snapshot
-    from rosrm.ros.client import MasterClient
+    from rosrm.client.client import Client
+    from rosrm.model.rows import EventRow
 
 
 def events(  # noqa: PLR0917 - an argument for each option
@@ -51,38 +50,35 @@ def events(  # noqa: PLR0917 - an argument for each option
         if as_json and not follow:
             json_forms.show(json_forms.forms(snapshot.events))
             return
-        while True:
-            for row in snapshot.events:
-                if as_json:
-                    json_forms.show_line(json_forms.form(row))
-                elif console.is_terminal:
-                    console.print(tables.event(row))
-                else:
-                    typer.echo(tables.event_line(row))
-            if not follow:
-                _say_left_out(len(snapshot.events), newest)
-                return
-            time.sleep(PERIOD)
-            snapshot = _later(client, snapshot, process, host)
+
+        def show(row: EventRow) -> None:
+            if as_json:
+                json_forms.show_line(json_forms.form(row))
+            elif console.is_terminal:
+                console.print(tables.event(row))
+            else:
+                typer.echo(tables.event_line(row))
+
+        for row in snapshot.events:
+            show(row)
+        if not follow:
+            _say_left_out(len(snapshot.events), newest)
+            return
+        after = snapshot.last_sequence
+        for row in client.events(process=process, host=host, after=after, follow=True):
+            show(row)
 
 
-def _check_names(client: MasterClient, process: str, host: str) -> None:
+def _check_names(client: Client, process: str, host: str) -> None:
     """Refuse the name of a process or host that the master does not know."""
     known = client.list(hosts=True, processes=True)
-    connection.check_name("process", process, [row.name for row in known.processes])
-    connection.check_name("host", host, [row.description.name for row in known.hosts])
+    check_name("process", process, [row.name for row in known.processes])
+    check_name("host", host, [row.description.name for row in known.hosts])
 
 
 def _say_left_out(shown: int, newest: int) -> None:
     if shown >= newest:
         typer.echo(f"rosrm: at most the newest {newest} are shown; -n N shows more", err=True)
-
-
-def _later(client: MasterClient, before: Snapshot, process: str, host: str) -> Snapshot:
-    def look() -> Snapshot:
-        return client.list(events=True, process=process, host=host, after=before.last_sequence)
-
-    return ask_until_answered(look)
 
 
 def logs(  # noqa: PLR0917 - an argument for each option
@@ -116,17 +112,18 @@ def logs(  # noqa: PLR0917 - an argument for each option
     The output is complete, over restarts and moves; a line tells where the bound on logs dropped
     something, and how much.
     """
-    from rosrm.cli.log_reader import Wanted, copy_logs, since_of
+    from rosrm.cli.log_copies import copy_logs, since_of
     from rosrm.cli.output.log_lines import Stream
+    from rosrm.client.logs import LogSelection
 
-    wanted = Wanted(tail or 0, since_of(since), host, follow)
+    selection = LogSelection(tail or 0, since_of(since), host, follow)
     width = max(map(len, names)) if len(names) > 1 else 0
     streams = [
         Stream(name, f"{name:<{width}} | ".encode() if width else b"", timestamps)
         for name in dict.fromkeys(names)
     ]
     with connection.master(ctx, domain) as client:
-        copy_logs(client, streams, wanted)
+        copy_logs(client, streams, selection)
 
 
 def top(

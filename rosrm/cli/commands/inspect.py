@@ -11,7 +11,7 @@ import typer
 
 from rosrm.cli import connection
 from rosrm.cli.options import AsJson, Domain, Name
-from rosrm.errors import Refused
+from rosrm.client.connecting import check_name
 
 
 def status(ctx: typer.Context, as_json: AsJson = False, domain: Domain = None) -> None:
@@ -46,7 +46,7 @@ def ps(
     with connection.master(ctx, domain) as client:
         snapshot = client.list(processes=True, hosts=bool(host))
     connection.say_trouble(snapshot)
-    connection.check_name("host", host, [row.description.name for row in snapshot.hosts])
+    check_name("host", host, [row.description.name for row in snapshot.hosts])
     shown = [row for row in snapshot.processes if not host or row.host == host]
     if as_json:
         json_forms.show(json_forms.forms(shown))
@@ -99,7 +99,7 @@ def plugins(
         rows = list(Registry.discover().rows())
     else:
         with connection.master(ctx, domain) as client:
-            rows = list(client.list(plugins=True).plugins)
+            rows = list(client.list_plugins())
     if as_json:
         json_forms.show(json_forms.forms(rows))
     elif rows:
@@ -116,13 +116,7 @@ def explain(ctx: typer.Context, name: Name, as_json: AsJson = False, domain: Dom
     from rosrm.cli.output import explain, json_forms, tables
 
     with connection.master(ctx, domain) as client:
-        try:
-            story = client.explain(name)
-        except Refused as refusal:
-            if refusal.code == "unknown":
-                known = client.list(processes=True).processes
-                connection.check_name("process", name, [row.name for row in known])
-            raise
+        story = client.explain(name)
     if as_json:
         json_forms.show(dict(story))
     else:

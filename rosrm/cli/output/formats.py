@@ -5,24 +5,9 @@ from __future__ import annotations
 import math
 import time
 
-from rosrm.wording import amount, size
+from rosrm.wording import amount, duration, size
 
 __all__ = ["amount", "clock", "duration", "percent", "size", "words"]
-
-
-def duration(seconds: float) -> str:
-    """A span of time in at most two units: "0.4 s", "3 min", "2 h 5 min"."""
-    if not math.isfinite(seconds):
-        return "?"
-    if seconds < 9.95:
-        return f"{max(seconds, 0.0):.1f} s"
-    if seconds < 120:
-        return f"{seconds:.0f} s"
-    minutes = int(seconds // 60)
-    if minutes < 120:
-        return f"{minutes} min"
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours} h {minutes} min" if hours < 48 else f"{hours // 24} d"
 
 
 def percent(fraction: float) -> str:

@@ -12,6 +12,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 from rosrm.cli.output import formats
+from rosrm.client.logs import LogChunk
 
 Marks = Sequence[tuple[float, int, int]]
 #: Output, and the unix time by which it was written; 0.0: not known.
@@ -52,23 +53,15 @@ class Stream:
         pieces, self._pieces = self._pieces, []
         return pieces
 
-    def enter(self, host: str) -> None:
-        """Begin with another instance, on a host."""
-        self._host, self._is_new = host, self.wrote
-
-    def write(self, content: bytes, offset: int, marks: Marks, dropped: int = 0) -> None:
-        """Add a part.
-
-        Args:
-            content: the bytes.
-            offset: of the first byte, like the offsets of the marks.
-            marks: when the bytes were written, and where a program was started.
-            dropped: bytes before this part that are missing.
-        """
+    def write(self, chunk: LogChunk) -> None:
+        """Add bytes of the process."""
+        content, offset, marks = chunk.content, chunk.offset, chunk.marks
+        if chunk.is_first:
+            self._host, self._is_new = chunk.host, self.wrote
         begun = marks[0][0] if marks else 0.0
         starts = [(at, when) for when, at, pid in marks if pid and 0 <= at - offset < len(content)]
-        if dropped:
-            self._say(f"{formats.size(dropped)} before this were dropped", begun)
+        if chunk.dropped:
+            self._say(f"{formats.size(chunk.dropped)} before this were dropped", begun)
         if self._is_new and content and (not starts or starts[0][0] > offset):
             self._say(f"on {self._host}", begun)
         done = offset

@@ -88,7 +88,7 @@ STORY = {
 
 @dataclass
 class FakeClient:
-    """Answers like a master and notes what it was asked."""
+    """A connection that answers like a master and notes what it was asked."""
 
     hosts: list = field(default_factory=lambda: list(HOSTS))
     processes: list = field(default_factory=lambda: list(PROCESSES))
@@ -100,10 +100,7 @@ class FakeClient:
     settings: object = None
     closed: bool = False
 
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *exception):
+    def close(self):
         self.closed = True
 
     def _note(self, *what):
@@ -169,7 +166,7 @@ class FakeClient:
 
 @pytest.fixture
 def client(monkeypatch):
-    """The client that every command gets; it keeps the settings that it was reached with."""
+    """The connection of every command; it keeps the settings that it was reached with."""
     fake = FakeClient()
 
     def connect(settings):

@@ -77,7 +77,7 @@ def test_wait_says_how_a_checkpoint_a_restore_or_a_move_ended(
             event(4, kind, "a", message=message),
         ]
 
-    monkeypatch.setattr("rosrm.cli.waiting.time.sleep", later)
+    monkeypatch.setattr("rosrm.client.waiting.time.sleep", later)
     result = rosrm(action, "a", "--wait")
     assert result.code == code
     assert "a is stuck: alpha is lost" in result.err
@@ -107,7 +107,7 @@ def test_submit_wait_fails_if_a_job_left_the_list_before_it_was_seen_done(
     def later(seconds):
         client.processes = next(looks)
 
-    monkeypatch.setattr("rosrm.cli.waiting.time.sleep", later)
+    monkeypatch.setattr("rosrm.client.waiting.time.sleep", later)
     result = rosrm("submit", work, "--wait")
     assert result.code == code
     assert ("not seen to be done: a (" in result.err) == bool(code)
@@ -157,7 +157,7 @@ def test_submit_wait_fails_with_the_reason_when_a_process_failed(rosrm, client, 
 
 def test_submit_wait_gives_up_after_its_time(rosrm, client, work, monkeypatch):
     """The message names processes that have not ended, and no others."""
-    monkeypatch.setattr("rosrm.cli.waiting.PERIOD", 0.01)
+    monkeypatch.setattr("rosrm.client.waiting.PERIOD", 0.01)
     client.processes = [process("a", "starting", kind="job"), process("b", "finished")]
     result = rosrm("submit", work, "--wait", "--timeout", "50ms")
     assert result.code == 1
@@ -186,7 +186,7 @@ def test_submit_wait_ends_when_all_that_is_left_is_set_aside(rosrm, client, work
         ]
 
     later()
-    monkeypatch.setattr("rosrm.cli.waiting.time.sleep", later)
+    monkeypatch.setattr("rosrm.client.waiting.time.sleep", later)
     result = rosrm("submit", work, "--wait")
     assert (result.code, result.out.splitlines()[-1]) == (1, "1 running, 1 set aside")
     assert "a is set aside: no host has camera=front" in result.err
@@ -199,7 +199,7 @@ def test_ctrl_c_in_a_wait_says_that_the_processes_stay(rosrm, client, work, monk
     def interrupt(seconds):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("rosrm.cli.waiting.time.sleep", interrupt)
+    monkeypatch.setattr("rosrm.client.waiting.time.sleep", interrupt)
     result = rosrm("submit", work, "--wait")
     assert result.code == 130
     assert result.err == (
@@ -252,7 +252,7 @@ def test_cancel_wait_ends_when_all_have_ended(rosrm, client, monkeypatch):
     def later(seconds):
         client.processes = [process("a", "cancelled"), process("b", "finished")]
 
-    monkeypatch.setattr("rosrm.cli.waiting.time.sleep", later)
+    monkeypatch.setattr("rosrm.client.waiting.time.sleep", later)
     result = rosrm("cancel", "a", "b", "--wait")
     said = "cancelled\n1 cancelled, 1 finished\n"
     assert (result.code, result.out, result.err) == (0, said, "")
@@ -279,7 +279,7 @@ def test_restart_wait_ends_when_each_runs_in_another_run(rosrm, client, monkeypa
     def later(seconds):
         client.processes = next(looks)
 
-    monkeypatch.setattr("rosrm.cli.waiting.time.sleep", later)
+    monkeypatch.setattr("rosrm.client.waiting.time.sleep", later)
     result = rosrm("restart", "a", "b", "c", "--wait")
     assert (result.code, result.out) == (0, "restarted\n1 finished, 2 running\n")
     assert next(looks, None) is None
@@ -294,7 +294,7 @@ def test_drain_wait_ends_when_the_host_is_drained(rosrm, client, monkeypatch, le
         client.hosts, client.processes = [host("alpha", draining=True, drained=True)], left
         client.events += [event(9, "host_drained", message="alpha is drained: so and so")]
 
-    monkeypatch.setattr("rosrm.cli.waiting.time.sleep", later)
+    monkeypatch.setattr("rosrm.client.waiting.time.sleep", later)
     result = rosrm("drain", "alpha", "--wait")
     assert (result.code, "alpha is drained: so and so\n" in result.out + result.err) == (code, True)
 
@@ -366,7 +366,7 @@ def test_a_wait_for_a_silent_master_ends_after_its_time(rosrm, client, work, mon
         raise NoMaster("the master did not answer")
 
     client.list = list_
-    monkeypatch.setattr("rosrm.cli.patience.PERIOD", 0.01)
+    monkeypatch.setattr("rosrm.client.retrying.PERIOD", 0.01)
     result = rosrm("submit", work, "--wait", "--timeout", "50ms")
     assert result.code == 3
     assert "rosrm: --timeout has passed: the master did not answer\n" in result.err

@@ -12,7 +12,8 @@ from io import StringIO
 
 import pytest
 
-from rosrm.cli import log_reader
+from rosrm import Client
+from rosrm.cli import log_copies
 from rosrm.errors import NoMaster, Refused
 from rosrm.model.values import InstanceId
 from rosrm.ros.slave.services import LogQuery
@@ -86,7 +87,7 @@ def slaves(client, tmp_path):
 
 
 def test_a_log_is_copied_byte_by_byte_in_parts(rosrm, client, slaves, monkeypatch):
-    monkeypatch.setattr("rosrm.cli.log_reader._CHUNK", 3)
+    monkeypatch.setattr("rosrm.client.logs._PART", 3)
     slaves.write("alpha", 1, "one\ntwo ä\nend".encode())
     result = rosrm("logs", "talker")
     assert (result.code, result.out) == (0, "one\ntwo ä\nend")
@@ -198,7 +199,7 @@ def test_lines_have_times(rosrm, client, slaves):
 
 def test_several_logs_are_merged_by_time(rosrm, client, slaves, monkeypatch):
     """Each line has its process, also the line before each start, the first one included."""
-    monkeypatch.setattr("rosrm.cli.log_reader._CHUNK", 5)
+    monkeypatch.setattr("rosrm.client.logs._PART", 5)
     client.processes = [process("talker"), process("ear", host="beta", number=2)]
     slaves.write("alpha", 1, b"one\ntwo\n", at=NOON + 1)
     slaves.write("beta", 2, b"a\n", "ear", at=NOON)
@@ -339,8 +340,8 @@ def test_a_lost_host_holds_up_no_other_log(rosrm, client, slaves, monkeypatch):
         client.processes = [process("ear", "finished")]
 
     capture = StringIO()
-    monkeypatch.setattr(log_reader.typer, "echo", lambda text, err: capture.write(text))
-    monkeypatch.setattr(log_reader.time, "sleep", later)
+    monkeypatch.setattr(log_copies.typer, "echo", lambda text, err: capture.write(text))
+    monkeypatch.setattr(log_copies.time, "sleep", later)
     result = rosrm("logs", "talker", "ear", "-f")
     assert (result.code, result.out.splitlines()[1:]) == (1, ["ear    | heard"])
     assert "the log of talker is on alpha, and alpha is lost" in reported[0]
@@ -422,7 +423,7 @@ def test_several_are_followed_at_once(rosrm, client, slaves, monkeypatch):
         slaves.live.clear()
         client.processes = [process("talker", "finished"), process("ear", "finished")]
 
-    monkeypatch.setattr(log_reader.time, "sleep", later)
+    monkeypatch.setattr(log_copies.time, "sleep", later)
     lines = rosrm("logs", "talker", "ear", "-f").out.splitlines()
     assert [line for line in lines if "---" not in line] == [
         "talker | one", "ear    | a", "talker | two", "ear    | b",
@@ -445,15 +446,36 @@ def test_a_host_that_is_lost_ends_only_its_own_log(rosrm, client, slaves, monkey
     def lose(seconds):
         client.read_log = read
         slaves.write("beta", 2, b"b\n", "ear")
-        monkeypatch.setattr(log_reader.time, "sleep", end)
+        monkeypatch.setattr(log_copies.time, "sleep", end)
 
     def end(seconds):
         slaves.live.clear()
         client.processes = [process("ear", "finished")]
 
-    monkeypatch.setattr(log_reader.time, "sleep", lose)
+    monkeypatch.setattr(log_copies.time, "sleep", lose)
     result = rosrm("logs", "talker", "ear", "-f")
     assert [line for line in result.out.splitlines() if "---" not in line] == [
         "ear    | a", "talker | half", "ear    | b",
     ]  # fmt: skip
     assert (result.code, result.err) == (3, "rosrm: talker: no slave answers on alpha\n")
+
+
+# --- in a program -----------------------------------------------------------------------------
+
+
+def test_the_client_yields_what_was_written_with_host_and_instance(client, slaves):
+    client.events = [event(1, host="beta"), event(2, host="alpha")]
+    slaves.write("beta", 1, b"on beta\n")
+    slaves.write("alpha", 2, b"on alpha\n")
+    chunks = Client(connection=client).logs("talker")
+    assert [(one.host, one.number, one.content) for one in chunks] == [
+        ("beta", 1, b"on beta\n"), ("alpha", 2, b"on alpha\n"),
+    ]  # fmt: skip
+
+
+def test_the_client_follows_until_its_time_out(client, slaves, monkeypatch):
+    slaves.write("alpha", 1, b"one\n")
+    slaves.live.add(("alpha", 1))
+    monkeypatch.setattr("time.sleep", lambda seconds: slaves.write("alpha", 1, b"two\n"))
+    following = Client(connection=client).logs("talker", follow=True, timeout=0.2)
+    assert {one.content for one in following} >= {b"one\n", b"two\n"}

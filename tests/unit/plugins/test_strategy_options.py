@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rosrm.extensions.plans import options_of
+from rosrm.extensions.options import options_of
 from rosrm.model.values import MigrationPolicy, ProcessSpec
 from rosrm_migration.criu import CriuOptions, OwnCriuOptions
 

@@ -6,10 +6,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from rosrm.extensions.contracts import MigrationOffer
-from rosrm.extensions.hookspecs import hookimpl
-from rosrm.extensions.plans import AwaitReady, Commit, Execute, Move, Plan, Start, Stop
-from rosrm.extensions.units import PositiveSeconds
+from rosrm import (
+    AwaitReady,
+    Commit,
+    Execute,
+    MigrationOffer,
+    Move,
+    Plan,
+    PositiveSeconds,
+    Start,
+    Stop,
+    hookimpl,
+)
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,7 @@ from typing import Annotated
 
 from annotated_types import Gt, Le
 
-from rosrm.errors import SkipPlugin
-from rosrm.extensions.contracts import ProbeContext, ProbeOffer, Reading, ResourceDescription
-from rosrm.extensions.hookspecs import hookimpl
+from rosrm import ProbeContext, ProbeOffer, Reading, ResourceDescription, SkipPlugin, hookimpl
 
 
 @dataclass(frozen=True)

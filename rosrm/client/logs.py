@@ -1,4 +1,4 @@
-"""`rosrm logs`: finds the slaves that hold the logs of processes, copies them, and follows them.
+"""Reads the logs of processes: finds the slaves that hold them, copies them, and follows them.
 
 The numbers of instances ascend over all hosts, so that they order what a process wrote.
 """
@@ -6,31 +6,23 @@ The numbers of instances ascend over all hosts, so that they order what a proces
 from __future__ import annotations
 
 import sys
-import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from heapq import merge
-from operator import itemgetter
 from typing import TYPE_CHECKING, Final
 
-import typer
-
-from rosrm.cli.connection import check_name
-from rosrm.cli.output import formats
-from rosrm.cli.output.log_lines import Piece, Stream, show
-from rosrm.errors import ConfigError, NoMaster, Refused, RosrmError
-from rosrm.extensions.units import Quantity
-from rosrm.wording import listed, no_such, standing, standing_for
+from rosrm.client.connecting import check_name
+from rosrm.client.retrying import Notify
+from rosrm.client.waiting import ENDED
+from rosrm.errors import NoMaster, Refused
+from rosrm.wording import duration, listed, no_such, standing, standing_for
 
 if TYPE_CHECKING:
     from rosrm.model.rows import HostRow, ProcessRow, Snapshot
     from rosrm.ros.client import LogPart, MasterClient
 
-_CHUNK: Final = 256 * 1024
+_PART: Final = 256 * 1024
 #: Seconds between two looks at logs that have nothing new.
 PERIOD: Final = 0.3
-#: States in which nothing more will be written anywhere.
-_OVER: Final = frozenset({"finished", "failed", "cancelled"})
 #: Offset behind all that is written while the log is read.
 _NO_END: Final = sys.maxsize
 #: Newest events by which the hosts of a process are found.
@@ -38,14 +30,14 @@ _EVENTS: Final = 200
 
 
 @dataclass(frozen=True)
-class Wanted:
-    """Options of `rosrm logs`.
+class LogSelection:
+    """Selects a part of a log.
 
     Attributes:
         tail: the last lines only, so many; 0: all.
         since: unix time (s): only what was written then or later; 0.0: all.
         host: only what was written there; "": everywhere.
-        follow: until the processes have ended.
+        follow: until the process has ended.
     """
 
     tail: int = 0
@@ -54,116 +46,79 @@ class Wanted:
     follow: bool = False
 
 
-def since_of(text: str) -> float:
-    """Return the option --since as unix time, 0.0 where it is not given; raises `ConfigError`."""
-    try:
-        ago = Quantity("duration", above=True).parse(text) if text else 0.0
-    except ValueError as error:
-        raise ConfigError(f"--since: {error}. Give a time span up to now, e.g. 10min") from None
-    return time.time() - ago if ago else 0.0
+@dataclass(frozen=True, slots=True)
+class LogChunk:
+    """Consecutive bytes that one instance of a process wrote.
 
-
-def copy_logs(client: MasterClient, streams: Sequence[Stream], wanted: Wanted) -> None:
-    """Copy the logs of processes to standard output by the times of their lines; follow all.
-
-    A log that is out of reach is reported at once, and the others are copied.
-
-    Raises:
-        typer.Exit: one of them could not be copied.
+    Attributes:
+        process: that wrote.
+        host: on which it ran.
+        number: of the instance.
+        content: the bytes; b"": none yet, of an instance that is new.
+        offset: of the content, from the first byte that the instance wrote.
+        dropped: bytes before the content that the bound on logs removed.
+        is_first: no chunk of this instance came before.
+        marks: looks at the log: (unix time, offset, pid). Everything before the offset had been
+            written by that time; a pid not 0 is that of a program whose output begins there.
     """
-    silent: dict[str, str] = {}
-    copies = [_Copy(client, stream, wanted, silent) for stream in streams]
-    # `merge` takes the least of the next pieces: one without a time follows the one before it.
-    show(merge(*map(_begin, copies), key=itemgetter(0)))
-    if wanted.follow:
-        _follow([copy for copy in copies if not copy.over])
-    if exit_code := max(copy.exit_code for copy in copies):
-        raise typer.Exit(exit_code)
 
-
-def _begin(copy: _Copy) -> Iterator[Piece]:
-    """Read what there is, in pieces."""
-    try:
-        for _ in copy.begin():
-            yield from copy.stream.take()
-    except RosrmError as error:
-        copy.fail(error)
-    if copy.over or not copy.wanted.follow:
-        copy.stream.close()
-    yield from copy.stream.take()
-
-
-def _follow(copies: Sequence[_Copy]) -> None:
-    """Copy what is new until all processes have ended."""
-    while copies:
-        news = False
-        for copy in copies:
-            try:
-                news = copy.look() or news
-            except RosrmError as error:
-                copy.fail(error)
-            if copy.over:
-                copy.stream.close()
-            show(copy.stream.take())
-        copies = [copy for copy in copies if not copy.over]
-        if copies and not news:
-            time.sleep(PERIOD)
+    process: str
+    host: str
+    number: int
+    content: bytes
+    offset: int
+    dropped: int
+    is_first: bool
+    marks: Sequence[tuple[float, int, int]]
 
 
 @dataclass
-class _Copy:
-    """The copy of the logs of one process.
+class LogReader:
+    """Reads the log of one process: `read` what there is, then `poll` what is new.
 
     Attributes:
-        client: asks master and slaves.
-        stream: takes the bytes.
-        wanted: options of the command.
-        silent: hosts that did not answer, with the error; shared, so that each is asked once.
+        master: asks master and slaves.
+        process: that writes.
+        selection: of the log.
+        notify: is told about parts out of reach, and about a log without output.
+        silent: hosts that did not answer, with the error; readers that share it ask each once.
         over: nothing more comes.
-        exit_code: of the error that ended the copy; 0: none.
     """
 
-    client: MasterClient
-    stream: Stream
-    wanted: Wanted
-    silent: dict[str, str]
+    master: MasterClient
+    process: str
+    selection: LogSelection
+    notify: Notify
+    silent: dict[str, str] = field(default_factory=dict)
     over: bool = False
-    exit_code: int = 0
     _host: str = ""
     _number: int = 0
     _offset: int = 0
+    _wrote: bool = False
     _started: bool = False
     _hosts: Sequence[str] = ()
     _away: dict[str, str] = field(default_factory=dict)
 
-    def fail(self, error: RosrmError) -> None:
-        """Report that the log cannot be read any further."""
-        self.over, self.exit_code = True, error.exit_code
-        typer.echo(f"rosrm: {error}", err=True)
-
-    def begin(self) -> Iterator[None]:
-        """Copy what there is, one part at each step; raises `RosrmError`."""
+    def read(self) -> Iterator[LogChunk]:
+        """Yield what there is, the oldest first; raises `RosrmError`."""
         found = self._find()
         for host, first, end in self._chosen(found):
             self._started = self._started or any(pid for _, _, pid in first.marks)
-            self._take(host, _up_to(end, first))
-            yield
+            yield self._take(host, _up_to(end, first))
             while self._offset < end:
                 part = self._read(host, first.number, self._offset)
                 if not part.content:
                     break
-                self._take(host, _up_to(end, part))
-                yield
-        if not self.stream.wrote:
+                yield self._take(host, _up_to(end, part))
+        if not self._wrote:
             self._explain_nothing(found)
 
-    def look(self) -> bool:
-        """Copy what is new; return False if there was nothing."""
+    def poll(self) -> LogChunk | None:
+        """Return what is new, None if there is nothing; raises `RosrmError`."""
         part = self._read(self._host, self._number, self._offset) if self._host else None
         if part is not None and part.content:
-            self._take(self._host, part)
-            return True
-        return (part is None or part.ended) and self._find_next()
+            return self._take(self._host, part)
+        return self._find_next() if part is None or part.ended else None
 
     # --- one instance ------------------------------------------------------------------------
 
@@ -172,17 +127,17 @@ class _Copy:
 
         The offset behind what is to be shown stands beside them.
         """
-        left = self.wanted.tail
+        left = self.selection.tail
         if not left:
             for host, number in found:
-                yield host, self._read(host, number, 0, since=self.wanted.since), _NO_END
+                yield host, self._read(host, number, 0, since=self.selection.since), _NO_END
             return
         chosen: list[tuple[str, LogPart, int]] = []
         for host, number in reversed(found):
             if left <= 0:
                 break
             first, end, lines = self._last_lines(host, number, left)
-            chosen.insert(0, (host, first, _NO_END if self.wanted.follow else end))
+            chosen.insert(0, (host, first, _NO_END if self.selection.follow else end))
             left -= lines
         yield from chosen
 
@@ -205,40 +160,43 @@ class _Copy:
         self, host: str, number: int, offset: int, most: int = 0, *, tail: int = 0,
         since: float = 0.0,
     ) -> LogPart:  # fmt: skip
-        name, most = self.stream.name, most or _CHUNK
+        name, most = self.process, most or _PART
         if host not in self.silent:
             try:
-                return self.client.read_log(
+                return self.master.read_log(
                     host, name, number, offset, most, tail=tail, since=since
                 )
             except NoMaster as error:
                 self.silent[host] = str(error)
         raise NoMaster(f"{name}: {self.silent[host]}")
 
-    def _take(self, host: str, part: LogPart) -> None:
+    def _take(self, host: str, part: LogPart) -> LogChunk:
+        """Continue behind a part, and return it as a chunk."""
         new = (host, part.number) != (self._host, self._number)
-        whole = not (self.wanted.tail or self.wanted.since)
+        whole = not (self.selection.tail or self.selection.since)
         expected = (0 if whole else part.offset) if new else self._offset
-        if new:
-            self.stream.enter(host)
-        self.stream.write(part.content, part.offset, part.marks, part.offset - expected)
         self._host, self._number, self._offset = host, part.number, part.next_offset
+        self._wrote = self._wrote or bool(part.content)
+        return LogChunk(
+            self.process, host, part.number, part.content, part.offset, part.offset - expected,
+            new, part.marks,
+        )  # fmt: skip
 
     # --- where -------------------------------------------------------------------------------
 
     def _find(self) -> list[tuple[str, int]]:
         """Return host and number of every instance within reach, the oldest first."""
         name, row, hosts, events = self._ask()
-        check_name("host", self.wanted.host, hosts)
-        if self.wanted.host:
-            names = [self.wanted.host]
+        check_name("host", self.selection.host, hosts)
+        if self.selection.host:
+            names = [self.selection.host]
         else:
             here = [row.host] if row is not None and row.host else []
             names = list(dict.fromkeys([*here, *(host for host in events if host)]))
         if not names and row is None:
-            known = self.client.list(processes=True).processes
+            known = self.master.list(processes=True).processes
             raise Refused(no_such("process", [name], [row.name for row in known]), "unknown")
-        owner = row.host if row is not None and not self.wanted.host else self.wanted.host
+        owner = row.host if row is not None and not self.selection.host else self.selection.host
         self._hosts = names
         self._away = {host: away for host in names if (away := _why_away(hosts.get(host), host))}
         if owner in self._away:
@@ -248,7 +206,7 @@ class _Copy:
             if host not in self._away:
                 found += [(host, number) for number in self._numbers(host, owner)]
         for away in self._away.values():
-            typer.echo(f"rosrm: {name}: part of its log cannot be read: {away}", err=True)
+            self.notify(f"{name}: part of its log cannot be read: {away}")
         return sorted(found, key=lambda one: one[1])
 
     def _numbers(self, host: str, owner: str) -> Sequence[int]:
@@ -267,8 +225,8 @@ class _Copy:
         return part.numbers or (part.number,)
 
     def _ask(self) -> tuple[str, ProcessRow | None, dict[str, HostRow], list[str]]:
-        name = self.stream.name
-        listed: Snapshot = self.client.list(
+        name = self.process
+        listed: Snapshot = self.master.list(
             hosts=True, processes=True, events=True, process=name, newest=_EVENTS
         )
         row = next((row for row in listed.processes if row.name == name), None)
@@ -277,10 +235,10 @@ class _Copy:
 
     def _refuse(self, row: ProcessRow | None, host: str) -> None:
         """Say at once that the newest part is out of reach, with what the master knows."""
-        name, why = self.stream.name, f", and {self._away[host]}"
+        name, why = self.process, f", and {self._away[host]}"
         known = ""
         if row is not None:
-            known = f". {name} {standing_for(row.state, formats.duration(row.since))}"
+            known = f". {name} {standing_for(row.state, duration(row.since))}"
         if row is not None and row.reason:
             known += f": {row.reason}"
             why = "" if row.reason.startswith(f"{host} is ") else why  # the reason says the same
@@ -294,33 +252,32 @@ class _Copy:
     def _explain_nothing(self, found: Sequence[tuple[str, int]]) -> None:
         """Say why nothing is shown; raises `Refused` where no program was started."""
         name, row, _, _ = self._ask()
-        if self.wanted.follow and row is not None and row.state not in _OVER:
+        if self.selection.follow and row is not None and row.state not in ENDED:
             return
-        where = f" on {self.wanted.host}" if self.wanted.host else ""
-        if found and (self._started or self.wanted.since):
-            since = " since then" if self.wanted.since else ""
-            typer.echo(f"rosrm: {name} has written nothing{where}{since}", err=True)
+        where = f" on {self.selection.host}" if self.selection.host else ""
+        if found and (self._started or self.selection.since):
+            since = " since then" if self.selection.since else ""
+            self.notify(f"{name} has written nothing{where}{since}")
             return
         state = "is no longer known to the master" if row is None else standing(row.state)
         reason = f": {row.reason}" if row is not None and row.reason else ""
         gone = "it was not started, or its log has been removed"
         raise Refused(f"{name} has no log{where}: {gone}. {name} {state}{reason}")
 
-    def _find_next(self) -> bool:
-        """Copy the beginning of the next instance; return False if there is none, or none yet."""
+    def _find_next(self) -> LogChunk | None:
+        """Return the beginning of the next instance; None if there is none, or none yet."""
         _, row, _, _ = self._ask()
-        if row is None or row.state in _OVER or self.wanted.host:
+        if row is None or row.state in ENDED or self.selection.host:
             self.over = True
-            return False
+            return None
         if not row.number or not row.host or (row.host, row.number) == (self._host, self._number):
-            return False
+            return None
         try:
-            self._take(row.host, self._read(row.host, row.number, 0))
+            return self._take(row.host, self._read(row.host, row.number, 0))
         except Refused as refusal:
             if refusal.code != "unknown":  # its host is about to begin the log
                 raise
-            return False
-        return True
+            return None
 
 
 def _up_to(end: int, part: LogPart) -> LogPart:
@@ -346,7 +303,7 @@ def _why_away(row: HostRow | None, host: str) -> str:
         return ""
     if row.state == "left":
         return f"{host} has left: no slave runs there"
-    silent = formats.duration(row.reading_age)
+    silent = duration(row.reading_age)
     if row.state == "detached":
         return f"{host} is detached: its slave was stopped {silent} ago"
     return f"{host} is {row.state}: the master received its last reading {silent} ago"

@@ -1,0 +1,104 @@
+"""`rosrm logs`: copies the logs of processes to standard output, merged by time."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from heapq import merge
+from operator import itemgetter
+from typing import TYPE_CHECKING
+
+import typer
+
+from rosrm.cli.output.log_lines import Piece, Stream, show
+from rosrm.client.logs import PERIOD, LogReader, LogSelection
+from rosrm.errors import ConfigError, RosrmError
+from rosrm.extensions.units import Quantity
+
+if TYPE_CHECKING:
+    from rosrm.client.client import Client
+
+
+def since_of(text: str) -> float:
+    """Return the option --since as unix time, 0.0 where it is not given; raises `ConfigError`."""
+    try:
+        ago = Quantity("duration", above=True).parse(text) if text else 0.0
+    except ValueError as error:
+        raise ConfigError(f"--since: {error}. Give a time span up to now, e.g. 10min") from None
+    return time.time() - ago if ago else 0.0
+
+
+def copy_logs(client: Client, streams: Sequence[Stream], selection: LogSelection) -> None:
+    """Copy the logs of processes to standard output by the times of their lines; follow all.
+
+    A log that is out of reach is reported at once, and the others are copied.
+
+    Raises:
+        typer.Exit: one of them could not be copied.
+    """
+    readers = client.log_readers([stream.name for stream in streams], selection)
+    copies = [_Copy(reader, stream) for reader, stream in zip(readers, streams, strict=True)]
+    # `merge` takes the least of the next pieces: one without a time follows the one before it.
+    show(merge(*(copy.begin() for copy in copies), key=itemgetter(0)))
+    if selection.follow:
+        _follow([copy for copy in copies if not copy.reader.over])
+    if exit_code := max(copy.exit_code for copy in copies):
+        raise typer.Exit(exit_code)
+
+
+def _follow(copies: Sequence[_Copy]) -> None:
+    """Copy what is new until all processes have ended."""
+    while copies:
+        news = False
+        for copy in copies:
+            news = copy.poll() or news
+            if copy.reader.over:
+                copy.stream.close()
+            show(copy.stream.take())
+        copies = [copy for copy in copies if not copy.reader.over]
+        if copies and not news:
+            time.sleep(PERIOD)
+
+
+@dataclass
+class _Copy:
+    """The copy of the log of one process.
+
+    Attributes:
+        reader: of the log.
+        stream: takes the bytes.
+        exit_code: of the error that ended the copy; 0: none.
+    """
+
+    reader: LogReader
+    stream: Stream
+    exit_code: int = 0
+
+    def begin(self) -> Iterator[Piece]:
+        """Copy what there is, and yield it in pieces."""
+        try:
+            for chunk in self.reader.read():
+                self.stream.write(chunk)
+                yield from self.stream.take()
+        except RosrmError as error:
+            self._fail(error)
+        if self.reader.over or not self.reader.selection.follow:
+            self.stream.close()
+        yield from self.stream.take()
+
+    def poll(self) -> bool:
+        """Copy what is new; return False if there was nothing."""
+        try:
+            chunk = self.reader.poll()
+        except RosrmError as error:
+            self._fail(error)
+            return False
+        if chunk is not None:
+            self.stream.write(chunk)
+        return chunk is not None
+
+    def _fail(self, error: RosrmError) -> None:
+        """Report that the log cannot be read any further."""
+        self.reader.over, self.exit_code = True, error.exit_code
+        typer.echo(f"rosrm: {error}", err=True)

