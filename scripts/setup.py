@@ -109,8 +109,8 @@ def set_up(*, remake_other_version: bool) -> None:
         )
         write_stamp({k: wanted[k] for k in ("where", "interfaces")})
     steps.run(
-        "ROS 2 Jazzy, rosrm, its plugins and examples, the tools for the tests",
-        *pip("install", "--no-build-isolation", *editables(extras="ros,plot,test")),
+        "ROS 2 Jazzy, rosrm, its plugins, tools and examples, what the tests need",
+        *pip("install", "--no-build-isolation", *editables(extras="ros,test")),
     )
     steps.run(
         "do they work together?",
@@ -160,7 +160,7 @@ def digest(files: list[Path]) -> str:
 
 def distributions() -> list[Path]:
     """The folders of the repository's own distributions, the core first."""
-    others = [*sorted(ROOT.glob("plugins/*")), ROOT / "examples"]
+    others = [*sorted(ROOT.glob("plugins/*")), *sorted(ROOT.glob("tools/*")), ROOT / "examples"]
     return [ROOT, *(d for d in others if (d / "pyproject.toml").is_file())]
 
 

@@ -32,6 +32,8 @@ _ELSEWHERE: Final = {
     )
     for word in words.split()
 }
+#: Commands that distributions of their own bring.
+DISTRIBUTIONS: Final = {"lab": "rosrm-lab", "simulate": "rosrm-simulate"}
 #: Wide enough that no summary of a command is cut.
 _UNCUT: Final = 1000
 #: "WORK......" and "[NAME...]..." say twice that a word may be repeated.

@@ -1,4 +1,4 @@
-"""Where the installed plugins and commands are; nothing of them is loaded."""
+"""Where the installed plugins and commands, and checks of files, are; nothing of them is loaded."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from typing import Final
 GROUP: Final = "rosrm"
 #: Entry-point group of further commands of `rosrm`: name of the command, function or `typer.Typer`.
 COMMANDS: Final = "rosrm.commands"
+#: Entry-point group of the checks of `rosrm config check`: kind of file, function.
+CHECKS: Final = "rosrm.checks"
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,15 +19,13 @@ from typing import Annotated, Any
 
 import typer
 
-from rosrm.cli import simulate
 from rosrm.cli.commands import change, check, follow, inspect, start
 from rosrm.cli.criu import criu
-from rosrm.cli.groups import PlainCommand, PlainGroup, add_command, hint_after
+from rosrm.cli.groups import DISTRIBUTIONS, PlainCommand, PlainGroup, add_command, hint_after
 from rosrm.cli.installed_commands import find_commands, load_command
-from rosrm.cli.lab import lab
 from rosrm.cli.options import Common, Domain
 from rosrm.cli.process import INTERRUPTED
-from rosrm.errors import RosrmError
+from rosrm.errors import ConfigError, RosrmError
 from rosrm.extensions.installed import PluginAddress
 from rosrm.version import PROTOCOL_VERSION, __version__
 
@@ -55,6 +53,10 @@ class Guarded(PlainGroup):
         """Find the command; for an unknown one name the command that is meant."""
         word = args[0]
         if not (word in self.commands or word in self._installed or ctx.resilient_parsing):
+            if word in DISTRIBUTIONS:
+                raise ConfigError(
+                    f"the command {word!r} comes with `pip install {DISTRIBUTIONS[word]}`"
+                )
             hint = hint_after(word, self.list_commands(ctx))
             if hint:
                 ctx.fail(f"No such command {word!r}. {hint}")
@@ -111,8 +113,8 @@ def common(
     ctx.obj = Common(domain, cluster)
 
 
-for module in (start, change, inspect, follow, simulate):
+for module in (start, change, inspect, follow):
     for function in module.COMMANDS:
         app.command(cls=PlainCommand)(function)
-for name, group in (("config", check.config), ("lab", lab), ("criu", criu)):
+for name, group in (("config", check.config), ("criu", criu)):
     add_command(app, name, group)

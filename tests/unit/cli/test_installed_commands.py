@@ -118,6 +118,20 @@ def test_a_misspelt_command_of_another_distribution_is_hinted_at(rosrm, installe
     assert "No such command 'helo'. Did you mean 'hello'?" in result.err
 
 
+@pytest.mark.parametrize(
+    ("command", "distribution"), [("lab", "rosrm-lab"), ("simulate", "rosrm-simulate")]
+)
+def test_a_command_whose_distribution_is_absent_names_it(rosrm, monkeypatch, command, distribution):
+    """A command of this repository that is not installed says in one sentence where it is."""
+    monkeypatch.setattr(commands, "find_commands", dict)
+
+    result = rosrm(command, "up", "--help")
+
+    assert (result.code, result.out, result.err) == (
+        2, "", f"rosrm: the command {command!r} comes with `pip install {distribution}`\n",
+    )  # fmt: skip
+
+
 def test_a_command_of_rosrm_is_found_without_a_search(rosrm, monkeypatch):
     """The search reads the metadata of all distributions: only other commands wait for that."""
 
