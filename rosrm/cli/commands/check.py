@@ -152,15 +152,26 @@ def _checked(file: Path, kind: KindOfFile | None, registry: Registry) -> str:
 
 
 def _check_of_simulations(file: Path) -> Callable[[Path, Registry], str]:
-    """Return the check that the distribution of the simulator brings; raise `ConfigError`."""
+    """Return the check that the distribution of the simulator brings.
+
+    Raises:
+        ConfigError: it is not installed.
+        PluginError: it does not import.
+    """
     from pkgutil import resolve_name
 
-    from rosrm.errors import ConfigError
+    from rosrm.errors import ConfigError, PluginError, describe_plugin_fault
     from rosrm.extensions.installed import CHECKS, installed_plugins
 
     for address in installed_plugins(CHECKS):
         if address.name == "simulation":
-            check: Callable[[Path, Registry], str] = resolve_name(address.target)
+            try:
+                check: Callable[[Path, Registry], str] = resolve_name(address.target)
+            except Exception as fault:  # noqa: BLE001 - code of another distribution
+                reason = f"cannot be loaded: {describe_plugin_fault(fault)}"
+                raise PluginError(
+                    f"the check of simulation files of {address.distribution} {reason}"
+                ) from None
             return check
     needed = DISTRIBUTIONS["simulate"]
     raise ConfigError(f"{file}: the check of a simulation file comes with `pip install {needed}`")
