@@ -24,9 +24,9 @@ from rosrm.core.master.settings import CoreSettings
 from rosrm.master.recorder import Recorder
 from rosrm.model.values import RESOURCE_SLOTS, Kind, ProcessSpec, ResourceDescription
 from rosrm.recording.reader import Header
-from rosrm.simulation.engine import Simulation
-from rosrm.simulation.workload import Curve, HostPlan, ProcessPlan, Workload
 from rosrm_scoring.weighted import Weighted, WeightedOptions
+from rosrm_simulate.engine import Simulation
+from rosrm_simulate.workload import Curve, HostPlan, ProcessPlan, Workload
 
 _JOBS = 1_000
 _HOSTS = 50

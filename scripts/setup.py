@@ -107,14 +107,14 @@ def set_up(*, remake_other_version: bool, tests: bool) -> None:
     if "packages" in missing:
         steps.run(
             "ROS 2 Jazzy, rosrm, its plugins and examples",
-            *pip("install", "--no-build-isolation", *editables(extras="ros,plot")),
+            *pip("install", "--no-build-isolation", *editables(extras="ros")),
         )
         steps.run("do they work together?", PYTHON, "-c", IMPORTS)
         stamp(wanted, "packages")
     if "tests" in missing:
         steps.run(
             "the tools for tests and benchmarks",
-            *pip("install", "--no-build-isolation", *editables(extras="ros,plot,test")),
+            *pip("install", "--no-build-isolation", *editables(extras="ros,test")),
         )
         try_criu(steps)
         stamp(wanted, "tests")
@@ -194,7 +194,7 @@ def digest(files: list[Path]) -> str:
 
 def distributions() -> list[Path]:
     """The folders of the repository's own distributions, the core first."""
-    others = [*sorted(ROOT.glob("plugins/*")), ROOT / "examples"]
+    others = [*sorted(ROOT.glob("plugins/*")), *sorted(ROOT.glob("tools/*")), ROOT / "examples"]
     return [ROOT, *(d for d in others if (d / "pyproject.toml").is_file())]
 
 

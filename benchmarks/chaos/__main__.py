@@ -24,7 +24,7 @@ from benchmarks.chaos.story import Story
 from benchmarks.chaos.trial import Stuck, Tally, Trial
 from benchmarks.machine import percentile, print_report, say
 from benchmarks.stopping import run
-from rosrm.lab import needs
+from rosrm_lab import needs
 
 #: Labs that may get stuck before a run is given up.
 _MOST_STUCK: Final = 5

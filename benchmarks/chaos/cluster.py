@@ -21,7 +21,7 @@ import psutil
 from benchmarks.chaos import clocks
 from benchmarks.chaos.faults import MASTER
 from benchmarks.chaos.work import LINE_HOST, ROOT
-from rosrm.lab import GIB, MIB, HostPlan, Lab, uniform
+from rosrm_lab import GIB, MIB, HostPlan, Lab, uniform
 
 if TYPE_CHECKING:
     from typing_extensions import Self

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from benchmarks.chaos.cluster import DESK
 from benchmarks.chaos.work import ROOT
-from rosrm.lab import Lab
+from rosrm_lab import Lab
 
 if TYPE_CHECKING:
     from typing_extensions import Self

@@ -16,7 +16,7 @@ from benchmarks.chaos.cluster import DESK, Cluster
 from benchmarks.chaos.excuses import Harm
 from benchmarks.chaos.faults import MASTER, Fault
 from benchmarks.chaos.reality import members
-from rosrm.lab import Direction
+from rosrm_lab import Direction
 
 _ALL: Final = frozenset({"*"})
 _FILLER: Final = "filler"

@@ -2,6 +2,6 @@
 
     python -m benchmarks.paper fig6|fig7|fig8|fig9|fig10|table3|all --out DIR
 
-A master and slaves, started as users start them, run on virtual hosts (`rosrm.lab`: needs root).
+A master and slaves, started as users start them, run on virtual hosts (`rosrm_lab`: needs root).
 Each figure leaves FIGURE.json and FIGURE.png in DIR.
 """

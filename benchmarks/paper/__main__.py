@@ -26,8 +26,8 @@ from benchmarks.paper.page import checked_page, update_page
 from benchmarks.paper.report import FIGURES, Options, plain_report, write_report
 from benchmarks.stopping import Stopped, raise_signals
 from rosrm.errors import RosrmError
-from rosrm.lab import needs
 from rosrm_examples.errors import ExampleError
+from rosrm_lab import needs
 
 #: Needs no hosts: the slaves are simulated.
 _WITHOUT_LAB = ("fig9",)

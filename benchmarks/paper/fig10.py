@@ -13,7 +13,7 @@ from benchmarks.paper.labs import LabCluster
 from benchmarks.paper.report import Options, Result
 from benchmarks.paper.settings import HOLDER_MB, MEMORY_LIMIT, cluster_settings, holder
 from benchmarks.paper.trace import Move, Trace
-from rosrm.lab import MIB, HostPlan
+from rosrm_lab import MIB, HostPlan
 
 CLAIM: Final = (
     "A process whose slave has reached the limit of 80 % migrates to the slave that has the "

@@ -16,7 +16,7 @@ from benchmarks.paper.report import Options, Result
 from benchmarks.paper.settings import HOLDER_MB, MEMORY_LIMIT, alike, cluster_settings, holder
 from benchmarks.paper.simulated import agreement
 from benchmarks.paper.trace import Trace, per_host
-from rosrm.lab import GIB, MIB, HostPlan, uniform
+from rosrm_lab import GIB, MIB, HostPlan, uniform
 
 CLAIM: Final = (
     "Processes go to the slave with the largest margin: the three stay balanced all the way, and "

@@ -14,7 +14,7 @@ from benchmarks.paper.labs import LabCluster
 from benchmarks.paper.report import Options, Result
 from benchmarks.paper.settings import HOLDER_MB, MEMORY_LIMIT, alike, holder
 from benchmarks.paper.trace import Trace, per_host
-from rosrm.lab import GIB, MIB, uniform
+from rosrm_lab import GIB, MIB, uniform
 
 CLAIM: Final = (
     "Slaves that join at 25 s and 75 s are given the processes, as they have the largest margin, "

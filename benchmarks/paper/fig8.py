@@ -13,7 +13,7 @@ from benchmarks.paper.labs import LabCluster
 from benchmarks.paper.report import Options, Result
 from benchmarks.paper.settings import HOLDER_MB, MEMORY_LIMIT, alike, holder
 from benchmarks.paper.trace import Look, Trace, per_host
-from rosrm.lab import MIB, uniform
+from rosrm_lab import MIB, uniform
 
 CLAIM: Final = (
     "The number of processes that are allocated is proportional to that of slaves; none ends above "

@@ -18,7 +18,7 @@ from typing import IO, TYPE_CHECKING, Any, Final
 
 from benchmarks.paper.settings import cluster_settings, host_settings
 from benchmarks.paper.trace import Look, Trace
-from rosrm.lab import DATA, MIB, HostPlan, Lab
+from rosrm_lab import DATA, MIB, HostPlan, Lab
 
 if TYPE_CHECKING:
     from typing_extensions import Self

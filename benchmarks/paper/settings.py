@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Final
 
-from rosrm.lab import MIB, HostPlan
+from rosrm_lab import MIB, HostPlan
 
 #: Section IV A: only memory decides, up to 80 % of it, at 10 Hz.
 WEIGHTS: Final = {"memory": 1.0, "cpu": 0.0, "disk": 0.0}

@@ -22,7 +22,7 @@ from benchmarks.paper.report import Options, Result
 from benchmarks.paper.settings import TABLE3_MIN, alike
 from benchmarks.paper.slam import PIECES, Piece, drives_at_hand, pieces_of, scans_mapped
 from benchmarks.paper.trace import Look, Trace, per_host
-from rosrm.lab import MIB, uniform
+from rosrm_lab import MIB, uniform
 
 CLAIM: Final = (
     "rosrm takes at most 1.05 times as long as the ideal placement by hand, gives each host one "

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from typing import Any, Final
 
-from typer import BadParameter
+from typer import BadParameter, Typer
 from typer.core import TyperCommand, TyperGroup
 
-from rosrm.wording import listed
+from rosrm.wording import get_close_matches, listed
 
 #: Verbs of other tools, and the commands of rosrm that do as much.
 _ELSEWHERE: Final = {
@@ -31,6 +32,8 @@ _ELSEWHERE: Final = {
     )
     for word in words.split()
 }
+#: Commands that distributions of their own bring.
+DISTRIBUTIONS: Final = {"lab": "rosrm-lab", "simulate": "rosrm-simulate"}
 #: Wide enough that no summary of a command is cut.
 _UNCUT: Final = 1000
 #: "WORK......" and "[NAME...]..." say twice that a word may be repeated.
@@ -58,14 +61,36 @@ class PlainCommand(TyperCommand):
 class PlainGroup(TyperGroup):
     """A group whose help prints the whole summary of each command."""
 
-    def format_commands(self, ctx: Any, formatter: Any) -> None:  # noqa: ARG002 - as click calls it
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write the list of commands."""
-        shown = [(name, one) for name, one in self.commands.items() if not one.hidden]
+        found = [(name, self.get_command(ctx, name)) for name in self.list_commands(ctx)]
+        shown = [(name, one) for name, one in found if one is not None and not one.hidden]
         with formatter.section("Commands"):
             formatter.write_dl([(name, one.get_short_help_str(_UNCUT)) for name, one in shown])
 
 
-def hint_after(word: str) -> str:
-    """Return the commands meant by a verb of another tool, as a question; "" for none."""
-    verbs = _ELSEWHERE.get(word.lower(), ())
-    return f"Did you mean {listed([repr(verb) for verb in verbs], 'or')}?" if verbs else ""
+def add_command(app: Typer, name: str, command: object) -> None:
+    """Add a command, or a group of commands (`typer.Typer`), with plain help and errors.
+
+    Raises:
+        TypeError: the object is neither a function nor a `typer.Typer`.
+    """
+    if isinstance(command, Typer):
+        for one in command.registered_commands:
+            one.cls = PlainCommand
+        app.add_typer(command, name=name, cls=PlainGroup)
+    elif callable(command):
+        app.command(name, cls=PlainCommand)(command)
+    else:
+        raise TypeError(f"{command!r} is neither a function nor a typer.Typer")
+
+
+def hint_after(word: str, known: Iterable[str]) -> str:
+    """Return the commands meant by an unknown one, as a question; "" for none.
+
+    Args:
+        word: a verb of another tool, or a misspelt command.
+        known: the names of all commands.
+    """
+    meant = _ELSEWHERE.get(word.lower()) or get_close_matches(word, known)
+    return f"Did you mean {listed([repr(one) for one in meant], 'or')}?" if meant else ""

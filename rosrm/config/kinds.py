@@ -13,15 +13,18 @@ from rosrm.config.settings import ClusterConfig, HostConfig
 from rosrm.errors import ConfigError
 from rosrm.wording import get_close_matches
 
+#: Keys of a simulation's workload. The distribution `rosrm-simulate` reads such a file; its keys
+#: are here because a file that is given to the wrong command is named without that distribution.
+SIMULATION_KEYS: Final = (
+    "name", "seed", "until", "hosts", "processes", "model", "cluster", "variants",
+)  # fmt: skip
 #: Keys of each kind of file.
 _KEYS: Final = {
     "cluster": {f.name for f in fields(ClusterConfig)},
     "host": {f.name for f in fields(HostConfig)},
     "work": {"processes", "defaults"},
-    "simulation": {
-        "name", "seed", "until", "hosts", "processes", "model", "cluster", "variants",
-    },
-}  # fmt: skip
+    "simulation": {*SIMULATION_KEYS},
+}
 #: A file without this key is of another kind.
 _NEEDED: Final = {"work": "processes", "simulation": "hosts"}
 #: End of a file's name, before `.yaml`.

@@ -1,12 +1,16 @@
-"""Where the installed plugins are; nothing of them is loaded."""
+"""Where the installed plugins and commands, and checks of files, are; nothing of them is loaded."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Final
 
-#: The group of the entry points.
+#: Entry-point group of the plugins.
 GROUP: Final = "rosrm"
+#: Entry-point group of further commands of `rosrm`: name of the command, function or `typer.Typer`.
+COMMANDS: Final = "rosrm.commands"
+#: Entry-point group of the checks of `rosrm config check`: kind of file, function.
+CHECKS: Final = "rosrm.checks"
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,13 +28,13 @@ class PluginAddress:
     distribution: str = ""
 
 
-def installed_plugins() -> list[PluginAddress]:
+def installed_plugins(group: str = GROUP) -> list[PluginAddress]:
     """Each entry point once, in the order of names, even where a folder is twice on the path."""
     # Entry points are e-mail headers in zip files: a runtime does not load their readers.
     from importlib.metadata import entry_points  # noqa: PLC0415 - see above
 
     found: dict[tuple[str, str], PluginAddress] = {}
-    for point in entry_points(group=GROUP):
+    for point in entry_points(group=group):
         distribution = f"{point.dist.name} {point.dist.version}" if point.dist else ""
         address = PluginAddress(point.name, point.value, distribution)
         found.setdefault((distribution, point.name), address)

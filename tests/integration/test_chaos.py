@@ -24,7 +24,7 @@ SEED, FAULTS = 741, 9
 @pytest.fixture
 def lab():
     """The name of a lab that is not left."""
-    from rosrm.lab import all_labs
+    from rosrm_lab import all_labs
 
     reason = why_not()
     if reason:

@@ -26,7 +26,7 @@ COMMAND = [sys.executable, "-m", "benchmarks.paper"]
 @pytest.fixture
 def lab():
     """What the names of the labs begin with; none of them may be left."""
-    from rosrm.lab import all_labs
+    from rosrm_lab import all_labs
 
     reason = why_not()
     if reason:

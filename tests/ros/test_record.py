@@ -8,17 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from rosrm.cli.simulation_runs import (
-    Request,
-    agreement_of,
-    carry_out,
-    load_record,
-    replay_record,
-)
 from rosrm.config.settings import MigrationSettings, ProcessDefaults, RecordSettings
 from rosrm.errors import RecordError
 from rosrm.extensions.registry import Registry
 from rosrm.model.values import MigrationPolicy
+from rosrm_simulate.runs import Request, agreement_of, carry_out, load_record, replay_record
 from tests.ros.clusters import MIB, PATIENCE, STEADY, host, job, python, service
 
 HOLD = """

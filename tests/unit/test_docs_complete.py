@@ -223,7 +223,8 @@ _OF_NO_USE = {(plan.Commit, "timeout"), (plan.Commit, "undo")}
 
 
 def commands(group, before: str = "rosrm") -> Iterator[tuple[str, object]]:
-    for name, command in group.commands.items():
+    for name in group.list_commands(None):
+        command = group.get_command(None, name)
         if hasattr(command, "commands"):
             yield from commands(command, f"{before} {name}")
         else:

@@ -22,7 +22,7 @@ else:
 ROOT = Path(__file__).resolve().parents[2]
 PROJECTS = [
     path.relative_to(ROOT)
-    for folder in (".", "rosrm_msgs", "examples", "plugins/*")
+    for folder in (".", "rosrm_msgs", "examples", "plugins/*", "tools/*")
     for path in sorted(ROOT.glob(f"{folder}/pyproject.toml"))
 ]
 PYTHONS = ("3.10", "3.11", "3.12", "3.13")
@@ -75,10 +75,12 @@ def test_every_distribution_is_looked_at() -> None:
         "rosrm",
         "rosrm-checkpoint",
         "rosrm-examples",
+        "rosrm-lab",
         "rosrm-migration",
         "rosrm-msgs",
         "rosrm-resources",
         "rosrm-scoring",
+        "rosrm-simulate",
     } <= OWN
 
 
@@ -103,7 +105,11 @@ def test_every_distribution_runs_on_the_same_pythons_under_the_same_licence(proj
 
 
 def test_the_readme_installs_all_that_runs() -> None:
-    """Its one pip command names rosrm with ROS 2, the interfaces and each plugin, pinned."""
+    """Its one pip command names rosrm with ROS 2, the interfaces and each plugin, pinned.
+
+    The tools `rosrm-lab` and `rosrm-simulate` are left to who wants them.
+    """
     (line,) = re.findall(r"^\$ pip install (.*)$", (ROOT / "README.md").read_text(), re.MULTILINE)
-    needed = [f"./{p.parent}" for p in PROJECTS if p.parent not in (Path(), Path("examples"))]
+    optional = (Path(), Path("examples"), Path("tools/lab"), Path("tools/simulate"))
+    needed = [f"./{p.parent}" for p in PROJECTS if p.parent not in optional]
     assert sorted(shlex.split(line)) == sorted(["-c", "constraints.txt", ".[ros]", *needed])

@@ -13,30 +13,53 @@ exit    when
 
 from __future__ import annotations
 
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from rosrm.cli import simulate
 from rosrm.cli.commands import change, check, follow, inspect, start
 from rosrm.cli.criu import criu
-from rosrm.cli.groups import PlainCommand, PlainGroup, hint_after
-from rosrm.cli.lab import lab
+from rosrm.cli.groups import DISTRIBUTIONS, PlainCommand, PlainGroup, add_command, hint_after
+from rosrm.cli.installed_commands import find_commands, load_command
 from rosrm.cli.options import Common, Domain
 from rosrm.cli.process import INTERRUPTED
-from rosrm.errors import RosrmError
+from rosrm.errors import ConfigError, RosrmError
+from rosrm.extensions.installed import PluginAddress
 from rosrm.version import PROTOCOL_VERSION, __version__
 
 
 class Guarded(PlainGroup):
-    """Says what a user did wrong without a traceback."""
+    """Says what a user did wrong without a traceback; has the commands of other distributions."""
+
+    @cached_property
+    def _installed(self) -> dict[str, list[PluginAddress]]:
+        """The commands of other distributions; the names of rosrm's own are not theirs."""
+        return {name: one for name, one in find_commands().items() if name not in self.commands}
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Return the names of all commands, rosrm's own first."""
+        return [*super().list_commands(ctx), *self._installed]
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """Return a command, that of another distribution imported now; None if there is none."""
+        own = super().get_command(ctx, cmd_name)
+        if own is None and cmd_name in self._installed:
+            return load_command(cmd_name, self._installed[cmd_name])
+        return own
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Find the command; a verb that other tools have gets the name of ours."""
-        hint = "" if args[0] in self.commands else hint_after(args[0])
-        if hint:
-            ctx.fail(f"No such command {args[0]!r}. {hint}")
+        """Find the command; for an unknown one name the command that is meant."""
+        word = args[0]
+        if not (word in self.commands or word in self._installed or ctx.resilient_parsing):
+            if word in DISTRIBUTIONS:
+                raise ConfigError(
+                    f"the command {word!r} comes with `pip install {DISTRIBUTIONS[word]}`"
+                )
+            hint = hint_after(word, self.list_commands(ctx))
+            if hint:
+                ctx.fail(f"No such command {word!r}. {hint}")
         return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: Any) -> Any:
@@ -90,11 +113,8 @@ def common(
     ctx.obj = Common(domain, cluster)
 
 
-for module in (start, change, inspect, follow, simulate):
+for module in (start, change, inspect, follow):
     for function in module.COMMANDS:
-        app.command()(function)
-for name, group in (("config", check.config), ("lab", lab), ("criu", criu)):
-    app.add_typer(group, name=name, cls=PlainGroup)
-for group in (app, check.config, lab, criu):
-    for command in group.registered_commands:
-        command.cls = PlainCommand
+        app.command(cls=PlainCommand)(function)
+for name, group in (("config", check.config), ("criu", criu)):
+    add_command(app, name, group)

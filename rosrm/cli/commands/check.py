@@ -5,13 +5,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
+from rosrm.cli.groups import DISTRIBUTIONS
 from rosrm.wording import counted, get_close_matches, listed
 
 if TYPE_CHECKING:
@@ -137,12 +138,7 @@ def _checked(file: Path, kind: KindOfFile | None, registry: Registry) -> str:
             probes = ", ".join(registry.default_probes() if host.probes is None else host.probes)
             return f"a host: {host.host}, probes {probes or 'none'}"
         case "simulation":
-            from rosrm.config.workload import load_workload
-
-            comparison = load_workload(file, registry)
-            hosts, processes = len(comparison.workload.hosts), len(comparison.workload.processes)
-            held = counted(processes, "process", "processes")
-            return f"a simulation: {counted(hosts, 'host')}, {held}"
+            return _check_of_simulations(file)(file, registry)
         case _:
             for warning in _misspelt_needs(root, registry):  # a wrong file has them too
                 typer.echo(warning, err=True)
@@ -153,6 +149,32 @@ def _checked(file: Path, kind: KindOfFile | None, registry: Registry) -> str:
             numbers = ((jobs, "job"), (len(specs) - jobs, "service"))
             parts = [counted(number, noun) for number, noun in numbers if number]
             return f"work: {listed(parts) if parts else 'no processes'}"
+
+
+def _check_of_simulations(file: Path) -> Callable[[Path, Registry], str]:
+    """Return the check that the distribution of the simulator brings.
+
+    Raises:
+        ConfigError: it is not installed.
+        PluginError: it does not import.
+    """
+    from pkgutil import resolve_name
+
+    from rosrm.errors import ConfigError, PluginError, describe_plugin_fault
+    from rosrm.extensions.installed import CHECKS, installed_plugins
+
+    for address in installed_plugins(CHECKS):
+        if address.name == "simulation":
+            try:
+                check: Callable[[Path, Registry], str] = resolve_name(address.target)
+            except Exception as fault:  # noqa: BLE001 - code of another distribution
+                reason = f"cannot be loaded: {describe_plugin_fault(fault)}"
+                raise PluginError(
+                    f"the check of simulation files of {address.distribution} {reason}"
+                ) from None
+            return check
+    needed = DISTRIBUTIONS["simulate"]
+    raise ConfigError(f"{file}: the check of a simulation file comes with `pip install {needed}`")
 
 
 def _misspelt_needs(root: Node, registry: Registry) -> Iterator[str]:

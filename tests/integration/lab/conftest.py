@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from rosrm.errors import LabError
-from rosrm.lab import MIB, Lab, needs, store, uniform
+from rosrm_lab import MIB, Lab, needs, store, uniform
 
 #: Seconds for whatever a busy machine needs; nothing waits so long when all goes well.
 PATIENCE = 30.0
@@ -22,7 +22,7 @@ def why_not() -> str:
     It makes none: a lab that cannot be made where nothing is missing is an error, no reason to
     skip.
     """
-    from rosrm.lab import groups
+    from rosrm_lab import groups
 
     try:
         needs.check_rights()
@@ -55,7 +55,7 @@ def remains(lab: str) -> dict[str, set[str]]:
             line for line in mounts if lab in line or not {"rosrm-lab", "/run/netns"} & _words(line)
         },
         "groups": _below(Path("/sys/fs/cgroup"), lab),
-        "processes": {line for line in commands if lab in line and "rosrm/lab/inside" in line},
+        "processes": {line for line in commands if lab in line and "rosrm_lab/inside" in line},
         "loops": {line for line in loops if lab in line},
         "files": _below(store.RUN, lab) | _below(store.IMAGES, lab),
     }
@@ -97,7 +97,7 @@ def name():
 @pytest.fixture
 def lab(name):
     """Two small hosts, and one without a quota."""
-    from rosrm.lab import HostPlan
+    from rosrm_lab import HostPlan
 
     hosts = uniform(2, memory=128 * MIB, cpu=0.5, disk=32 * MIB)
     with Lab(name, [*hosts, HostPlan("desk", disk=32 * MIB)]) as made:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from rosrm.lab import DATA, GIB, MIB, HostPlan, Lab, uniform
+from rosrm_lab import DATA, GIB, MIB, HostPlan, Lab, uniform
 
 ROSRM = str(Path(sys.executable).parent / "rosrm")
 #: Seconds for whatever a busy machine needs; nothing waits so long when all goes well.

@@ -16,7 +16,7 @@ from types import SimpleNamespace
 import pytest
 
 from rosrm.errors import LabError
-from rosrm.lab import MIB, Lab, all_labs, disks, store, uniform
+from rosrm_lab import MIB, Lab, all_labs, disks, store, uniform
 from tests.integration.lab.conftest import remains
 
 PATIENCE = 30.0
@@ -26,7 +26,7 @@ SIZES = ["-n", "2", "--memory", "64MiB", "--cpu", "0.5", "--disk", "16MiB"]
 #: Makes a lab, and kills itself before or after the n-th call of a function on the way.
 KILLED_AT = """
 import importlib, os, signal, sys
-from rosrm.lab import MIB, Lab, uniform
+from rosrm_lab import MIB, Lab, uniform
 lab, module, function, moment, count = sys.argv[1:]
 place = importlib.import_module(module)
 real, left = getattr(place, function), [int(count)]
@@ -40,19 +40,19 @@ setattr(place, function, deadly)
 Lab(lab, uniform(2, memory=64 * MIB, cpu=0.5, disk=16 * MIB)).up()
 """
 STEPS = [
-    ("rosrm.lab.store", "write", "before", 1),
-    ("rosrm.lab.store", "write", "after", 1),
-    ("rosrm.lab.network", "make_switch", "after", 1),
-    ("rosrm.lab.groups", "_make_group", "after", 1),
-    ("rosrm.lab.groups", "make", "after", 2),
-    ("rosrm.lab.disks", "make", "after", 1),
-    ("rosrm.lab.network", "plug_in", "before", 2),
-    ("rosrm.lab.network", "plug_in", "after", 1),
-    ("rosrm.lab.host", "_until_ready", "before", 1),  # the host is just booting
-    ("rosrm.lab.host", "_until_ready", "after", 1),
-    ("rosrm.lab.host", "_last_words", "after", 2),
-    ("rosrm.lab.store", "write", "before", 2),
-    ("rosrm.lab.store", "write", "after", 2),  # complete, but nobody was told
+    ("rosrm_lab.store", "write", "before", 1),
+    ("rosrm_lab.store", "write", "after", 1),
+    ("rosrm_lab.network", "make_switch", "after", 1),
+    ("rosrm_lab.groups", "_make_group", "after", 1),
+    ("rosrm_lab.groups", "make", "after", 2),
+    ("rosrm_lab.disks", "make", "after", 1),
+    ("rosrm_lab.network", "plug_in", "before", 2),
+    ("rosrm_lab.network", "plug_in", "after", 1),
+    ("rosrm_lab.host", "_until_ready", "before", 1),  # the host is just booting
+    ("rosrm_lab.host", "_until_ready", "after", 1),
+    ("rosrm_lab.host", "_last_words", "after", 2),
+    ("rosrm_lab.store", "write", "before", 2),
+    ("rosrm_lab.store", "write", "after", 2),  # complete, but nobody was told
 ]
 
 
@@ -71,7 +71,7 @@ def test_a_killed_up_is_removed_wholly(name, module, function, moment, count):
 
 def test_a_second_up_removes_what_a_killed_one_left(name):
     """And makes its own lab."""
-    command = [sys.executable, "-c", KILLED_AT, name, "rosrm.lab.host", "_last_words", "after", "1"]
+    command = [sys.executable, "-c", KILLED_AT, name, "rosrm_lab.host", "_last_words", "after", "1"]
     subprocess.run(command, check=False, timeout=PATIENCE)
     with pytest.raises(LabError, match="was not made to the end: `rosrm lab up` begins anew"):
         Lab(name).status()
@@ -85,7 +85,7 @@ def test_a_second_up_removes_what_a_killed_one_left(name):
 def test_a_lab_whose_owner_was_killed_was_left_behind(name):
     """The next one of its name takes its place, although it was complete."""
     code = (
-        "import os, signal, sys\nfrom rosrm.lab import Lab, MIB, uniform\n"
+        "import os, signal, sys\nfrom rosrm_lab import Lab, MIB, uniform\n"
         "with Lab(sys.argv[1], uniform(1, disk=16 * MIB)) as lab:\n"
         "    lab.popen('host1', ['setsid', 'sleep', '1000'])\n"
         "    os.kill(os.getpid(), signal.SIGKILL)"
@@ -144,11 +144,11 @@ def stopped_at(monkeypatch):
 
 
 REMOVAL = [
-    ("rosrm.lab.groups", "kill", "before"),
-    ("rosrm.lab.groups", "kill", "after"),
-    ("rosrm.lab.network", "remove", "before"),
-    ("rosrm.lab.network", "remove", "after"),
-    ("rosrm.lab.store", "forget", "before"),
+    ("rosrm_lab.groups", "kill", "before"),
+    ("rosrm_lab.groups", "kill", "after"),
+    ("rosrm_lab.network", "remove", "before"),
+    ("rosrm_lab.network", "remove", "after"),
+    ("rosrm_lab.store", "forget", "before"),
 ]
 
 
@@ -166,7 +166,7 @@ def test_a_signal_while_a_failed_attempt_is_removed_leaves_nothing(name, stopped
     before = remains(name)
 
     def fails(image, host):
-        stopped_at("rosrm.lab.groups", "kill", "before")
+        stopped_at("rosrm_lab.groups", "kill", "before")
         raise LabError("no room")
 
     monkeypatch.setattr(disks, "make", fails)
@@ -178,7 +178,7 @@ def test_a_signal_while_a_failed_attempt_is_removed_leaves_nothing(name, stopped
 def test_what_a_killed_lab_holds_does_not_hinder_the_next(name, monkeypatch):
     """It is removed before memory is looked at, also where there is too little even then."""
     before = remains(name)
-    command = [sys.executable, "-c", KILLED_AT, name, "rosrm.lab.host", "_last_words", "after", "1"]
+    command = [sys.executable, "-c", KILLED_AT, name, "rosrm_lab.host", "_last_words", "after", "1"]
     subprocess.run(command, check=False, timeout=PATIENCE)
     assert remains(name) != before
     monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(available=MIB))
@@ -215,7 +215,7 @@ def test_a_file_that_cannot_be_written_is_one_clear_error(name, monkeypatch, cou
 
 def test_a_kernel_without_bridges_is_one_clear_error(name, monkeypatch):
     """Here it is asked for a kind of interface that no kernel has; nothing is left."""
-    from rosrm.lab import network
+    from rosrm_lab import network
 
     class Without(network.IPRoute):
         def link(self, command, **what):

@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks.criu import parts, play
 from rosrm.criu import outcome
-from rosrm.lab import DATA, GIB, HostPlan, Lab, uniform
+from rosrm_lab import DATA, GIB, HostPlan, Lab, uniform
 from tests.integration.lab.conftest import PATIENCE
 
 HOSTS = ("host1", "host2")

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from rosrm.errors import ConfigError, LabError
-from rosrm.lab import DATA, MIB, HostPlan, Lab, uniform
+from rosrm_lab import DATA, MIB, HostPlan, Lab, uniform
 
 PATIENCE = 30.0
 PYTHON = [sys.executable, "-ISc"]
@@ -49,7 +49,7 @@ def test_hosts_reach_each_other_by_name_and_nobody_else(lab):
     assert "Network is unreachable" in refused.stderr
     from pyroute2 import IPRoute
 
-    from rosrm.lab.plan import switch_namespace
+    from rosrm_lab.plan import switch_namespace
 
     with IPRoute(netns=switch_namespace(lab.name)) as switch:
         names = {link.get("ifname") for link in switch.get_links()}
@@ -207,7 +207,7 @@ def test_two_labs_live_side_by_side(lab, name):
 
 def test_a_range_of_this_machine_is_refused(name):
     """Nobody could tell the two apart."""
-    from rosrm.lab.network import ranges_in_use
+    from rosrm_lab.network import ranges_in_use
 
     used = ranges_in_use()
     if not used:

@@ -167,9 +167,9 @@ def test_the_end_of_a_delay_takes_its_queue_away(lab):
     """Also shown by a kernel without netem, with a queue that it has."""
     from pyroute2 import IPRoute
 
-    from rosrm.lab import network
-    from rosrm.lab.plan import switch_namespace
-    from rosrm.lab.wires import Wire
+    from rosrm_lab import network
+    from rosrm_lab.plan import switch_namespace
+    from rosrm_lab.wires import Wire
 
     name = switch_namespace(lab.name)
 

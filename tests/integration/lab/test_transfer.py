@@ -9,7 +9,7 @@ import time
 
 import pytest
 
-from rosrm.lab import DATA
+from rosrm_lab import DATA
 
 #: Seconds for whatever a busy machine needs; nothing waits so long when all goes well.
 PATIENCE = 90.0

@@ -25,8 +25,8 @@ from benchmarks.paper.trace import Happening, HostLook, Look, Trace
 from rosrm.config.host import load_host
 from rosrm.config.work import load_work
 from rosrm.errors import RosrmError
-from rosrm.lab import GIB, MIB, uniform
 from rosrm_examples.errors import DriveError
+from rosrm_lab import GIB, MIB, uniform
 
 ROOT = Path(__file__).resolve().parents[3]
 

@@ -15,7 +15,7 @@ from benchmarks import stopping
 from benchmarks.chaos import __main__ as chaos
 from benchmarks.chaos import clocks
 from rosrm.errors import LabError
-from rosrm.lab import needs
+from rosrm_lab import needs
 
 ROOT = Path(__file__).resolve().parents[3]
 #: Programs that a benchmark starts and ends.

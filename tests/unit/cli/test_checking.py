@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from rosrm.errors import SkipPlugin
+from rosrm.extensions import installed
 from rosrm.extensions.contracts import CheckpointOffer, MigrationOffer, ProbeOffer, ScoringOffer
 from rosrm.extensions.hookspecs import hookimpl
 from rosrm.extensions.registry import Registry
@@ -81,6 +82,19 @@ def test_the_name_tells_the_kind_where_the_keys_do_not(rosrm, file, name, text, 
 
 HOST = "host: desk\nscope: slice\nbudget: {memory: 1GiB, cpu: 1}\nlimts: {cpu: 1}"
 WORK = "processes: [{name: a, command: x}]"
+
+
+def test_the_check_of_a_simulation_names_its_distribution(rosrm, file, monkeypatch):
+    """Without `rosrm-simulate` the keys tell the kind, and the error names what is missing."""
+    monkeypatch.setattr(installed, "installed_plugins", lambda group: [])
+    path = file(f"seed: 1\n{SIMULATION}")
+
+    result = rosrm("config", "check", path)
+
+    assert (result.code, result.err) == (
+        2,
+        f"rosrm: {path}: the check of a simulation file comes with `pip install rosrm-simulate`\n",
+    )
 
 
 @pytest.mark.parametrize(

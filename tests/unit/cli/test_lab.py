@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from rosrm.cli.lab import fraction, planned
 from rosrm.errors import ConfigError
-from rosrm.lab import GIB, MIB, HostPlan, HostStatus, needs
+from rosrm_lab import GIB, MIB, HostPlan, HostStatus, needs
+from rosrm_lab.cli import fraction, planned
 
 LIMITS = {"memory": "1GiB", "cpu": "0.5", "disk": "2GiB"}
 
@@ -139,8 +139,8 @@ class OneHost:
 
 @pytest.fixture
 def one_host(monkeypatch):
-    monkeypatch.setattr("rosrm.cli.lab.opened", lambda name: OneHost())
-    monkeypatch.setattr("rosrm.cli.lab._check_rights", lambda: None)
+    monkeypatch.setattr("rosrm_lab.cli.opened", lambda name: OneHost())
+    monkeypatch.setattr("rosrm_lab.cli._check_rights", lambda: None)
 
 
 def test_a_size_is_shown_in_the_units_that_it_was_given_in(rosrm, one_host):

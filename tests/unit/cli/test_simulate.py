@@ -8,10 +8,10 @@ import sys
 import pytest
 from rich.console import Console
 
-from rosrm.cli import simulation_picture
 from rosrm.cli.output import tables
-from rosrm.cli.simulation_runs import agreement_of
 from rosrm.errors import ConfigError
+from rosrm_simulate import picture
+from rosrm_simulate.runs import agreement_of
 from tests.unit.simulation.workloads import host, plan, recorded, simulation
 
 WORKLOAD = """
@@ -107,11 +107,12 @@ def test_a_picture_that_cannot_be_drawn_is_refused_before_the_run(
 
 
 def test_without_matplotlib_it_says_what_to_install(rosrm, workload, tmp_path, monkeypatch):
-    monkeypatch.setattr(simulation_picture, "find_spec", lambda _name: None)
+    monkeypatch.setattr(picture, "find_spec", lambda _name: None)
     result = rosrm("simulate", workload, "--plot", tmp_path / "p.png")
     assert result.code == 1
     assert result.err == (
-        "rosrm: --plot needs matplotlib, which is not installed: pip install 'rosrm[plot]'\n"
+        "rosrm: --plot needs matplotlib, which is not installed: "
+        "pip install 'rosrm-simulate[plot]'\n"
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rosrm.lab.host import host_environment
+from rosrm_lab.host import host_environment
 
 
 def test_discovery_reaches_the_lab_whatever_the_terminal_says():

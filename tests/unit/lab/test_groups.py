@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from rosrm.errors import LabError
-from rosrm.lab import groups
-from rosrm.lab.groups import Hierarchy, find_hierarchies, limits
-from rosrm.lab.plan import GIB, HostPlan
+from rosrm_lab import groups
+from rosrm_lab.groups import Hierarchy, find_hierarchies, limits
+from rosrm_lab.plan import GIB, HostPlan
 
 HOST = HostPlan("host1", GIB, 0.5)
 V1 = "31 23 0:{n} / /sys/fs/cgroup/{name} rw shared:{n} - cgroup cgroup rw,{name}"

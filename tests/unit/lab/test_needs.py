@@ -8,9 +8,9 @@ from types import SimpleNamespace
 import pytest
 
 from rosrm.errors import LabError
-from rosrm.lab import needs
-from rosrm.lab.groups import Hierarchy
-from rosrm.lab.plan import GIB, MIB, HostPlan, uniform
+from rosrm_lab import needs
+from rosrm_lab.groups import Hierarchy
+from rosrm_lab.plan import GIB, MIB, HostPlan, uniform
 
 ALL = sum(1 << bit for bit, _ in needs.CAPABILITIES.values())
 

@@ -7,10 +7,9 @@ from ipaddress import IPv4Network
 import pytest
 
 from rosrm.errors import LabError
-from rosrm.lab.plan import LabPlan, uniform
-from rosrm.lab.wires import Link
-
-network = pytest.importorskip("rosrm.lab.network", exc_type=LabError)
+from rosrm_lab import network
+from rosrm_lab.plan import LabPlan, uniform
+from rosrm_lab.wires import Link
 
 PLAN = LabPlan("lab", tuple(uniform(2)), IPv4Network("10.9.8.0/24"))
 

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rosrm.errors import ConfigError
-from rosrm.lab import Lab
-from rosrm.lab.plan import (
+from rosrm_lab import Lab
+from rosrm_lab.plan import (
     GIB,
     MIB,
     HostPlan,

@@ -10,10 +10,10 @@ from ipaddress import IPv4Network
 import pytest
 
 from rosrm.errors import LabError
-from rosrm.lab import store
-from rosrm.lab.plan import LabPlan, uniform
-from rosrm.lab.store import Birth, Record
-from rosrm.lab.wires import Link
+from rosrm_lab import store
+from rosrm_lab.plan import LabPlan, uniform
+from rosrm_lab.store import Birth, Record
+from rosrm_lab.wires import Link
 
 
 @pytest.fixture(autouse=True)
@@ -78,7 +78,7 @@ def test_a_lock_is_held_by_one():
 def test_a_lock_ends_with_who_held_it():
     """A killed command hinders nobody."""
     code = (
-        "import os, signal\nfrom rosrm.lab import store\n"
+        "import os, signal\nfrom rosrm_lab import store\n"
         "with store.lock('test-killed'): os.kill(os.getpid(), signal.SIGKILL)"
     )
     subprocess.run([sys.executable, "-c", code], check=False, timeout=60)

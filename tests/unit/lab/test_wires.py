@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rosrm.errors import ConfigError
-from rosrm.lab.wires import Link, check_delay, check_loss, from_plain, ruleset, to_plain
+from rosrm_lab.wires import Link, check_delay, check_loss, from_plain, ruleset, to_plain
 
 
 def rules(**links):

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from rosrm.core.master import events as happened
 from rosrm.core.master.state.process import ProcessPhase
-from rosrm.simulation.workload import Curve
+from rosrm_simulate.workload import Curve
 
 from .workloads import MIB, host, plan, run, simulation
 

@@ -14,11 +14,11 @@ from rosrm.core.master.settings import CoreSettings
 from rosrm.extensions.contracts import Intent
 from rosrm.recording.encoding import Happened
 from rosrm.recording.reader import Header, Recording
-from rosrm.simulation.agreement import compare
-from rosrm.simulation.engine import Simulation
-from rosrm.simulation.extraction import Extraction
-from rosrm.simulation.replay import replay as replay_declared
 from rosrm_scoring.weighted import Weighted, WeightedOptions
+from rosrm_simulate.agreement import compare
+from rosrm_simulate.engine import Simulation
+from rosrm_simulate.extraction import Extraction
+from rosrm_simulate.replay import replay as replay_declared
 
 from .workloads import (
     EQ1,

@@ -9,13 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from rosrm.cli.simulation_runs import run
-from rosrm.config import workload as in_file
-from rosrm.config.variants import variant_in_text
-from rosrm.config.workload import load_workload
+from rosrm.config.kinds import SIMULATION_KEYS
 from rosrm.errors import ConfigError
 from rosrm.extensions.registry import Registry
 from rosrm.model.values import Kind
+from rosrm_simulate import workload_file as in_file
+from rosrm_simulate.runs import run
+from rosrm_simulate.variants import variant_in_text
+from rosrm_simulate.workload_file import load_workload
 
 ROOT = Path(__file__).resolve().parents[3]
 HOST = "hosts: [{name: a, memory: 1GiB, cpu: 2}]\n"
@@ -168,7 +169,7 @@ def test_the_workload_in_the_how_to_shows_differences(load, registry):
 @pytest.mark.parametrize(
     ("heading", "names"),
     [
-        ("## The workload", in_file._PARTS),
+        ("## The workload", SIMULATION_KEYS),
         ("### A host", [f.name for f in fields(in_file.HostInFile)]),
         ("### A process", [f.name for f in fields(in_file.ProcessInFile)]),
         ("### The model", [f.name for f in fields(in_file.ModelInFile)]),

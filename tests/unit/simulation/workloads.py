@@ -12,11 +12,11 @@ from rosrm.model.values import Kind, MigrationPolicy, ProcessSpec, ResourceDescr
 from rosrm.recording.encoding import decisions, encode, encode_decisions
 from rosrm.recording.frames import FrameKind, frame, opening
 from rosrm.recording.reader import Header, read_record
-from rosrm.simulation.engine import Simulation
-from rosrm.simulation.workload import Curve, HostPlan, ProcessPlan, Workload
 from rosrm_migration.handoff import Handoff, HandoffOptions
 from rosrm_migration.relaunch import Relaunch, RelaunchOptions
 from rosrm_scoring.weighted import Weighted, WeightedOptions
+from rosrm_simulate.engine import Simulation
+from rosrm_simulate.workload import Curve, HostPlan, ProcessPlan, Workload
 from tests.unit.core.cluster import declared_by
 
 MIB = 2.0**20

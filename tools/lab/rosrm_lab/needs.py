@@ -11,8 +11,8 @@ from typing import Final
 import psutil
 
 from rosrm.errors import LabError
-from rosrm.lab import groups
-from rosrm.lab.plan import MIB, HostPlan, total
+from rosrm_lab import groups
+from rosrm_lab.plan import MIB, HostPlan, total
 
 #: Bits of the capabilities (linux/capability.h), and what they are needed for.
 CAPABILITIES: Final = {

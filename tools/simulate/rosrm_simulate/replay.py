@@ -18,7 +18,7 @@ from rosrm.extensions.contracts import MigrationStrategy
 from rosrm.extensions.declared_fields import Declared
 from rosrm.recording.encoding import Happened, decisions
 from rosrm.recording.reader import Recording
-from rosrm.simulation.meter import Meter, Outcome
+from rosrm_simulate.meter import Meter, Outcome
 
 #: Differences that are told in full.
 _TOLD: Final = 5

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from rosrm.lab import disks, groups
-from rosrm.lab.groups import Hierarchy
-from rosrm.lab.host import DATA
-from rosrm.lab.plan import HostPlan
-from rosrm.lab.store import Record
+from rosrm_lab import disks, groups
+from rosrm_lab.groups import Hierarchy
+from rosrm_lab.host import DATA
+from rosrm_lab.plan import HostPlan
+from rosrm_lab.store import Record
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rosrm.core.master.state.host_arrays import FloatArray
-from rosrm.simulation.meter import MEASURED, Curves, Outcome
+from rosrm_simulate.meter import MEASURED, Curves, Outcome
 
 #: Moments at which the curves of two runs are compared.
 _MOMENTS = 500

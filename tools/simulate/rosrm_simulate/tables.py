@@ -9,11 +9,11 @@ import typer
 from rich.text import Text
 
 from rosrm.cli.output import tables
-from rosrm.cli.simulation_runs import Report, Run
 from rosrm.model.codec import to_plain
-from rosrm.simulation.agreement import Agreement
-from rosrm.simulation.replay import Replay
 from rosrm.wording import counted, few
+from rosrm_simulate.agreement import Agreement
+from rosrm_simulate.replay import Replay
+from rosrm_simulate.runs import Report, Run
 
 #: Processes that were never placed, of which the reason is told.
 _TOLD: Final = 3

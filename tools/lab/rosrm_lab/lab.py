@@ -15,12 +15,12 @@ from types import TracebackType
 from typing import IO, TYPE_CHECKING, Any, Final
 
 from rosrm.errors import ConfigError, LabError
-from rosrm.lab import groups, needs, store
-from rosrm.lab.host import DATA, entrance
-from rosrm.lab.plan import HostPlan, LabPlan, check_name, check_usable, switch_namespace
-from rosrm.lab.status import HostStatus, host_status
-from rosrm.lab.store import Birth, Record
-from rosrm.lab.wires import Direction, check_delay, check_loss
+from rosrm_lab import groups, needs, store
+from rosrm_lab.host import DATA, entrance
+from rosrm_lab.plan import HostPlan, LabPlan, check_name, check_usable, switch_namespace
+from rosrm_lab.status import HostStatus, host_status
+from rosrm_lab.store import Birth, Record
+from rosrm_lab.wires import Direction, check_delay, check_loss
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -80,7 +80,7 @@ class Lab:
             LabError: it is up already, or something is missing on this machine; nothing is left.
             ConfigError: the hosts or the subnet cannot be.
         """
-        from rosrm.lab import making
+        from rosrm_lab import making
 
         needs.check_rights(self._hosts)
         with making.explained(self.name), store.lock(self.name):
@@ -105,7 +105,7 @@ class Lab:
         Raises:
             LabError: something could not be removed; repeating it goes on.
         """
-        from rosrm.lab import making
+        from rosrm_lab import making
 
         needs.check_rights()
         with making.explained(self.name), store.lock(self.name):
@@ -313,7 +313,7 @@ class Lab:
 
         Its disk keeps what was written; memory, /run and /dev/shm are lost. `boot` ends it.
         """
-        from rosrm.lab import making
+        from rosrm_lab import making
 
         with making.explained(self.name), store.lock(self.name):
             record = self._record()
@@ -322,7 +322,7 @@ class Lab:
 
     def boot(self, host: str) -> None:
         """Switch a host on again after `kill`; nothing runs there yet. Raises `LabError`."""
-        from rosrm.lab import making
+        from rosrm_lab import making
 
         with making.explained(self.name), store.lock(self.name):
             record = self._record()
@@ -359,7 +359,7 @@ class Lab:
         return record
 
     def _change_link(self, host: str, direction: Direction, **values: Any) -> None:
-        from rosrm.lab import making
+        from rosrm_lab import making
 
         with making.explained(self.name), store.lock(self.name):
             record = self._record()
@@ -380,7 +380,7 @@ def _to_the_end(remove: Callable[[], object]) -> None:
 
 def all_labs() -> Iterator[Lab]:
     """Every lab of which there is something on this machine, killed attempts too."""
-    from rosrm.lab import network
+    from rosrm_lab import network
 
     found = store.labs() | groups.labs(groups.find_hierarchies())
     prefix = switch_namespace("")

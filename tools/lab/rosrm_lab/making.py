@@ -8,12 +8,12 @@ from collections.abc import Callable, Iterator, Sequence
 from ipaddress import IPv4Network
 
 from rosrm.errors import LabError
-from rosrm.lab import disks, groups, network, store
-from rosrm.lab.groups import Hierarchy
-from rosrm.lab.host import boot, power_off
-from rosrm.lab.plan import check_free, free_subnet, host_namespace, namespaces_of
-from rosrm.lab.store import Record
-from rosrm.lab.wires import Link
+from rosrm_lab import disks, groups, network, store
+from rosrm_lab.groups import Hierarchy
+from rosrm_lab.host import boot, power_off
+from rosrm_lab.plan import check_free, free_subnet, host_namespace, namespaces_of
+from rosrm_lab.store import Record
+from rosrm_lab.wires import Link
 
 
 @contextlib.contextmanager

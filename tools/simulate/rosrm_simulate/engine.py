@@ -32,12 +32,12 @@ from rosrm.core.slave import reducer
 from rosrm.extensions.contracts import Intent, MigrationStrategy, Record
 from rosrm.extensions.declared_fields import Declared
 from rosrm.model.values import EMPTY, InstanceId
-from rosrm.simulation.agenda import Agenda
-from rosrm.simulation.hosting import Hosting
-from rosrm.simulation.machine import Machine
-from rosrm.simulation.meter import Meter, Outcome
-from rosrm.simulation.nodes import Nodes
-from rosrm.simulation.workload import HostPlan, Workload
+from rosrm_simulate.agenda import Agenda
+from rosrm_simulate.hosting import Hosting
+from rosrm_simulate.machine import Machine
+from rosrm_simulate.meter import Meter, Outcome
+from rosrm_simulate.nodes import Nodes
+from rosrm_simulate.workload import HostPlan, Workload
 
 #: Events between two calls of `progress`.
 _TELL_EVERY: Final = 2000

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Final, Literal
 
 from rosrm.errors import LabError
-from rosrm.lab.plan import PREFIX, HostPlan
+from rosrm_lab.plan import PREFIX, HostPlan
 
 Leaf = Literal["limited", "free", "own"]
 LEAVES: Final[tuple[Leaf, ...]] = ("limited", "free", "own")

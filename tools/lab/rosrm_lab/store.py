@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import Any, Final
 
 from rosrm.errors import LabError
-from rosrm.lab import wires
-from rosrm.lab.plan import PREFIX, LabPlan
-from rosrm.lab.wires import Link
 from rosrm.supervisor.procfs import read_stat
+from rosrm_lab import wires
+from rosrm_lab.plan import PREFIX, LabPlan
+from rosrm_lab.wires import Link
 
 RUN: Final = Path("/run") / PREFIX
 #: Disks go where there is room, not into the memory that /run is made of.

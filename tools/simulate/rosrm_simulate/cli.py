@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated
 
 import typer
 
@@ -62,26 +62,23 @@ def simulate(  # noqa: PLR0913, PLR0917 - an argument for each option
     The first row is the workload as given; each variant adds a row. The first row of a record is
     the real run.
     """
-    from rosrm.cli import simulation_picture, simulation_tables
-    from rosrm.cli.simulation_runs import Request, carry_out
+    from rosrm_simulate import picture, tables
+    from rosrm_simulate.runs import Request, carry_out
 
     if plot is not None:
-        simulation_picture.check(plot)
+        picture.check(plot)
     request = Request(
         file, variants, tuple(variant or ()), tuple(policy or ()), tuple(hosts or ()), until, seed,
         cut,
     )  # fmt: skip
     report = carry_out(request)
     if plot is not None:
-        simulation_picture.draw(report, plot)
+        picture.draw(report, plot)
     if as_json:
         from rosrm.cli.output.json_forms import show
 
-        show(simulation_tables.report_form(report))
+        show(tables.report_form(report))
         return
-    simulation_tables.show(report)
+    tables.show(report)
     if plot is not None:
         typer.echo(f"drawn: {plot}")
-
-
-COMMANDS: Final = (simulate,)

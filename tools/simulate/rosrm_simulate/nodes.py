@@ -13,9 +13,9 @@ from rosrm.core.master.commands import PublishStateConfig
 from rosrm.core.master.events import Event, HandoffReported
 from rosrm.model.plan import HandoffPhase, ReportPhase
 from rosrm.model.values import InstanceId
-from rosrm.simulation.agenda import Agenda
-from rosrm.simulation.hosting import Hosting
-from rosrm.simulation.workload import Model
+from rosrm_simulate.agenda import Agenda
+from rosrm_simulate.hosting import Hosting
+from rosrm_simulate.workload import Model
 
 
 class Nodes:

@@ -12,16 +12,13 @@ from collections.abc import Iterator, Mapping
 from ipaddress import IPv4Network
 from typing import TYPE_CHECKING, Any, Final
 
-from rosrm.errors import LabError
-from rosrm.lab import plan as names
-from rosrm.lab.needs import find_command
-from rosrm.lab.plan import LabPlan
-from rosrm.lab.wires import Link, Wire, ruleset
+from pyroute2 import IPRoute, NetlinkError, netns
 
-try:
-    from pyroute2 import IPRoute, NetlinkError, netns
-except ImportError:
-    raise LabError("the Python package pyroute2 is missing: pip install 'rosrm[lab]'") from None
+from rosrm.errors import LabError
+from rosrm_lab import plan as names
+from rosrm_lab.needs import find_command
+from rosrm_lab.plan import LabPlan
+from rosrm_lab.wires import Link, Wire, ruleset
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

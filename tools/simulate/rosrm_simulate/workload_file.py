@@ -13,20 +13,20 @@ import numpy as np
 from rosrm.config.checking import near, validated
 from rosrm.config.documents import Node, Problems, read
 from rosrm.config.foreach import rows_of, substituted
-from rosrm.config.kinds import check_kind
+from rosrm.config.kinds import SIMULATION_KEYS, check_kind
 from rosrm.config.merging import merged, written_out
 from rosrm.config.namesakes import refuse_namesakes
 from rosrm.config.options import PluginCheck
 from rosrm.config.process import Labels, LabelsInFile, MigrationInFile
 from rosrm.config.rules import check_amounts, check_name
-from rosrm.config.variants import Variant, check_keys, load_variants, text_of, variants_of
 from rosrm.errors import ConfigError
 from rosrm.extensions.registry import Registry
 from rosrm.extensions.units import Amount, Count, Fraction, PositiveSeconds, Quantity, Seconds
 from rosrm.model.values import Kind, MigrationPolicy, ProcessSpec, ResourceDescription
-from rosrm.simulation.workload import Curve, HostPlan, Model, ProcessPlan, Workload
+from rosrm.wording import counted
+from rosrm_simulate.variants import Variant, check_keys, load_variants, text_of, variants_of
+from rosrm_simulate.workload import Curve, HostPlan, Model, ProcessPlan, Workload
 
-_PARTS: Final = ("name", "seed", "until", "hosts", "processes", "model", "cluster", "variants")
 _MODEL: Final = Model()
 _UNITS: Final = {"memory": "B", "cpu": "core", "disk": "B"}
 _LIMITS: Final[Mapping[str, float]] = {"memory": 0.8, "cpu": 0.9, "disk": 0.9}
@@ -137,7 +137,7 @@ def load_workload(
     """
     root, problems = read(path), Problems()
     check_kind(root, "simulation")
-    check_keys(root, _PARTS, "", problems)
+    check_keys(root, SIMULATION_KEYS, "", problems)
     hosts = [_host(node, problems) for node in _listed(root, "hosts", problems)]
     nodes = list(_listed(root, "processes", problems))
     known = [host for host in hosts if host is not None]
@@ -168,6 +168,13 @@ def load_workload(
         Model(**_values(model)), until=until,
     )  # fmt: skip
     return Comparison(workload, variants)
+
+
+def check_workload(path: Path, registry: Registry) -> str:
+    """Return the summary that `rosrm config check` prints; raise `ConfigError`."""
+    workload = load_workload(path, registry).workload
+    processes = counted(len(workload.processes), "process", "processes")
+    return f"a simulation: {counted(len(workload.hosts), 'host')}, {processes}"
 
 
 def _values(model: Any) -> dict[str, Any]:

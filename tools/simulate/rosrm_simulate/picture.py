@@ -8,9 +8,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from rosrm.cli.simulation_runs import Report, Run
 from rosrm.errors import ConfigError, RosrmError
-from rosrm.simulation.meter import MEASURED
+from rosrm_simulate.meter import MEASURED
+from rosrm_simulate.runs import Report, Run
 
 _FORMATS: Final = (".png", ".svg", ".pdf")
 #: Hosts that are named beside the curves; more would hide them.
@@ -22,7 +22,7 @@ def check(path: Path) -> None:
     """Refuse at once what could not be drawn after a long run."""
     if find_spec("matplotlib") is None:
         raise RosrmError(
-            "--plot needs matplotlib, which is not installed: pip install 'rosrm[plot]'"
+            "--plot needs matplotlib, which is not installed: pip install 'rosrm-simulate[plot]'"
         )
     if path.suffix not in _FORMATS:
         raise ConfigError(f"--plot {path}: the name has to end with {', '.join(_FORMATS)}")

@@ -25,7 +25,7 @@ from rosrm.model.values import (
     InstanceStatus,
     RestartPolicy,
 )
-from rosrm.simulation.workload import HostPlan, ProcessPlan
+from rosrm_simulate.workload import HostPlan, ProcessPlan
 
 #: Work left, seconds, that counts as none: sums of fractions are not exact.
 _NONE_LEFT = 1e-9

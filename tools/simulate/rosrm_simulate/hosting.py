@@ -9,9 +9,9 @@ from rosrm.core.master import events as happened
 from rosrm.core.master.commands import Order
 from rosrm.core.slave import reducer
 from rosrm.model.values import Assignment, InstanceId, InstanceState, InstanceStatus, RestartPolicy
-from rosrm.simulation.agenda import Agenda, Entry
-from rosrm.simulation.machine import Machine, Program
-from rosrm.simulation.workload import Model, ProcessPlan
+from rosrm_simulate.agenda import Agenda, Entry
+from rosrm_simulate.machine import Machine, Program
+from rosrm_simulate.workload import Model, ProcessPlan
 
 #: The signal of an instance that was stopped: SIGINT.
 _INTERRUPTED = 2

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Final
 
 from rosrm.errors import LabError
-from rosrm.lab import needs
-from rosrm.lab.plan import HostPlan
+from rosrm_lab import needs
+from rosrm_lab.plan import HostPlan
 
 #: Seconds for mkfs on a sparse file.
 _FORMAT: Final = 60.0

@@ -16,13 +16,13 @@ from pathlib import Path
 from typing import Final
 
 from rosrm.errors import ConfigError, LabError
-from rosrm.lab import groups, store
-from rosrm.lab import plan as names
-from rosrm.lab.groups import Hierarchy, Leaf
-from rosrm.lab.needs import find_command
-from rosrm.lab.plan import HostPlan
-from rosrm.lab.store import Birth
 from rosrm.runtime.ros_wheels import without_bootstrapper
+from rosrm_lab import groups, store
+from rosrm_lab import plan as names
+from rosrm_lab.groups import Hierarchy, Leaf
+from rosrm_lab.needs import find_command
+from rosrm_lab.plan import HostPlan
+from rosrm_lab.store import Birth
 
 #: Where a host has its disk, as its processes see it.
 DATA: Final = Path("/run/data")

@@ -26,7 +26,7 @@ from rosrm.model.spec_json import spec_from_dict
 from rosrm.model.values import HostDescription, InstanceState, InstanceStatus, ProcessSpec
 from rosrm.recording.encoding import Happened
 from rosrm.recording.reader import Recording
-from rosrm.simulation.workload import Curve, HostPlan, Model, ProcessPlan, Workload
+from rosrm_simulate.workload import Curve, HostPlan, Model, ProcessPlan, Workload
 
 #: Points of a memory curve that are kept.
 _POINTS: Final = 64

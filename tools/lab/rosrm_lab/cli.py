@@ -18,7 +18,7 @@ from rosrm.cli.options import AsJson
 from rosrm.errors import ConfigError, LabError
 
 if TYPE_CHECKING:
-    from rosrm.lab import HostPlan, HostStatus, Lab
+    from rosrm_lab import HostPlan, HostStatus, Lab
 
 lab = typer.Typer(
     no_args_is_help=True,
@@ -83,9 +83,9 @@ def up(  # noqa: PLR0917 - typer calls it, by name
     name: Named = "lab",
 ) -> None:
     """Make a lab. What a killed attempt left behind is removed first."""
-    from rosrm.lab import Lab
-    from rosrm.lab.needs import overbooked
-    from rosrm.lab.plan import parse_subnet
+    from rosrm_lab import Lab
+    from rosrm_lab.needs import overbooked
+    from rosrm_lab.plan import parse_subnet
 
     limits = {"memory": memory, "cpu": cpu, "disk": disk}
     hosts = planned(number, limits, host or [])
@@ -220,7 +220,7 @@ def status(
     """List the labs and their hosts."""
     from rosrm.cli.output import json_forms, tables
     from rosrm.errors import LabError
-    from rosrm.lab import all_labs
+    from rosrm_lab import all_labs
 
     _check_rights()
     rows: list[HostStatus] = []
@@ -247,7 +247,7 @@ def down(
     ] = False,
 ) -> None:
     """Remove a lab: its processes end at once, and its disks are deleted."""
-    from rosrm.lab import Lab, all_labs
+    from rosrm_lab import Lab, all_labs
 
     _check_rights()
     chosen = list(all_labs()) if everything else [Lab(name)]
@@ -263,7 +263,7 @@ def down(
 
 def opened(name: str) -> Lab:
     """A lab that a command works on."""
-    from rosrm.lab import Lab
+    from rosrm_lab import Lab
 
     _check_rights()
     return Lab(name)
@@ -277,7 +277,7 @@ def planned(number: int, limits: dict[str, str], more: Sequence[str]) -> list[Ho
         limits: theirs, as text, by resource.
         more: further hosts, or other limits, as `--host` takes them.
     """
-    from rosrm.lab.plan import MOST_HOSTS
+    from rosrm_lab.plan import MOST_HOSTS
 
     if not 0 <= number <= MOST_HOSTS or (number == 0 and not more):
         raise ConfigError(f"-n {number}; allowed are 1 to {MOST_HOSTS} hosts, 0 with --host")
@@ -290,7 +290,7 @@ def planned(number: int, limits: dict[str, str], more: Sequence[str]) -> list[Ho
 
 def fraction(text: str) -> float:
     """`1%` or `0.01`; raises `ConfigError`."""
-    from rosrm.lab.wires import check_loss
+    from rosrm_lab.wires import check_loss
 
     percent = text.endswith("%")
     try:
@@ -316,7 +316,7 @@ def _named_limits(text: str) -> tuple[str, dict[str, str]]:
 
 
 def _host(name: str, limits: dict[str, str]) -> HostPlan:
-    from rosrm.lab import HostPlan
+    from rosrm_lab import HostPlan
 
     memory = _limit(name, "memory", limits["memory"])
     cpu = _limit(name, "cpu", limits["cpu"])
@@ -363,7 +363,7 @@ def _variable(text: str) -> tuple[str, str]:
 
 
 def _check_rights() -> None:
-    from rosrm.lab.needs import check_rights
+    from rosrm_lab.needs import check_rights
 
     check_rights()
 

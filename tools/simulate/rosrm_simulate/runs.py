@@ -14,15 +14,6 @@ from typing import Final
 
 from rosrm.config.documents import Node
 from rosrm.config.settings import ClusterConfig
-from rosrm.config.variants import (
-    Variant,
-    load_variants,
-    read_variants,
-    settings_node,
-    variant_in_text,
-    variant_of_option,
-)
-from rosrm.config.workload import load_workload
 from rosrm.core.master.scheduling.ranking import NamedPolicy
 from rosrm.errors import ConfigError, RecordError
 from rosrm.extensions.contracts import MigrationStrategy
@@ -31,12 +22,21 @@ from rosrm.extensions.registry import Registry
 from rosrm.extensions.units import Quantity
 from rosrm.recording.frames import is_record
 from rosrm.recording.reader import Recording, read_record
-from rosrm.simulation.agreement import Agreement, compare
-from rosrm.simulation.engine import Progress, Simulation
-from rosrm.simulation.extraction import Extraction
-from rosrm.simulation.meter import Outcome
-from rosrm.simulation.replay import Replay, replay
-from rosrm.simulation.workload import Workload
+from rosrm_simulate.agreement import Agreement, compare
+from rosrm_simulate.engine import Progress, Simulation
+from rosrm_simulate.extraction import Extraction
+from rosrm_simulate.meter import Outcome
+from rosrm_simulate.replay import Replay, replay
+from rosrm_simulate.variants import (
+    Variant,
+    load_variants,
+    read_variants,
+    settings_node,
+    variant_in_text,
+    variant_of_option,
+)
+from rosrm_simulate.workload import Workload
+from rosrm_simulate.workload_file import load_workload
 
 #: Seconds after which progress is shown.
 _SHOWN_AFTER: Final = 2.0

@@ -1,8 +1,0 @@
-"""The same core on virtual time: what would have been, with other policies, weights and hosts.
-
-Everything here is pure. `workload` says what is simulated, `engine` runs the cores of the master
-and of the slaves on it, `machine` is the model of one host, `meter` measures a run, real or
-simulated, and `agreement` compares two. `replay` tells a master's core again what a record holds,
-and `extraction` makes a workload of a record. Files are read by `rosrm.config.workload` and
-`rosrm.cli`.
-"""

@@ -1,0 +1,143 @@
+"""Commands that other distributions bring by the entry-point group `rosrm.commands`."""
+
+from __future__ import annotations
+
+import pytest
+
+from rosrm.cli import commands
+
+#: A module with a function, a group, and objects that are no commands.
+MODULE = '''
+import typer
+
+def hello(name: str, loudly: bool = False) -> None:
+    """Greet someone."""
+    print(f"hello {name}" + ("!" if loudly else ""))
+
+def strange(value: int | str) -> None:
+    """Has an argument that no command line can have."""
+
+tools = typer.Typer(no_args_is_help=True, help="Tools of acme.")
+
+@tools.callback()
+def _group() -> None: ...
+
+@tools.command()
+def saw(times: int) -> None:
+    """Saw some wood."""
+    print("saw " * times)
+
+number = 7
+'''
+
+
+@pytest.fixture
+def installed(tmp_path, monkeypatch):
+    """Install distributions, as far as Python sees it: metadata and one module on the path."""
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / "acme_commands.py").write_text(MODULE)
+
+    def install(distribution, *entry_points):
+        metadata = tmp_path / f"{distribution}-1.5.dist-info"
+        metadata.mkdir()
+        (metadata / "METADATA").write_text(
+            f"Metadata-Version: 2.1\nName: {distribution}\nVersion: 1.5\n"
+        )
+        lines = "\n".join(("[rosrm.commands]", *entry_points))
+        (metadata / "entry_points.txt").write_text(lines)
+
+    return install
+
+
+def test_a_function_is_a_command(rosrm, installed):
+    """An entry point that names a function adds a command with its arguments and help."""
+    installed("acme", "hello = acme_commands:hello")
+
+    assert rosrm("hello", "you", "--loudly").out == "hello you!\n"
+    assert "hello" in rosrm("--help").out.partition("Commands:")[2]
+    assert "Greet someone." in rosrm("hello", "-h").out
+    assert rosrm("hello").code == 2
+
+
+def test_a_typer_app_is_a_group_of_commands(rosrm, installed):
+    """An entry point that names a `typer.Typer` adds a group, with plain usage lines."""
+    installed("acme", "tools = acme_commands:tools")
+
+    assert rosrm("tools", "saw", "2").out == "saw saw \n"
+    assert "Tools of acme." in rosrm("--help").out
+    assert "\n  saw " in rosrm("tools", "--help").out
+
+
+@pytest.mark.parametrize(
+    ("target", "said"),
+    [
+        ("no_such_module:hello", "ModuleNotFoundError: No module named 'no_such_module'"),
+        ("acme_commands:nothing", "AttributeError: "),
+        ("acme_commands:number", "TypeError: 7 is neither a function nor a typer.Typer"),
+        ("acme_commands:strange", "AssertionError: Typer currently"),
+    ],
+)
+def test_a_command_that_cannot_be_loaded_is_one_sentence(rosrm, installed, target, said):
+    """The sentence names the distribution and the error; the help lists it, and works."""
+    installed("acme", f"hello = {target}")
+
+    result = rosrm("hello", "you", "--help")
+
+    assert (result.code, result.out, result.err.count("\n")) == (1, "", 1)
+    assert f"rosrm: the command 'hello' of acme 1.5 cannot be loaded: {said}" in result.err
+    assert "the command 'hello' of acme 1.5 cannot be loaded" in rosrm("--help").out
+
+
+def test_a_command_of_rosrm_cannot_be_replaced(rosrm, installed):
+    """A distribution cannot take the name of a built-in command."""
+    installed("acme", "config = acme_commands:hello")
+
+    assert rosrm("config", "check", "--help").code == 0
+    assert rosrm("--help").out.count("\n  config ") == 1
+
+
+def test_two_distributions_with_one_command_are_both_named(rosrm, installed):
+    """A command that two distributions bring is neither's: the user uninstalls one of them."""
+    for distribution in ("acme", "bolt"):
+        installed(distribution, "hello = acme_commands:hello")
+
+    result = rosrm("hello", "you")
+
+    assert (result.code, result.err) == (
+        1, "rosrm: the command 'hello' is in acme 1.5 and bolt 1.5; uninstall all but one\n",
+    )  # fmt: skip
+
+
+def test_a_misspelt_command_of_another_distribution_is_hinted_at(rosrm, installed):
+    """Hints name installed commands as they name built-in ones."""
+    installed("acme", "hello = acme_commands:hello")
+
+    result = rosrm("helo")
+
+    assert result.code == 2
+    assert "No such command 'helo'. Did you mean 'hello'?" in result.err
+
+
+@pytest.mark.parametrize(
+    ("command", "distribution"), [("lab", "rosrm-lab"), ("simulate", "rosrm-simulate")]
+)
+def test_a_command_whose_distribution_is_absent_names_it(rosrm, monkeypatch, command, distribution):
+    """A command of this repository that is not installed says in one sentence where it is."""
+    monkeypatch.setattr(commands, "find_commands", dict)
+
+    result = rosrm(command, "up", "--help")
+
+    assert (result.code, result.out, result.err) == (
+        2, "", f"rosrm: the command {command!r} comes with `pip install {distribution}`\n",
+    )  # fmt: skip
+
+
+def test_a_command_of_rosrm_is_found_without_a_search(rosrm, monkeypatch):
+    """The search reads the metadata of all distributions: only other commands wait for that."""
+
+    def search():
+        raise AssertionError("no search is needed")
+
+    monkeypatch.setattr(commands, "find_commands", search)
+
+    assert rosrm("ps", "--help").code == 0
