@@ -1,0 +1,353 @@
+"""The placement rules: which hosts may take a process, and why another host may not.
+
+`FILTERS` is the whole list. Each entry has a mask over many hosts, by which a ranking chooses, and
+beside it the reason against one host, which `rosrm explain` prints. A new rule is one more entry.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from enum import Enum
+from typing import Final, Literal
+
+import numpy as np
+
+from rosrm.core.master.state.demand import Demand
+from rosrm.core.master.state.host_arrays import (
+    BUSY,
+    CAPACITY,
+    LIMIT,
+    LOAD,
+    USAGE,
+    BoolArray,
+    FloatArray,
+    IntArray,
+)
+from rosrm.core.master.state.hosts import Host, HostCondition, HostTable
+from rosrm.wording import amount, counted
+
+#: Sums of fractions are compared with this much tolerance.
+_CLOSE: Final = 1e-9
+
+Columns = slice | IntArray
+
+
+@dataclass(slots=True)  # not frozen: that costs a microsecond for each of thousands
+class Candidates:
+    """Some hosts, n of them, as the filters see them beside one demand.
+
+    The arrays hold what assignments change. With an array of columns they are copies.
+
+    Attributes:
+        columns: of the hosts in the table; a column stays with its host.
+        resources: names of the R rows.
+        need: (R, n) fractions of the capacity of each host.
+        cells: (planes, R, n) as in `HostColumns`.
+        busy: (R, n) reading plus reservations.
+        processes: (n,) held or promised.
+        bound: (n,) most processes.
+        empty: True for hosts as if no process ran on them.
+    """
+
+    table: HostTable
+    demand: Demand
+    columns: Columns
+    resources: tuple[str, ...]
+    need: FloatArray
+    cells: FloatArray
+    busy: FloatArray
+    processes: IntArray
+    bound: IntArray
+    empty: bool = False
+
+    def __len__(self) -> int:
+        return len(self.processes)
+
+    def host(self, row: int) -> Host:
+        """Return the host of a row."""
+        columns = self.columns
+        at = columns.start + row if isinstance(columns, slice) else int(columns[row])
+        return self.table.hosts[at]
+
+
+def candidates(
+    table: HostTable, demand: Demand, need: FloatArray, columns: Columns,
+    more: IntArray | None = None,
+) -> Candidates:  # fmt: skip
+    """Return some hosts as they are, beside a demand.
+
+    Args:
+        need: (R, H) fractions, of every host.
+        more: (n,) processes of this demand that each host is supposed to hold in addition.
+    """
+    need = need[:, columns]
+    cells = table.cells[:, :, columns]  # all planes at once: one copy costs less than five
+    busy, processes = cells[BUSY], table.processes[columns]
+    if more is not None:
+        busy, processes = busy + need * more, processes + more
+    return Candidates(
+        table, demand, columns, table.resources, need, cells, busy, processes, table.bound[columns]
+    )
+
+
+def as_if_empty(table: HostTable, demand: Demand, columns: Columns) -> Candidates:
+    """Return some hosts as if no process ran on them, beside a demand."""
+    need = table.fractions(demand.amounts, demand.estimated)
+    hosts = candidates(table, demand, need, columns)
+    hosts.busy, hosts.processes = np.zeros_like(hosts.busy), np.zeros_like(hosts.processes)
+    hosts.empty = True
+    return hosts
+
+
+class Lasts(Enum):
+    """How long a host fails a filter."""
+
+    MOMENT = "until a message or the end of a process changes it"
+    AWAY = "until a user or the slave brings the host back"
+    PERMANENT = "until the host registers with something else"
+
+
+@dataclass(frozen=True, slots=True)
+class Filter:
+    """One placement rule.
+
+    Attributes:
+        name: unique.
+        mask: (n,) True: the host passes. None: every host passes.
+        reason: why the host of a row does not pass, without its name. Called only where `mask` is
+            False there.
+        lasts: how long a host fails it; a process that every host fails for longer than a moment is
+            set aside, and does not block the queue.
+        by_assignment: True if an assignment changes the mask. Mask and reason then read only the
+            demand and the arrays of the candidates, because a decision keeps a copy of those and
+            spells the reason out later.
+        verdict: stands before the reason in an explanation.
+    """
+
+    name: str
+    mask: Callable[[Candidates], BoolArray | None]
+    reason: Callable[[Candidates, int], str]
+    lasts: Lasts = Lasts.MOMENT
+    by_assignment: bool = False
+    verdict: Literal["excluded", "full"] = "excluded"
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """The first filter that a host fails, and why."""
+
+    filter: Filter
+    reason: str
+
+
+def passing(filters: Iterable[Filter], hosts: Candidates) -> BoolArray:
+    """Return which hosts pass all of some filters."""
+    passes = np.ones(len(hosts), np.bool_)
+    for one in filters:
+        mask = one.mask(hosts)
+        if mask is not None:
+            passes &= mask
+    return passes
+
+
+def refusals(filters: Iterable[Filter], hosts: Candidates) -> list[Refusal | None]:
+    """Return for each host the first of some filters that it fails."""
+    found: list[Refusal | None] = [None] * len(hosts)
+    for one in filters:
+        mask = one.mask(hosts)
+        for row in [] if mask is None else np.flatnonzero(~mask).tolist():
+            found[row] = found[row] or Refusal(one, one.reason(hosts, row))
+    return found
+
+
+def first_of(one: Refusal | None, other: Refusal | None) -> Refusal | None:
+    """Return the refusal whose filter comes first in the list."""
+    both = [refusal for refusal in (one, other) if refusal is not None]
+    return min(both, key=lambda refusal: FILTERS.index(refusal.filter), default=None)
+
+
+# --- the process and the host -----------------------------------------------------------------
+
+
+def _is_not_excluded(hosts: Candidates) -> BoolArray | None:
+    if not hosts.demand.excluded:
+        return None
+    allowed = np.ones(len(hosts.table), np.bool_)
+    for name in hosts.demand.excluded:
+        host = hosts.table.by_name.get(name)
+        if host is not None:
+            allowed[host.column] = False
+    return allowed[hosts.columns]
+
+
+def _why_excluded(hosts: Candidates, row: int) -> str:
+    return hosts.demand.excluded[hosts.host(row).name]
+
+
+def _has_labels(hosts: Candidates) -> BoolArray | None:
+    required = hosts.demand.spec.required_labels
+    if not required:
+        return None
+    allowed = np.ones(len(hosts), np.bool_)
+    for key, value in required.items():
+        allowed &= hosts.table.labelled(key, value)[hosts.columns]
+    return allowed
+
+
+def _which_label_lacks(hosts: Candidates, row: int) -> str:
+    labels, required = hosts.host(row).description.labels, hosts.demand.spec.required_labels
+    missing = [f"{key}={value}" for key, value in required.items() if labels.get(key) != value]
+    return f"it lacks the label {', '.join(missing)}"
+
+
+def _has_resources(hosts: Candidates) -> BoolArray | None:
+    declared = hosts.demand.declared
+    if not declared:
+        return None
+    allowed = np.ones(len(hosts), np.bool_)
+    for resource in declared:
+        allowed &= _capacity(hosts, resource) > 0.0
+    return allowed
+
+
+def _which_resource_lacks(hosts: Candidates, row: int) -> str:
+    lacking = [name for name in hosts.demand.declared if not _capacity(hosts, name)[row] > 0.0]
+    return f"it has no {min(lacking)}"
+
+
+def _capacity(hosts: Candidates, resource: str) -> FloatArray:
+    """Return the capacity of each host, NaN without the resource."""
+    if resource not in hosts.resources:
+        return np.full(len(hosts), np.nan)
+    capacity: FloatArray = hosts.cells[CAPACITY, hosts.resources.index(resource)]
+    return capacity
+
+
+# --- whether the host is there ----------------------------------------------------------------
+
+
+def _is_none_of(*conditions: HostCondition) -> Callable[[Candidates], BoolArray]:
+    first, *others = (int(condition) for condition in conditions)
+
+    def mask(hosts: Candidates) -> BoolArray:
+        condition = hosts.table.condition[hosts.columns]
+        passes: BoolArray = condition != first
+        for other in others:
+            passes &= condition != other
+        return passes
+
+    return mask
+
+
+def _in_which_condition(hosts: Candidates, row: int) -> str:
+    return f"it {hosts.table.condition_of(hosts.host(row)).words()}"
+
+
+def _is_open(hosts: Candidates) -> BoolArray:
+    return ~hosts.table.closed[hosts.columns]
+
+
+def _why_not_open(hosts: Candidates, row: int) -> str:
+    return "it is being drained" if hosts.host(row).draining else "it is cordoned"
+
+
+# --- what the host reports --------------------------------------------------------------------
+
+
+def _is_fresh(hosts: Candidates) -> BoolArray:
+    return np.equal(hosts.table.stale[hosts.columns], 0)
+
+
+def _which_reading_is_stale(hosts: Candidates, row: int) -> str:
+    return f"its reading of {', '.join(hosts.table.stale_resources(hosts.host(row)))} is stale"
+
+
+def _is_accepting(hosts: Candidates) -> BoolArray:
+    return hosts.table.accepting[hosts.columns]
+
+
+def _why_not_accepting(hosts: Candidates, row: int) -> str:
+    over = hosts.table.over_limit(hosts.host(row).column)
+    return f"it is over its limit of {', '.join(over)}" if over else "its slave accepts no work now"
+
+
+def _has_reported(hosts: Candidates) -> BoolArray:
+    return ~hosts.table.untold[hosts.columns]
+
+
+def _why_not_reported(_hosts: Candidates, _row: int) -> str:
+    return "it was lost, and has not reported its processes yet"
+
+
+def _has_asked(hosts: Candidates) -> BoolArray:
+    return hosts.table.asking[hosts.columns]
+
+
+def _why_not_asked(_hosts: Candidates, _row: int) -> str:
+    return "it has not asked for work yet"
+
+
+# --- what an assignment changes ---------------------------------------------------------------
+
+
+def _has_slot(hosts: Candidates) -> BoolArray:
+    return hosts.processes < hosts.bound
+
+
+def _why_no_slot(hosts: Candidates, row: int) -> str:
+    most = counted(int(hosts.bound[row]), "process", "processes")
+    return f"it accepts no more than {most} now"
+
+
+def _has_room(hosts: Candidates) -> BoolArray:
+    # A host without a resource has NaN there, which is over nothing.
+    limits = hosts.cells[LIMIT] - (hosts.demand.headroom - _CLOSE)
+    has_room: BoolArray = ~np.logical_or.reduce(hosts.busy + hosts.need > limits)
+    return has_room
+
+
+def _why_no_room(hosts: Candidates, row: int) -> str:
+    limits = hosts.cells[LIMIT, :, row] - hosts.demand.headroom
+    worst = int(np.nanargmax(hosts.busy[:, row] + hosts.need[:, row] - limits))
+    name, limit = hosts.resources[worst], float(limits[worst])
+    units = (one.unit for one in hosts.host(row).description.resources if one.name == name)
+    unit, cells = next(units, ""), hosts.cells[:, worst, row]
+    has, need, usable, used, reserved = (
+        amount(float(part * cells[CAPACITY]), unit)
+        for part in (1.0, hosts.need[worst, row], limit, cells[USAGE], cells[LOAD])
+    )
+    most = f"{usable} ({limit:.0%}) may be used"
+    if hosts.empty:
+        return f"it has {has} of {name}, of which {most}; needed: {need}"
+    taken = f"{used} in use" + (f", {reserved} reserved" if cells[LOAD] else "")
+    return f"{name}: needs {need}; at most {most}: {taken}"
+
+
+# --- the list ---------------------------------------------------------------------------------
+
+_GONE: Final = (HostCondition.LOST, HostCondition.LEFT, HostCondition.DETACHED)
+
+EXCLUSION: Final = Filter("exclusion", _is_not_excluded, _why_excluded, Lasts.PERMANENT)
+#: A host that fails one of these is away.
+PRESENCE: Final = (
+    Filter("gone", _is_none_of(*_GONE), _in_which_condition, Lasts.AWAY),
+    Filter("expected", _is_none_of(HostCondition.EXPECTED), _in_which_condition),
+    Filter("cordon", _is_open, _why_not_open, Lasts.AWAY),
+)
+#: In this order: of several that a host fails, the first one says why.
+FILTERS: Final = (
+    EXCLUSION,
+    Filter("labels", _has_labels, _which_label_lacks, Lasts.PERMANENT),
+    Filter("resources", _has_resources, _which_resource_lacks, Lasts.PERMANENT),
+    *PRESENCE,
+    Filter("suspect", _is_none_of(HostCondition.SUSPECT), _in_which_condition),
+    Filter("processes", _has_slot, _why_no_slot, by_assignment=True),
+    Filter("stale", _is_fresh, _which_reading_is_stale),
+    Filter("limits", _is_accepting, _why_not_accepting),
+    Filter("report", _has_reported, _why_not_reported),
+    Filter("request", _has_asked, _why_not_asked),
+    Filter("room", _has_room, _why_no_room, Lasts.PERMANENT, by_assignment=True, verdict="full"),
+)
+STANDING: Final = tuple(one for one in FILTERS if not one.by_assignment)
+BY_ASSIGNMENT: Final = tuple(one for one in FILTERS if one.by_assignment)
