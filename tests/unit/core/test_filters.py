@@ -8,15 +8,10 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rosrm.core.master.scheduling.candidates import as_if_empty, candidates
 from rosrm.core.master.scheduling.decision import decide
 from rosrm.core.master.scheduling.feasibility import why_never
-from rosrm.core.master.scheduling.filters import (
-    FILTERS,
-    as_if_empty,
-    candidates,
-    passing,
-    refusals,
-)
+from rosrm.core.master.scheduling.filters import FILTERS, passing, refusals
 from rosrm.core.master.scheduling.ranking import Ranking
 from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.hosts import HostCondition, HostTable

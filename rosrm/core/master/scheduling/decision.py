@@ -12,14 +12,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from rosrm.core.master.scheduling.filters import (
-    BY_ASSIGNMENT,
-    Candidates,
-    Refusal,
-    candidates,
-    first_of,
-    refusals,
-)
+from rosrm.core.master.scheduling.candidates import Candidates, candidates
+from rosrm.core.master.scheduling.filters import BY_ASSIGNMENT, Refusal, first_of, refusals
 from rosrm.core.master.scheduling.host_views import host_view, process_view
 from rosrm.core.master.scheduling.ranking import TIE, NamedPolicy, Ranking
 from rosrm.core.master.state.host_arrays import FloatArray
@@ -177,8 +171,10 @@ def verdict_of(ranking: Ranking, column: int) -> Verdict:
 def _moment(ranking: Ranking, columns: list[int]) -> Moment:
     at = np.array(columns, np.int64)
     hosts = candidates(ranking.table, ranking.demand, ranking.need, at)
-    standing = ranking.standing_refusals(columns)
-    return Moment(ranking.judge, ranking.plugins, hosts, ranking.value[at], standing)
+    value = ranking.value[at]
+    some_fail = np.inf in value.tolist()
+    standing = ranking.standing_refusals(columns) if some_fail else (None,) * len(columns)
+    return Moment(ranking.judge, ranking.plugins, hosts, value, standing)
 
 
 def _verdicts(moment: Moment, *, chosen: bool) -> tuple[Verdict, ...]:

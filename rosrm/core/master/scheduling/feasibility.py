@@ -7,14 +7,13 @@ from typing import Final
 
 import numpy as np
 
+from rosrm.core.master.scheduling.candidates import Candidates, as_if_empty
 from rosrm.core.master.scheduling.filters import (
     EXCLUSION,
     FILTERS,
     PRESENCE,
-    Candidates,
     Filter,
     Lasts,
-    as_if_empty,
     passing,
     refusals,
 )

@@ -13,91 +13,16 @@ from typing import Final, Literal
 
 import numpy as np
 
-from rosrm.core.master.state.demand import Demand
-from rosrm.core.master.state.host_arrays import (
-    BUSY,
-    CAPACITY,
-    LIMIT,
-    LOAD,
-    USAGE,
-    BoolArray,
-    FloatArray,
-    IntArray,
-)
-from rosrm.core.master.state.hosts import Host, HostCondition, HostTable
+from rosrm.core.master.scheduling.candidates import Candidates
+from rosrm.core.master.state.host_arrays import CAPACITY, LIMIT, LOAD, USAGE, BoolArray
+from rosrm.core.master.state.hosts import HostCondition
 from rosrm.wording import amount, counted
 
 #: Sums of fractions are compared with this much tolerance.
 _CLOSE: Final = 1e-9
-
-Columns = slice | IntArray
-
-
-@dataclass(slots=True)  # not frozen: that costs a microsecond for each of thousands
-class Candidates:
-    """Some hosts, n of them, as the filters see them beside one demand.
-
-    The arrays hold what assignments change. With an array of columns they are copies.
-
-    Attributes:
-        columns: of the hosts in the table; a column stays with its host.
-        resources: names of the R rows.
-        need: (R, n) fractions of the capacity of each host.
-        cells: (planes, R, n) as in `HostColumns`.
-        busy: (R, n) reading plus reservations.
-        processes: (n,) held or promised.
-        bound: (n,) most processes.
-        empty: True for hosts as if no process ran on them.
-    """
-
-    table: HostTable
-    demand: Demand
-    columns: Columns
-    resources: tuple[str, ...]
-    need: FloatArray
-    cells: FloatArray
-    busy: FloatArray
-    processes: IntArray
-    bound: IntArray
-    empty: bool = False
-
-    def __len__(self) -> int:
-        return len(self.processes)
-
-    def host(self, row: int) -> Host:
-        """Return the host of a row."""
-        columns = self.columns
-        at = columns.start + row if isinstance(columns, slice) else int(columns[row])
-        return self.table.hosts[at]
-
-
-def candidates(
-    table: HostTable, demand: Demand, need: FloatArray, columns: Columns,
-    more: IntArray | None = None,
-) -> Candidates:  # fmt: skip
-    """Return some hosts as they are, beside a demand.
-
-    Args:
-        need: (R, H) fractions, of every host.
-        more: (n,) processes of this demand that each host is supposed to hold in addition.
-    """
-    need = need[:, columns]
-    cells = table.cells[:, :, columns]  # all planes at once: one copy costs less than five
-    busy, processes = cells[BUSY], table.processes[columns]
-    if more is not None:
-        busy, processes = busy + need * more, processes + more
-    return Candidates(
-        table, demand, columns, table.resources, need, cells, busy, processes, table.bound[columns]
-    )
-
-
-def as_if_empty(table: HostTable, demand: Demand, columns: Columns) -> Candidates:
-    """Return some hosts as if no process ran on them, beside a demand."""
-    need = table.fractions(demand.amounts, demand.estimated)
-    hosts = candidates(table, demand, need, columns)
-    hosts.busy, hosts.processes = np.zeros_like(hosts.busy), np.zeros_like(hosts.processes)
-    hosts.empty = True
-    return hosts
+#: As plain numbers, because a comparison with those takes half the time.
+_SUSPECT, _EXPECTED = int(HostCondition.SUSPECT), int(HostCondition.EXPECTED)
+_FIRST_GONE: Final = int(HostCondition.LOST)
 
 
 class Lasts(Enum):
@@ -141,14 +66,16 @@ class Refusal:
     reason: str
 
 
-def passing(filters: Iterable[Filter], hosts: Candidates) -> BoolArray:
-    """Return which hosts pass all of some filters."""
-    passes = np.ones(len(hosts), np.bool_)
+def passing(
+    filters: Iterable[Filter], hosts: Candidates, among: BoolArray | None = None
+) -> BoolArray:
+    """Return which hosts, of all or of those that are True in `among`, pass all of some filters."""
+    passes = among
     for one in filters:
         mask = one.mask(hosts)
         if mask is not None:
-            passes &= mask
-    return passes
+            passes = mask if passes is None else passes & mask
+    return np.ones(len(hosts), np.bool_) if passes is None else passes
 
 
 def refusals(filters: Iterable[Filter], hosts: Candidates) -> list[Refusal | None]:
@@ -195,7 +122,7 @@ def _has_labels(hosts: Candidates) -> BoolArray | None:
     return allowed
 
 
-def _which_label_lacks(hosts: Candidates, row: int) -> str:
+def _why_no_labels(hosts: Candidates, row: int) -> str:
     labels, required = hosts.host(row).description.labels, hosts.demand.spec.required_labels
     missing = [f"{key}={value}" for key, value in required.items() if labels.get(key) != value]
     return f"it lacks the label {', '.join(missing)}"
@@ -205,42 +132,34 @@ def _has_resources(hosts: Candidates) -> BoolArray | None:
     declared = hosts.demand.declared
     if not declared:
         return None
-    allowed = np.ones(len(hosts), np.bool_)
-    for resource in declared:
-        allowed &= _capacity(hosts, resource) > 0.0
-    return allowed
+    if not declared.issubset(hosts.resources):
+        return np.zeros(len(hosts), np.bool_)
+    has_all: BoolArray = np.logical_and.reduce(hosts.need < np.inf)
+    return has_all
 
 
-def _which_resource_lacks(hosts: Candidates, row: int) -> str:
-    lacking = [name for name in hosts.demand.declared if not _capacity(hosts, name)[row] > 0.0]
-    return f"it has no {min(lacking)}"
-
-
-def _capacity(hosts: Candidates, resource: str) -> FloatArray:
-    """Return the capacity of each host, NaN without the resource."""
-    if resource not in hosts.resources:
-        return np.full(len(hosts), np.nan)
-    capacity: FloatArray = hosts.cells[CAPACITY, hosts.resources.index(resource)]
-    return capacity
+def _why_no_resources(hosts: Candidates, row: int) -> str:
+    needs = zip(hosts.resources, hosts.need[:, row].tolist(), strict=True)
+    there = {name for name, need in needs if need < np.inf}
+    return f"it has no {min(hosts.demand.declared - there)}"
 
 
 # --- whether the host is there ----------------------------------------------------------------
 
 
-def _is_none_of(*conditions: HostCondition) -> Callable[[Candidates], BoolArray]:
-    first, *others = (int(condition) for condition in conditions)
-
-    def mask(hosts: Candidates) -> BoolArray:
-        condition = hosts.table.condition[hosts.columns]
-        passes: BoolArray = condition != first
-        for other in others:
-            passes &= condition != other
-        return passes
-
-    return mask
+def _is_not_gone(hosts: Candidates) -> BoolArray:
+    return np.less(hosts.table.condition[hosts.columns], _FIRST_GONE)
 
 
-def _in_which_condition(hosts: Candidates, row: int) -> str:
+def _is_not_expected(hosts: Candidates) -> BoolArray:
+    return np.not_equal(hosts.table.condition[hosts.columns], _EXPECTED)
+
+
+def _is_not_suspect(hosts: Candidates) -> BoolArray:
+    return np.not_equal(hosts.table.condition[hosts.columns], _SUSPECT)
+
+
+def _why_not_up(hosts: Candidates, row: int) -> str:
     return f"it {hosts.table.condition_of(hosts.host(row)).words()}"
 
 
@@ -256,10 +175,10 @@ def _why_not_open(hosts: Candidates, row: int) -> str:
 
 
 def _is_fresh(hosts: Candidates) -> BoolArray:
-    return np.equal(hosts.table.stale[hosts.columns], 0)
+    return np.logical_not(hosts.table.stale[hosts.columns])
 
 
-def _which_reading_is_stale(hosts: Candidates, row: int) -> str:
+def _why_stale(hosts: Candidates, row: int) -> str:
     return f"its reading of {', '.join(hosts.table.stale_resources(hosts.host(row)))} is stale"
 
 
@@ -326,24 +245,22 @@ def _why_no_room(hosts: Candidates, row: int) -> str:
 
 # --- the list ---------------------------------------------------------------------------------
 
-_GONE: Final = (HostCondition.LOST, HostCondition.LEFT, HostCondition.DETACHED)
-
 EXCLUSION: Final = Filter("exclusion", _is_not_excluded, _why_excluded, Lasts.PERMANENT)
 #: A host that fails one of these is away.
 PRESENCE: Final = (
-    Filter("gone", _is_none_of(*_GONE), _in_which_condition, Lasts.AWAY),
-    Filter("expected", _is_none_of(HostCondition.EXPECTED), _in_which_condition),
+    Filter("gone", _is_not_gone, _why_not_up, Lasts.AWAY),
+    Filter("expected", _is_not_expected, _why_not_up),
     Filter("cordon", _is_open, _why_not_open, Lasts.AWAY),
 )
 #: In this order: of several that a host fails, the first one says why.
 FILTERS: Final = (
     EXCLUSION,
-    Filter("labels", _has_labels, _which_label_lacks, Lasts.PERMANENT),
-    Filter("resources", _has_resources, _which_resource_lacks, Lasts.PERMANENT),
+    Filter("labels", _has_labels, _why_no_labels, Lasts.PERMANENT),
+    Filter("resources", _has_resources, _why_no_resources, Lasts.PERMANENT),
     *PRESENCE,
-    Filter("suspect", _is_none_of(HostCondition.SUSPECT), _in_which_condition),
+    Filter("suspect", _is_not_suspect, _why_not_up),
     Filter("processes", _has_slot, _why_no_slot, by_assignment=True),
-    Filter("stale", _is_fresh, _which_reading_is_stale),
+    Filter("stale", _is_fresh, _why_stale),
     Filter("limits", _is_accepting, _why_not_accepting),
     Filter("report", _has_reported, _why_not_reported),
     Filter("request", _has_asked, _why_not_asked),

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from rosrm.core.master.scheduling.filters import Candidates
+from rosrm.core.master.scheduling.candidates import Candidates
 from rosrm.core.master.state.host_arrays import CAPACITY, LIMIT, BoolArray, FloatArray
 from rosrm.core.master.state.hosts import Host
 from rosrm.errors import PluginError

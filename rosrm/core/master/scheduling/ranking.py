@@ -1,9 +1,9 @@
 """Which host takes a process: filter, score, pick.
 
-A host fits when reading + in-flight load + need stays under every limit. Among the hosts that fit
-the lowest score goes first (Eq. 1 of the paper with the policy `weighted`). A `Ranking` keeps the
-scores of one demand, so that a queue of equal processes is judged once and then only where an
-assignment has changed a host.
+A host fits when it passes every filter of `filters.py` and the policy does not veto it. Among the
+hosts that fit the lowest score goes first (Eq. 1 of the paper with the policy `weighted`). A
+`Ranking` keeps the scores of one demand, so that a queue of equal processes is judged once and then
+only where an assignment has changed a host.
 
 This module is the hot path of the master: a ranking is made once for each demand and batch of
 readings (one pass over all hosts), and one refresh and one argmin follow for each assignment.
@@ -16,12 +16,11 @@ from typing import Final
 
 import numpy as np
 
+from rosrm.core.master.scheduling.candidates import Columns, candidates
 from rosrm.core.master.scheduling.filters import (
     BY_ASSIGNMENT,
     STANDING,
-    Columns,
     Refusal,
-    candidates,
     passing,
     refusals,
 )
@@ -180,7 +179,7 @@ class Ranking:
         `more`, (n,), supposes so many further processes of this demand on each host.
         """
         judged = candidates(self.table, self.demand, self.need, columns, more)
-        fits = self._standing[columns] & passing(BY_ASSIGNMENT, judged)
+        fits = passing(BY_ASSIGNMENT, judged, self._standing[columns])
         if not np.count_nonzero(fits):
             return np.full(len(fits), np.inf)
         tie = TIE * judged.processes
@@ -196,7 +195,7 @@ class Ranking:
             self._leave_out(error)
             return None
         if veto is not None:
-            fits &= ~veto
+            fits = fits & ~veto
         return np.where(fits, value + tie, np.inf)
 
     def _leave_out(self, error: PluginError) -> None:

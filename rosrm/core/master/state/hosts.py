@@ -32,13 +32,13 @@ _MOST_GUESSED: Final = 0.5
 
 
 class HostCondition(IntEnum):
-    """How well a host is heard."""
+    """How well a host is heard. From LOST on the host is gone until it registers or is heard."""
 
     UP = 0
     SUSPECT = 1
-    LOST = 2
-    LEFT = 3
-    EXPECTED = 4  # known from the journal, not heard since this master's start
+    EXPECTED = 2  # known from the journal, not heard since this master's start
+    LOST = 3
+    LEFT = 4
     DETACHED = 5  # its slave was stopped and left processes running
 
     def words(self, *only: HostCondition) -> str:
