@@ -11,7 +11,6 @@ from rosrm.core.master.scheduling.candidates import Candidates, as_if_empty
 from rosrm.core.master.scheduling.filters import (
     EXCLUSION,
     FILTERS,
-    PRESENCE,
     Filter,
     Lasts,
     passing,
@@ -27,6 +26,7 @@ _NAMED_HOSTS: Final = 16
 
 _PERMANENT: Final = tuple(one for one in FILTERS if one.lasts is Lasts.PERMANENT)
 _AWAY: Final = tuple(one for one in FILTERS if one.lasts is Lasts.AWAY)
+_ABSENT: Final = tuple(one for one in FILTERS if one.lasts in (Lasts.AWAY, Lasts.RETURN))
 _LASTING: Final = tuple(one for one in FILTERS if one.lasts is not Lasts.MOMENT)
 
 
@@ -69,9 +69,9 @@ def may_ever_take(table: HostTable, demand: Demand) -> BoolArray:
 
 def why_all_away(table: HostTable, demand: Demand) -> str:
     """Return why each host is away; "" if one of them is there."""
-    if passing(PRESENCE, _every(table, demand)).any():
+    if passing(_ABSENT, _every(table, demand)).any():
         return ""
-    return f"every host is away: {_host_by_host(PRESENCE, table, demand)}"
+    return f"every host is away: {_host_by_host(_ABSENT, table, demand)}"
 
 
 def _every(table: HostTable, demand: Demand) -> Candidates:

@@ -29,6 +29,7 @@ class Lasts(Enum):
     """How long a host fails a filter."""
 
     MOMENT = "until a message or the end of a process changes it"
+    RETURN = "until the slave reports to this run of the master, which is expected"
     AWAY = "until a user or the slave brings the host back"
     PERMANENT = "until the host registers with something else"
 
@@ -42,8 +43,8 @@ class Filter:
         mask: (n,) True: the host passes. None: every host passes.
         reason: why the host of a row does not pass, without its name. Called only where `mask` is
             False there.
-        lasts: how long a host fails it; a process that every host fails for longer than a moment is
-            set aside, and does not block the queue.
+        lasts: how long a host fails it. A process is set aside, and does not block the queue, if
+            each host fails a permanent one. Hosts that are away count too, unless all hosts are.
         by_assignment: True if an assignment changes the mask. Mask and reason then read only the
             demand and the arrays of the candidates, because a decision keeps a copy of those and
             spells the reason out later.
@@ -246,18 +247,14 @@ def _why_no_room(hosts: Candidates, row: int) -> str:
 # --- the list ---------------------------------------------------------------------------------
 
 EXCLUSION: Final = Filter("exclusion", _is_not_excluded, _why_excluded, Lasts.PERMANENT)
-#: A host that fails one of these is away.
-PRESENCE: Final = (
-    Filter("gone", _is_not_gone, _why_not_up, Lasts.AWAY),
-    Filter("expected", _is_not_expected, _why_not_up),
-    Filter("cordon", _is_open, _why_not_open, Lasts.AWAY),
-)
 #: In this order: of several that a host fails, the first one says why.
 FILTERS: Final = (
     EXCLUSION,
     Filter("labels", _has_labels, _why_no_labels, Lasts.PERMANENT),
     Filter("resources", _has_resources, _why_no_resources, Lasts.PERMANENT),
-    *PRESENCE,
+    Filter("gone", _is_not_gone, _why_not_up, Lasts.AWAY),
+    Filter("expected", _is_not_expected, _why_not_up, Lasts.RETURN),
+    Filter("cordon", _is_open, _why_not_open, Lasts.AWAY),
     Filter("suspect", _is_not_suspect, _why_not_up),
     Filter("processes", _has_slot, _why_no_slot, by_assignment=True),
     Filter("stale", _is_fresh, _why_stale),
