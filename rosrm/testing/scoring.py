@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Final
 import numpy as np
 import numpy.typing as npt
 
-from rosrm.core.master.scheduling.ranking import sound
+from rosrm.core.master.scheduling.host_views import sound
 from rosrm.extensions.contracts import (
     BoolArray,
     FloatArray,

@@ -81,7 +81,7 @@ def test_who_is_too_large_for_every_host_is_set_aside() -> None:
     assert cluster.phase("p") == "set_aside"
     assert cluster["p"].reason == (
         "no host may take it: a: it has 1.0 GB of memory, of which 839 MB (80%) may be used; "
-        "needed: 944 MB"
+        "needed: 944 MB; there is no other host"
     )
     assert cluster.restart("p").message.startswith("p is set aside: no host may take it: a: ")
 

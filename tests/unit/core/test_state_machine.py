@@ -18,6 +18,7 @@ from rosrm.core.master.assignment.assign import demand_of
 from rosrm.core.master.checkpoint.replication import awaits_states
 from rosrm.core.master.commands import Assign, Command
 from rosrm.core.master.master_state import ProcessPhase, Wanted
+from rosrm.core.master.state.hosts import HostCondition, HostTable
 from rosrm.core.slave import reducer
 from rosrm.extensions.contracts import CheckpointChoice, CheckpointView
 from rosrm.model.values import (
@@ -52,6 +53,13 @@ chance = st.booleans()
 which_one = st.integers(0, 11)
 #: Seconds for which a host is heard until nothing runs there any more beside a successor.
 FENCED_WITHIN = 1.0
+
+
+def is_open(hosts: HostTable, column: int) -> bool:
+    """Return True if a host may take work at all, said apart from the filters."""
+    is_up = hosts.condition[column] == HostCondition.UP and not hosts.closed[column]
+    has_told = not hosts.untold[column] and not hosts.stale[column]
+    return bool(is_up and has_told and hosts.accepting[column] and hosts.asking[column])
 
 
 def spec(
@@ -157,7 +165,7 @@ class Play(RuleBasedStateMachine):
             column = assign.host_id - 1
             over = state.hosts.busy[:, column] - state.hosts.limit[:, column]
             assert not (over > 1e-6).any(), "assigned over a limit"
-            assert state.hosts.open()[column], "assigned to a host that is closed"
+            assert is_open(state.hosts, column), "assigned to a host that is closed"
             assert state.hosts.processes[column] <= state.hosts.bound[column]
         self.look_at_order(given)
         self.look_at_states(given)

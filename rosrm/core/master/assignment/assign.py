@@ -13,10 +13,9 @@ from rosrm.core.master.commands import Assign
 from rosrm.core.master.hosts import capabilities
 from rosrm.core.master.master_state import MasterState, Process, ProcessPhase, larger
 from rosrm.core.master.recovery.journal_gap import why_no_work
-from rosrm.core.master.scheduling.decision import (
-    Decision,
+from rosrm.core.master.scheduling.decision import Decision, decide
+from rosrm.core.master.scheduling.feasibility import (
     a_known_host_may,
-    decide,
     refused_everywhere,
     why_all_away,
     why_never,
@@ -205,7 +204,7 @@ def _place_or_set_aside(state: MasterState, process: Process, now: float) -> boo
     if never:
         _set_aside(state, process, never, now)
         return True
-    _tell_waiting(state, process, now)
+    _tell_waiting(state, process, demand, now)
     return False
 
 
@@ -288,12 +287,12 @@ def reconsider_set_aside(state: MasterState, now: float) -> None:
         state.save(process)
 
 
-def _tell_waiting(state: MasterState, process: Process, now: float) -> None:
+def _tell_waiting(state: MasterState, process: Process, demand: Demand, now: float) -> None:
     """Say once that the head of the queue waits, and why."""
     if not state.hosts.listed():
         _tell_waits(state, process, "no host has registered yet", now)
         return
-    reason = why_all_away(state.hosts) or "no host can take it now"
+    reason = why_all_away(state.hosts, demand) or "no host can take it now"
     if process.reason != reason:
         state.note_decision(process, decide_now(state, process), "waits", now)
         _tell_waits(state, process, reason, now, {"decision": process.decision})

@@ -22,7 +22,8 @@ from rosrm.core.master.migration.start import (
     why_no_executor,
     without_executor,
 )
-from rosrm.core.master.scheduling.decision import decide, may_ever_take, verdict_of
+from rosrm.core.master.scheduling.decision import decide, verdict_of
+from rosrm.core.master.scheduling.feasibility import may_ever_take
 from rosrm.core.master.scheduling.ranking import Ranking
 from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.hosts import Host

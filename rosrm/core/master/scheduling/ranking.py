@@ -1,9 +1,9 @@
 """Which host takes a process: filter, score, pick.
 
-A host fits when reading + in-flight load + need stays under every limit. Among the hosts that fit
-the lowest score goes first (Eq. 1 of the paper with the policy `weighted`). A `Ranking` keeps the
-scores of one demand, so that a queue of equal processes is judged once and then only where an
-assignment has changed a host.
+A host fits when it passes every filter of `filters.py` and the policy does not veto it. Among the
+hosts that fit the lowest score goes first (Eq. 1 of the paper with the policy `weighted`). A
+`Ranking` keeps the scores of one demand, so that a queue of equal processes is judged once and then
+only where an assignment has changed a host.
 
 This module is the hot path of the master: a ranking is made once for each demand and batch of
 readings (one pass over all hosts), and one refresh and one argmin follow for each assignment.
@@ -11,44 +11,36 @@ readings (one pass over all hosts), and one refresh and one argmin follow for ea
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from types import MappingProxyType
-from typing import Any, Final, TypeVar
+from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
-from rosrm.core.master.state.demand import Demand
-from rosrm.core.master.state.host_arrays import (
-    BUSY,
-    CAPACITY,
-    LIMIT,
-    BoolArray,
-    FloatArray,
-    IntArray,
+from rosrm.core.master.scheduling.candidates import Columns, candidates
+from rosrm.core.master.scheduling.filters import (
+    BY_ASSIGNMENT,
+    STANDING,
+    Refusal,
+    passing,
+    refusals,
 )
-from rosrm.core.master.state.hosts import Host, HostTable
+from rosrm.core.master.scheduling.host_views import host_view, process_view, sound
+from rosrm.core.master.state.demand import Demand
+from rosrm.core.master.state.host_arrays import FloatArray, IntArray
+from rosrm.core.master.state.hosts import HostTable
 from rosrm.errors import PluginError
-from rosrm.extensions.contracts import HostView, ProcessView, Scores, ScoringPolicy
-from rosrm.extensions.declared_fields import declared_spec
-from rosrm.extensions.plugin_calls import PluginCalls, given, required
+from rosrm.extensions.contracts import ScoringPolicy
+from rosrm.extensions.plugin_calls import PluginCalls
 
 #: Equal scores: the host with fewer processes goes first, then the one registered first.
 TIE: Final = 1e-9
-#: Sums of fractions are compared with this much tolerance.
-CLOSE: Final = 1e-9
-
 #: Of many hosts, so many that were nearly chosen are named beside the one that was.
 RUNNERS_UP: Final = 3
-
 #: Equal processes that a host may take one after the other are judged so many at a time.
 _AT_A_TIME: Final = 8
 
-T = TypeVar("T")
-
 #: A scoring policy with its name.
 NamedPolicy = tuple[str, ScoringPolicy]
-Columns = slice | IntArray
 
 
 class Ranking:
@@ -73,15 +65,16 @@ class Ranking:
         self.version = table.version
         self.need = table.fractions(demand.amounts, demand.estimated)
         self._left = list(policies)
-        self._spec = declared_spec(demand.spec, demand.reads)
         self._seen = len(table.touched)
-        self._open = table.open() & eligible(table, demand)
+        every = slice(0, len(table))
+        self._standing = passing(STANDING, candidates(table, demand, self.need, every))
+        self._refusals: dict[int, Refusal | None] = {}
         self._tier = _tiers(table, demand)
         self._lowest: list[int] | None = None
         self._own = -1
         self._ahead: dict[int, list[float]] = {}
         self.value = np.full(len(table), np.inf)
-        self._judge(slice(0, len(table)))
+        self._judge(every)
 
     @property
     def judge(self) -> NamedPolicy | None:
@@ -144,6 +137,17 @@ class Ranking:
         """True: this host may take it now."""
         return bool(self.value[column] < np.inf)
 
+    def standing_refusals(self, columns: Sequence[int]) -> tuple[Refusal | None, ...]:
+        """Return for each host the first filter that it fails, of those that last with this."""
+        new = [
+            column for column in columns
+            if not self._standing[column] and column not in self._refusals
+        ]  # fmt: skip
+        if new:
+            hosts = candidates(self.table, self.demand, self.need, np.array(new))
+            self._refusals.update(zip(new, refusals(STANDING, hosts), strict=True))
+        return tuple(self._refusals.get(column) for column in columns)
+
     def _judge(self, columns: Columns) -> None:
         """Set `value` of some columns."""
         self._lowest = None
@@ -174,27 +178,14 @@ class Ranking:
 
         `more`, (n,), supposes so many further processes of this demand on each host.
         """
-        table = self.table
-        need, processes = self.need[:, columns], table.processes[columns]
-        cells = table.cells[:, :, columns]  # all planes at once: one copy costs less than three
-        busy, limit = cells[BUSY], cells[LIMIT]
-        if more is not None:
-            busy, processes = busy + need * more, processes + more
-        # A host without a resource has NaN there, which is over nothing.
-        over = busy + need > limit - (self.demand.headroom - CLOSE)
-        fits: BoolArray = ~np.logical_or.reduce(over)
-        fits &= self._open[columns]
-        fits &= processes < table.bound[columns]
+        judged = candidates(self.table, self.demand, self.need, columns, more)
+        fits = passing(BY_ASSIGNMENT, judged, self._standing[columns])
         if not np.count_nonzero(fits):
             return np.full(len(fits), np.inf)
-        tie = TIE * processes
+        tie = TIE * judged.processes
         if not self._left:
             return np.where(fits, tie, np.inf)
-        hosts = HostView(
-            Names(table, columns), table.resources, _read_only(busy.T), _read_only(limit.T),
-            _read_only(cells[CAPACITY].T), _read_only(processes[:]), Labels(table, columns),
-        )  # fmt: skip
-        process = ProcessView(self._spec, _read_only(need.T))
+        hosts, process = host_view(judged), process_view(judged)
         name, policy = self._left[0]
         try:
             value, veto = self.plugins.ask(
@@ -204,7 +195,7 @@ class Ranking:
             self._leave_out(error)
             return None
         if veto is not None:
-            fits &= ~veto
+            fits = fits & ~veto
         return np.where(fits, value + tie, np.inf)
 
     def _leave_out(self, error: PluginError) -> None:
@@ -223,114 +214,6 @@ class Ranking:
             return self.value
         best = self._tier[fitting].min()
         return np.where(self._tier == best, self.value, np.inf)
-
-
-def _read_only(view: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Closes a view of a standing array to a policy that would write into it."""
-    view.flags.writeable = False
-    return view
-
-
-def sound(scores: Scores, hosts: HostView, fits: BoolArray) -> tuple[FloatArray, BoolArray | None]:
-    """The value and veto of an answer that keeps to the contract; raises for any other."""
-    size = len(fits)
-    required(scores, Scores)
-    try:
-        value = np.asarray(scores.value, np.float64)
-    except (TypeError, ValueError):
-        raise PluginError(
-            f"answered scores that are no numbers: {given(scores.value)}; {size} numbers are "
-            f"required, one for each host"
-        ) from None
-    if value.shape != (size,):
-        raise PluginError(f"scores of shape {value.shape} for {size} hosts")
-    veto = None
-    asked = fits
-    if scores.veto is not None:
-        veto = np.asarray(scores.veto)
-        if veto.shape != (size,):
-            raise PluginError(f"vetoes of shape {veto.shape} for {size} hosts")
-        if veto.dtype != np.bool_:
-            raise PluginError(f"vetoes of type {veto.dtype}; booleans are required, True: vetoed")
-        asked = fits & ~veto
-    if np.count_nonzero(np.isfinite(value)) < size:
-        wrong = np.flatnonzero(asked & ~np.isfinite(value))
-        if len(wrong):
-            row = int(wrong[0])
-            raise PluginError(
-                f"the score of host {hosts.names[row]} is {value[row]}{_unread_by(hosts, row)}"
-            )
-    return value, veto
-
-
-def _unread_by(hosts: HostView, row: int) -> str:
-    """Return what a host does not measure, as that is where a NaN comes from; "": nothing."""
-    names = [
-        name for name, usage in zip(hosts.resources, hosts.usage[row], strict=True)
-        if np.isnan(usage)
-    ]  # fmt: skip
-    if not names:
-        return ""
-    return (
-        f". It does not measure {', '.join(names)}, so `usage` and `capacity` are NaN there; "
-        "`column` is not"
-    )
-
-
-class _PerHost(Sequence[T]):
-    """Something of each host on demand: a thousand of them are not listed for each decision."""
-
-    def __init__(self, table: HostTable, columns: Columns) -> None:
-        self._hosts = table.hosts
-        self._columns = columns
-
-    def _list(self) -> Sequence[int]:
-        if isinstance(self._columns, slice):
-            return range(self._columns.start, self._columns.stop)
-        return [int(column) for column in self._columns]
-
-    def __len__(self) -> int:
-        return len(self._list())
-
-    def __getitem__(self, row: Any) -> Any:
-        columns = self._list()[row]
-        if isinstance(columns, int):
-            return self._of(self._hosts[columns])
-        return [self._of(self._hosts[column]) for column in columns]
-
-    def _of(self, host: Host) -> T:
-        raise NotImplementedError
-
-
-class Names(_PerHost[str]):
-    """The name of each host."""
-
-    def _of(self, host: Host) -> str:
-        return host.name
-
-
-class Labels(_PerHost[Mapping[str, str]]):
-    """The labels of each host."""
-
-    def _of(self, host: Host) -> Mapping[str, str]:
-        return MappingProxyType(dict(host.description.labels))
-
-
-def eligible(table: HostTable, demand: Demand) -> BoolArray:
-    """(H,) True: labels, exclusions and the resources that it has allow the host."""
-    allowed = np.ones(len(table), np.bool_)
-    for key, value in demand.spec.required_labels.items():
-        allowed &= table.labelled(key, value)
-    for name in demand.excluded:
-        host = table.by_name.get(name)
-        if host is not None:
-            allowed[host.column] = False
-    for resource in demand.declared:
-        if resource not in table.resources:
-            allowed[:] = False
-        else:
-            allowed &= table.capacity[table.resources.index(resource)] > 0.0
-    return allowed
 
 
 def _tiers(table: HostTable, demand: Demand) -> IntArray | None:

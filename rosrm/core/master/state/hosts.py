@@ -25,7 +25,6 @@ from rosrm.core.master.state.host_arrays import (
 )
 from rosrm.extensions.plugin_calls import Failing, Plugin
 from rosrm.model.values import HostDescription
-from rosrm.wording import counted
 
 #: An estimate, unlike a declared need, fills at most this part of a host's limit: a guess alone
 #: must not keep a process off every host for ever.
@@ -33,13 +32,13 @@ _MOST_GUESSED: Final = 0.5
 
 
 class HostCondition(IntEnum):
-    """How well a host is heard."""
+    """How well a host is heard. From LOST on the host is gone until it registers or is heard."""
 
     UP = 0
     SUSPECT = 1
-    LOST = 2
-    LEFT = 3
-    EXPECTED = 4  # known from the journal, not heard since this master's start
+    EXPECTED = 2  # known from the journal, not heard since this master's start
+    LOST = 3
+    LEFT = 4
     DETACHED = 5  # its slave was stopped and left processes running
 
     def words(self, *only: HostCondition) -> str:
@@ -282,39 +281,6 @@ class HostTable(HostColumns):
             part[np.isnan(self.capacity[row, columns])] = absent
         return need
 
-    def open(self) -> BoolArray:
-        """(H,) True: may be given work now, room and number of processes aside."""
-        return np.asarray(
-            (self.condition == HostCondition.UP) & self.asking & self.accepting
-            & ~self.closed & ~self.untold & (self.stale == 0)
-        )  # fmt: skip
-
-    def why_closed(self, column: int) -> str:
-        """Why a host may not be given work now, its room aside; "" if it may."""
-        host = self.hosts[column]
-        away = self.why_away(column)
-        if away:
-            return away
-        if self.condition[column] == HostCondition.SUSPECT:
-            return f"it {HostCondition.SUSPECT.words()}"
-        if self.processes[column] >= self.bound[column]:
-            most = counted(int(self.bound[column]), "process", "processes")
-            return f"it accepts no more than {most} now"
-        if self.stale[column]:
-            return f"its reading of {', '.join(self.stale_resources(host))} is stale"
-        if not self.accepting[column]:
-            over = self.over_limit(column)
-            return (
-                f"it is over its limit of {', '.join(over)}"
-                if over
-                else "its slave accepts no work now"
-            )
-        if self.untold[column]:
-            return "it was lost, and has not reported its processes yet"
-        if not self.asking[column]:
-            return "it has not asked for work yet"
-        return ""
-
     def without_reading(self) -> BoolArray:
         """(H,) True: no reading of this run has come, so that the limits are unknown."""
         # A reading that was refused has marked all that the host reads as stale.
@@ -334,23 +300,9 @@ class HostTable(HostColumns):
         silent = np.isin(self.condition, _SILENT)
         return [int(column) + 1 for column in np.flatnonzero(silent)]
 
-    def away(self) -> BoolArray:
-        """(H,) True: gets no work until somebody brings it back: lost, left, cordoned, drained."""
-        return np.asarray(self.closed | np.isin(self.condition, _GONE))
-
     def why_unreachable(self, host: Host) -> str:
         """Return why a host cannot be reached, without its name; "" if it can."""
         return self.condition_of(host).words(*_NO_ANSWER)
-
-    def why_away(self, column: int) -> str:
-        """Why a host is away, or may be; "" if it is there."""
-        host = self.hosts[column]
-        condition = self.condition_of(host)
-        if condition is not HostCondition.SUSPECT and (words := condition.words()):
-            return f"it {words}"
-        if host.draining or host.cordoned:
-            return "it is being drained" if host.draining else "it is cordoned"
-        return ""
 
     def stale_resources(self, host: Host) -> Sequence[str]:
         """Names of the limited resources of a host whose reading is stale."""
@@ -406,4 +358,3 @@ def _over(usage: FloatArray, limit: FloatArray) -> BoolArray:
 #: Of hosts that reported before, and do not now.
 _SILENT: Final = (HostCondition.SUSPECT, HostCondition.LOST, HostCondition.DETACHED)
 _NO_ANSWER: Final = (HostCondition.LOST, HostCondition.DETACHED, HostCondition.EXPECTED)
-_GONE: Final = (HostCondition.LOST, HostCondition.LEFT, HostCondition.DETACHED)

@@ -1,0 +1,80 @@
+"""Some hosts beside one demand: what the placement filters and the scoring policies judge."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rosrm.core.master.state.demand import Demand
+from rosrm.core.master.state.host_arrays import BUSY, FloatArray, IntArray
+from rosrm.core.master.state.hosts import Host, HostTable
+
+Columns = slice | IntArray
+
+
+@dataclass(slots=True)  # not frozen: that costs a microsecond for each of thousands
+class Candidates:
+    """Some hosts, n of them, beside one demand.
+
+    The arrays hold all that assignments change. With an array of columns they are copies.
+
+    Attributes:
+        columns: of the hosts in the table; a column stays with its host.
+        resources: names of the R rows.
+        need: (R, n) fractions of the capacity of each host; inf where it lacks the resource.
+        cells: (planes, R, n) as in `HostColumns`.
+        busy: (R, n) reading plus reservations.
+        processes: (n,) held or promised.
+        bound: (n,) most processes.
+        empty: True for hosts as if no process ran on them.
+    """
+
+    table: HostTable
+    demand: Demand
+    columns: Columns
+    resources: tuple[str, ...]
+    need: FloatArray
+    cells: FloatArray
+    busy: FloatArray
+    processes: IntArray
+    bound: IntArray
+    empty: bool = False
+
+    def __len__(self) -> int:
+        return len(self.processes)
+
+    def host(self, row: int) -> Host:
+        """Return the host of a row."""
+        columns = self.columns
+        at = columns.start + row if isinstance(columns, slice) else int(columns[row])
+        return self.table.hosts[at]
+
+
+def candidates(
+    table: HostTable, demand: Demand, need: FloatArray, columns: Columns,
+    more: IntArray | None = None,
+) -> Candidates:  # fmt: skip
+    """Return some hosts as they are, beside a demand.
+
+    Args:
+        need: (R, H) fractions, of every host.
+        more: (n,) processes of this demand that each host is supposed to hold in addition.
+    """
+    need = need[:, columns]
+    cells = table.cells[:, :, columns]  # all planes at once: one copy costs less than five
+    busy, processes = cells[BUSY], table.processes[columns]
+    if more is not None:
+        busy, processes = busy + need * more, processes + more
+    return Candidates(
+        table, demand, columns, table.resources, need, cells, busy, processes, table.bound[columns]
+    )
+
+
+def as_if_empty(table: HostTable, demand: Demand, columns: Columns) -> Candidates:
+    """Return some hosts as if no process ran on them, beside a demand."""
+    need = table.fractions(demand.amounts, demand.estimated)
+    hosts = candidates(table, demand, need, columns)
+    hosts.busy, hosts.processes = np.zeros_like(hosts.busy), np.zeros_like(hosts.processes)
+    hosts.empty = True
+    return hosts

@@ -1,0 +1,117 @@
+"""Whether any known host may ever take a process, and why not: it is set aside then."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+
+from rosrm.core.master.scheduling.candidates import Candidates, as_if_empty
+from rosrm.core.master.scheduling.filters import (
+    EXCLUSION,
+    FILTERS,
+    Filter,
+    Lasts,
+    passing,
+    refusals,
+)
+from rosrm.core.master.state.demand import Demand
+from rosrm.core.master.state.host_arrays import BoolArray
+from rosrm.core.master.state.hosts import HostCondition, HostTable
+from rosrm.wording import by_reason, counted, first_line, get_close_matches
+
+#: A reason names every host up to this many.
+_NAMED_HOSTS: Final = 16
+
+_PERMANENT: Final = tuple(one for one in FILTERS if one.lasts is Lasts.PERMANENT)
+_AWAY: Final = tuple(one for one in FILTERS if one.lasts is Lasts.AWAY)
+_ABSENT: Final = tuple(one for one in FILTERS if one.lasts in (Lasts.AWAY, Lasts.RETURN))
+_LASTING: Final = tuple(one for one in FILTERS if one.lasts is not Lasts.MOMENT)
+
+
+def why_never(table: HostTable, demand: Demand) -> str:
+    """Return why no host may take a process before something lasting changes; "" if one may.
+
+    A host that is away may not, as long as another one is there: a process that waits for that host
+    must not block the others.
+    """
+    if not len(table) or _possible(table, demand).any():
+        return ""
+    unmeasured = _unmeasured(table, demand)
+    if unmeasured:
+        return unmeasured
+    alone = "; there is no other host" if len(table.listed()) == 1 else ""
+    return _host_by_host(_LASTING, table, demand) + alone
+
+
+def a_known_host_may(table: HostTable, demand: Demand) -> bool:
+    """Return True if a host whose limits are known may take a demand."""
+    return bool((_possible(table, demand) & ~table.without_reading()).any())
+
+
+def refused_everywhere(table: HostTable, demand: Demand) -> bool:
+    """Return True if every host that might have taken the process has refused it."""
+    if not demand.excluded:
+        return False
+    allowed = Demand(demand.spec, demand.amounts, demand.estimated)
+    might = may_ever_take(table, allowed)
+    return all(table.hosts[column].name in demand.excluded for column in np.flatnonzero(might))
+
+
+def may_ever_take(table: HostTable, demand: Demand) -> BoolArray:
+    """Return which hosts, (H,), fit a demand if nothing else runs there.
+
+    A host without a reading counts, because its limits are not known yet; a pruned one does not.
+    """
+    return _fit_empty(_every(table, demand))
+
+
+def why_all_away(table: HostTable, demand: Demand) -> str:
+    """Return why each host is away; "" if one of them is there."""
+    if passing(_ABSENT, _every(table, demand)).any():
+        return ""
+    return f"every host is away: {_host_by_host(_ABSENT, table, demand)}"
+
+
+def _every(table: HostTable, demand: Demand) -> Candidates:
+    return as_if_empty(table, demand, slice(0, len(table)))
+
+
+def _fit_empty(hosts: Candidates) -> BoolArray:
+    table = hosts.table
+    is_listed = table.condition != HostCondition.LEFT  # of a host without a reading
+    return np.where(table.without_reading(), is_listed, passing(_PERMANENT, hosts))
+
+
+def _possible(table: HostTable, demand: Demand) -> BoolArray:
+    """Return which hosts, (H,), may take a demand before something lasting changes."""
+    hosts = _every(table, demand)
+    possible = _fit_empty(hosts) & passing([EXCLUSION], hosts)
+    there = passing(_AWAY, hosts)
+    return possible & there if there.any() else possible
+
+
+def _host_by_host(filters: Sequence[Filter], table: HostTable, demand: Demand) -> str:
+    """Return the first reason against each host, equal ones once."""
+    listed = table.listed()
+    named = listed[:_NAMED_HOSTS]
+    columns = np.array([host.column for host in named], np.int64)
+    found = refusals(filters, as_if_empty(table, demand, columns))
+    said = by_reason(
+        (host.name, first_line(refusal.reason))  # `rosrm explain` has the details
+        for host, refusal in zip(named, found, strict=True)
+        if refusal is not None
+    )
+    more = len(listed) - len(named)
+    return f"{said}; and {counted(more, 'more host')}" if more else said
+
+
+def _unmeasured(table: HostTable, demand: Demand) -> str:
+    """Return which resource no host reports, with the nearest one that is; "" if there is none."""
+    for resource in sorted(demand.declared - set(table.resources)):
+        near = get_close_matches(resource, table.resources, n=1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        there = ", ".join(sorted(table.resources)) or "none"
+        return f"no host reports the resource {resource!r}{hint} (reported: {there})"
+    return ""

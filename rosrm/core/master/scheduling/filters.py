@@ -1,0 +1,267 @@
+"""The placement rules: which hosts may take a process, and why another host may not.
+
+`FILTERS` is the whole list. Each entry has a mask over many hosts, by which a ranking chooses, and
+beside it the reason against one host, which `rosrm explain` prints. A new rule is one more entry.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from enum import Enum
+from typing import Final, Literal
+
+import numpy as np
+
+from rosrm.core.master.scheduling.candidates import Candidates
+from rosrm.core.master.state.host_arrays import CAPACITY, LIMIT, LOAD, USAGE, BoolArray
+from rosrm.core.master.state.hosts import HostCondition
+from rosrm.wording import amount, counted
+
+#: Sums of fractions are compared with this much tolerance.
+_CLOSE: Final = 1e-9
+#: As plain numbers, because a comparison with those takes half the time.
+_SUSPECT, _EXPECTED = int(HostCondition.SUSPECT), int(HostCondition.EXPECTED)
+_FIRST_GONE: Final = int(HostCondition.LOST)
+
+
+class Lasts(Enum):
+    """How long a host fails a filter."""
+
+    MOMENT = "until a message or the end of a process changes it"
+    RETURN = "until the slave reports to this run of the master, which is expected"
+    AWAY = "until a user or the slave brings the host back"
+    PERMANENT = "until the host registers with something else"
+
+
+@dataclass(frozen=True, slots=True)
+class Filter:
+    """One placement rule.
+
+    Attributes:
+        name: unique.
+        mask: (n,) True: the host passes. None: every host passes.
+        reason: why the host of a row does not pass, without its name. Called only where `mask` is
+            False there.
+        lasts: how long a host fails it. A process is set aside, and does not block the queue, if
+            each host fails a permanent one. Hosts that are away count too, unless all hosts are.
+        by_assignment: True if an assignment changes the mask. Mask and reason then read only the
+            demand and the arrays of the candidates, because a decision keeps a copy of those and
+            spells the reason out later.
+        verdict: stands before the reason in an explanation.
+    """
+
+    name: str
+    mask: Callable[[Candidates], BoolArray | None]
+    reason: Callable[[Candidates, int], str]
+    lasts: Lasts = Lasts.MOMENT
+    by_assignment: bool = False
+    verdict: Literal["excluded", "full"] = "excluded"
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """The first filter that a host fails, and why."""
+
+    filter: Filter
+    reason: str
+
+
+def passing(
+    filters: Iterable[Filter], hosts: Candidates, among: BoolArray | None = None
+) -> BoolArray:
+    """Return which hosts, of all or of those that are True in `among`, pass all of some filters."""
+    passes = among
+    for one in filters:
+        mask = one.mask(hosts)
+        if mask is not None:
+            passes = mask if passes is None else passes & mask
+    return np.ones(len(hosts), np.bool_) if passes is None else passes
+
+
+def refusals(filters: Iterable[Filter], hosts: Candidates) -> list[Refusal | None]:
+    """Return for each host the first of some filters that it fails."""
+    found: list[Refusal | None] = [None] * len(hosts)
+    for one in filters:
+        mask = one.mask(hosts)
+        for row in [] if mask is None else np.flatnonzero(~mask).tolist():
+            found[row] = found[row] or Refusal(one, one.reason(hosts, row))
+    return found
+
+
+def first_of(one: Refusal | None, other: Refusal | None) -> Refusal | None:
+    """Return the refusal whose filter comes first in the list."""
+    both = [refusal for refusal in (one, other) if refusal is not None]
+    return min(both, key=lambda refusal: FILTERS.index(refusal.filter), default=None)
+
+
+# --- the process and the host -----------------------------------------------------------------
+
+
+def _is_not_excluded(hosts: Candidates) -> BoolArray | None:
+    if not hosts.demand.excluded:
+        return None
+    allowed = np.ones(len(hosts.table), np.bool_)
+    for name in hosts.demand.excluded:
+        host = hosts.table.by_name.get(name)
+        if host is not None:
+            allowed[host.column] = False
+    return allowed[hosts.columns]
+
+
+def _why_excluded(hosts: Candidates, row: int) -> str:
+    return hosts.demand.excluded[hosts.host(row).name]
+
+
+def _has_labels(hosts: Candidates) -> BoolArray | None:
+    required = hosts.demand.spec.required_labels
+    if not required:
+        return None
+    allowed = np.ones(len(hosts), np.bool_)
+    for key, value in required.items():
+        allowed &= hosts.table.labelled(key, value)[hosts.columns]
+    return allowed
+
+
+def _why_no_labels(hosts: Candidates, row: int) -> str:
+    labels, required = hosts.host(row).description.labels, hosts.demand.spec.required_labels
+    missing = [f"{key}={value}" for key, value in required.items() if labels.get(key) != value]
+    return f"it lacks the label {', '.join(missing)}"
+
+
+def _has_resources(hosts: Candidates) -> BoolArray | None:
+    declared = hosts.demand.declared
+    if not declared:
+        return None
+    if not declared.issubset(hosts.resources):
+        return np.zeros(len(hosts), np.bool_)
+    has_all: BoolArray = np.logical_and.reduce(hosts.need < np.inf)
+    return has_all
+
+
+def _why_no_resources(hosts: Candidates, row: int) -> str:
+    needs = zip(hosts.resources, hosts.need[:, row].tolist(), strict=True)
+    there = {name for name, need in needs if need < np.inf}
+    return f"it has no {min(hosts.demand.declared - there)}"
+
+
+# --- whether the host is there ----------------------------------------------------------------
+
+
+def _is_not_gone(hosts: Candidates) -> BoolArray:
+    return np.less(hosts.table.condition[hosts.columns], _FIRST_GONE)
+
+
+def _is_not_expected(hosts: Candidates) -> BoolArray:
+    return np.not_equal(hosts.table.condition[hosts.columns], _EXPECTED)
+
+
+def _is_not_suspect(hosts: Candidates) -> BoolArray:
+    return np.not_equal(hosts.table.condition[hosts.columns], _SUSPECT)
+
+
+def _why_not_up(hosts: Candidates, row: int) -> str:
+    return f"it {hosts.table.condition_of(hosts.host(row)).words()}"
+
+
+def _is_open(hosts: Candidates) -> BoolArray:
+    return ~hosts.table.closed[hosts.columns]
+
+
+def _why_not_open(hosts: Candidates, row: int) -> str:
+    return "it is being drained" if hosts.host(row).draining else "it is cordoned"
+
+
+# --- what the host reports --------------------------------------------------------------------
+
+
+def _is_fresh(hosts: Candidates) -> BoolArray:
+    return np.logical_not(hosts.table.stale[hosts.columns])
+
+
+def _why_stale(hosts: Candidates, row: int) -> str:
+    return f"its reading of {', '.join(hosts.table.stale_resources(hosts.host(row)))} is stale"
+
+
+def _is_accepting(hosts: Candidates) -> BoolArray:
+    return hosts.table.accepting[hosts.columns]
+
+
+def _why_not_accepting(hosts: Candidates, row: int) -> str:
+    over = hosts.table.over_limit(hosts.host(row).column)
+    return f"it is over its limit of {', '.join(over)}" if over else "its slave accepts no work now"
+
+
+def _has_reported(hosts: Candidates) -> BoolArray:
+    return ~hosts.table.untold[hosts.columns]
+
+
+def _why_not_reported(_hosts: Candidates, _row: int) -> str:
+    return "it was lost, and has not reported its processes yet"
+
+
+def _has_asked(hosts: Candidates) -> BoolArray:
+    return hosts.table.asking[hosts.columns]
+
+
+def _why_not_asked(_hosts: Candidates, _row: int) -> str:
+    return "it has not asked for work yet"
+
+
+# --- what an assignment changes ---------------------------------------------------------------
+
+
+def _has_slot(hosts: Candidates) -> BoolArray:
+    return hosts.processes < hosts.bound
+
+
+def _why_no_slot(hosts: Candidates, row: int) -> str:
+    most = counted(int(hosts.bound[row]), "process", "processes")
+    return f"it accepts no more than {most} now"
+
+
+def _has_room(hosts: Candidates) -> BoolArray:
+    # A host without a resource has NaN there, which is over nothing.
+    limits = hosts.cells[LIMIT] - (hosts.demand.headroom - _CLOSE)
+    has_room: BoolArray = ~np.logical_or.reduce(hosts.busy + hosts.need > limits)
+    return has_room
+
+
+def _why_no_room(hosts: Candidates, row: int) -> str:
+    limits = hosts.cells[LIMIT, :, row] - hosts.demand.headroom
+    worst = int(np.nanargmax(hosts.busy[:, row] + hosts.need[:, row] - limits))
+    name, limit = hosts.resources[worst], float(limits[worst])
+    units = (one.unit for one in hosts.host(row).description.resources if one.name == name)
+    unit, cells = next(units, ""), hosts.cells[:, worst, row]
+    has, need, usable, used, reserved = (
+        amount(float(part * cells[CAPACITY]), unit)
+        for part in (1.0, hosts.need[worst, row], limit, cells[USAGE], cells[LOAD])
+    )
+    most = f"{usable} ({limit:.0%}) may be used"
+    if hosts.empty:
+        return f"it has {has} of {name}, of which {most}; needed: {need}"
+    taken = f"{used} in use" + (f", {reserved} reserved" if cells[LOAD] else "")
+    return f"{name}: needs {need}; at most {most}: {taken}"
+
+
+# --- the list ---------------------------------------------------------------------------------
+
+EXCLUSION: Final = Filter("exclusion", _is_not_excluded, _why_excluded, Lasts.PERMANENT)
+#: In this order: of several that a host fails, the first one says why.
+FILTERS: Final = (
+    EXCLUSION,
+    Filter("labels", _has_labels, _why_no_labels, Lasts.PERMANENT),
+    Filter("resources", _has_resources, _why_no_resources, Lasts.PERMANENT),
+    Filter("gone", _is_not_gone, _why_not_up, Lasts.AWAY),
+    Filter("expected", _is_not_expected, _why_not_up, Lasts.RETURN),
+    Filter("cordon", _is_open, _why_not_open, Lasts.AWAY),
+    Filter("suspect", _is_not_suspect, _why_not_up),
+    Filter("processes", _has_slot, _why_no_slot, by_assignment=True),
+    Filter("stale", _is_fresh, _why_stale),
+    Filter("limits", _is_accepting, _why_not_accepting),
+    Filter("report", _has_reported, _why_not_reported),
+    Filter("request", _has_asked, _why_not_asked),
+    Filter("room", _has_room, _why_no_room, Lasts.PERMANENT, by_assignment=True, verdict="full"),
+)
+STANDING: Final = tuple(one for one in FILTERS if not one.by_assignment)
+BY_ASSIGNMENT: Final = tuple(one for one in FILTERS if one.by_assignment)

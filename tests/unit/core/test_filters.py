@@ -1,0 +1,152 @@
+"""The placement filters: mask and reason of each agree, and everything that uses them agrees."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rosrm.core.master.scheduling.candidates import as_if_empty, candidates
+from rosrm.core.master.scheduling.decision import decide
+from rosrm.core.master.scheduling.feasibility import why_never
+from rosrm.core.master.scheduling.filters import FILTERS, passing, refusals
+from rosrm.core.master.scheduling.ranking import Ranking
+from rosrm.core.master.state.demand import Demand
+from rosrm.core.master.state.hosts import HostCondition, HostTable
+from rosrm.extensions.plugin_calls import PluginCalls
+from rosrm.model.values import HostDescription, ProcessSpec, ResourceDescription
+
+RESOURCES = ("memory", "cpu", "gpu")
+
+fractions = st.sampled_from([0.0, 0.1, 0.3, 0.5, 0.8])
+amounts = st.dictionaries(
+    st.sampled_from([*RESOURCES * 4, "unknown"]), st.sampled_from([0.0, 1.0, 2.0, 9.0]), max_size=2
+)
+labels = st.dictionaries(st.just("arm"), st.sampled_from(["yes", "no"]), max_size=1)
+resources = st.sampled_from([RESOURCES, RESOURCES[:2], RESOURCES[1:], ()]).map(
+    lambda names: tuple(ResourceDescription(name, "", 10.0) for name in names)
+)
+conditions = st.sampled_from([HostCondition.UP] * 9 + [*HostCondition])
+rarely = st.sampled_from([False] * 7 + [True])
+usually = st.sampled_from([True] * 7 + [False])
+
+
+@st.composite
+def tables(draw: st.DrawFn, most: int = 20) -> HostTable:
+    """Hosts in any state that the master may know."""
+    table = HostTable()
+    for number in range(draw(st.integers(1, most))):
+        name = f"h{number}"
+        if draw(rarely):
+            table.expect(name, cordoned=draw(rarely))
+            continue
+        described = draw(resources)
+        description = HostDescription(
+            name, number + 1, labels=draw(labels), resources=described,
+            max_processes=draw(st.sampled_from([0, 1, 2])),
+        )  # fmt: skip
+        host = table.register(description, 0.0)
+        column = host.column
+        for resource in described:
+            row = table.resources.index(resource.name)
+            table.usage[row, column] = draw(fractions)
+            table.limit[row, column] = draw(st.sampled_from([0.5, 0.8, 1.0]))
+        np.add(table.usage, table.load, out=table.busy)
+        table.sequence[column] = draw(usually)
+        table.accepting[column], table.asking[column] = draw(usually), draw(usually)
+        table.untold[column] = draw(rarely)
+        table.stale[column] = 1 if described and draw(rarely) else 0
+        table.set_closed(host, cordoned=draw(rarely), draining=draw(rarely))
+        table.set_condition(host, draw(conditions))
+        load = np.array([draw(fractions) / 4 for _ in table.resources])
+        table.charge(host, load, processes=draw(st.sampled_from([0, 0, 1])))
+        if draw(rarely):
+            table.prune(host)
+    return table
+
+
+@st.composite
+def demands(draw: st.DrawFn) -> Demand:
+    needs: Mapping[str, float] = draw(amounts)
+    estimated = frozenset(name for name in needs if draw(st.booleans()))
+    excluded = draw(st.dictionaries(st.sampled_from(["h0", "h1", "h2"]), st.just("no"), max_size=1))
+    required = draw(labels) if draw(rarely) else {}
+    spec = ProcessSpec("p", command=("run",), required_labels=required)
+    return Demand(spec, needs, estimated, excluded, draw(st.sampled_from([0.0, 0.05])))
+
+
+def ranked(table: HostTable, demand: Demand) -> Ranking:
+    return Ranking(table, (), demand, PluginCalls())
+
+
+def test_no_two_filters_have_one_name() -> None:
+    """A name stands for one rule."""
+    assert len({one.name for one in FILTERS}) == len(FILTERS)
+
+
+@given(tables(), demands())
+def test_a_host_fits_exactly_if_no_filter_has_a_reason_against_it(
+    table: HostTable, demand: Demand
+) -> None:
+    """The ranking and the explanation follow one list."""
+    ranking = ranked(table, demand)
+    every = candidates(table, demand, ranking.need, slice(0, len(table)))
+    found = refusals(FILTERS, every)
+
+    assert [ranking.fits(column) for column in range(len(table))] == [one is None for one in found]
+    verdicts = {one.host: one for one in decide(ranking).verdicts}
+    for host in table.listed():
+        refusal, verdict = found[host.column], verdicts.get(host.name)
+        if verdict is not None and refusal is not None:
+            assert (verdict.verdict, verdict.reason) == (refusal.filter.verdict, refusal.reason)
+
+
+@given(tables(), demands(), st.booleans())
+def test_every_filter_that_says_no_says_why(
+    table: HostTable, demand: Demand, as_empty: bool
+) -> None:
+    """Of all hosts, of some of them, and of hosts as if nothing ran there."""
+    need = table.fractions(demand.amounts, demand.estimated)
+    columns = np.arange(len(table))[::-2]
+    if as_empty:
+        every = as_if_empty(table, demand, slice(0, len(table)))
+        some = as_if_empty(table, demand, columns)
+    else:
+        every = candidates(table, demand, need, slice(0, len(table)))
+        some = candidates(table, demand, need, columns)
+    for one in FILTERS:
+        mask = passing([one], every)
+        assert passing([one], some).tolist() == mask[columns].tolist()
+        for row in np.flatnonzero(~mask):
+            if passing(FILTERS[: FILTERS.index(one)], every)[row]:
+                assert one.reason(every, int(row))
+
+
+@given(tables(), demands(), st.lists(st.integers(0, 19), min_size=1, max_size=6))
+def test_a_ranking_that_was_refreshed_equals_a_new_one(
+    table: HostTable, demand: Demand, chosen: list[int]
+) -> None:
+    """After assignments of its own demand and of others, judged in advance or not."""
+    ranking = ranked(table, demand)
+    for number in chosen:
+        fitting = [host for host in table.hosts if ranking.fits(host.column)]
+        host = (fitting or table.hosts)[number % len(fitting or table.hosts)]
+        own = bool(fitting) and number % 3 > 0
+        need = ranking.need[:, host.column] if own else np.full(len(table.resources), 0.1)
+        table.charge(host, need, processes=1)
+        if own:
+            ranking.took()
+        ranking.refresh()
+        assert ranking.value.tolist() == ranked(table, demand).value.tolist()
+
+
+@given(tables(most=3), demands())
+def test_no_process_is_set_aside_that_a_host_takes_now(table: HostTable, demand: Demand) -> None:
+    """And one that is set aside is told a reason for each host."""
+    never = why_never(table, demand)
+    if (ranked(table, demand).value < np.inf).any():
+        assert never == ""
+    if never and "no host reports" not in never:
+        assert all(host.name in never for host in table.listed())
