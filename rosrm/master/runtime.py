@@ -253,7 +253,7 @@ class MasterRuntime:
         try:
             self._write([Record("master_stopped", message=f"master stopped: {self._stopping}")], [])
         except JournalBlocked as fault:
-            _log.warning("%s; what was decided last was not written, nor carried out", fault)
+            _log.warning("%s; the last decisions were neither written nor executed", fault)
         _log.info(
             "master %s ended (%s); %s", self._config.name, self._stopping, what_runs(self._state)
         )
@@ -320,7 +320,9 @@ class MasterRuntime:
             stored = self._write(records, intents) if records or intents else ()
         except JournalBlocked as fault:
             self._held = Standstill(commands, str(fault), now, self._core_now(now), now)
-            _log.error("%s. What runs goes on; nothing new is taken in until then", fault)
+            _log.error(
+                "%s. Running processes continue; the master accepts no new work until then", fault
+            )
             return
         self._act_on(commands, stored, now)
 
@@ -406,7 +408,7 @@ def what_runs(state: MasterState) -> str:
     if running or not stopping:
         said.append(f"{counted(running, 'process keeps', 'processes keep')} running")
     if running:
-        said.append("start the master again to manage what runs")
+        said.append("start the master again to manage them")
     return "; ".join(said)
 
 

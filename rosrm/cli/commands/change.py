@@ -24,7 +24,9 @@ Wait = Annotated[
 ]
 Timeout = Annotated[
     str,
-    typer.Option("--timeout", metavar="TIME", help="With --wait: longest wait, e.g. 5min."),
+    typer.Option(
+        "--timeout", metavar="TIME", help="With --wait: maximum wait, e.g. 5min; default: no limit."
+    ),
 ]
 #: A process has a name without a slash, and a name that ends like this is rather a file's.
 _FILE_ENDINGS: Final = (".yaml", ".yml")
@@ -60,7 +62,7 @@ def submit(
     with connection.master(ctx, domain) as client:
         typer.echo(client.submit(specs))
         if wait:
-            with interruptible("what was submitted stays queued or runs (`rosrm ps`)"):
+            with interruptible("the submitted processes stay queued or run (`rosrm ps`)"):
                 _exit_unless(wait_for(client, [spec.name for spec in specs], limit))
 
 
@@ -84,7 +86,7 @@ def cancel(
 ) -> None:
     """Cancel processes: take them out of the queue, or stop them for good.
 
-    A work file stands for those of its processes that have not ended.
+    For a work file, all its processes that have not ended are cancelled.
     """
     from rosrm.cli.waiting import interruptible, longest, over, wait_for
 
@@ -164,7 +166,7 @@ def migrate(
 def checkpoint(
     ctx: typer.Context, name: Name, wait: Wait = False, timeout: Timeout = "", domain: Domain = None
 ) -> None:
-    """Stop a process, with its memory in an image on its host.
+    """Write the memory of a process to a checkpoint image, and stop it.
 
     `rosrm restore` continues the process from there.
     """
@@ -174,7 +176,7 @@ def checkpoint(
 def restore(
     ctx: typer.Context, name: Name, wait: Wait = False, timeout: Timeout = "", domain: Domain = None
 ) -> None:
-    """Restore a process from its image, on the host of the image."""
+    """Restore a process from its checkpoint image, on the image's host."""
     _with_ending(ctx, name, lambda client: client.restore(name), domain, wait, timeout)
 
 
@@ -190,17 +192,17 @@ def _with_ending(
         since = client.list().last_sequence if wait else 0
         typer.echo(ask(client))
         if wait:
-            with interruptible(f"what was begun with {name} continues (`rosrm events --process`)"):
+            with interruptible(f"the request for {name} continues (`rosrm events --process`)"):
                 _exit_unless(wait_for_ending(client, name, since, limit))
 
 
 def cordon(ctx: typer.Context, host: Host, domain: Domain = None) -> None:
-    """Give a host no new work."""
+    """Stop giving new work to a host; its processes stay."""
     _set_host(ctx, host, "cordon", domain)
 
 
 def uncordon(ctx: typer.Context, host: Host, domain: Domain = None) -> None:
-    """Give a host work again."""
+    """Give new work to a host again."""
     _set_host(ctx, host, "uncordon", domain)
 
 
@@ -218,8 +220,8 @@ def drain(
 ) -> None:
     """Cordon a host and move away the processes that can leave it.
 
-    The master says which can and which cannot; when no process is left that can, the host is
-    `drained`.
+    The reply lists the processes that leave and those that cannot. The host is `drained` when no
+    process is left that can leave.
     """
     from rosrm.cli.waiting import interruptible, longest, wait_until_drained
 
@@ -250,8 +252,8 @@ def prune(
 ) -> None:
     """Remove ended processes and departed hosts from all listings.
 
-    Without names, remove all ended processes and all hosts that left. A lost host is removed by its
-    name alone; what was cancelled there then counts as cancelled.
+    Without names, remove all ended processes and all hosts that left. A lost host is removed only
+    by `--host`; processes that were being cancelled there are cancelled then.
     """
     with connection.master(ctx, domain) as client:
         typer.echo(client.prune(names or [], hosts or []))

@@ -97,7 +97,7 @@ def test_one_that_counts_on_its_slave_goes_on_while_that_is_at_work(host, client
     assert {status.instance.process for status in told if status.state.ended} == {"two"}
     status = host.ended(client, "one")
     assert time.monotonic() - alive >= 2.0
-    assert "whether its slave lives" in status.message
+    assert "its slave runs" in status.message
 
 
 def test_it_goes_on_while_somebody_says_heard(host, client):
