@@ -26,7 +26,7 @@ Domain = Annotated[
         metavar="N",
         min=0,
         max=HIGHEST_DOMAIN,
-        help="The ROS domain, instead of ROS_DOMAIN_ID.",
+        help="ROS domain, e.g. 42, instead of ROS_DOMAIN_ID.",
     ),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")]

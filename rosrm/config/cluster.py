@@ -83,7 +83,7 @@ def _check_beats(root: Node, config: ClusterConfig, problems: Problems) -> None:
     problems.add(
         root.deepest(given).place,
         f"control.beat_period ({period:g} s) must be at most a third of liveness.suspect "
-        f"({suspect:g} s): a slave with nothing new to say is heard once in a beat period",
+        f"({suspect:g} s): a slave without changes reports once in a beat period",
     )
 
 

@@ -35,7 +35,7 @@ def rows_of(foreach: Node, problems: Problems) -> list[Row]:
     faults = Problems()
     rows = _rows(foreach, faults)
     if not rows and not faults:
-        faults.add(foreach.place, "foreach: stands for no process at all")
+        faults.add(foreach.place, "foreach: makes no process")
     problems.found.update(faults.found)
     return [] if faults else rows
 
@@ -118,7 +118,7 @@ def _product(foreach: Node, names: Mapping[str, list[Scalar]], problems: Problem
     for values in names.values():
         count *= len(values)
     if count > MOST:
-        problems.add(foreach.place, f"foreach: stands for more than {MOST} processes")
+        problems.add(foreach.place, f"foreach: makes more than {MOST} processes")
         return []
     return [dict(zip(names, values, strict=True)) for values in itertools.product(*names.values())]
 

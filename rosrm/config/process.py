@@ -246,7 +246,7 @@ def _about_restarts(process: ProcessInFile) -> Iterator[Complaint]:
 def _about_faults(process: ProcessInFile) -> Iterator[Complaint]:
     standby = process.standby
     if standby.wanted and process.migration.strategy != "handoff":
-        text = "a standby follows the state as in a handoff: say `migration: handoff`"
+        text = "a standby follows the state as in a handoff: set `migration: handoff`"
         yield Complaint(("standby",), text)
     if standby.wanted and process.kind == "job":
         yield Complaint(("standby",), "a job runs to completion; only a service has a standby")
@@ -273,7 +273,7 @@ def _about_health(process: ProcessInFile) -> Iterator[Complaint]:
         text = f"health.lifecycle {health.lifecycle!r}; allowed: {', '.join(_LIFECYCLE)}"
         yield Complaint(("health", "lifecycle"), text)
     if (health.topic or health.lifecycle) and not process.is_ros:
-        text = "health: only a ROS node has topics and a lifecycle; say `ros: true` if this is one"
+        text = "health: only a ROS node has topics and a lifecycle; set `ros: true` if this is one"
         yield Complaint(("health",), text)
 
 
@@ -299,7 +299,7 @@ def _about_program(process: ProcessInFile) -> Iterator[Complaint]:
 def _about_others(process: ProcessInFile) -> Iterator[Complaint]:
     for name in _ROS_ONLY:
         if getattr(process, name):
-            text = f"{name}: only a ROS node has one; say `ros: true` if this is one"
+            text = f"{name}: only a ROS node has one; set `ros: true` if this is one"
             yield Complaint((name,), text)
     if process.readiness.kind == "graph":
         text = "readiness: only a ROS node is seen in the graph"
@@ -336,10 +336,10 @@ def _fault_of_parameter(value: Any) -> str:
     items = value if isinstance(value, list) else [value]
     kinds = {type(item) for item in items}
     if kinds - {bool, int, float, str}:
-        return "a list of ROS holds booleans, numbers or text"
+        return "a list in ROS parameters has only booleans, numbers or text"
     if any(isinstance(item, float) and not math.isfinite(item) for item in items):
         return "a finite number is required"
-    return "a list of ROS holds values of one type" if len(kinds) > 1 else ""
+    return "a list in ROS parameters has values of one type only" if len(kinds) > 1 else ""
 
 
 _Rule = Callable[[ProcessInFile], Iterator[Complaint]]

@@ -53,13 +53,15 @@ def main() -> NoReturn:
         if found is not None:
             _restore(*found, options)
     except (CriuError, PortableError) as error:
-        sys.stderr.write(f"not started from its periodic image, but anew: {error}\n")
+        sys.stderr.write(f"not started from its periodic image, but without it: {error}\n")
         sys.stderr.flush()
     _become(then)
 
 
 def _options(words: list[str]) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description="Starts a process from its newest image, or anew.")
+    parser = argparse.ArgumentParser(
+        description="Starts a process from its newest image, or without one."
+    )
     parser.add_argument("directory", help="of the images")
     parser.add_argument("--criu", required=True, help="the program")
     parser.add_argument("--timeout", type=float, required=True, help="seconds for the restore")

@@ -254,8 +254,8 @@ def _advice(manifest: Manifest) -> str:
     if not manifest.checksums:
         return ""
     return (
-        f". What it held is lost: `rosrm restart {manifest.process or 'NAME'}` lets the process "
-        f"begin anew"
+        f". Its memory is lost: `rosrm restart {manifest.process or 'NAME'}` starts the process "
+        f"without it"
     )
 
 

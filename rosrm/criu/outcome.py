@@ -104,9 +104,9 @@ def wait(directory: Path, *, timeout: float, ended: Callable[[], bool] = lambda:
         if outcome is not None:
             break
         if is_over:
-            raise CriuError(f"the restore of {directory} ended and told nothing")
+            raise CriuError(f"the restore of {directory} ended without a result")
         if time.monotonic() > end:
-            raise CriuError(f"nothing was heard of the restore of {directory} for {timeout:g} s")
+            raise CriuError(f"the restore of {directory} has not reported for {timeout:g} s")
         time.sleep(_LOOK)
     if outcome.reason:
         raise CriuError(outcome.reason)

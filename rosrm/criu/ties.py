@@ -77,8 +77,8 @@ def shared_memory(pids: Iterable[int]) -> str:
         if found:
             path = found.split(None, 5)[5]
             return (
-                f"its ROS participant has shared memory ({path}), which its peers clear away while "
-                f"it stands still: say `FASTDDS_BUILTIN_TRANSPORTS: UDPv4` in its `environment`, "
+                f"its ROS participant has shared memory ({path}), which its peers remove while it "
+                f"is frozen: set `FASTDDS_BUILTIN_TRANSPORTS: UDPv4` in its `environment`, "
                 f"or `transports: UDPv4` below `ros:` in the file of its host, and restart it"
             )
     return ""

@@ -379,7 +379,7 @@ class Registry:
 
         def late() -> str:
             return (
-                f"it did not return within {CREATE_LIMIT:g} s; repair what it waits for, or leave "
+                f"it did not return within {CREATE_LIMIT:g} s; correct what blocks it, or leave "
                 f"{name!r} out of the configuration"
             )
 

@@ -23,22 +23,22 @@ def fault_of(path: Path, error: sqlite3.Error | OSError) -> JournalError:
         return JournalBlocked(f"{said}the disk is full{where}: make room; {_NOTHING_LOST}")
     if "I/O" in text:
         return JournalBlocked(
-            f"{said}the disk does not take what is written: make room, look at quotas and at the "
+            f"{said}writing to the disk fails: make room, check quotas and the "
             f"disk itself; {_NOTHING_LOST}"
         )
     if "unable to open" in text or "readonly" in text or isinstance(error, OSError):
         return JournalBlocked(
-            f"{said}look at the owner and permissions of it, of its folder and of what lies beside "
+            f"{said}check owner and permissions of the file, its folder and the files beside "
             f"it (-wal, -shm), or {_OTHER_STATE}"
         )
     if "locked" in text:
         return JournalBlocked(
-            f"{said}another program holds it: is a second master running on this state directory?"
+            f"{said}another program has it open: does a second master use this state directory?"
         )
     return JournalError(said + DAMAGED)
 
 
-_NOTHING_LOST = "nothing that was answered is lost"
+_NOTHING_LOST = "no acknowledged request is lost"
 
 
 def unreadable(path: Path, fault: Exception) -> JournalError:
@@ -52,7 +52,7 @@ def unreadable(path: Path, fault: Exception) -> JournalError:
 #: What to do with a damaged file.
 DAMAGED = (
     "the file is damaged: restore it from a backup, or start the master once with `--recover`, "
-    "which goes on with all that can still be read of it and keeps the damaged file, or move it "
+    "which continues with its readable part and keeps the damaged file, or move it "
     "away to start with an empty journal. Nothing is stopped as long as no master runs; then the "
     "processes that its journal does not know are stopped as their slaves register"
 )

@@ -239,5 +239,5 @@ def _summary(found: _Found, aside: Path) -> str:
     return (
         f"the journal was recovered from a damaged one, {part} {held}, {counted(hosts, 'host')} "
         f"and {events}; the damaged file is {aside}. Look at `rosrm ps` "
-        f"for what is missing, and submit it again: it is stopped where it still runs"
+        f"for what is missing, and submit it again: a missing process that still runs is stopped"
     )

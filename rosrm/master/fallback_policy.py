@@ -20,5 +20,5 @@ def fallback_of(registry: Registry, chosen: str) -> tuple[str, ScoringPolicy] | 
     try:
         return name, registry.scoring(name, {})
     except (ConfigError, PluginError, SkipPlugin) as fault:
-        _log.warning("scoring %r cannot stand in for %r: %s", name, chosen, fault)
+        _log.warning("scoring %r cannot replace %r: %s", name, chosen, fault)
         return None

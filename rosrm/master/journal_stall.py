@@ -85,6 +85,6 @@ class Standstill:
     def refusal(self) -> str:
         """What a request is told."""
         return (
-            f"nothing new is taken in just now: {self.reason}. What runs goes on, and so does the "
-            f"master as soon as it can write"
+            f"the master accepts no new work: {self.reason}. Running processes continue, and the "
+            f"master accepts work again as soon as it can write"
         )

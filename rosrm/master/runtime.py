@@ -256,7 +256,7 @@ class MasterRuntime:
                 [Record(EventKind.MASTER_STOPPED, message=f"master stopped: {self._stopping}")], []
             )
         except JournalBlocked as fault:
-            _log.warning("%s; what was decided last was not written, nor carried out", fault)
+            _log.warning("%s; the last decisions were neither written nor executed", fault)
         _log.info(
             "master %s ended (%s); %s", self._config.name, self._stopping, what_runs(self._state)
         )
@@ -323,7 +323,9 @@ class MasterRuntime:
             stored = self._write(records, intents) if records or intents else ()
         except JournalBlocked as fault:
             self._held = Standstill(commands, str(fault), now, self._core_now(now), now)
-            _log.error("%s. What runs goes on; nothing new is taken in until then", fault)
+            _log.error(
+                "%s. Running processes continue; the master accepts no new work until then", fault
+            )
             return
         self._act_on(commands, stored, now)
 
@@ -410,7 +412,7 @@ def what_runs(state: MasterState) -> str:
     if running or not stopping:
         said.append(f"{counted(running, 'process keeps', 'processes keep')} running")
     if running:
-        said.append("start the master again to manage what runs")
+        said.append("start the master again to manage them")
     return "; ".join(said)
 
 

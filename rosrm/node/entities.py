@@ -133,7 +133,7 @@ def refuse_coroutine(callback: Callable[..., Any], what: str) -> None:
     """
     if inspect.iscoroutinefunction(callback):
         raise TypeError(
-            f"rosrm.node: the callback of {what} is `async`, and a state lies between two "
+            f"rosrm.node: the callback of {what} is `async`, but a state is saved between two "
             f"callbacks: use an ordinary function"
         )
 

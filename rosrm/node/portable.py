@@ -39,8 +39,8 @@ class PortableNode(rclpy.node.Node):  # type: ignore[misc]  # rclpy brings no ty
     def __init__(self, *arguments: Any, **named: Any) -> None:
         if named.get("context") is not None:
             raise TypeError(
-                "context: a portable node is of rclpy's default context, which is made anew when "
-                "it joins; leave it out"
+                "context: a portable node uses rclpy's default context, which is created again "
+                "when it joins; leave it out"
             )
         self._portable_arguments = arguments, named
         self._portable_made: frozenset[int] = frozenset()

@@ -205,7 +205,7 @@ class _Run:
             if time.monotonic() > deadline:
                 raise PortableError(
                     f"{len(unfinished)} callbacks have begun and not ended in {_REST:g} s (async "
-                    f"functions that wait, or goals that are executed); the node goes on as it was"
+                    f"functions that wait, or goals that are executed); the node stays as it was"
                 )
             if any(one.executing() for one in unfinished):
                 time.sleep(0.001)  # another thread's: rclpy has nothing to wait on
@@ -285,7 +285,7 @@ class _Run:
             self._node.get_logger().warning("Fast DDS keeps its GUIDs: restore an image only once")
         if missing:
             self._node.get_logger().warning(
-                f"goes on without peers that it had: {', '.join(missing)}"
+                f"continues without some of its former peers: {', '.join(missing)}"
             )
         return missing
 

@@ -96,6 +96,6 @@ def _check(path: Path, descriptor: int, owner: int) -> None:
 
 def _advice(owner: int) -> str:
     return (
-        f"; a node of user {owner} is asked to move only where nobody else writes: remove it, or "
-        f"mend it"
+        f"; a node of user {owner} is asked to move only where no one else can write: remove it, "
+        f"or correct its owner and mode"
     )

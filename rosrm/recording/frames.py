@@ -109,7 +109,7 @@ def cut_short(name: str, at: int) -> RecordError:
     """The file ends before the record does."""
     return CutShort(
         f"{name}: the record is cut short at byte {at}: its master was killed, lost its power, "
-        f"still runs, or the file was not copied as a whole. --cut takes what is there"
+        f"still runs, or the file was not copied as a whole. --cut accepts the complete part"
     )
 
 

@@ -429,7 +429,7 @@ class MasterClient:
         answers = _ask_until_answered(self._participant, client, request, deadline, _GREET_AGAIN)
         answer = answers.answer
         trouble = answer.trouble if answer is not None else ""
-        return f": {trouble}. What was asked for may still be carried out then" if trouble else ""
+        return f": {trouble}. The request may still be executed then" if trouble else ""
 
     def close(self) -> None:
         """Leave ROS."""

@@ -21,10 +21,10 @@ def what_is_left() -> str:
     threads = sorted(one for one in _thread_names() if one.startswith(_THREADS))
     if any(thread.startswith(_OF_SHARED) for thread in threads):
         return (
-            f"Fast DDS speaks through shared memory (threads {', '.join(threads)}), whatever its "
+            f"Fast DDS uses shared memory (threads {', '.join(threads)}), whatever its "
             f"transports are set to, as with ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST: start the "
-            f"slaves with SUBNET, where nobody else hears them, or destroy in leave() what else "
-            f"of ROS this process has"
+            f"slaves with SUBNET, in a domain of their own, or destroy in leave() all other ROS "
+            f"entities of this process"
         )
     if threads:
         return (

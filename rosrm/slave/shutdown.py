@@ -86,8 +86,8 @@ class Ending:
             keep = counted(len(running), "process keeps", "processes keep")
             self.say(
                 f"slave of {self.config.host} ended ({cause or 'refused'}); {keep} running "
-                f"(supervisor pid {self.supervisor.pid}). Start the slave again to manage what "
-                f"runs, or end it by `rosrm slave {STOP_ALL}` with the same --config"
+                f"(supervisor pid {self.supervisor.pid}). Start the slave again to manage "
+                f"them, or stop them by `rosrm slave {STOP_ALL}` with the same --config"
             )
             return 1 if failure else 0
         live = self.state.live()
@@ -114,7 +114,7 @@ class Ending:
         left = _live(self._begun())
         if left:
             _log.error(
-                "%s may still run: %s. Start the slave again, or end what runs by `rosrm slave %s` "
+                "%s may still run: %s. Start the slave again, or stop them by `rosrm slave %s` "
                 "with the same --config",
                 listed(str(one.instance) for one in left), self._supervisor_fault, STOP_ALL,
             )  # fmt: skip
@@ -173,7 +173,7 @@ class Ending:
         left = self._kill_at - time.monotonic()
         if not 0.0 < left < math.inf:
             return ""
-        return f"; what has not ended within {math.ceil(left)} s is killed (SIGKILL)"
+        return f"; processes that run after {math.ceil(left)} s are killed (SIGKILL)"
 
     def _unfinished(self) -> str:
         """Return what the supervisor has reported last of each process that has not ended."""
@@ -184,7 +184,7 @@ class Ending:
         if running:
             also = f"still stops {listed(stopping)} and " if stopping else ""
             return (
-                f"{supervisor} {also}has not begun to stop {listed(running)}. End what runs by "
+                f"{supervisor} {also}has not begun to stop {listed(running)}. Stop them by "
                 f"`rosrm slave {STOP_ALL}` with the same --config"
             )
         return f"{supervisor} still stops {listed(stopping or ['what they left'])}"

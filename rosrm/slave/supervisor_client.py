@@ -100,8 +100,8 @@ class SupervisorLink:
         waits = self._client.waits
         if waits > _TOLD_AFTER and not self._told_waits:
             self._say(
-                f"the supervisor (pid {self._client.pid}) has taken no order for {waits:.0f} s: is "
-                f"it stopped? They wait until it goes on"
+                f"the supervisor (pid {self._client.pid}) has accepted no order for {waits:.0f} s: "
+                f"is it stopped? Orders wait until it continues"
             )
         self._told_waits = waits > _TOLD_AFTER
 

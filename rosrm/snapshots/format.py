@@ -122,12 +122,12 @@ def decoded_head(data: bytes) -> tuple[Head, int]:
         magic, instance, sequence, name_size, count = _FIXED.unpack_from(data)
         end = _FIXED.size + name_size + count * _BLOCK.size
         if magic != _MAGIC or count > _MOST_BLOCKS or end + _CRC.size > len(data):
-            raise Damaged("it is no kept state")
+            raise Damaged("it is no snapshot")
         if _CRC.unpack_from(data, end)[0] != zlib.crc32(data[:end]):
             raise Damaged("its head is damaged")
         name = data[_FIXED.size : _FIXED.size + name_size].decode()
     except (struct.error, UnicodeDecodeError):
-        raise Damaged("it is no kept state") from None
+        raise Damaged("it is no snapshot") from None
     table = data[_FIXED.size + name_size : end]
     blocks = tuple(_BLOCK.iter_unpack(table))
     start = end + _CRC.size

@@ -114,7 +114,7 @@ class _Desk:
             raise _Refusal(400, f"the request has no {READER_HEADER}")
         self._reader = self._reader or reader
         if not hmac.compare_digest(_bytes(reader), _bytes(self._reader)):
-            raise _Refusal(403, "somebody has begun to fetch it already, and an offer stands once")
+            raise _Refusal(403, "another reader fetches it already, and an offer can be used once")
 
     def stop(self) -> None:
         """End the sending that is under way, if one is."""

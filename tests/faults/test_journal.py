@@ -189,11 +189,11 @@ def test_a_journal_that_somebody_else_holds_holds_new_work_up(make_cluster) -> N
     holder = sqlite3.connect(files_of(cluster)[0], isolation_level=None)
     holder.execute("BEGIN IMMEDIATE")
     os.kill(pids["ends"], signal.SIGKILL)
-    assert "another program holds it" in blocked(cluster)
-    with pytest.raises(Refused, match="another program holds it"):
+    assert "another program has it open" in blocked(cluster)
+    with pytest.raises(Refused, match="another program has it open"):
         cluster.submit(job("new", "true"))
     holder.close()
-    cluster.wait_for_event("journal_back", "another program holds it")
+    cluster.wait_for_event("journal_back", "another program has it open")
     assert cluster.ended("ends").state == "failed"
     assert cluster.run(job("new", "true"))[0].state == "finished"
     assert cluster.wait("stays", "running").pid == pids["stays"]
@@ -237,7 +237,7 @@ def test_a_full_disk_stops_new_work_and_keeps_what_runs(cluster, disk) -> None:
     disk.fill()
     os.kill(pids["ends"], signal.SIGKILL)  # the master must decide something: its place is free
     reason = blocked(cluster)
-    for part in (str(disk.place), "free of 1.0 MiB", "make room", "What runs goes on"):
+    for part in (str(disk.place), "free of 1.0 MiB", "make room", "Running processes continue"):
         assert part in reason
     for request in (
         lambda: cluster.submit(job("late", "true")),
@@ -268,7 +268,7 @@ def test_a_full_disk_stops_new_work_and_keeps_what_runs(cluster, disk) -> None:
         assert (row.pid, row.host) == (pids[name], where[name])
     assert not cluster.events("host_lost")
     assert cluster.run(job("late", "true"))[0].state == "finished"
-    assert cluster.log_of("master").count("nothing new is taken in until then") == 1
+    assert cluster.log_of("master").count("the master accepts no new work until then") == 1
 
 
 def test_a_master_is_killed_while_its_disk_is_full(cluster, disk) -> None:
@@ -311,7 +311,7 @@ def test_whoever_asked_as_the_disk_became_full_is_told(cluster, disk) -> None:
     """The answer waits for the journal; without one in time, the reason is said."""
     disk.fill()
     cluster.client._timeout = 1.0
-    with pytest.raises(NoMaster, match=r"did not answer .*disk is full.* may still be carried out"):
+    with pytest.raises(NoMaster, match=r"did not answer .*disk is full.* may still be executed"):
         cluster.submit(job("first", "true"))
     with pytest.raises(Refused, match="disk is full"):
         cluster.submit(job("second", "true"))

@@ -113,7 +113,7 @@ def test_a_killed_node_goes_on_from_its_last_state(make_cluster):
         last, first = runs[run][-1], runs[run + 1][0]
         assert max(2, last - 60) <= first <= last + 1, runs
         assert runs[run] == list(range(runs[run][0], last + 1))
-    cluster.wait_for_log("counter", "goes on from the state kept of counter#")
+    cluster.wait_for_log("counter", "continues from the snapshot of counter#")
 
 
 def test_a_large_state_is_kept_too(make_cluster):
@@ -232,7 +232,7 @@ def test_when_its_host_is_lost_it_goes_on_elsewhere_from_the_kept_state(make_clu
     assert after.host == keeper
     runs = wait_for_count(cluster, before)
     assert runs[0][0] > before
-    cluster.wait_for_log("counter", "goes on from the state kept of counter#")
+    cluster.wait_for_log("counter", "continues from the snapshot of counter#")
 
 
 def test_a_host_that_does_not_keep_the_state_fetches_it(make_cluster):
@@ -328,7 +328,7 @@ def test_a_node_goes_on_where_nothing_can_be_kept(make_cluster):
     cluster.submit(counter())
     wait_for_count(cluster, 200)
     log = cluster.log("counter")
-    assert log.count("its state is not kept: Not a directory") == 1, log
+    assert log.count("its state is not saved: Not a directory") == 1, log
 
 
 def test_a_master_that_was_started_again_knows_where_states_lie(make_cluster):

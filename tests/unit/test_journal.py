@@ -180,7 +180,7 @@ def test_a_file_system_that_is_read_only_is_said(tmp_path) -> None:
     try:
         fill(disk / "journal.sqlite")
         subprocess.run(["mount", "-o", "remount,ro", disk], check=True)
-        with pytest.raises(JournalBlocked, match="look at the owner and permissions"):
+        with pytest.raises(JournalBlocked, match="check owner and permissions"):
             SqliteJournal(disk / "journal.sqlite").write([Record("a")], [], 0.0)
     finally:
         subprocess.run(["umount", "-l", disk], check=True)
@@ -209,7 +209,7 @@ def test_a_locked_file_is_refused(path) -> None:
     fill(path)
     holder = sqlite3.connect(path, isolation_level=None)
     holder.execute("BEGIN EXCLUSIVE")
-    with pytest.raises(JournalError, match="another program holds it"):
+    with pytest.raises(JournalError, match="another program has it open"):
         SqliteJournal(path).write([Record("a")], [], 0.0)
     holder.close()
 

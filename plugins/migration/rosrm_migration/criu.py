@@ -121,8 +121,8 @@ class Criu:
         """Why a process cannot be moved so; "" if it can."""
         if not spec.ros_node:
             return (
-                "it moves ROS nodes that leave and join by themselves (rosrm.node.PortableNode), "
-                "and this process is no node: say `ros: true`"
+                "it moves only ROS nodes that can leave and rejoin (rosrm.node.PortableNode), "
+                "and this process is no node: set `ros: true`"
             )
         return ""
 

@@ -83,7 +83,7 @@ def check_wanted(attempt: str) -> None:
     """Raise `CriuError` where an attempt was given up meanwhile."""
     with _turning:
         if attempt in _turned_back:
-            raise CriuError("it was turned back meanwhile")
+            raise CriuError("the move was undone")
 
 
 @contextlib.contextmanager

@@ -110,7 +110,7 @@ class Handoff:
 
 def _fault(spec: ProcessSpec, options: HandoffOptions) -> str:
     if not spec.ros:
-        return "it moves ROS nodes, and this process is none: say `ros: true`"
+        return "it moves only ROS nodes, and this process is none: set `ros: true`"
     if options.protocol == "paper" and not spec.migration.overlap:
         return "with `protocol: paper` both are active for a moment, and `overlap: false` is set"
     return ""

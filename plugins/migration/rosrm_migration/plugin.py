@@ -33,7 +33,7 @@ def register_migration_strategies() -> Sequence[MigrationOffer]:
             name="handoff",
             create=Handoff,
             options=HandoffOptions,
-            summary="the destination follows the source's state, and goes on from it",
+            summary="the destination follows the source's state, and continues from it",
             executors={WATCH: watch},
         ),
         MigrationOffer(

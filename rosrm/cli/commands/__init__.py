@@ -98,7 +98,7 @@ def common(
             "--cluster",
             metavar="FILE",
             envvar="ROSRM_CLUSTER",
-            help="A cluster.yaml: its `ros` section says how to reach the master.",
+            help="A cluster.yaml; its section `ros` is used to reach the master.",
         ),
     ] = None,
     version: Annotated[

@@ -24,7 +24,9 @@ Wait = Annotated[
 ]
 Timeout = Annotated[
     str,
-    typer.Option("--timeout", metavar="TIME", help="With --wait: longest wait, e.g. 5min."),
+    typer.Option(
+        "--timeout", metavar="TIME", help="With --wait: maximum wait, e.g. 5min; default: no limit."
+    ),
 ]
 #: A process has a name without a slash, and a name that ends like this is rather a file's.
 _FILE_ENDINGS: Final = (".yaml", ".yml")
@@ -60,7 +62,7 @@ def submit(
     with connection.master(ctx, domain) as client:
         typer.echo(client.submit(specs))
         if wait:
-            with interruptible("what was submitted stays queued or runs (`rosrm ps`)"):
+            with interruptible("the submitted processes stay queued or run (`rosrm ps`)"):
                 names = [spec.name for spec in specs]
                 show_processes(client.wait(names, timeout=limit, on_change=show_change))
 
@@ -80,7 +82,7 @@ def cancel(
 ) -> None:
     """Cancel processes: take them out of the queue, or stop them for good.
 
-    A work file stands for those of its processes that have not ended.
+    For a work file, all its processes that have not ended are cancelled.
     """
     from rosrm.cli.waiting import interruptible, longest, show_change, show_processes
     from rosrm.client.waiting import ENDED
@@ -163,7 +165,7 @@ def migrate(
 def checkpoint(
     ctx: typer.Context, name: Name, wait: Wait = False, timeout: Timeout = "", domain: Domain = None
 ) -> None:
-    """Stop a process, with its memory in an image on its host.
+    """Write the memory of a process to a checkpoint image, and stop it.
 
     `rosrm restore` continues the process from there.
     """
@@ -173,7 +175,7 @@ def checkpoint(
 def restore(
     ctx: typer.Context, name: Name, wait: Wait = False, timeout: Timeout = "", domain: Domain = None
 ) -> None:
-    """Restore a process from its image, on the host of the image."""
+    """Restore a process from its checkpoint image, on the image's host."""
     _with_ending(ctx, name, lambda client: client.restore(name), domain, wait, timeout)
 
 
@@ -189,7 +191,7 @@ def _with_ending(
         since = client.list().last_sequence if wait else 0
         typer.echo(ask(client))
         if wait:
-            with interruptible(f"what was begun with {name} continues (`rosrm events --process`)"):
+            with interruptible(f"the request for {name} continues (`rosrm events --process`)"):
                 show_end(
                     client.wait_for_migration(
                         name, after=since, timeout=limit, on_change=show_change
@@ -198,13 +200,13 @@ def _with_ending(
 
 
 def cordon(ctx: typer.Context, host: Host, domain: Domain = None) -> None:
-    """Give a host no new work."""
+    """Stop giving new work to a host; its processes stay."""
     with connection.master(ctx, domain) as client:
         typer.echo(client.cordon(host))
 
 
 def uncordon(ctx: typer.Context, host: Host, domain: Domain = None) -> None:
-    """Give a host work again."""
+    """Give new work to a host again."""
     with connection.master(ctx, domain) as client:
         typer.echo(client.uncordon(host))
 
@@ -223,8 +225,8 @@ def drain(
 ) -> None:
     """Cordon a host and move away the processes that can leave it.
 
-    The master says which can and which cannot; when no process is left that can, the host is
-    `drained`.
+    The reply lists the processes that leave and those that cannot. The host is `drained` when no
+    process is left that can leave.
     """
     from rosrm.cli.waiting import interruptible, longest, show_end
 
@@ -250,8 +252,8 @@ def prune(
 ) -> None:
     """Remove ended processes and departed hosts from all listings.
 
-    Without names, remove all ended processes and all hosts that left. A lost host is removed by its
-    name alone; what was cancelled there then counts as cancelled.
+    Without names, remove all ended processes and all hosts that left. A lost host is removed only
+    by `--host`; processes that were being cancelled there are cancelled then.
     """
     with connection.master(ctx, domain) as client:
         typer.echo(client.prune(names or [], hosts or []))

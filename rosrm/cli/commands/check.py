@@ -50,10 +50,10 @@ def check(
     ],
     kind: Annotated[
         KindOfFile | None,
-        typer.Option("--kind", help="Kind of the files; default: their keys or names decide."),
+        typer.Option("--kind", help="Kind of the files; default: found by their keys or names."),
     ] = None,
 ) -> None:
-    """Check files before they are used.
+    """Check configuration files without starting anything.
 
     The files are checked against all rules and against the plugins installed on this machine.
     """

@@ -1,4 +1,4 @@
-"""Commands that may go on until Ctrl-C: events, logs, top."""
+"""Commands that may run until Ctrl-C: events, logs, top."""
 
 # Each command imports what it needs when it runs, so that `rosrm --help` is quick.
 # ruff: noqa: PLC0415
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 def events(  # noqa: PLR0917 - an argument for each option
     ctx: typer.Context,
     follow: Annotated[
-        bool, typer.Option("--follow", "-f", help="Keep printing what is new until Ctrl-C.")
+        bool, typer.Option("--follow", "-f", help="Print new events until Ctrl-C.")
     ] = False,
     process: Annotated[
         str, typer.Option("--process", metavar="NAME", help="Show only events of this process.")
@@ -86,31 +86,35 @@ def logs(  # noqa: PLR0917 - an argument for each option
     names: Names,
     follow: Annotated[
         bool,
-        typer.Option(
-            "--follow", "-f", help="Keep printing what is new until the processes have ended."
-        ),
+        typer.Option("--follow", "-f", help="Print new output until the processes have ended."),
     ] = False,
     tail: Annotated[
         int | None,
-        typer.Option("--tail", metavar="N", min=1, help="Only the last N lines of each."),
+        typer.Option(
+            "--tail", metavar="N", min=1, help="Print only the last N lines of each process."
+        ),
     ] = None,
     since: Annotated[
         str,
-        typer.Option("--since", metavar="TIME", help="Only what was written since, e.g. 10min."),
+        typer.Option(
+            "--since", metavar="TIME", help="Print only output of the last TIME, e.g. 10min."
+        ),
     ] = "",
     timestamps: Annotated[
         bool,
-        typer.Option("--timestamps", "-t", help="Begin lines with their time, by their host."),
+        typer.Option(
+            "--timestamps", "-t", help="Begin each line with its time, by the clock of its host."
+        ),
     ] = False,
     host: Annotated[
-        str, typer.Option("--host", metavar="HOST", help="Only what was written on this host.")
+        str, typer.Option("--host", metavar="HOST", help="Print only output from this host.")
     ] = "",
     domain: Domain = None,
 ) -> None:
-    """Print what processes wrote, from their hosts.
+    """Print the output of processes, from all hosts.
 
-    The output is complete, over restarts and moves; a line tells where the bound on logs dropped
-    something, and how much.
+    The output is complete over restarts and moves. Where the size limit of logs dropped output, a
+    line gives the dropped size.
     """
     from rosrm.cli.log_copies import copy_logs, since_of
     from rosrm.cli.output.log_lines import Stream
@@ -130,10 +134,17 @@ def top(
     ctx: typer.Context,
     period: Annotated[
         str,
-        typer.Option("--period", metavar="TIME", help="Time between two pictures, e.g. 2s."),
+        typer.Option("--period", metavar="TIME", help="Time between two updates, e.g. 2s."),
     ] = "1s",
     count: Annotated[
-        int, typer.Option("--count", "-n", metavar="N", min=0, help="End after N; 0: never.")
+        int,
+        typer.Option(
+            "--count",
+            "-n",
+            metavar="N",
+            min=0,
+            help="Exit after N updates; 0: only on q or Ctrl-C.",
+        ),
     ] = 0,
     sort: Annotated[
         str,

@@ -15,7 +15,7 @@ from rosrm.client.connecting import check_name
 
 
 def status(ctx: typer.Context, as_json: AsJson = False, domain: Domain = None) -> None:
-    """Show the cluster on half a page."""
+    """Show an overview: hosts, processes, problems, newest events."""
     from rosrm.cli.output import json_forms
     from rosrm.cli.output import status as overview
     from rosrm.cli.output.tables import show
@@ -61,9 +61,9 @@ def ps(
 
 
 def hosts(ctx: typer.Context, as_json: AsJson = False, domain: Domain = None) -> None:
-    """List the hosts and what they use.
+    """List the hosts and their usage.
 
-    Usage and limit are percent of the capacity; `?` stands before a reading that is stale.
+    Usage and limit are percent of the capacity; `?` marks a stale reading.
     """
     from rosrm.cli.output import json_forms, tables
 
@@ -83,7 +83,9 @@ def plugins(
     ctx: typer.Context,
     local: Annotated[
         bool,
-        typer.Option("--local", help="List what is installed here, without a master."),
+        typer.Option(
+            "--local", help="List the plugins installed on this machine; needs no master."
+        ),
     ] = False,
     as_json: AsJson = False,
     domain: Domain = None,
@@ -109,9 +111,10 @@ def plugins(
 
 
 def explain(ctx: typer.Context, name: Name, as_json: AsJson = False, domain: Domain = None) -> None:
-    """Explain why a process is where it is, or why it waits.
+    """Explain the placement of a process, or why it waits.
 
-    Each host is listed with its score, its veto or what it lacks; the events follow.
+    Lists each host with its score, its veto or the requirement that it does not meet, then the
+    newest events.
     """
     from rosrm.cli.output import explain, json_forms, tables
 

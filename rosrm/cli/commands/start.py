@@ -29,17 +29,21 @@ def master(
     ctx: typer.Context,
     config: Annotated[
         Path | None,
-        typer.Option("--config", metavar="FILE", help="cluster.yaml; without it, the defaults."),
+        typer.Option(
+            "--config",
+            metavar="FILE",
+            help="A cluster.yaml; default: --cluster, else the default settings.",
+        ),
     ] = None,
     recover: Annotated[
         bool,
-        typer.Option("--recover", help="Recover what can still be read of a damaged journal."),
+        typer.Option("--recover", help="First rebuild a damaged journal from its readable part."),
     ] = False,
     domain: Domain = None,
 ) -> None:
     """Start the master of a cluster.
 
-    The master runs until Ctrl-C, which stops no process; started again it continues from there.
+    The master runs until Ctrl-C. Processes keep running, and a restarted master takes them over.
     """
     from rosrm.config.cluster import default_cluster, load_cluster
     from rosrm.extensions.registry import Registry
@@ -60,13 +64,15 @@ def slave(
     ctx: typer.Context,
     config: Annotated[
         Path | None,
-        typer.Option("--config", metavar="FILE", help="host.yaml; without it, the defaults."),
+        typer.Option(
+            "--config", metavar="FILE", help="A host.yaml; default: the default settings."
+        ),
     ] = None,
     stop_everything: Annotated[
         bool,
         typer.Option(
             "--stop-all",
-            help="Start no slave: stop the processes that an ended one left running here.",
+            help="Start no slave: stop the processes that an earlier slave left running.",
         ),
     ] = False,
     domain: Domain = None,

@@ -42,8 +42,7 @@ def too_late(state: SlaveState, assignment: Assignment, now: float) -> str:
     if fence is None or fence.alive or now < state.heard_at + fence.after:
         return ""
     return (
-        f"fenced before it was started: for {fence.after:g} s it was not known here whether the "
-        f"master hears this host"
+        f"fenced before it was started: no confirmed contact with the master for {fence.after:g} s"
     )
 
 

@@ -145,7 +145,7 @@ def stopping(instance: Instance) -> str:
 
 
 def _left_to_stop(instance: Instance) -> str:
-    return "stopping it" if instance.fault else "stopping what it left"
+    return "stopping it" if instance.fault else "stopping its remaining children"
 
 
 def ending(instance: Instance) -> str:

@@ -274,8 +274,8 @@ def _take_fence(instance: Instance, event: Event, now: float) -> None:
         why, by = "it has a successor", now
     else:
         after, grace, alive = instance.fence
-        unknown = "whether its slave lives" if alive else "whether the master hears this host"
-        why = f"for {after:g} s it was not known here {unknown}"
+        missing = "activity of its slave" if alive else "confirmed contact with the master"
+        why = f"no {missing} for {after:g} s"
         by = instance.heard + after + grace
     instance.kill_by = by if instance.kill_by is None else min(by, instance.kill_by)
     if instance.then != THEN_END:

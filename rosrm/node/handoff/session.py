@@ -44,7 +44,7 @@ class Handoff:
         """The node is made; its author's constructor may go on."""
         node = self.member.node
         for fault in self._damaged:
-            node.get_logger().warning(f"a kept state is damaged, and left alone: {fault}")
+            node.get_logger().warning(f"ignoring a damaged snapshot: {fault}")
         self._parts.append(ParametersPart(self._own(_PARAMETERS), node))
         if self.identity.shadow:
             self._destination = Destination(

@@ -21,7 +21,7 @@ from rosrm_msgs.msg import StateMark
 _PATIENCE: Final = 10.0
 _LOOK: Final = 0.02
 _REMEDY: Final = (
-    "This node does not start, so that what is kept stays as it is. To begin from nothing, cancel "
+    "The node does not start, so that the snapshot is not overwritten. To start without it, cancel "
     "the process and submit it again"
 )
 
@@ -66,7 +66,7 @@ class Revival:
             try:
                 mark = self._restored()
             except StateError as fault:
-                message = f"the state kept in {self._kept.path} cannot be restored: {fault}"
+                message = f"the snapshot {self._kept.path} cannot be restored: {fault}"
                 self._member.node.get_logger().error(f"{message}. {_REMEDY}")
                 raise StateError(message) from fault
             self._go_on(mark)
@@ -96,7 +96,9 @@ class Revival:
                 f"{PROTOCOL_VERSION}"
             )
         if len(mark.parts) != len(self._kept.blocks) - 1:
-            return f"it has {len(self._kept.blocks) - 1} parts, and says {len(mark.parts)}"
+            return (
+                f"it has {len(self._kept.blocks) - 1} parts, but its mark lists {len(mark.parts)}"
+            )
         theirs = {part.topic: part.type for part in mark.parts}
         ours = {part.topic: part.type_name for part in self._parts}
         for topic in sorted(ours.keys() | theirs.keys()):
@@ -124,5 +126,5 @@ class Revival:
     def _say(self) -> None:
         head = self._kept.head
         self._member.node.get_logger().info(
-            f"goes on from the state kept of {head.process}#{head.instance}, cycle {head.sequence}"
+            f"continues from the snapshot of {head.process}#{head.instance}, cycle {head.sequence}"
         )

@@ -93,7 +93,7 @@ class Keeper:
         except StateError as error:
             self._next = now + self._every
             self._member.node.get_logger().error(
-                f"the state is not kept: {error}", throttle_duration_sec=_TOLD_EVERY
+                f"no snapshot was written: {error}", throttle_duration_sec=_TOLD_EVERY
             )
             return
         self._kept = self._member.sequence
@@ -108,7 +108,7 @@ class Keeper:
         blocks = [Block(mark, zlib.crc32(mark)), *(part.block() for part in self._parts)]
         size = sum(len(block.data) for block in blocks)
         if size > LARGEST - (1 << 20):
-            raise StateError(f"it has {size} bytes; at most {LARGEST} are kept")
+            raise StateError(f"it has {size} bytes; the maximum is {LARGEST}")
         return blocks
 
     def _mark(self) -> StateMark:
@@ -210,21 +210,21 @@ class _Writer:
         except OSError as error:
             self._not_written(error)
             return True
-        self._warn(f"not kept any more: {identity.keep} is a newer instance's")
+        self._warn(f"not saved any more: {identity.keep} is a newer instance's")
         return False
 
     def _written(self, sequence: int) -> None:
         if self._fault:
             self._fault = ""
             # A line of code of its own: rclpy takes one severity from each, and raises at another.
-            self._member.node.get_logger().info(f"its state is kept again, up to cycle {sequence}")
+            self._member.node.get_logger().info(f"its state is saved again, up to cycle {sequence}")
 
     def _not_written(self, error: OSError) -> None:
         if self._fault != str(error):
             self._fault = str(error)
             self._warn(
-                f"not kept: {error.strerror}, in {self._member.identity.keep}. This node goes on, "
-                f"and tries again with each newer state"
+                f"not saved: {error.strerror}, in {self._member.identity.keep}. The node "
+                f"continues, and retries with each newer state"
             )
 
     def _warn(self, message: str) -> None:

@@ -74,7 +74,7 @@ class KeptEndpoint:
             host.take_part(part, answer)
 
         def read(request: srv.ReadKept.Request, open_request: OpenRequest) -> None:
-            fault = version_refusal(request.protocol_version, "a reader of kept states")
+            fault = version_refusal(request.protocol_version, "a reader of snapshots")
 
             def answer(part: Part | None) -> None:
                 open_request.answer(_read_answer(part))
@@ -173,7 +173,7 @@ def _part_of(response: srv.ReadKept.Response, wanted: Part) -> Part | str:
 
 def _read_answer(part: Part | None) -> srv.ReadKept.Response:
     if part is None:
-        return srv.ReadKept.Response(answer=refused("unknown", "no such state is kept here"))
+        return srv.ReadKept.Response(answer=refused("unknown", "there is no such snapshot here"))
     return srv.ReadKept.Response(
         answer=accepted(), number=part.number, sequence=part.sequence, total=part.total,
         digest=part.digest, data=array("B", part.data),

@@ -120,7 +120,7 @@ def _command(spec: ProcessSpec, environment: Mapping[str, str], python: str) -> 
     if spec.module is not None:
         return (python, "-m", spec.module)
     if not spec.command:
-        raise LaunchError(f"{spec.name!r} says nothing to run: package, module or command")
+        raise LaunchError(f"{spec.name!r} has nothing to run: set package, module or command")
     program, *words = spec.command
     return (_at_home(program, "command"), *words)
 

@@ -69,9 +69,9 @@ class Fetch:
         if isinstance(part, str):
             self._next_host(part, now)
         elif part.number < self._assignment.kept_from or not part.data:
-            self._next_host("what it keeps is of no use", now)
+            self._next_host("its snapshot is of an earlier process of that name", now)
         elif part.offset == 0 and self._here is not None and self._here.age >= part.age:
-            self._next_host("what it keeps is not newer than what is here", now)
+            self._next_host("its snapshot is not newer than the one here", now)
         else:
             self._take(part, partial(self._taken, part))
 

@@ -36,7 +36,7 @@ _LOST_WORDS: Final = frozenset({"timeout", "order"})
 
 
 #: What is answered where a part could not be taken for a reason that nobody thought of.
-_FAILED: Final = ("full", "the slave failed to take it; its log says why")
+_FAILED: Final = ("full", "the slave failed to store it; its log has the reason")
 
 
 @dataclass(slots=True)
@@ -133,7 +133,7 @@ class Keeping:
             try:
                 outcome = work()
             except Exception as error:  # noqa: BLE001 - the thread has to live on
-                self._post(partial(self._say, f"a kept state: {type(error).__name__}: {error}"))
+                self._post(partial(self._say, f"a snapshot: {type(error).__name__}: {error}"))
                 outcome = otherwise
             self._post(partial(then, outcome))
 

@@ -105,7 +105,7 @@ class KeptStore:
                 return refusal
         coming = self._coming.get(part.process)
         if coming is None or coming.age != part.age or coming.writer.size != part.offset:
-            return "order", "it does not follow the part before it: begin anew"
+            return "order", "it does not follow the part before it: send all parts again"
         try:
             coming.writer.append(part.data)
             coming.digest = zlib.crc32(part.data, coming.digest)

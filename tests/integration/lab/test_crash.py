@@ -73,7 +73,7 @@ def test_a_second_up_removes_what_a_killed_one_left(name):
     """And makes its own lab."""
     command = [sys.executable, "-c", KILLED_AT, name, "rosrm_lab.host", "_last_words", "after", "1"]
     subprocess.run(command, check=False, timeout=PATIENCE)
-    with pytest.raises(LabError, match="was not made to the end: `rosrm lab up` begins anew"):
+    with pytest.raises(LabError, match="is incomplete: `rosrm lab up` makes it again"):
         Lab(name).status()
     assert name in {one.name for one in all_labs()}
     lab = Lab(name, uniform(1, disk=16 * MIB))

@@ -203,7 +203,7 @@ def test_ctrl_c_in_a_wait_says_that_the_processes_stay(rosrm, client, work, monk
     result = rosrm("submit", work, "--wait")
     assert result.code == 130
     assert result.err == (
-        "rosrm: no longer waiting; what was submitted stays queued or runs (`rosrm ps`)\n"
+        "rosrm: no longer waiting; the submitted processes stay queued or run (`rosrm ps`)\n"
     )
 
 

@@ -51,14 +51,14 @@ def test_the_kind_of_a_right_file_is_known_by_its_keys(rosrm, file, text, said):
 def test_a_file_that_may_be_either_wants_the_kind(rosrm, file):
     result = rosrm("config", "check", file("ros: {domain: 1}"))
     assert result.code == 2
-    assert "its keys fit a cluster and a host file alike; say which with --kind" in result.err
+    assert "its keys fit a cluster and a host file alike; choose one with --kind" in result.err
     assert rosrm("config", "check", "--kind", "cluster", file("ros: {domain: 1}")).code == 0
     result = rosrm("config", "check", file(""))
-    assert "it has no key of a cluster, host, work or simulation file; say" in result.err
+    assert "it has no key of a cluster, host, work or simulation file; choose" in result.err
     result = rosrm("config", "check", file("proceses: []"))
-    assert "simulation file, and 'proceses': did you mean 'processes'? Say which" in result.err
+    assert "simulation file, and 'proceses': did you mean 'processes'? Choose one" in result.err
     result = rosrm("config", "check", file("- {name: a}"))
-    assert "it is no mapping; in a work file the list stands under `processes:`" in result.err
+    assert "it is no mapping; in a work file the list is under `processes:`" in result.err
 
 
 SIMULATION = "hosts: [{name: a, memory: 1GiB, cpu: 1}]\nprocesses: [{name: p, duration: 1s}]"

@@ -57,10 +57,10 @@ def test_status_names_the_plugins_that_fail(rosrm, client):
 @pytest.mark.parametrize("json_too", [(), ("--json",)])
 def test_a_master_that_takes_no_work_is_told_beside_the_listing(rosrm, client, command, json_too):
     whole = rosrm(command, *json_too)
-    client.trouble = "nothing new is taken in just now: the disk is full"
+    client.trouble = "the master accepts no new work: the disk is full"
     result = rosrm(command, *json_too)
     assert result.code == 0
-    assert result.err == "rosrm: nothing new is taken in just now: the disk is full\n"
+    assert result.err == "rosrm: the master accepts no new work: the disk is full\n"
     if not json_too:
         assert result.out == whole.out
 

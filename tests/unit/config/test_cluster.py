@@ -187,7 +187,7 @@ def test_a_quiet_slave_is_not_taken_for_a_silent_one(refusal, text, place, perio
     """It is heard once in a beat period, and a message may be lost."""
     assert refusal(load_cluster, text) == (
         f"f.yaml:{place}: control.beat_period ({period} s) must be at most a third of "
-        f"liveness.suspect ({suspect} s): a slave with nothing new to say is heard once in a beat "
+        f"liveness.suspect ({suspect} s): a slave without changes reports once in a beat "
         f"period"
     )
 

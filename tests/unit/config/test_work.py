@@ -156,9 +156,9 @@ def test_braces_are_plain_without_foreach(file):
         ("{i: range(3)}", "n{i:zz}", "'n{i:zz}': 'zz' is no format for 0"),
         ("{i: range(3)}", "n{i:099999}", "'099999' is no format for 0"),
         ("{i: range(3)}", "n{i.x}", "unknown name 'i.x'"),
-        ("{i: range(0)}", "n{i}", "f.yaml:1:37: foreach: stands for no process at all"),
+        ("{i: range(0)}", "n{i}", "f.yaml:1:37: foreach: makes no process"),
         ("{i: 'range(0,5,0)'}", "n{i}", "f.yaml:1:41: foreach.i: a step of 0"),
-        ("{i: range(10001)}", "n{i}", "foreach: stands for more than 10000 processes"),
+        ("{i: range(10001)}", "n{i}", "foreach: makes more than 10000 processes"),
         (
             "{i: 5}",
             "n{i}",

@@ -206,7 +206,7 @@ def test_what_cannot_be_checkpointed_is_refused_with_its_reason() -> None:
         ("x", "no such process: 'x'"),
         ("waits", "only a running process is checkpointed"),
         ("watched", "watched has a standby, which would take over"),
-        ("stateful", "takes part under the number of its instance"),
+        ("stateful", "is identified by the number of its instance"),
     ]
     for name, said in cases:
         reply = cluster.checkpoint(name)

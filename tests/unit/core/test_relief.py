@@ -239,7 +239,7 @@ def test_a_process_that_no_other_host_may_take_stays_on_a_draining_host() -> Non
     cluster.submit(movable("p", required_labels={"camera": "front"}))
     said = cluster.set_host("a", "drain").message
     assert said.endswith(
-        "nothing can leave: p may run on no other host (`rosrm explain NAME` says why)"
+        "nothing can leave: p may run on no other host (`rosrm explain NAME` shows the reason)"
     )
     cluster.wait(3.0)
     assert len(cluster.told("host_drained")) == 1

@@ -6,7 +6,7 @@ from rosrm.core.master import events as happened
 from rosrm.master.runtime import what_runs
 from tests.unit.core.cluster import Cluster, process
 
-AGAIN = "start the master again to manage what runs"
+AGAIN = "start the master again to manage them"
 
 
 def test_processes_of_hosts_that_leave_do_not_keep_running() -> None:

@@ -113,7 +113,7 @@ def test_nonsense_is_refused_when_the_process_is_submitted(given: Any, said: str
 def test_what_is_no_node_has_no_alias() -> None:
     """And so cannot be moved so."""
     spec = replace(move().spec, ros=False)
-    assert "say `ros: true`" in Handoff(HandoffOptions()).spec_fault(spec)
+    assert "set `ros: true`" in Handoff(HandoffOptions()).spec_fault(spec)
 
 
 def test_the_papers_protocol_needs_an_overlap() -> None:

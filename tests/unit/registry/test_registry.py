@@ -464,8 +464,8 @@ def test_a_create_that_hangs_is_ended_and_named(monkeypatch, context):
             register_scoring_policies=[ScoringOffer("s", hangs)],
         )
     )
-    said = r"`create` \(.*\) raised TimeoutError: it did not return within 0.05 s; repair what it "
-    said += r"waits for, or leave '{}' out of the configuration"
+    said = r"`create` \(.*\) raised TimeoutError: it did not return within 0.05 s; "
+    said += r"correct what blocks it, or leave '{}' out of the configuration"
     with pytest.raises(PluginError, match=said.format("s")):
         registry.scoring("s")
     reason = failed(registry.probes({"slow": {}}, context))["slow"]

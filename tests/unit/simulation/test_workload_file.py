@@ -112,7 +112,7 @@ def test_variants_say_their_own_word_over_the_settings(load):
         (of_process("needs: {disk: 1GB}"), "2:37", "p: disk 1e+09 B is more"),
         (HOST + "processes: [{name: p}, {name: p}]\n", "2:31", "duplicate process name 'p', first"),
         (of_process("foreach: {i: [1, 2]}"), "2:20", "every process the name 'p'"),
-        (of_process("growth: 1MB/s"), "2:31", "p grows for ever; give it `most`"),
+        (of_process("growth: 1MB/s"), "2:31", "p grows without a bound; set `most`"),
         (of_process("migration: move"), "2:34", "unknown migration strategy"),
         ("hosts: [{name: a, memory: 1GiB}]\n" + PROCESS, "1:9", "cpu: is missing"),
         ("hosts: [{name: a, memory: 0, cpu: 1}]\n" + PROCESS, "1:27", "memory: 0 is not greater"),

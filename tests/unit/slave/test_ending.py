@@ -62,7 +62,7 @@ def test_an_order_to_stop_that_was_not_taken_is_no_stop(slave, caplog) -> None:
     """The supervisor hangs: what it has not begun to stop is named, with the way to stop it."""
     slave.when_stopped = lambda: slave.report("q", InstanceState.STOPPING)
     assert slave.end() == 1
-    assert "(pid 7) still stops q#1 and has not begun to stop p#1. End what runs" in caplog.text
+    assert "(pid 7) still stops q#1 and has not begun to stop p#1. Stop them by" in caplog.text
 
 
 def test_what_is_still_being_stopped_is_named(slave, caplog) -> None:
@@ -105,8 +105,8 @@ def test_a_second_signal_is_answered_with_what_is_left_and_until_when(slave) -> 
     slave.ending.say_progress()
     assert slave.end() == 0
     assert slave.said == [
-        "stopping 2 processes (SIGINT); what has not ended within 2 s is killed (SIGKILL)",
-        "still stopping q#1; what has not ended within 1 s is killed (SIGKILL)",
+        "stopping 2 processes (SIGINT); processes that run after 2 s are killed (SIGKILL)",
+        "still stopping q#1; processes that run after 1 s are killed (SIGKILL)",
         "still stopping q#1",
         "slave of h0 ended; 2 processes were stopped",
     ]

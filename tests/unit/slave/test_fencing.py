@@ -93,7 +93,7 @@ def test_what_is_given_out_too_late_is_not_started() -> None:
     """The slave was stopped with the order in its sockets: the successor may run by now."""
     one = Slave()
     (message,) = refusals(one.assign(after=2.0))
-    assert message.startswith("fenced before it was started: for 2 s")
+    assert message.startswith("fenced before it was started: no confirmed contact")
     assert refusals(one.assign(number=2, after=0.0, fence=Fence(2.5, 0.0))) == []
 
 

@@ -48,7 +48,7 @@ class Wire:
 
     def ask(self, host, wanted, now, timeout, done) -> None:
         def answer(part: Part | None) -> None:
-            done("no such state is kept here" if part is None else part)
+            done("there is no such snapshot here" if part is None else part)
 
         age = (wanted.number, wanted.sequence)
         self.net.slaves[host].read_part(wanted.process, age, wanted.offset, 1000, answer)
@@ -380,7 +380,7 @@ def test_without_a_state_it_starts_from_what_is_there(net, monkeypatch):
     net.add("b")
     prepare(net, "a", assignment("b"))
     assert net.said["a"] == [
-        "no newer state for p#9, it starts from nothing: b: no such state is kept here"
+        "no newer state for p#9, it starts from nothing: b: there is no such snapshot here"
     ]
     net.hidden.add("b")
     net.write("a", 5)

@@ -48,7 +48,7 @@ def test_it_is_stopped_when_nobody_says_that_it_is_heard():
     """By the steps of its stop, as much shorter as its fence wants; it is fenced, and says why."""
     core, instance = running()
     assert signals(core, 13.5) == [(10.0, "SIGINT"), (11.0, "SIGTERM"), (13.0, "SIGKILL")]
-    why = "fenced: for 10 s it was not known here whether the master hears this host; "
+    why = "fenced: no confirmed contact with the master for 10 s; "
     steps = "SIGINT, SIGTERM after 1.0 s, SIGKILL after 3.0 s"
     assert instance.message == why + steps
     core.handle(sv.Exited(ONE, signal=9), 13.5)
@@ -119,8 +119,8 @@ def test_a_restart_by_policy_does_not_put_it_off():
     assert instance.phase == sv.BACKOFF
     core.handle(sv.TimePassed(), 10.0)
     assert instance.phase == sv.FENCED
-    assert instance.message.endswith("the master hears this host; it waited for its restart "
-                                     "(exit code 1)")  # fmt: skip
+    assert instance.message.endswith("contact with the master for 10 s; "
+                                     "it waited for its restart (exit code 1)")  # fmt: skip
 
 
 def test_a_start_that_waits_its_turn_is_given_up():

@@ -348,13 +348,13 @@ class Lab:
             )
         if not record.complete:
             raise LabError(
-                f"lab {self.name!r} was not made to the end: `rosrm lab up` begins anew, "
-                "`rosrm lab down` removes what there is"
+                f"lab {self.name!r} is incomplete: `rosrm lab up` makes it again, "
+                "`rosrm lab down` removes its parts"
             )
         if record.boot != store.boot_id():
             raise LabError(
                 f"lab {self.name!r} did not survive the restart of this machine: `rosrm lab up` "
-                "makes it anew, `rosrm lab down` removes the rest of it"
+                "makes it again, `rosrm lab down` removes the rest of it"
             )
         return record
 

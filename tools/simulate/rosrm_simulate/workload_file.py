@@ -322,5 +322,5 @@ def _refuse_endless(
         if plan is not None and plan.memory.most == inf == plan.duration == until:
             problems.add(
                 node.deepest(("growth",)).place,
-                f"{plan.name} grows for ever; give it `most` or `duration`, or the whole `until`",
+                f"{plan.name} grows without a bound; set `most` or `duration`, or the key `until`",
             )

@@ -74,7 +74,7 @@ def _why_no_checkpoint(state: MasterState, process: Process) -> str:
         )
     if process.spec.keeps_state:
         return (
-            f"{process.name} moves by handoff: its node takes part under the number of its "
+            f"{process.name} moves by handoff: its node is identified by the number of its "
             f"instance, and the restored instance would have another one"
         )
     if process.instances - {process.owner}:

@@ -267,7 +267,7 @@ def _why_it_stays(state: MasterState, instance: Instance) -> str:
         return ""
     if _is_alone(state, source):
         return _ALONE
-    return f"{process.name} may run on no other host (`rosrm explain NAME` says why)"
+    return f"{process.name} may run on no other host (`rosrm explain NAME` shows the reason)"
 
 
 def _note_drained(state: MasterState, host: Host, now: float) -> None:
@@ -313,7 +313,7 @@ def _images_on(state: MasterState, host: Host) -> list[tuple[str, str]]:
 def _tell_nothing_moves(
     state: MasterState, host: Host, what: str, reasons: list[tuple[str, str]], now: float
 ) -> None:
-    why = "; ".join(_grouped(reasons)[:8]) or "it holds no process of this cluster"
+    why = "; ".join(_grouped(reasons)[:8]) or "it runs no process of this cluster"
     key = f"nothing_moves {what}"
     soon = now - host.told.get(key, float("-inf")) < _TOLD_EVERY
     if soon or host.blocked.get(what) == why:

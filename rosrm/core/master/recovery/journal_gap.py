@@ -91,7 +91,7 @@ def note_seen(state: MasterState, host: str, seen: int, now: float) -> None:
         now, EventKind.JOURNAL_BEHIND,
         f"the journal has lost its newest records: {host} has seen record {seen}, and the journal "
         f"ended at {tail.newest} when this master started: {records} missing. Repeat the "
-        f"requests that they held; processes that these started are stopped{wait}",
+        f"requests in them; processes that these started are stopped{wait}",
         host=host, facts={"seen": seen, "newest": tail.newest, "lost": lost},
     )  # fmt: skip
 
