@@ -21,6 +21,7 @@ from rosrm.criu.image import Manifest
 from rosrm.criu.program import Criu
 from rosrm.errors import CriuError
 from rosrm.supervisor import paths, procfs
+from rosrm.supervisor.procfs import inner_pid
 
 #: What both CRIU's dump and its restore are told.
 COMMON: Final = ("--tcp-close", "--file-locks", "--manage-cgroups=ignore")
@@ -79,7 +80,7 @@ def dump(
         _run(criu, root, directory, timeout, process)
         manifest = _describe(root, directory, Manifest(
             process, instance, platform.node(), time.time(), criu.version, platform.release(),
-            platform.machine(), tree.inner_pid(root), (), (), "", _shelter(pid), "",
+            platform.machine(), inner_pid(root), (), (), "", _shelter(pid), "",
         ))  # fmt: skip
         if leave == "running" and not was_stopped:
             resume(pid)  # the checksums are of files alone: it need not stand still for them
@@ -118,7 +119,7 @@ def kill(pid: int) -> None:
 
 def _run(criu: Criu, root: int, directory: Path, timeout: float, process: str) -> None:
     arguments = (
-        "dump", "--tree", str(tree.inner_pid(root)), "--images-dir", str(directory / image.PAGES),
+        "dump", "--tree", str(inner_pid(root)), "--images-dir", str(directory / image.PAGES),
         "--leave-stopped", *COMMON, "--timeout", str(_FREEZE),
         "--ghost-limit", str(held_files.MOST),
     )  # fmt: skip

@@ -6,11 +6,11 @@ import contextlib
 import os
 import signal
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Final
 
-from rosrm.supervisor.procfs import read_stat
+from rosrm.supervisor.procfs import inner_pid, read_stat
 
 #: Namespaces that CRIU has to share with what it dumps, with the option of nsenter for each.
 _NAMESPACES: Final = {
@@ -59,19 +59,22 @@ def root_of(leader: int) -> int:
 
 def is_hold(pid: int) -> bool:
     """It runs the program that holds a restored process."""
-    return _runs(pid, HOLD)
+    return _names(_words(pid), HOLD)
 
 
-def may_hold(pid: int) -> bool:
-    """It does, or may do so in a moment.
+def leads(pid: int) -> bool | None:
+    """Return True if it is a hold; None: not yet, but it may be one in a moment.
 
     One that was spawned just now has no command line yet: it may be anything.
     """
-    return _words(pid) == [""] or _runs(pid, HOLD, _AGAIN)
+    words = _words(pid)
+    if _names(words, HOLD):
+        return True
+    return None if words == [""] or _names(words, _AGAIN) else False
 
 
-def _runs(pid: int, *programs: str) -> bool:
-    return any(word.endswith(programs) for word in _words(pid)[1:5])
+def _names(words: Sequence[str], program: str) -> bool:
+    return any(word.endswith(program) for word in words[1:5])
 
 
 def _words(pid: int) -> list[str]:
@@ -108,19 +111,7 @@ def is_stopped(pid: int) -> bool:
 
 def inner_ids(pid: int) -> list[int]:
     """The ids of its threads in its own pid namespace; raises OSError where it has ended."""
-    return sorted(map(_inner_id, Path(f"/proc/{pid}/task").iterdir()))
-
-
-def inner_pid(pid: int) -> int:
-    """Its id in its own pid namespace; raises OSError where it has ended."""
-    return _inner_id(Path(f"/proc/{pid}"))
-
-
-def _inner_id(entry: Path) -> int:
-    for line in (entry / "status").read_text(errors="replace").splitlines():
-        if line.startswith("NSpid:"):
-            return int(line.split()[-1])
-    return int(entry.name)
+    return sorted(inner_pid(pid, int(task.name)) for task in Path(f"/proc/{pid}/task").iterdir())
 
 
 def entering(pid: int) -> tuple[str, ...]:

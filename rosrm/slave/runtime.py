@@ -7,6 +7,7 @@ import logging
 import os
 import signal
 import socket
+import sys
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
@@ -18,7 +19,7 @@ import numpy as np
 from rosrm.config.settings import HostConfig
 from rosrm.core.slave import reducer as core
 from rosrm.errors import Refused
-from rosrm.extensions.contracts import ProbeContext
+from rosrm.extensions.contracts import LauncherContext, ProbeContext
 from rosrm.extensions.registry import Registry
 from rosrm.model.values import (
     RESOURCE_SLOTS,
@@ -39,6 +40,7 @@ from rosrm.runtime.bootstrap import handle_stop_signals
 from rosrm.runtime.state_lock import only_one
 from rosrm.slave.executors import Done, Executors, Here
 from rosrm.slave.health import HealthWatch
+from rosrm.slave.launch.launchers import Launchers
 from rosrm.slave.launch.starter import Starter
 from rosrm.slave.logs import newest_instance, nothing_yet, read_log
 from rosrm.slave.replication.service import Keeping
@@ -103,7 +105,8 @@ class SlaveRuntime:
                     config.state, "slave", code="name_taken", remedy="another `host:` and `state:`"
                 )
             )
-            sessions = SessionTable()
+            launchers = self._launchers(registry)
+            sessions = SessionTable(launchers=launchers)
             self._usage = UsageWatch(sessions)
             context = ProbeContext(config.scope, config.budget, config.state, sessions)
             probes = registry.probes(config.probes, context)
@@ -123,7 +126,7 @@ class SlaveRuntime:
             )
             opened.callback(self._participant.close)
             graph = GraphWatch(self._participant.node)
-            self._health = HealthWatch(self._participant, graph, sessions)
+            self._health = HealthWatch(self._participant, graph, sessions, launchers)
             self._limit = self._limits()
             self._endpoint = SlaveEndpoint(
                 self._participant,
@@ -143,8 +146,8 @@ class SlaveRuntime:
                 post=self._post, say=self.say, publish=self._endpoint.publish_kept,
             )  # fmt: skip
             self._starter = Starter(
-                config, self._incarnation, kept, self._state, self._supervisor, self._endpoint,
-                self._keeping, graph, sessions, take=self.take, say=self.say,
+                config, kept, self._state, self._supervisor, self._endpoint, self._keeping, graph,
+                sessions, launchers, take=self.take, say=self.say,
             )  # fmt: skip
             self._ending = Ending(
                 config, self._state, self._starter, self._supervisor, self._endpoint,
@@ -152,6 +155,13 @@ class SlaveRuntime:
             )  # fmt: skip
             self._closing = opened.pop_all()
         self._adopt()
+
+    def _launchers(self, registry: Registry) -> Launchers:
+        context = LauncherContext(self._config.state, sys.executable, self._incarnation)
+        found = registry.launchers(context)
+        for name, reason in found.unusable.items():
+            self.say(f"launcher {name} is {reason}")
+        return Launchers(found.made, found.unusable, registry.capabilities_of(), self.say)
 
     def _limits(self) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
         limit = np.ones(RESOURCE_SLOTS, np.float32)
@@ -363,7 +373,7 @@ class SlaveRuntime:
         if isinstance(command, core.Fail):
             self.say(f"{command.instance} is {command.reason}")
         if isinstance(command, core.Restart):  # by hand
-            self._starter.begin_anew(command.instance)
+            self._starter.launchers.discard_images(command.instance)
         self._supervisor.carry_out(command)
 
     def _wake(self) -> None:

@@ -16,6 +16,7 @@ says that it is absent (`SkipPlugin`), its contract is skipped with that reason.
 
 from rosrm.testing.checkpoints import CheckpointContract
 from rosrm.testing.journals import JournalContract, MemoryJournal
+from rosrm.testing.launchers import LauncherContract
 from rosrm.testing.migrations import MigrationContract, before_commit, with_options
 from rosrm.testing.probes import (
     FakeClock,
@@ -33,6 +34,7 @@ __all__ = [
     "FakeProbe",
     "FakeSessions",
     "JournalContract",
+    "LauncherContract",
     "MemoryJournal",
     "MigrationContract",
     "ProbeContract",

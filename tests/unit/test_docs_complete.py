@@ -161,6 +161,7 @@ def test_every_hook_and_its_parameters_are_documented(hook):
         contracts.ScoringOffer,
         contracts.MigrationOffer,
         contracts.CheckpointOffer,
+        contracts.LauncherOffer,
     ],
     ids=lambda offer: offer.__name__,
 )

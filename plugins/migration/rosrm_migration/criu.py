@@ -13,6 +13,7 @@ from math import inf
 from typing import Any, Final
 
 from rosrm.criu.fitting import mismatch
+from rosrm.extensions.contracts import Capabilities
 from rosrm.extensions.plans import (
     Commit,
     Execute,
@@ -98,6 +99,12 @@ class OwnCriuOptions(CriuOptions):
             )
 
 
+def capabilities(options: OwnCriuOptions) -> Capabilities:
+    """Return what the strategy can do for a process with these options."""
+    periodic = options.checkpoint_every > 0.0
+    return Capabilities(state="memory", restart_from_image=periodic, launcher=NAME)
+
+
 class Criu:
     """Plans a move of the whole memory."""
 
@@ -146,7 +153,7 @@ class Criu:
 
     def checkpoint_every(self, spec: ProcessSpec) -> float:
         """As its own options say."""
-        return self._own(spec).checkpoint_every if spec.checkpointed else 0.0
+        return self._own(spec).checkpoint_every if spec.ros_node else 0.0
 
     def periodic(self, spec: ProcessSpec, instance: InstanceId, host: str, now: int) -> Execute:
         """Have the node leave, dump it, and have it join again."""

@@ -6,9 +6,10 @@ from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from typing import Any, Final
 
-from rosrm.extensions.contracts import MigrationOffer
+from rosrm.extensions.contracts import Launcher, LauncherContext, LauncherOffer, MigrationOffer
 from rosrm.extensions.hookspecs import hookimpl
-from rosrm_migration import criu, criu_kept, criu_periodic
+from rosrm.portable.form import VARIABLE
+from rosrm_migration import criu, criu_kept, criu_periodic, handoff
 from rosrm_migration.criu import Criu, CriuOptions, OwnCriuOptions
 from rosrm_migration.handoff import WATCH, Handoff, HandoffOptions, watch
 from rosrm_migration.relaunch import Relaunch, RelaunchOptions
@@ -36,12 +37,14 @@ def register_migration_strategies() -> Sequence[MigrationOffer]:
             options=HandoffOptions,
             summary="the destination follows the source's state, and goes on from it",
             executors={WATCH: watch},
+            capabilities=handoff.capabilities,
         ),
         MigrationOffer(
             name=criu.NAME,
             create=Criu,
             options=CriuOptions,
             own_options=OwnCriuOptions,
+            capabilities=criu.capabilities,
             summary="the whole memory of a portable node is dumped, and restored elsewhere",
             executors={
                 criu.ABILITY: _when_asked("say_ability"),
@@ -64,6 +67,26 @@ def register_migration_strategies() -> Sequence[MigrationOffer]:
             },
         ),
     ]
+
+
+@hookimpl
+def register_launchers() -> Sequence[LauncherOffer]:
+    """Offer the launcher of the processes that move by `criu`, and of all that it restores."""
+    return [
+        LauncherOffer(
+            name=criu.NAME,
+            create=_launcher,
+            summary="starts portable nodes, and processes from images of their memory",
+            variables=(VARIABLE,),
+        )
+    ]
+
+
+def _launcher(context: LauncherContext) -> Launcher:
+    """Load the launcher in slaves alone."""
+    module = import_module("rosrm_migration.criu_launcher")
+    launcher: Launcher = module.CriuLauncher(context)
+    return launcher
 
 
 def _when_asked(

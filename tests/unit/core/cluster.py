@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+import rosrm_migration.plugin
 from rosrm.core.master import events as happened
 from rosrm.core.master import listing
 from rosrm.core.master.commands import (
@@ -35,6 +36,7 @@ from rosrm.core.slave import reducer
 from rosrm.extensions.contracts import HostView, Intent, ProcessView, Record, Scores
 from rosrm.extensions.declared_fields import Declared
 from rosrm.extensions.options import merged_options
+from rosrm.extensions.registry import Registry
 from rosrm.model.codec import to_plain
 from rosrm.model.plan import (
     AwaitReady,
@@ -162,10 +164,12 @@ class HandOver:
 
 
 _SHIPPED = {offer.name: offer for offer in register_migration_strategies()}
+_REGISTRY = Registry.of(plugin=rosrm_migration.plugin)
+_CAPABILITIES, _CAPABILITIES_OF = _REGISTRY.capabilities(), _REGISTRY.capabilities_of()
 
 
 def declared_by(strategies: Mapping[str, Any]) -> Declared:
-    """Return the declarations of the shipped strategies among these: their options."""
+    """Return the declarations of the shipped strategies: their options and capabilities."""
 
     def options_of(name: str, spec: ProcessSpec) -> Any:
         offer = _SHIPPED.get(name)
@@ -175,7 +179,9 @@ def declared_by(strategies: Mapping[str, Any]) -> Declared:
         own = spec.migration.options if spec.migration.strategy == name else {}
         return merged_options(offer.own_options or offer.options, to_plain(cluster), own)
 
-    return Declared(options_of=options_of)
+    return Declared(
+        options_of=options_of, capabilities_of=_CAPABILITIES_OF, capabilities=_CAPABILITIES
+    )
 
 
 # --- the cluster ------------------------------------------------------------------------------
