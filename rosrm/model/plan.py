@@ -1,8 +1,8 @@
 """Plans as data: how a process moves, step by step, and the way back from each step.
 
-A strategy proposes a `Plan`; `moves.py` carries it out, and a `Run` holds how far it is. Before the
-commit a failure undoes the steps done so far, newest first, back to a running source; after it the
-plan is rolled forward. What can be neither is STUCK, and said loudly.
+A strategy proposes a `Plan`; `executor.py` carries it out, and a `Run` holds how far it is. Before
+the commit a failure undoes the steps done so far, newest first, back to a running source; after it
+the plan is rolled forward. What can be neither is STUCK, and said loudly.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The values that the core thinks in.
 
 Seconds, bytes and fractions 0..1 are the base units. All values are frozen; what changes lives in
-the reducers (`master.py`, `slave.py`) and in the standing arrays of `hosts.py`.
+the reducers of `rosrm.core` and in the standing arrays of `hosts.py`.
 """
 
 from __future__ import annotations

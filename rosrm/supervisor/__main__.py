@@ -2,7 +2,7 @@
 
 First stage: it becomes a daemon of its own session, so that neither a terminal's Ctrl-C nor the
 end of the slave reaches it, and a subreaper, which only ctypes can ask for. Then it executes the
-bare interpreter (see `bare.py`), which keeps the subreaper's role and sheds this stage's memory.
+bare interpreter (`bare_interpreter.py`), which keeps the subreaper's role and frees this memory.
 
 The slave runs this file by its path in an interpreter without site-packages, which starts faster
 and past the ROS wheels' bootstrapper: so it imports the standard library only.
@@ -41,7 +41,7 @@ def main() -> None:
         options.log_instances,
         options.log_processes,
     )
-    bare = os.path.join(os.path.dirname(os.path.abspath(__file__)), "bare.py")
+    bare = os.path.join(os.path.dirname(os.path.abspath(__file__)), "bare_interpreter.py")
     command = [sys.executable, "-I", "-S", bare, state, *(str(limit) for limit in limits)]
     os.execv(sys.executable, command)  # noqa: S606 - no shell is wanted
 

@@ -1,4 +1,4 @@
-"""Where the bare interpreter of the supervisor begins: `python -I -S bare.py STATE LIMITS...`.
+"""Where the bare interpreter of the supervisor begins: `-I -S bare_interpreter.py STATE LIMITS`.
 
 Without site-packages (-S) no `.pth` file runs: neither the ROS wheels' bootstrapper nor an
 environment's imports. So this file finds the `rosrm` package itself, which it lies in.

@@ -1,4 +1,4 @@
-"""All that the master's core knows; the handlers of `master.py` change it in place."""
+"""The state of the master's core; the handlers of `reducer.py` change it in place."""
 
 from __future__ import annotations
 

@@ -2,10 +2,10 @@
 
 Put together here; each part stands in a file of its own:
 
-- `hearing.py`: what slaves say without being asked;
-- `master_services.py`: what slaves and clients ask;
-- `host_links.py`: what is said to slaves;
-- `handoff_endpoint.py`: what is said and heard of handoffs.
+- `subscriptions.py`: what slaves publish;
+- `services.py`: requests of slaves and clients;
+- `slave_links.py`: orders to slaves;
+- `handoff.py`: reports and signals of handoffs.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The hosts: what they say of themselves, what is promised to them, and who may be given work.
 
-What placement and liveness need of a thousand hosts at once stands in arrays (`columns.py`); what
-is asked of one host at a time (its description, its labels) lives in `Host` beside them.
+What placement and liveness need of a thousand hosts at once stands in `host_arrays.py`; what is
+asked of one host at a time (its description, its labels) lives in `Host` beside them.
 """
 
 from __future__ import annotations
