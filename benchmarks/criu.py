@@ -27,9 +27,9 @@ from typing import Any, Final
 
 from benchmarks.machine import percentile, print_report, say
 from benchmarks.stopping import run
-from rosrm.criu.probe import ability
 from rosrm.errors import LabError
 from rosrm.lab import DATA, GIB, HostPlan, Lab, uniform
+from rosrm_criu.engine.probe import ability
 
 _ROOT: Final = Path(__file__).resolve().parents[1]
 _ROSRM: Final = (sys.executable, "-m", "rosrm.cli")

@@ -2,7 +2,7 @@
 
 from rosrm.model.values import MigrationPolicy, ProcessSpec
 from rosrm.testing import LauncherContract
-from rosrm_migration import plugin
+from rosrm_criu import plugin
 
 OFFERS = {offer.name: offer for offer in plugin.register_launchers()}
 

@@ -23,7 +23,7 @@ from rosrm.model import plan
 from rosrm.model import rows as listing_rows
 from rosrm.model.values import HostDescription
 from rosrm_checkpoint.other_host import OtherHostOptions
-from rosrm_migration.criu import CriuOptions
+from rosrm_criu.options import CriuOptions
 from rosrm_migration.handoff import HandoffOptions
 from rosrm_migration.relaunch import RelaunchOptions
 from rosrm_scoring.threshold import ThresholdOptions

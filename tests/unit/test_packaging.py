@@ -74,6 +74,7 @@ def test_every_distribution_is_looked_at() -> None:
     assert {
         "rosrm",
         "rosrm-checkpoint",
+        "rosrm-criu",
         "rosrm-examples",
         "rosrm-migration",
         "rosrm-msgs",

@@ -13,6 +13,7 @@ exit    when
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,7 +21,6 @@ import typer
 
 from rosrm.cli import simulate
 from rosrm.cli.commands import change, check, follow, inspect, start
-from rosrm.cli.criu import criu
 from rosrm.cli.groups import PlainCommand, PlainGroup, hint_after
 from rosrm.cli.lab import lab
 from rosrm.cli.options import Common, Domain
@@ -93,8 +93,14 @@ def common(
 for module in (start, change, inspect, follow, simulate):
     for function in module.COMMANDS:
         app.command()(function)
-for name, group in (("config", check.config), ("lab", lab), ("criu", criu)):
+groups = {"config": check.config, "lab": lab}
+# Until commands come by the entry points `rosrm.commands`, which plugins/criu names already.
+with contextlib.suppress(ModuleNotFoundError):
+    from rosrm_criu.cli import criu
+
+    groups["criu"] = criu
+for name, group in groups.items():
     app.add_typer(group, name=name, cls=PlainGroup)
-for group in (app, check.config, lab, criu):
+for group in (app, *groups.values()):
     for command in group.registered_commands:
         command.cls = PlainCommand

@@ -13,8 +13,8 @@ import pytest
 HOPS = """
 import json, os, subprocess, sys, time
 from pathlib import Path
-from rosrm.criu import dumping, outcome
-from rosrm.criu.program import opened
+from rosrm_criu.engine import dumping, outcome
+from rosrm_criu.engine.binary import opened
 
 program, folder = Path(sys.argv[1]), Path(sys.argv[2])
 COUNTER = '''

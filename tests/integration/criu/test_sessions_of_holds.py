@@ -11,7 +11,7 @@ from rosrm.extensions.contracts import LauncherContext
 from rosrm.extensions.registry import MadeLauncher
 from rosrm.slave.launch.launchers import Launchers
 from rosrm.slave.sessions import SessionTable
-from rosrm_migration.criu_launcher import CriuLauncher
+from rosrm_criu.launcher import CriuLauncher
 
 #: It has a child in a session of its own, and waits for it.
 PROGRAM = """
@@ -60,7 +60,7 @@ def test_a_hold_is_known_as_one_however_early_it_was_added(spawn):
     """A process that was spawned just now has no command line yet, for most of the tries."""
     table = SessionTable(launchers=BY_CRIU)
     for _ in range(ROUNDS):
-        hold = spawn("rosrm/criu/hold.py")
+        hold = spawn("plugins/criu/rosrm_criu/engine/shim.py")
         table.add(hold)
         child = child_of(hold)
         table.refresh(0.0)

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+import rosrm_criu.plugin
 import rosrm_migration.plugin
 from rosrm.core.master import events as happened
 from rosrm.core.master import listing
@@ -60,7 +61,6 @@ from rosrm.model.values import (
     Readiness,
     RestartPolicy,
 )
-from rosrm_migration.plugin import register_migration_strategies
 from tests.unit.core.machine import GIB, MIB, Machine
 from tests.unit.core.nodes import Air, Node
 
@@ -163,8 +163,8 @@ class HandOver:
         )
 
 
-_SHIPPED = {offer.name: offer for offer in register_migration_strategies()}
-_REGISTRY = Registry.of(plugin=rosrm_migration.plugin)
+_REGISTRY = Registry.of(migration=rosrm_migration.plugin, criu=rosrm_criu.plugin)
+_SHIPPED = {name: _REGISTRY.offer("migration", name) for name in _REGISTRY.names("migration")}
 _CAPABILITIES, _CAPABILITIES_OF = _REGISTRY.capabilities(), _REGISTRY.capabilities_of()
 
 

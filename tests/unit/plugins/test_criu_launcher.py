@@ -11,7 +11,7 @@ import pytest
 from rosrm.errors import LaunchError
 from rosrm.extensions.contracts import Launch, LauncherContext
 from rosrm.model.values import Assignment, InstanceId, MigrationPolicy, ProcessSpec
-from rosrm_migration.criu_launcher import CriuLauncher
+from rosrm_criu.launcher import CriuLauncher
 
 
 def prepared(
