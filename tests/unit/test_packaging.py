@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
+import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -108,3 +109,27 @@ def test_the_readme_installs_all_that_runs() -> None:
     (line,) = re.findall(r"^\$ pip install (.*)$", (ROOT / "README.md").read_text(), re.MULTILINE)
     needed = [f"./{p.parent}" for p in PROJECTS if p.parent not in (Path(), Path("examples"))]
     assert sorted(shlex.split(line)) == sorted(["-c", "constraints.txt", ".[ros]", *needed])
+
+
+#: Shows the help as where none of these distributions is installed.
+ALONE = """
+import sys
+sys.modules.update(dict.fromkeys({absent!r}))
+from rosrm.cli.commands import app
+app(["--help"])
+"""
+
+
+def test_rosrm_alone_shows_its_help() -> None:
+    """Without any plugin, and without the libraries that only plugins need."""
+    plugins = [project.parent.name for project in PROJECTS if project.parent.parent.name]
+    absent = [f"rosrm_{name}" for name in plugins] + ["aiohttp", "cryptography", "urllib3"]
+    assert "rosrm_criu" in absent
+    done = subprocess.run(
+        [sys.executable, "-c", ALONE.format(absent=absent)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "submit" in done.stdout
