@@ -152,11 +152,13 @@ class MadeLaunchers:
 
     Attributes:
         made: by name.
-        unusable: name to the reason, of those that are absent or broken here.
+        absent: name to the reason, of those that say that they are absent here.
+        broken: name to the reason, of those that could not be made.
     """
 
     made: Mapping[str, MadeLauncher]
-    unusable: Mapping[str, str]
+    absent: Mapping[str, str]
+    broken: Mapping[str, str]
 
 
 @dataclass(frozen=True)
@@ -358,18 +360,19 @@ class Registry:
     def launchers(self, context: LauncherContext) -> MadeLaunchers:
         """Make the launchers of a host; one that cannot be made is left out with the reason."""
         made: dict[str, MadeLauncher] = {}
-        unusable: dict[str, str] = {}
+        absent: dict[str, str] = {}
+        broken: dict[str, str] = {}
         for name in self.names("launcher"):
             offer = cast(LauncherOffer, self._offered("launcher", name).offer)
             try:
                 launcher = self._create("launcher", name, offer, context)
                 made[name] = MadeLauncher(launcher, tuple(offer.variables))
             except SkipPlugin as skip:
-                unusable[name] = f"absent: {skip}"
+                absent[name] = str(skip)
                 self._outcome["launcher", name] = ("absent", str(skip))
             except PluginError as fault:
-                unusable[name] = f"broken: {fault}"
-        return MadeLaunchers(made, unusable)
+                broken[name] = str(fault)
+        return MadeLaunchers(made, absent, broken)
 
     def executors(self) -> dict[str, OfferedExecutor]:
         """Return what the open steps of plans may name on this host, from all migration offers."""

@@ -105,7 +105,10 @@ class SlaveRuntime:
                     config.state, "slave", code="name_taken", remedy="another `host:` and `state:`"
                 )
             )
-            launchers = self._launchers(registry)
+            offered = registry.launchers(
+                LauncherContext(config.state, sys.executable, self._incarnation)
+            )
+            launchers = Launchers.of(offered, registry.capabilities_of(), self.say)
             sessions = SessionTable(launchers=launchers)
             self._usage = UsageWatch(sessions)
             context = ProbeContext(config.scope, config.budget, config.state, sessions)
@@ -137,6 +140,8 @@ class SlaveRuntime:
             )
             self._note_probes(first)
             self._endpoint.failing.update(self._executors.failing_plugins())
+            for name, reason in offered.broken.items():
+                self._endpoint.failing["launcher", name] = reason
             for strategy, reason in self._executors.failing.items():
                 self.say(f"migration strategy {strategy} is broken: {reason}")
             kept = config.state / "kept"
@@ -155,13 +160,6 @@ class SlaveRuntime:
             )  # fmt: skip
             self._closing = opened.pop_all()
         self._adopt()
-
-    def _launchers(self, registry: Registry) -> Launchers:
-        context = LauncherContext(self._config.state, sys.executable, self._incarnation)
-        found = registry.launchers(context)
-        for name, reason in found.unusable.items():
-            self.say(f"launcher {name} is {reason}")
-        return Launchers(found.made, found.unusable, registry.capabilities_of(), self.say)
 
     def _limits(self) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
         limit = np.ones(RESOURCE_SLOTS, np.float32)

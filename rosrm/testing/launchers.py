@@ -48,11 +48,10 @@ class LauncherContract:
             raise ContractBroken(registry.broken[0].reason)
         context = LauncherContext(Path(mkdtemp(prefix="rosrm-")), sys.executable, 1)
         found = registry.launchers(context)
-        reason = found.unusable.get(self.offer.name, "")
-        if reason.startswith("absent: "):
-            raise SkipTest(f"{self.offer.name} is {reason}")
-        if reason:
-            raise ContractBroken(reason)
+        if found.absent:
+            raise SkipTest(f"{self.offer.name} is absent: {found.absent[self.offer.name]}")
+        if found.broken:
+            raise ContractBroken(found.broken[self.offer.name])
         return found.made[self.offer.name].launcher
 
     def launch(self, number: int = 1, *, restored: bool = False) -> Launch:

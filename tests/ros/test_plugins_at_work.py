@@ -149,6 +149,7 @@ def register_launchers():
     return [
         LauncherOffer("imager", ByImage, variables=("IMAGER_KNOWS",)),
         LauncherOffer("absent_launcher", absent_launcher),
+        LauncherOffer("broken_launcher", lambda context: None),
     ]
 
 def absent_launcher(context): raise SkipPlugin("no container engine here")
@@ -458,8 +459,16 @@ def test_a_third_party_s_launcher_restores_from_its_image(
     cluster.wait("p", "checkpointed")
     cluster.client.restore("p")
     knows(b"knows what p#1 knew\n")
-    assert "launcher absent_launcher is absent: no container engine here" in cluster.log_of("h0")
     cluster.cancel("p")
+
+
+def test_a_launcher_that_cannot_be_used_is_named(cluster) -> None:
+    """In the log of its host, and listed as failing if it is broken; the host works without it."""
+    assert "launcher absent_launcher is absent: no container engine here" in cluster.log_of("h0")
+    (row,) = [row for row in plugins(cluster) if row.kind == "launcher"]
+    assert (row.name, row.host, row.state) == ("broken_launcher", "h0", "failing")
+    assert "an object with `prepare` is required" in row.reason
+    assert cluster.run(job("launched", "true"))[0].state == "finished"
 
 
 # --- at start ---------------------------------------------------------------------------------

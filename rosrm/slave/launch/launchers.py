@@ -17,7 +17,7 @@ from rosrm.extensions.contracts import (
 )
 from rosrm.extensions.discovery import FAULTS
 from rosrm.extensions.plugin_calls import implements, required
-from rosrm.extensions.registry import MadeLauncher
+from rosrm.extensions.registry import MadeLauncher, MadeLaunchers
 from rosrm.extensions.time_limit import limited
 from rosrm.model.values import EMPTY, InstanceId, ProcessSpec
 
@@ -52,6 +52,21 @@ class Launchers:
     capabilities_of: Callable[[ProcessSpec], Capabilities] = _no_capabilities
     log: Callable[[str], None] = _no_log
     _logged: dict[str, str] = field(init=False, default_factory=dict)
+
+    @classmethod
+    def of(
+        cls,
+        offered: MadeLaunchers,
+        capabilities_of: Callable[[ProcessSpec], Capabilities],
+        log: Callable[[str], None],
+    ) -> Launchers:
+        """Return the launchers of this host; log which of them cannot be used, and why."""
+        absent = {name: f"absent: {reason}" for name, reason in offered.absent.items()}
+        broken = {name: f"broken: {reason}" for name, reason in offered.broken.items()}
+        unusable = {**absent, **broken}
+        for name, reason in unusable.items():
+            log(f"launcher {name} is {reason}")
+        return cls(offered.made, unusable, capabilities_of, log)
 
     @property
     def variables(self) -> tuple[str, ...]:

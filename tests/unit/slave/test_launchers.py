@@ -176,4 +176,4 @@ def test_a_plugin_brings_a_launcher_that_its_strategy_declares():
 def test_a_launcher_that_cannot_be_made_is_named_with_the_reason():
     """The slave starts without it."""
     known = registry(lambda context: None)
-    assert "an object with `prepare` is required" in known.launchers(None).unusable["ours"]
+    assert "an object with `prepare` is required" in known.launchers(None).broken["ours"]
