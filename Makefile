@@ -21,20 +21,26 @@ export ROS_AUTOMATIC_DISCOVERY_RANGE := LOCALHOST
 export ROSRM_CRIU_PREFIX ?= $(CURDIR)/.venv/criu
 
 .DEFAULT_GOAL := help
-.PHONY: help setup test lint format demo demo-migration bench evaluation clean
+.PHONY: help setup environment check test lint format demo demo-migration bench evaluation clean
 
 help: ## this list
 	@echo "make TARGET, each sets up what it needs:"
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  %-16s%s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 	@echo "Variables: PYTHON=python3.12 (setup), LAYERS=\"unit ros\" ARGS=\"-k name\" (test), DRIVE=path (demo-migration), OUT=folder (evaluation)"
 
-setup: ## make .venv with all that the other targets need
+setup: SETUP := --tests
+setup: environment ## make .venv with all that the other targets need
+
+environment: ## make .venv with what the demos need
 	@command -v $(PYTHON) >/dev/null || { \
 	  echo "make setup: no '$(PYTHON)' here; install Python 3.10 to 3.13 or say PYTHON=/path/to/it" >&2; exit 1; }
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || { \
 	  echo "make setup: $(PYTHON) is $$($(PYTHON) --version 2>&1); rosrm needs Python 3.10 to 3.13:" \
 	       "make setup PYTHON=python3.12" >&2; exit 1; }
-	@$(PYTHON) scripts/setup.py $(if $(filter-out file,$(origin PYTHON)),--chosen)
+	@$(PYTHON) scripts/setup.py $(SETUP) $(if $(filter-out file,$(origin PYTHON)),--chosen)
+
+check: setup ## the inner loop, below 3 minutes: lint, types, unit and contract tests
+	@$(BIN)/python scripts/run_tests.py --layers unit contract $(ARGS)
 
 test: setup ## lint, types and all tests (LAYERS and ARGS narrow it down)
 	@$(BIN)/python scripts/run_tests.py --layers $(LAYERS) $(ARGS)
@@ -49,10 +55,10 @@ format: setup ## mend what ruff can mend
 	$(BIN)/ruff check --fix
 	$(BIN)/ruff format
 
-demo: setup ## three hosts on this machine map a LiDAR drive: out/demo/
+demo: environment ## three hosts on this machine map a LiDAR drive: out/demo/
 	@$(BIN)/python -m rosrm_examples.demo --out out/demo
 
-demo-migration: setup ## a LiDAR drive is mapped while the SLAM moves to another host: out/migration/
+demo-migration: environment ## a LiDAR drive is mapped while the SLAM moves to another host: out/migration/
 	@$(BIN)/python -m rosrm_examples.demo_migration --out out/migration $(if $(DRIVE),--drive "$(DRIVE)")
 
 bench: setup ## all benchmarks; each ends with one line of JSON

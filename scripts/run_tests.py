@@ -1,9 +1,9 @@
-"""Run the tests folder by folder and close with one table: `make test`.
+"""Run the tests in a few runs of pytest and close with one table: `make test`.
 
-Each folder under `tests/` is one run of pytest, and only what is independent runs in parallel. In
-the folders that run in real time, a failed test is run once more, alone, at the end of its folder.
-If it passes then, it is listed as flaky; both outputs are in build/test-results/flaky. A run with
-more than two flaky tests fails. `--lf` runs what failed last, and only the folders that hold it.
+The unit tests, which compute, run beside the integration tests, which mostly wait. In the folders
+that run in real time, a failed test is run once more, alone, at the end of its run. If it passes
+then, it is listed as flaky; both outputs are in build/test-results/flaky. More than two flaky tests
+fail. `--lf` runs what failed last, and only the folders that hold it.
 """
 
 from __future__ import annotations
@@ -17,14 +17,20 @@ import sys
 import time
 import xml.etree.ElementTree as ET
 from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "build" / "test-results"
 
-#: In this order: what fails fast comes first.
+#: The folders under tests/, in the order in which their results are shown.
 LAYERS = ("unit", "contract", "integration", "ros", "faults")
+
+#: The runs of pytest, in this order. A run with its output in a file goes on beside the next ones.
+RUNS = (("contract",), ("unit",), ("integration",), ("ros", "faults"))
+BESIDE = "unit"
 
 #: Workers of the folders that run in parallel. Tests in real time mostly wait, so that a core
 #: serves two of them. Where there is a ROS graph, each worker has a network of its own, if it may.
@@ -60,9 +66,9 @@ class Test:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one folder."""
+    """What became of one run."""
 
-    layer: str
+    folders: tuple[str, ...]
     status: int
     passed: int = 0
     failed: int = 0
@@ -73,67 +79,97 @@ class Outcome:
 
 def main() -> int:
     """Run the folders asked for; answer with the exit status of the first pytest that failed."""
+    began = time.monotonic()
     RESULTS.mkdir(parents=True, exist_ok=True)
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--layers", nargs="+", choices=LAYERS, default=LAYERS)
     options, for_pytest = parser.parse_known_args()
     # Ctrl-C goes to pytest too, which ends its tests in order: wait for it, then close.
     signal.signal(signal.SIGINT, lambda *_: None)
-    outcomes = []
-    layers = [layer for layer in options.layers if (ROOT / "tests" / layer).is_dir()]
+    folders = {layer for layer in options.layers if (ROOT / "tests" / layer).is_dir()}
     if {"--lf", "--last-failed"} & set(for_pytest):
-        layers = failed_last(layers) or layers
-    for layer in layers:
-        print(f"\n=== {layer} ===", flush=True)
-        outcomes.append(run(layer, for_pytest))
-        if outcomes[-1].status == INTERRUPTED:
-            break
-    return report(outcomes)
+        folders = failed_last(folders) or folders
+    chosen = [run for some in RUNS if (run := tuple(one for one in some if one in folders))]
+    with ThreadPoolExecutor(max_workers=1) as aside:
+        beside = None
+        outcomes = []
+        for run in chosen:
+            if run == (BESIDE,) and run != chosen[-1]:
+                beside = aside.submit(run_folders, run, for_pytest, RESULTS / f"{BESIDE}.txt")
+                continue
+            outcomes.append(run_folders(run, for_pytest))
+            if outcomes[-1].status == INTERRUPTED:
+                break
+        if beside is not None:
+            outcomes.insert(0, beside.result())
+            print(f"\n=== {BESIDE}, which ran beside ===", flush=True)
+            print((RESULTS / f"{BESIDE}.txt").read_text(), flush=True)
+    return report(outcomes, time.monotonic() - began)
 
 
-def failed_last(layers: list[str]) -> list[str]:
+def failed_last(folders: set[str]) -> set[str]:
     """Return the folders in which a test failed when it was run last."""
-    try:
-        failed = json.loads((ROOT / ".pytest_cache/v/cache/lastfailed").read_text())
-    except OSError:
-        return []
-    return [layer for layer in layers if any(one.startswith(f"tests/{layer}/") for one in failed)]
+    failed: list[str] = []
+    for cache in (ROOT / ".pytest_cache").glob("*/v/cache/lastfailed"):
+        failed += json.loads(cache.read_text())
+    return {one for one in folders if any(name.startswith(f"tests/{one}/") for name in failed)}
 
 
-def run(layer: str, for_pytest: list[str]) -> Outcome:
-    """Run one folder, and then once more, one by one, those of its tests that failed."""
+def run_folders(
+    folders: tuple[str, ...], for_pytest: list[str], output: Path | None = None
+) -> Outcome:
+    """Run some folders, and then once more, one by one, those of their tests that failed.
+
+    Args:
+        folders: below tests/; they run with the same workers.
+        for_pytest: further arguments.
+        output: takes the output of pytest; None: this process's own.
+    """
     began = time.monotonic()
-    chosen = [f"tests/{layer}", *WORKERS.get(layer, []), *for_pytest]
-    status, tests = run_pytest(layer, chosen)
+    name = "-".join(folders)
+    if output is None:
+        print(f"\n=== {' and '.join(folders)} ===", flush=True)
+    places = [f"tests/{folder}" for folder in folders]
+    status, tests = run_pytest(
+        name, [*places, *WORKERS.get(folders[0], []), *for_pytest], output=output
+    )
     if tests is None:
         failed = 0 if status == NO_TESTS else 1
-        return Outcome(layer, status or 1, failed=failed, seconds=time.monotonic() - began)
+        return Outcome(folders, status or 1, failed=failed, seconds=time.monotonic() - began)
     failures = [name for name, test in tests.items() if test.outcome == "failed"]
     flaky: tuple[str, ...] = ()
-    if status == TESTS_FAILED and layer in REAL_TIME and len(failures) <= SECOND_CHANCES:
-        print(f"\n=== {layer}: {len(failures)} failed, each once more, alone ===", flush=True)
-        known = [name for name in failures if name.startswith(f"tests/{layer}/")]
-        again = (run_pytest(f"{layer}-again", known)[1] if known else None) or {}
-        flaky = tuple(
-            name for name in failures if name in again and again[name].outcome == "passed"
-        )
-        for name in flaky:
-            keep_outputs(name, tests[name], again[name])
+    may_try = folders[0] in REAL_TIME and len(failures) <= SECOND_CHANCES
+    if status == TESTS_FAILED and may_try:
+        print(f"\n=== {len(failures)} failed, each once more, alone ===", flush=True)
+        known = [one for one in failures if one.startswith(tuple(f"{place}/" for place in places))]
+        again = (run_pytest(f"{name}-again", known)[1] if known else None) or {}
+        flaky = tuple(one for one in failures if one in again and again[one].outcome == "passed")
+        for one in flaky:
+            keep_outputs(one, tests[one], again[one])
         if len(flaky) == len(failures):
             status = 0
     count = Counter(test.outcome for test in tests.values())
     return Outcome(
-        layer, status, count["passed"] + len(flaky), len(failures) - len(flaky), count["skipped"],
+        folders, status, count["passed"] + len(flaky), len(failures) - len(flaky), count["skipped"],
         time.monotonic() - began, flaky,
     )  # fmt: skip
 
 
-def run_pytest(name: str, arguments: list[str]) -> tuple[int, dict[str, Test] | None]:
+def run_pytest(
+    name: str, arguments: list[str], *, output: Path | None = None
+) -> tuple[int, dict[str, Test] | None]:
     """Run pytest; return its exit status, and its tests by node id (None: it wrote no result)."""
     result = RESULTS / f"{name}.xml"
     result.unlink(missing_ok=True)
-    command = [sys.executable, "-m", "pytest", f"--junit-xml={result}", "-o", "junit_logging=all"]
-    status = subprocess.run([*command, *arguments], cwd=ROOT, check=False).returncode
+    command = [
+        *(sys.executable, "-m", "pytest", f"--junit-xml={result}", "-o", "junit_logging=all"),
+        # What failed last is remembered for each run: two that end at once would lose one's list.
+        *("-o", f"cache_dir=.pytest_cache/{name.removesuffix('-again')}"),
+        *("--durations=20", "--durations-min=5"),
+    ]
+    with output.open("w") if output else nullcontext() as target:
+        ended = subprocess.run([*command, *arguments], cwd=ROOT, check=False, stdout=target)
+    status = ended.returncode
     if status == NO_TESTS:
         return status, None
     try:
@@ -175,15 +211,15 @@ def keep_outputs(name: str, first: Test, second: Test) -> None:
     path.write_text(f"{name}\n\n--- failed ---\n{first.text}\n--- passed ---\n{second.text}\n")
 
 
-def report(outcomes: list[Outcome]) -> int:
+def report(outcomes: list[Outcome], seconds: float) -> int:
     """Print the table, and as the last line the sums."""
     print(f"\n{'':12}{'passed':>8}{'failed':>8}{'skipped':>9}{'seconds':>9}")
     for o in outcomes:
-        print(f"{o.layer:12}{o.passed:8}{o.failed:8}{o.skipped:9}{o.seconds:9.0f}")
+        name = "+".join(o.folders)
+        print(f"{name:12}{o.passed:8}{o.failed:8}{o.skipped:9}{o.seconds:9.0f}")
     passed, failed, skipped = (
         sum(getattr(o, k) for o in outcomes) for k in ("passed", "failed", "skipped")
     )
-    seconds = sum(o.seconds for o in outcomes)
     print(f"{'all':12}{passed:8}{failed:8}{skipped:9}{seconds:9.0f}\n")
     flaky = [name for o in outcomes for name in o.flaky]
     counts = count_flaky(flaky)

@@ -1,7 +1,8 @@
-"""Make `.venv`, with all that the demo, the tests and the benchmarks need: `make setup`.
+"""Make `.venv`: what the demos need, and with `--tests` what tests and benchmarks need too.
 
-Run by the Python that the environment shall have, with the standard library alone. What is done
-already is not done again: a stamp in `.venv` holds digests of what went into it.
+Run by the Python that the environment is made from, with the standard library alone. A stamp in
+`.venv` holds digests of its contents, so that a finished step is not repeated. The compiled ROS
+interfaces are cached outside of `.venv`, because they take longer than all other steps together.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import signal
 import subprocess
 import sys
 import sysconfig
+import tempfile
 import time
 from collections import deque
 from collections.abc import Iterator
@@ -36,6 +38,9 @@ CONSTRAINTS = ROOT / "constraints.txt"
 
 #: There are ROS 2 Jazzy wheels for these.
 OLDEST, NEWEST = (3, 10), (3, 13)
+
+#: Run in the environment: rclpy finds the compiled interfaces.
+IMPORTS = "import rclpy, rosrm, rosrm_msgs.msg as m; m.ResourceInfo.__import_type_support__()"
 
 #: Lines of pip, CMake and ninja that tell how far they are.
 PROGRESS = re.compile(
@@ -54,11 +59,14 @@ def main() -> int:
     parser.add_argument(
         "--chosen", action="store_true", help="this Python was asked for: remake a .venv of another"
     )
+    parser.add_argument(
+        "--tests", action="store_true", help="install what tests and benchmarks need, too"
+    )
     options = parser.parse_args()
     with Path(__file__).open() as lock:
         wait_for(lock.fileno())
         try:
-            set_up(remake_other_version=options.chosen)
+            set_up(remake_other_version=options.chosen, tests=options.tests)
         except SetupError as error:
             print(f"\nmake setup: {error}", file=sys.stderr)
             return 1
@@ -77,50 +85,76 @@ def wait_for(lock: int) -> None:
         fcntl.flock(lock, fcntl.LOCK_EX)
 
 
-def set_up(*, remake_other_version: bool) -> None:
-    """Do the steps that are not done yet."""
-    wanted = {
-        "where": str(VENV),
-        "interfaces": interfaces_digest(),
-        "packages": packages_digest(),
-    }
+def set_up(*, remake_other_version: bool, tests: bool) -> None:
+    """Run the steps that are not done yet."""
+    packages = packages_digest()
+    wanted = {"where": str(VENV), "interfaces": interfaces_digest(), "packages": packages}
+    if tests:
+        wanted["tests"] = packages
     if not venv_usable(remake_other_version=remake_other_version):
         check_machine()
         make_venv()
-    done = read_stamp()
-    if done == wanted:
+    missing = {part for part, state in wanted.items() if read_stamp().get(part) != state}
+    if not missing:
         return
     check_machine()
     began = time.monotonic()
-    steps = Steps(total=4 if done.get("interfaces") == wanted["interfaces"] else 5)
+    steps = Steps()
     steps.run("pip and the build backends", *pip("install", *BACKENDS))
-    if done.get("interfaces") != wanted["interfaces"]:
+    if "interfaces" in missing:
+        install_interfaces(steps, wanted["interfaces"])
+        stamp(wanted, "interfaces")
+    if "packages" in missing:
         steps.run(
-            "the ROS interfaces: generated and compiled, about a minute",
-            *pip(
-                "install",
-                "--verbose",  # pip shows how far the compiler is only then
-                "--force-reinstall",
-                "--no-deps",
-                "--build-constraint",
-                CONSTRAINTS,
-                INTERFACES,
-            ),
+            "ROS 2 Jazzy, rosrm, its plugins and examples",
+            *pip("install", "--no-build-isolation", *editables(extras="ros,plot")),
         )
-        write_stamp({k: wanted[k] for k in ("where", "interfaces")})
-    steps.run(
-        "ROS 2 Jazzy, rosrm, its plugins and examples, the tools for the tests",
-        *pip("install", "--no-build-isolation", *editables(extras="ros,plot,test")),
-    )
-    steps.run(
-        "do they work together?",
-        PYTHON,
-        "-c",
-        "import rclpy, rosrm, rosrm_msgs.msg as m; m.ResourceInfo.__import_type_support__()",
-    )
-    try_criu(steps)
-    write_stamp(wanted)
+        steps.run("do they work together?", PYTHON, "-c", IMPORTS)
+        stamp(wanted, "packages")
+    if "tests" in missing:
+        steps.run(
+            "the tools for tests and benchmarks",
+            *pip("install", "--no-build-isolation", *editables(extras="ros,plot,test")),
+        )
+        try_criu(steps)
+        stamp(wanted, "tests")
     print(f"      .venv is ready ({time.monotonic() - began:.0f} s in all)", flush=True)
+
+
+def install_interfaces(steps: Steps, content: str) -> None:
+    """Install the compiled ROS interfaces, from the cache if they were built before.
+
+    Args:
+        content: digest of all that the build reads.
+    """
+    folder = cache_folder() / f"{content[:16]}-{sysconfig.get_platform()}-{short_version()}"
+    if not any(folder.glob("*.whl")):
+        with tempfile.TemporaryDirectory(dir=folder.parent) as built:
+            steps.run(
+                "the ROS interfaces: generated and compiled, about a minute",
+                *pip("wheel", "--no-deps", "--build-constraint", CONSTRAINTS),
+                *("--verbose", "--wheel-dir", built, INTERFACES),  # else it shows no progress
+            )
+            wheel = next(Path(built).glob("*.whl"))
+            folder.mkdir(exist_ok=True)
+            wheel.replace(folder / wheel.name)  # whole, or not at all
+    wheel = next(folder.glob("*.whl"))
+    steps.run(
+        "the compiled ROS interfaces",
+        *pip("install", "--force-reinstall", "--no-deps", "--no-compile", wheel),
+    )
+
+
+def cache_folder() -> Path:
+    """Return the user's cache of compiled interfaces; it may be removed at any time."""
+    caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    cache = caches / "rosrm" / "interfaces"
+    try:
+        cache.mkdir(parents=True, exist_ok=True)
+    except OSError:  # a user without a home
+        cache = VENV / "interfaces"
+        cache.mkdir(exist_ok=True)
+    return cache
 
 
 def try_criu(steps: Steps) -> None:
@@ -140,7 +174,7 @@ def try_criu(steps: Steps) -> None:
 def interfaces_digest() -> str:
     """Digest of all that the build of rosrm_msgs reads."""
     files = [p for p in INTERFACES.rglob("*") if p.is_file() and "__pycache__" not in p.parts]
-    return digest(files)
+    return digest([*files, CONSTRAINTS])
 
 
 def packages_digest() -> str:
@@ -188,6 +222,11 @@ def read_stamp() -> dict[str, str]:
     except (OSError, ValueError):
         return {}
     return stamp if isinstance(stamp, dict) else {}
+
+
+def stamp(wanted: dict[str, str], part: str) -> None:
+    """Note that a part of the environment is finished."""
+    write_stamp({**read_stamp(), "where": wanted["where"], part: wanted[part]})
 
 
 def write_stamp(done: dict[str, str]) -> None:
@@ -269,15 +308,14 @@ def editables(*, extras: str) -> list[object]:
 class Steps:
     """Runs commands one after another, and shows how far they are."""
 
-    def __init__(self, total: int) -> None:
-        self.total = total
+    def __init__(self) -> None:
         self.number = 0
         LOG.write_text("")
 
     def run(self, title: str, *command: object) -> None:
         """Run one command; its output goes to the log, its progress to the terminal."""
         self.number += 1
-        print(f"[{self.number}/{self.total}] {title}", flush=True)
+        print(f"[{self.number}] {title}", flush=True)
         began = time.monotonic()
         last_lines: deque[str] = deque(maxlen=30)
         environment = {**os.environ, "PYTHONUNBUFFERED": "1", "PIP_DISABLE_PIP_VERSION_CHECK": "1"}

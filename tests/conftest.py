@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import os
+import shutil
 import signal
 from collections import Counter
 from pathlib import Path
@@ -43,6 +44,22 @@ settings.load_profile("rosrm")
 for _number in (signal.SIGHUP, signal.SIGINT, signal.SIGQUIT):
     if signal.getsignal(_number) is signal.SIG_IGN:
         signal.signal(_number, lambda *_: None)
+
+
+def pytest_report_header() -> list[str]:
+    """Name, before the first test, what this machine lacks and which tests are skipped for it."""
+    lab = "virtual hosts (tests/integration/lab, the chaos and paper benchmarks)"
+    kitti = os.environ.get("ROSRM_KITTI") or HERE.parent / "../shared/data/kitti"
+    no_kitti = not Path(kitti).is_dir()
+    lacking = {
+        "root": (os.geteuid() != 0, f"{lab}, private networks, full disks"),
+        "nft (package nftables)": (shutil.which("nft") is None, lab),
+        "mkfs.ext4 (package e2fsprogs)": (shutil.which("mkfs.ext4") is None, lab),
+        "a drive of KITTI (ROSRM_KITTI=folder)": (no_kitti, "SLAM on real scans"),
+    }  # fmt: skip
+    return [
+        f"not here: {what}; skipped: {tests}" for what, (lacks, tests) in lacking.items() if lacks
+    ]
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -14,6 +14,7 @@ import typer
 from rosrm.cli.patience import PERIOD, ask_until_answered
 from rosrm.errors import ConfigError
 from rosrm.extensions.units import Quantity
+from rosrm.model.event_kinds import EventKind
 from rosrm.model.rows import ProcessRow
 from rosrm.wording import listed, standing
 
@@ -33,9 +34,10 @@ _OVER: Final = frozenset({"finished", "failed", "cancelled"})
 #: States that only a request of a user ends.
 _UNTIL_ASKED: Final = frozenset({"failed", "cancelled", "stuck", "checkpointed"})
 #: Kinds of events by which a checkpoint, a restore or a migration ends; whether it was done.
-_ENDINGS: Final = {
-    "checkpointed": True, "restored": True, "migrated": True, "checkpoint_failed": False,
-    "restore_failed": False, "stayed": False, "cancelled": False, "migration_forgotten": False,
+_ENDINGS: Final[Mapping[str, bool]] = {
+    EventKind.CHECKPOINTED: True, EventKind.RESTORED: True, EventKind.MIGRATED: True,
+    EventKind.CHECKPOINT_FAILED: False, EventKind.RESTORE_FAILED: False, EventKind.STAYED: False,
+    EventKind.CANCELLED: False, EventKind.MIGRATION_FORGOTTEN: False,
 }  # fmt: skip
 _NOTEWORTHY: Final = _UNTIL_ASKED | {"set_aside", "unreachable", "unknown"}
 
@@ -182,7 +184,7 @@ def wait_until_drained(client: MasterClient, host: str, since: int, longest: flo
         row = next((row for row in view.hosts if row.description.name == host), None)
         staying = [row for row in view.processes if row.host == host and row.state not in _OVER]
         if row is not None and row.drained:
-            told = [event.message for event in view.events if event.kind == "host_drained"]
+            told = [event.message for event in view.events if event.kind == EventKind.HOST_DRAINED]
             typer.echo(told[-1] if told else f"{host} is drained", err=bool(staying))
             return not staying
         if row is None or not row.draining:

@@ -16,6 +16,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 import numpy as np
 import numpy.typing as npt
 
+from rosrm.model.event_kinds import EventKind
 from rosrm.model.plan import Execute, Move, Plan
 from rosrm.model.values import (
     EMPTY,
@@ -513,14 +514,13 @@ class Record:
     """One line of the event record, and the intent that it changes.
 
     Attributes:
-        kind: past tense: "submitted", "assigned", ...
         process: that it concerns; "" for none.
         host: that it concerns; "" for none.
         message: one sentence for people.
         facts: JSON-able particulars.
     """
 
-    kind: str
+    kind: EventKind
     process: str = ""
     host: str = ""
     message: str = ""

@@ -22,6 +22,7 @@ from typing import Any, Final
 from rosrm.errors import JournalBlocked, JournalError
 from rosrm.extensions.contracts import Intent, Record
 from rosrm.journal.sqlite import SqliteJournal
+from rosrm.model.event_kinds import EventKind
 from rosrm.runtime.disk_space import room_for
 from rosrm.wording import counted
 
@@ -189,7 +190,9 @@ def _write(path: Path, found: _Found, aside: Path) -> None:
         )
     journal = SqliteJournal(path)
     intents = [Intent(table, key, value) for (table, key), value in found.intents.items()]
-    journal.write([Record("journal_recovered", message=_summary(found, aside))], intents, 0.0)
+    journal.write(
+        [Record(EventKind.JOURNAL_RECOVERED, message=_summary(found, aside))], intents, 0.0
+    )
     journal.close()
 
 

@@ -17,6 +17,7 @@ from typing import Any, Final
 
 from rosrm.extensions.contracts import Intent, Record, StoredRecord
 from rosrm.journal.errors import fault_of, no_journal, other_version
+from rosrm.model.event_kinds import EventKind
 
 #: Version of the tables; a file of another one is refused.
 SCHEMA: Final = 1
@@ -147,7 +148,7 @@ class SqliteJournal:
                 "INSERT INTO record VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
                 [
                     (
-                        s.sequence, s.wall_time, s.elapsed, s.record.kind, s.record.process,
+                        s.sequence, s.wall_time, s.elapsed, str(s.record.kind), s.record.process,
                         s.record.host, s.record.message, json.dumps(s.record.facts, default=_plain),
                     )
                     for s in stored
@@ -201,7 +202,10 @@ class SqliteJournal:
         )
         return [
             StoredRecord(
-                row[0], row[1], row[2], Record(row[3], row[4], row[5], row[6], _facts(row[7]))
+                row[0],
+                row[1],
+                row[2],
+                Record(EventKind.read(row[3]), row[4], row[5], row[6], _facts(row[7])),
             )
             for row in reversed(rows)
         ]

@@ -46,6 +46,7 @@ from rosrm.master.journal_stall import Standstill
 from rosrm.master.plugin_deadline import Deadlines
 from rosrm.master.queries import Reading
 from rosrm.master.recorder import Recorder
+from rosrm.model.event_kinds import EventKind
 from rosrm.model.rows import PluginRow
 from rosrm.recording.reader import TABLES, Header
 from rosrm.ros.client import find_master
@@ -169,7 +170,7 @@ class MasterRuntime:
         journal_gap.begin(state, newest, now, fell=fell)
         started = f"master {self._config.name} started, epoch {epoch}"
         self._journal.write(
-            [Record("master_started", message=started)],
+            [Record(EventKind.MASTER_STARTED, message=started)],
             # As one: from the boot the next master cannot tell what this one had to wait for.
             [
                 Intent("cluster", "epoch", {"epoch": epoch, "boot": _boot()}),
@@ -184,7 +185,7 @@ class MasterRuntime:
         """The newest record, whether the machine fell since, and the last epoch."""
         known = self._journal.intents("cluster").get("epoch", {"epoch": 0})
         last = self._journal.records(newest=1)
-        stopped = not last or last[0].record.kind == "master_stopped"
+        stopped = not last or last[0].record.kind is EventKind.MASTER_STOPPED
         fell = not stopped and known.get("boot", _boot()) != _boot()
         return self._journal.last_sequence, fell, int(known["epoch"])
 
@@ -251,7 +252,9 @@ class MasterRuntime:
 
     def _say_stopped(self) -> None:
         try:
-            self._write([Record("master_stopped", message=f"master stopped: {self._stopping}")], [])
+            self._write(
+                [Record(EventKind.MASTER_STOPPED, message=f"master stopped: {self._stopping}")], []
+            )
         except JournalBlocked as fault:
             _log.warning("%s; what was decided last was not written, nor carried out", fault)
         _log.info(
@@ -333,7 +336,8 @@ class MasterRuntime:
         intents = [command for command in held.commands if isinstance(command, Intent)]
         length = now - held.since
         back = Record(
-            "journal_back", message=f"for {length:.1f} s nothing was decided: {held.reason}",
+            EventKind.JOURNAL_BACK,
+            message=f"for {length:.1f} s nothing was decided: {held.reason}",
             facts={"seconds": round(length, 1)},
         )  # fmt: skip
         try:

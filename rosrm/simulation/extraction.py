@@ -21,6 +21,7 @@ from rosrm.core.master.state.hosts import HostCondition
 from rosrm.core.master.state.process import ProcessPhase
 from rosrm.core.slave.reducer import awaits_graph
 from rosrm.extensions.contracts import Record
+from rosrm.model.event_kinds import EventKind
 from rosrm.model.spec_json import spec_from_dict
 from rosrm.model.values import HostDescription, InstanceState, InstanceStatus, ProcessSpec
 from rosrm.recording.encoding import Happened
@@ -94,7 +95,10 @@ class Extraction:
             elif isinstance(command, PublishStateConfig):  # the destination goes on at its age
                 since = self._runs_since.get(command.source, at)
                 self._runs_since[command.destination] = since
-            elif isinstance(command, Record) and command.kind in ("host_lost", "host_back"):
+            elif isinstance(command, Record) and command.kind in (
+                EventKind.HOST_LOST,
+                EventKind.HOST_BACK,
+            ):
                 self._heard(command, at)
 
     def _take(
@@ -127,16 +131,18 @@ class Extraction:
 
     def _heard(self, record: Record, at: float) -> None:
         host = self._hosts.get(record.host)
-        if host is not None and host.leaves == inf and record.kind == "host_lost":
+        if host is not None and host.leaves == inf and record.kind is EventKind.HOST_LOST:
             host.leaves, host.lost = at, True
-        elif host is not None and host.lost and record.kind == "host_back":
+        elif host is not None and host.lost and record.kind is EventKind.HOST_BACK:
             host.leaves, host.lost = inf, False
 
     def _submitted(
         self, event: happened.SubmissionReceived, commands: Sequence[Command], at: float
     ) -> None:
         taken = {
-            one.process for one in commands if isinstance(one, Record) and one.kind == "submitted"
+            one.process
+            for one in commands
+            if isinstance(one, Record) and one.kind is EventKind.SUBMITTED
         }
         for spec in event.specs:
             if spec.name in taken:

@@ -16,6 +16,7 @@ from rosrm.core.master.state.host_arrays import FloatArray
 from rosrm.core.master.state.hosts import HostCondition
 from rosrm.core.master.state.process import Process, ProcessPhase
 from rosrm.extensions.contracts import Record
+from rosrm.model.event_kinds import EventKind
 from rosrm.model.values import Kind
 from rosrm.wording import standing
 
@@ -23,8 +24,11 @@ from rosrm.wording import standing
 MEASURED: Final = ("memory", "cpu")
 #: Most samples of the curves; then every other one is dropped.
 _SAMPLES: Final = 4000
-_ENDS: Final = frozenset({"finished", "failed", "cancelled"})
-_CHANGES: Final = _ENDS | {"submitted", "assigned", "migration_begun", "migrated", "stayed"}
+_ENDS: Final = frozenset({EventKind.FINISHED, EventKind.FAILED, EventKind.CANCELLED})
+_CHANGES: Final = _ENDS | {
+    EventKind.SUBMITTED, EventKind.ASSIGNED, EventKind.MIGRATION_BEGUN, EventKind.MIGRATED,
+    EventKind.STAYED,
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,17 +161,17 @@ class Meter:
 
     def _note(self, record: Record, now: float) -> None:
         name = record.process
-        if record.kind == "submitted":
+        if record.kind is EventKind.SUBMITTED:
             self._first = min(self._first, now)
             self._arrivals.setdefault(name, now)
-        elif record.kind == "assigned":
+        elif record.kind is EventKind.ASSIGNED:
             self._placed.setdefault(name, []).append(record.host)
             self._placed_at.setdefault(name, now)
             self._ends.pop(name, None)
-        elif record.kind == "migrated":
+        elif record.kind is EventKind.MIGRATED:
             self._migrations += 1
             self._placed.setdefault(name, []).append(record.host)
-        elif record.kind == "stayed":
+        elif record.kind is EventKind.STAYED:
             self._failed += 1
         elif record.kind in _ENDS:
             self._ends[name] = now

@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 from unittest import SkipTest
 
 from rosrm.extensions.contracts import Intent, Journal, Record, StoredRecord
+from rosrm.model.event_kinds import EventKind
 
 
 @dataclass
@@ -82,8 +83,10 @@ class JournalContract:
         """Sequences go 1, 2, 3, ... over all groups; time stamps are kept."""
         journal = self.open(tmp_path)
         assert isinstance(journal, Journal)
-        first = journal.write([Record("submitted", "p"), Record("assigned", "p", "h")], [], 0.5)
-        second = journal.write([Record("ended", "p", "h", facts={"code": 3})], [], 1.5)
+        first = journal.write(
+            [Record(EventKind.SUBMITTED, "p"), Record(EventKind.ASSIGNED, "p", "h")], [], 0.5
+        )
+        second = journal.write([Record(EventKind.FAILED, "p", "h", facts={"code": 3})], [], 1.5)
         assert [stored.sequence for stored in [*first, *second]] == [1, 2, 3]
         assert [stored.elapsed for stored in journal.records()] == [0.5, 0.5, 1.5]
         assert list(journal.records()) == [*first, *second]
@@ -92,19 +95,24 @@ class JournalContract:
     def test_selects_records(self, tmp_path: Path) -> None:
         """By process, by host (moves from it too), after a sequence; of too many the newest."""
         journal = self.open(tmp_path)
-        moved = Record("d", facts={"from": "source", "to": "i"})
+        moved = Record(EventKind.MIGRATED, facts={"from": "source", "to": "i"})
         journal.write(
-            [Record("a", "p", "h"), Record("b", "q", "h"), Record("c", "p", "i"), moved],
+            [
+                Record(EventKind.ASSIGNED, "p", "h"),
+                Record(EventKind.READY, "q", "h"),
+                Record(EventKind.FAILED, "p", "i"),
+                moved,
+            ],
             [],
             0,
         )
         kinds = {
-            "a b c d": journal.records(),
-            "a c": journal.records(process="p"),
-            "a b": journal.records(host="h"),
-            "d": journal.records(host="source"),
-            "c": journal.records(process="p", after=1),
-            "c d": journal.records(newest=2),
+            "assigned ready failed migrated": journal.records(),
+            "assigned failed": journal.records(process="p"),
+            "assigned ready": journal.records(host="h"),
+            "migrated": journal.records(host="source"),
+            "failed": journal.records(process="p", after=1),
+            "failed migrated": journal.records(newest=2),
             "": journal.records(process="unknown"),
         }
         for expected, found in kinds.items():
@@ -126,10 +134,12 @@ class JournalContract:
         if not self.durable:
             raise SkipTest("this journal is not durable")
         journal = self.open(tmp_path)
-        journal.write([Record("a")], [Intent("host", "h", {"cordoned": True})], 0)
+        journal.write([Record(EventKind.SUBMITTED)], [Intent("host", "h", {"cordoned": True})], 0)
         journal.close()
         again = self.open(tmp_path)
         assert again.intents("host") == {"h": {"cordoned": True}}
-        assert [stored.sequence for stored in again.write([Record("b")], [], 0)] == [2]
-        assert [stored.record.kind for stored in again.records()] == ["a", "b"]
+        assert [stored.sequence for stored in again.write([Record(EventKind.QUEUED)], [], 0)] == [2]
+        assert [stored.record.kind for stored in again.records()] == [
+            EventKind.SUBMITTED, EventKind.QUEUED,
+        ]  # fmt: skip
         again.close()

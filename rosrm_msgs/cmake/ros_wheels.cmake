@@ -13,7 +13,14 @@ if(DEFINED Python3_EXECUTABLE)
   message(STATUS "ROS wheels: ${_rosrm_prefix}")
 endif()
 
-# 2. Their exported targets carry an include path of the machine that they were built on, and CMake
+# 2. rclpy and its middleware use the C type supports alone: generate nothing for C++, which is half of
+#    the files. (Fast DDS needs the introspection too: it registers each type by it.)
+find_package(ament_cmake REQUIRED)
+find_package(rosidl_default_generators REQUIRED)
+list(FILTER AMENT_EXTENSIONS_rosidl_generate_idl_interfaces EXCLUDE REGEX "_cpp")
+set(STATIC_ROSIDL_TYPESUPPORT_C rosidl_typesupport_fastrtps_c rosidl_typesupport_introspection_c)
+
+# 3. Their exported targets carry an include path of the machine that they were built on, and CMake
 #    refuses an imported target with an include folder that is missing: drop those, after all
 #    find_package() calls.
 function(_rosrm_drop_missing_includes)
@@ -32,23 +39,16 @@ function(_rosrm_drop_missing_includes)
   endforeach()
 endfunction()
 
-# 3. Some three hundred small generated files, most of whose compile time goes into the same headers:
+# 4. Some three hundred small generated files, most of whose compile time goes into the same headers:
 #    compile them in batches, or where files specialise templates after use, with precompiled headers
 #    (together 40 % less CPU time). rosidl_generator_c bears neither: its files repeat file-local names.
 function(_rosrm_compile_faster)
-  foreach(_part IN ITEMS fastrtps_c fastrtps_cpp introspection_c c cpp)
+  foreach(_part IN ITEMS fastrtps_c introspection_c c)
     set(_target ${PROJECT_NAME}__rosidl_typesupport_${_part})
     if(TARGET ${_target})
       set_target_properties(${_target} PROPERTIES UNITY_BUILD ON UNITY_BUILD_BATCH_SIZE 20)
     endif()
   endforeach()
-  set(_target ${PROJECT_NAME}__rosidl_typesupport_introspection_cpp)
-  if(TARGET ${_target})
-    target_precompile_headers(${_target} PRIVATE
-      <algorithm> <array> <memory> <string> <vector>
-      <rosidl_runtime_cpp/bounded_vector.hpp>
-      <rosidl_typesupport_introspection_cpp/message_introspection.hpp>)
-  endif()
 endfunction()
 
 cmake_language(DEFER CALL _rosrm_drop_missing_includes)

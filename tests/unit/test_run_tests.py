@@ -127,6 +127,16 @@ def test_what_failed_last_is_run_alone(run_tests):
     assert not any("unit" in line for line in lines)
 
 
+def test_what_fails_beside_another_run_is_shown_and_remembered(run_tests):
+    """The unit tests run beside the next folder: their output follows, and `--lf` finds both."""
+    files = {"unit/test_a.py": FAILS, "integration/test_b.py": FAILS}
+    status, lines = run_tests(files)
+    assert (status, lines[-1]) == (1, "0 passed, 2 failed, 0 skipped")
+    assert [line for line in lines if line.startswith("FAILED tests/unit/test_a.py")]
+    _, lines = run_tests({}, "--lf")
+    assert lines[-1] == "0 passed, 2 failed, 0 skipped"
+
+
 def test_where_nothing_failed_last_all_is_run(run_tests):
     run_tests({"unit/test_a.py": PASSES, "ros/test_b.py": PASSES})
     status, lines = run_tests({}, "--lf")

@@ -23,6 +23,7 @@ from rosrm.core.master.migration import failover
 from rosrm.core.master.plugin_failures import note_on_host
 from rosrm.core.master.state.hosts import Host, HostCondition
 from rosrm.core.master.state.migration import End, Run
+from rosrm.model.event_kinds import EventKind
 from rosrm.model.plan import Start
 from rosrm.model.values import EMPTY, InstanceId, InstanceState, InstanceStatus, Kind, RestartPolicy
 from rosrm.wording import standing
@@ -36,6 +37,17 @@ _PHASE: Final = {
     InstanceState.READY: ProcessPhase.RUNNING,
     InstanceState.BACKOFF: ProcessPhase.BACKOFF,
     InstanceState.STOPPING: ProcessPhase.STOPPING,
+}
+#: The event of a process that has entered a phase.
+_EVENT: Final = {
+    ProcessPhase.ASSIGNED: EventKind.ASSIGNED,
+    ProcessPhase.STARTING: EventKind.STARTING,
+    ProcessPhase.RUNNING: EventKind.RUNNING,
+    ProcessPhase.BACKOFF: EventKind.BACKOFF,
+    ProcessPhase.STOPPING: EventKind.STOPPING,
+    ProcessPhase.FINISHED: EventKind.FINISHED,
+    ProcessPhase.FAILED: EventKind.FAILED,
+    ProcessPhase.CANCELLED: EventKind.CANCELLED,
 }
 #: What a slave says of an instance whose restart it has begun.
 _RESTARTS: Final = frozenset({InstanceState.STOPPING, InstanceState.STARTING})
@@ -135,8 +147,8 @@ def _follow(
     if phase is not before:
         # A job that has begun is not ready for anything: it runs to its end.
         is_ready = phase is ProcessPhase.RUNNING and process.spec.kind is not Kind.JOB
-        kind = "ready" if is_ready else phase.value
-        kind = "reachable" if repeated else kind
+        kind = EventKind.READY if is_ready else _EVENT[phase]
+        kind = EventKind.REACHABLE if repeated else kind
         state.record(
             now, kind, f"{process.name} {standing(kind)} on {instance.host.name}"
             + (f": {status.message}" if status.message else ""),
@@ -172,7 +184,7 @@ def _take_stranger(state: MasterState, host: Host, status: InstanceStatus, now: 
     followed = readoption.has_successor(state, status)
     how = "has it killed: another instance owns its name" if followed else "stops it"
     state.record(
-        now, "fenced" if followed else "unassigned_stopped",
+        now, EventKind.FENCED if followed else EventKind.UNASSIGNED_STOPPED,
         f"{status.instance} is not assigned to {host.name}: the master {how}",
         process=status.instance.process, host=host.name,
     )  # fmt: skip
@@ -223,7 +235,7 @@ def _ended(
             exclude(process, instance.host, status)
     if process.owner != instance.id.number:
         state.record(
-            now, "instance_ended", f"{instance.id} ended on {instance.host.name}"
+            now, EventKind.INSTANCE_ENDED, f"{instance.id} ended on {instance.host.name}"
             + (f": {status.message}" if status.message else ""),
             process=process.name, host=instance.host.name,
         )  # fmt: skip
@@ -303,7 +315,7 @@ def _finish(
     state.set_phase(process, phase, now, reason)
     process.ended_on = host.name
     state.record(
-        now, phase.value,
+        now, _EVENT[phase],
         f"{process.name} {phase.value} on {host.name}" + (f": {reason}" if reason else ""),
         process=process.name, host=host.name, facts={"exit_code": process.exit_code},
     )  # fmt: skip
@@ -313,7 +325,8 @@ def _finish(
 def _requeue(state: MasterState, process: Process, host: Host, now: float, reason: str) -> None:
     """Back to its place in the line, once no other instance of it can be active any more."""
     state.record(
-        now, "queued", f"{process.name} returns to the queue: {reason}", process=process.name,
+        now, EventKind.QUEUED,
+        f"{process.name} returns to the queue: {reason}", process=process.name,
         host=host.name,
     )  # fmt: skip
     process.wanted = Wanted.REQUEUE
@@ -344,7 +357,7 @@ def requeue_if_clear(state: MasterState, process: Process, now: float) -> bool:
         return False
     if process.wanted is Wanted.CANCEL:
         state.set_phase(process, ProcessPhase.CANCELLED, now)
-        state.record(now, "cancelled", f"{process.name} cancelled", process=process.name)
+        state.record(now, EventKind.CANCELLED, f"{process.name} cancelled", process=process.name)
     elif process.wanted is Wanted.REQUEUE:
         state.enqueue(process, now)
     else:

@@ -28,6 +28,7 @@ from rosrm.core.master.state.replicas import Keeping
 from rosrm.extensions.contracts import Intent, MigrationStrategy, Record, ScoringPolicy
 from rosrm.extensions.declared_fields import Declared
 from rosrm.extensions.plugin_calls import PluginCalls
+from rosrm.model.event_kinds import EventKind
 from rosrm.model.values import EMPTY, Assignment, InstanceId, ProcessSpec
 from rosrm.wording import one_line
 
@@ -162,7 +163,7 @@ class MasterState:
         return out
 
     def record(
-        self, now: float, kind: str, message: str, *, process: str = "", host: str = "",
+        self, now: float, kind: EventKind, message: str, *, process: str = "", host: str = "",
         facts: Mapping[str, Any] = EMPTY, by: str = "",
     ) -> None:  # fmt: skip
         """Write a line of the event record; `by` is the client that asked for it."""

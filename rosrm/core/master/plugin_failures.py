@@ -7,13 +7,16 @@ from collections.abc import Mapping
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.hosts import Host
 from rosrm.extensions.plugin_calls import TITLES, Failing, Plugin
+from rosrm.model.event_kinds import EventKind
 
 
 def note(state: MasterState, now: float) -> None:
     """Record which plugins of the master began to fail since the last call, or work again."""
     for (kind, name), error in state.plugins.changes(now):
         event, outcome = (
-            ("plugin_failed", f"fails: {error}") if error else ("plugin_works", "works again")
+            (EventKind.PLUGIN_FAILED, f"fails: {error}")
+            if error
+            else (EventKind.PLUGIN_WORKS, "works again")
         )
         facts = {"plugin": kind, "name": name}
         state.record(now, event, f"the {TITLES[kind]} {name!r} {outcome}", facts=facts)
@@ -45,7 +48,7 @@ def _record_on_host(
     kind, name = plugin
     title = f"probe of {name}" if kind == "probe" else f"{TITLES[kind]} {name!r}"
     state.record(
-        now, "plugin_works" if outcome == "works again" else "plugin_failed",
+        now, EventKind.PLUGIN_WORKS if outcome == "works again" else EventKind.PLUGIN_FAILED,
         f"the {title} on {host.name} {outcome}", host=host.name,
         facts={"plugin": kind, "name": name},
     )  # fmt: skip

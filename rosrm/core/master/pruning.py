@@ -12,6 +12,7 @@ from rosrm.core.master.master_state import MasterState, Process, ProcessPhase, W
 from rosrm.core.master.requests import count, known_host, known_processes, refuse
 from rosrm.core.master.state.hosts import Host, HostCondition
 from rosrm.extensions.contracts import Intent
+from rosrm.model.event_kinds import EventKind
 from rosrm.wording import counted, listed
 
 _DEPARTED: Final = (HostCondition.LEFT, HostCondition.DETACHED)
@@ -37,7 +38,7 @@ def prune_requested(state: MasterState, event: happened.PruneRequested, now: flo
         state.remove_process(process.name)
     left_running = [_prune_host(state, host, event.by, now) for host in hosts]
     if processes:
-        state.record(now, "pruned", f"{count(len(processes))} removed", by=event.by)
+        state.record(now, EventKind.PRUNED, f"{count(len(processes))} removed", by=event.by)
     removed = [count(len(processes))] if processes else []
     removed += [counted(len(hosts), "host")] if hosts else []
     message = f"{listed(removed)} removed" if removed else "nothing to remove"
@@ -124,7 +125,7 @@ def _prune_host(state: MasterState, host: Host, by: str, now: float) -> str:
             process.reason = f"it may still run on {host.name}, which was removed"
             state.save(process)
     state.emit(Intent("host", host.name, None))
-    state.record(now, "host_pruned", f"{host.name} was removed", host=host.name, by=by)
+    state.record(now, EventKind.HOST_PRUNED, f"{host.name} was removed", host=host.name, by=by)
     if not names:
         return ""
     them = "it" if len(names) == 1 else "them"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable
+from typing import Final
 
 from rosrm.core.master import events as happened
 from rosrm.core.master import lifecycle
@@ -20,6 +21,7 @@ from rosrm.errors import PluginError
 from rosrm.extensions.contracts import SpecChecking
 from rosrm.extensions.declared_fields import no_standby
 from rosrm.extensions.plugin_calls import implements, required
+from rosrm.model.event_kinds import EventKind
 from rosrm.model.values import ProcessSpec
 from rosrm.wording import counted, listed, no_such
 
@@ -27,6 +29,14 @@ from rosrm.wording import counted, listed, no_such
 def refuse(state: MasterState, request: int, message: str, code: str = "invalid") -> None:
     """Answer a request that changes nothing."""
     state.emit(Reply(request, False, code, message))
+
+
+#: The event of each action on a host.
+_HOST_EVENTS: Final = {
+    "cordon": EventKind.HOST_CORDONED,
+    "uncordon": EventKind.HOST_UNCORDONED,
+    "drain": EventKind.HOST_DRAINING,
+}
 
 
 # --- submit -----------------------------------------------------------------------------------
@@ -56,7 +66,9 @@ def submission_received(state: MasterState, event: happened.SubmissionReceived, 
         state.next_order += 1
         state.add_process(process)
         state.enqueue(process, now)
-        state.record(now, "submitted", f"{spec.name} was submitted", process=spec.name, by=event.by)
+        state.record(
+            now, EventKind.SUBMITTED, f"{spec.name} was submitted", process=spec.name, by=event.by
+        )
         state.save(process)
     warnings = "".join(f". Warning: {one}" for one in shared)
     state.emit(Reply(event.request, message=f"{count(len(event.specs))} queued{warnings}"))
@@ -201,19 +213,23 @@ def _cancelled(state: MasterState, processes: Iterable[Process], over: list[str]
 def _cancel(state: MasterState, process: Process, now: float, by: str) -> None:
     process.wanted, process.left_behind = Wanted.CANCEL, None
     state.record(
-        now, "cancel_requested", f"{process.name} is to be cancelled", process=process.name, by=by
+        now,
+        EventKind.CANCEL_REQUESTED,
+        f"{process.name} is to be cancelled",
+        process=process.name,
+        by=by,
     )
     if process.phase in WAITING:
         state.unqueue(process)
         state.set_phase(process, ProcessPhase.CANCELLED, now)
         state.record(
-            now, "cancelled", f"{process.name} cancelled in the queue", process=process.name
+            now, EventKind.CANCELLED, f"{process.name} cancelled in the queue", process=process.name
         )
     elif process.image is not None and process.name not in state.runs:
         images.drop(state, process)
         state.set_phase(process, ProcessPhase.CANCELLED, now)
         state.record(
-            now, "cancelled", f"{process.name} cancelled; its image is removed",
+            now, EventKind.CANCELLED, f"{process.name} cancelled; its image is removed",
             process=process.name,
         )  # fmt: skip
     elif process.owner == 0 and process.name not in state.runs:
@@ -261,7 +277,7 @@ def _restart_fault(state: MasterState, process: Process) -> str:
 def _restart(state: MasterState, process: Process, now: float, by: str) -> None:
     state.record(
         now,
-        "restart_requested",
+        EventKind.RESTART_REQUESTED,
         f"a restart of {process.name} was requested",
         process=process.name,
         by=by,
@@ -309,7 +325,7 @@ def _note_refused_move(state: MasterState, process: Process, reason: str, now: f
     """Record why a process was not moved, unless that is the newest record of it already."""
     message = f"{process.name} is not moved: {reason}"
     if not process.history or process.history[-1][2] != message:
-        state.record(now, "migration_refused", message, process=process.name)
+        state.record(now, EventKind.MIGRATION_REFUSED, message, process=process.name)
 
 
 def checkpoint_requested(
@@ -364,8 +380,8 @@ def host_state_requested(
     host = known_host(state, event.request, event.host)
     if host is None:
         return
-    done = {"cordon": "cordoned", "uncordon": "uncordoned", "drain": "draining"}.get(event.action)
-    if done is None:
+    kind = _HOST_EVENTS.get(event.action)
+    if kind is None:
         refuse(
             state,
             event.request,
@@ -378,7 +394,8 @@ def host_state_requested(
     host.told.clear()
     host.blocked.clear()
     save_host(state, host)
-    state.record(now, f"host_{done}", f"{host.name} is {done}", host=host.name, by=event.by)
+    done = kind.removeprefix("host_")
+    state.record(now, kind, f"{host.name} is {done}", host=host.name, by=event.by)
     reconsider_set_aside(state, now)
     said = f"{host.name} is {done}"
     if host.draining:

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from typing import Final
 
-from rosrm.core.slave.events_and_commands import Command, MasterHears, Renew
+from rosrm.core.slave.commands import Command, Renew
+from rosrm.core.slave.events import MasterHears
 from rosrm.core.slave.state import SlaveState
 from rosrm.model.values import Assignment, InstanceId
 

@@ -8,32 +8,32 @@ from types import MappingProxyType
 from typing import Any, Final
 
 from rosrm.core.slave import fencing
-from rosrm.core.slave.events_and_commands import (
+from rosrm.core.slave.commands import (
     Amend,
-    AssignmentsReceived,
-    Awaited,
     Command,
     Fail,
     Fence,
-    FenceOrdered,
     Forget,
     Launch,
+    Remember,
+    Report,
+    Restart,
+    Settle,
+    Stop,
+)
+from rosrm.core.slave.events import (
+    AssignmentsReceived,
+    FenceOrdered,
     LaunchRefused,
     LookedAt,
     MasterHears,
     MasterLost,
-    Memo,
     Registered,
-    Remember,
-    Report,
     ReportRequested,
-    Restart,
     RestartOrdered,
     RestartPolicyRecorded,
     RestartPolicySet,
     SeenInGraph,
-    Settle,
-    Stop,
     StopOrdered,
     SupervisorReplaced,
     SupervisorReported,
@@ -41,6 +41,7 @@ from rosrm.core.slave.events_and_commands import (
 )
 from rosrm.core.slave.health import Judgement, watch_of
 from rosrm.core.slave.state import Held, SlaveState, awaits_graph, qualified_name
+from rosrm.core.slave.watches import Awaited, Memo
 from rosrm.model.values import Assignment, InstanceId, InstanceState, InstanceStatus
 
 #: Seconds for which the end of an instance is kept for a master that did not hear of it.

@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Iterator, Mapping
 from typing import Final
 
-from rosrm.core.slave.events_and_commands import Look, Watch
+from rosrm.core.slave.watches import Look, Watch
 from rosrm.model.values import Assignment, Health
 
 #: Seconds between two looks.

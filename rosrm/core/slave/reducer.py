@@ -30,40 +30,38 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from rosrm.core.slave.events_and_commands import (
+from rosrm.core.slave.commands import (
     Amend,
-    AssignmentsReceived,
-    Awaited,
     Command,
-    Event,
     Fail,
     Fence,
-    FenceOrdered,
     Forget,
     Launch,
-    LaunchRefused,
-    Look,
-    LookedAt,
-    MasterHears,
-    MasterLost,
-    Memo,
-    Registered,
     Remember,
     Renew,
     Report,
-    ReportRequested,
     Restart,
+    Settle,
+    Stop,
+)
+from rosrm.core.slave.events import (
+    AssignmentsReceived,
+    Event,
+    FenceOrdered,
+    LaunchRefused,
+    LookedAt,
+    MasterHears,
+    MasterLost,
+    Registered,
+    ReportRequested,
     RestartOrdered,
     RestartPolicyRecorded,
     RestartPolicySet,
     SeenInGraph,
-    Settle,
-    Stop,
     StopOrdered,
     SupervisorReplaced,
     SupervisorReported,
     TimePassed,
-    Watch,
 )
 from rosrm.core.slave.handlers import (
     HANDLERS,
@@ -78,6 +76,7 @@ from rosrm.core.slave.state import (
     qualified_name,
     under_limits,
 )
+from rosrm.core.slave.watches import Awaited, Look, Memo, Watch
 
 __all__ = [
     "HANDLERS",

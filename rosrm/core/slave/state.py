@@ -10,8 +10,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from rosrm.core.slave.events_and_commands import Awaited, Memo, Watch
 from rosrm.core.slave.health import Judgement
+from rosrm.core.slave.watches import Awaited, Memo, Watch
 from rosrm.model.values import (
     RESOURCE_SLOTS,
     Assignment,

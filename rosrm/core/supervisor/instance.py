@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 from typing import Final
 
-from rosrm.core.supervisor.events_and_commands import FenceRule, Key, RestartRule, StopRule
+from rosrm.core.supervisor.rules import FenceRule, Key, RestartRule, StopRule
 
 STARTING: Final = "starting"
 RUNNING: Final = "running"

@@ -5,30 +5,24 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Final
 
-from rosrm.core.supervisor.events_and_commands import (
+from rosrm.core.supervisor.commands import Command, Drop, Leave, Spawn, Tell
+from rosrm.core.supervisor.events import (
     AmendOrdered,
     ClientLost,
-    Command,
-    Drop,
     Event,
     FailOrdered,
     FenceOrdered,
     FencePassed,
     Forgotten,
     Heard,
-    Key,
-    Leave,
     RestartOrdered,
-    RestartRule,
     ShutdownOrdered,
-    Spawn,
     StartOrdered,
     StopOrdered,
-    StopRule,
-    Tell,
     TimePassed,
 )
 from rosrm.core.supervisor.instance import BACKOFF, MOST_KILLS, REFUSED, THEN_END, Instance, end
+from rosrm.core.supervisor.rules import Key, RestartRule, StopRule
 from rosrm.core.supervisor.transitions import TRANSITIONS
 
 #: Process names whose dead numbers are remembered.

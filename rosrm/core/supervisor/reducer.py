@@ -49,6 +49,8 @@ here, whatever its policy and whatever is ordered afterwards.
 `ShutdownOrdered` stops every instance as `StopOrdered` does. What no order had stopped before ends
 as withdrawn, not exited: the master must know that neither the process nor the master ended it.
 
+`ClientLost` changes nothing: each instance keeps running as long as its fence allows.
+
 Whatever is not in the table changes nothing; an order that changes nothing has its status told
 again, as DDS may repeat it. Every change of an instance is told (`Tell`). A signal goes to every
 process that is left of an instance, and none is sent after its end.
@@ -59,36 +61,26 @@ This package is imported by the supervisor, which must stay small: so nothing of
 
 from __future__ import annotations
 
-from rosrm.core.supervisor.events_and_commands import (
+from rosrm.core.supervisor.commands import Command, Drop, Leave, Signal, Spawn, Tell, Unspawn
+from rosrm.core.supervisor.events import (
     AmendOrdered,
     Cleared,
     ClientLost,
-    Command,
-    Drop,
     Event,
     Exited,
     FailOrdered,
     FenceOrdered,
     FencePassed,
-    FenceRule,
     Forgotten,
     Heard,
-    Key,
-    Leave,
     RestartOrdered,
-    RestartRule,
     Resumed,
     ShutdownOrdered,
-    Signal,
-    Spawn,
     Spawned,
     SpawnFailed,
     StartOrdered,
     StopOrdered,
-    StopRule,
-    Tell,
     TimePassed,
-    Unspawn,
 )
 from rosrm.core.supervisor.instance import (
     BACKOFF,
@@ -112,6 +104,7 @@ from rosrm.core.supervisor.instance import (
     signal_name,
 )
 from rosrm.core.supervisor.instances import MOST_TOMBSTONES, Supervision
+from rosrm.core.supervisor.rules import FenceRule, Key, RestartRule, StopRule
 from rosrm.core.supervisor.transitions import TRANSITIONS, Transition, backoff
 
 __all__ = [

@@ -7,26 +7,21 @@ import zlib
 from collections.abc import Callable
 from typing import Final
 
-from rosrm.core.supervisor.events_and_commands import (
+from rosrm.core.supervisor.commands import Command, Signal, Spawn, Tell, Unspawn
+from rosrm.core.supervisor.events import (
     AmendOrdered,
     Cleared,
-    Command,
     Event,
     Exited,
     FailOrdered,
     FenceOrdered,
     FencePassed,
     RestartOrdered,
-    RestartRule,
     Resumed,
-    Signal,
-    Spawn,
     Spawned,
     SpawnFailed,
     StopOrdered,
-    Tell,
     TimePassed,
-    Unspawn,
 )
 from rosrm.core.supervisor.instance import (
     BACKOFF,
@@ -48,6 +43,7 @@ from rosrm.core.supervisor.instance import (
     ending,
     stopping,
 )
+from rosrm.core.supervisor.rules import RestartRule
 from rosrm.wording import counted
 
 _KILL: Final = len(STEPS) - 1

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import signal
+from typing import get_args
 
 import hypothesis.strategies as st
 import pytest
 from hypothesis import given, settings
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
+from rosrm.core.supervisor import events, instances
 from rosrm.core.supervisor import reducer as sv
 from rosrm.model import values
 from rosrm.supervisor import messages
@@ -59,14 +62,20 @@ def test_status_is_that_of_the_model():
 
 
 def test_rules_stand_in_the_table_of_the_module():
-    """Each row of the table of transitions stands in the docstring, under its phase."""
-    documented: dict[str, str] = {}
-    phase = ""
-    for line in sv.__doc__.split("\n\n")[1].splitlines()[1:]:
-        phase = line[4:14].strip() or phase
-        documented[phase] = documented.get(phase, "") + line[14:31]
-    for row, event in sv.TRANSITIONS:
-        assert event.__name__ in documented[row], f"{event.__name__} in {row}"
+    """Each row of the docstring is a transition that runs, and the reverse; no event is left out.
+
+    The phase "-" has the orders that may concern an instance that is not known.
+    """
+    table = re.findall(r"^    (\w+|-|)  +(\w+)  +\S", sv.__doc__, re.MULTILINE)
+    documented, phase = [], ""
+    for first, event in table[1:]:
+        phase = first or phase
+        documented.append((phase, event))
+    runs = {(row, event.__name__) for row, event in sv.TRANSITIONS}
+    runs |= {("-", event.__name__) for event in get_args(instances._OrderOfStranger)}
+    runs |= {("ended", "Forgotten")}
+    assert sorted(documented) == sorted(runs)
+    assert all(event.__name__ in sv.__doc__ for event in get_args(events.Event))
 
 
 def test_start_is_recorded_before_it_is_tried():

@@ -24,6 +24,7 @@ from rosrm.core.master.scheduling.decision import (
 from rosrm.core.master.scheduling.ranking import Ranking
 from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.hosts import HostCondition
+from rosrm.model.event_kinds import EventKind
 from rosrm.model.values import EMPTY
 from rosrm.wording import listed
 
@@ -221,7 +222,7 @@ def _assign(
     state.set_phase(process, ProcessPhase.ASSIGNED, now)
     state.note_decision(process, decision, "assigned", now)
     state.record(
-        now, "assigned", f"{process.name} goes to {host.name}", process=process.name,
+        now, EventKind.ASSIGNED, f"{process.name} goes to {host.name}", process=process.name,
         host=host.name, facts={"number": instance.number, "decision": process.decision},
     )  # fmt: skip
     state.save(process)
@@ -234,13 +235,16 @@ def _set_aside(state: MasterState, process: Process, reason: str, now: float) ->
         state.set_phase(process, ProcessPhase.FAILED, now, f"no host can start it: {reason}")
         state.note_decision(process, decide_now(state, process), "set_aside", now)
         state.record(
-            now, "failed", f"{process.name} failed: {process.reason}", process=process.name
+            now, EventKind.FAILED, f"{process.name} failed: {process.reason}", process=process.name
         )
     else:
         state.set_phase(process, ProcessPhase.SET_ASIDE, now, _why_aside(reason))
         state.set_aside.add(process.name)
         state.record(
-            now, "set_aside", f"{process.name} is set aside: {process.reason}", process=process.name
+            now,
+            EventKind.SET_ASIDE,
+            f"{process.name} is set aside: {process.reason}",
+            process=process.name,
         )
     state.save(process)
 
@@ -278,7 +282,7 @@ def reconsider_set_aside(state: MasterState, now: float) -> None:
         state.set_aside.discard(process.name)
         state.enqueue(process, now)
         state.record(
-            now, "queued", f"{process.name} returns to the queue: a host may take it now",
+            now, EventKind.QUEUED, f"{process.name} returns to the queue: a host may take it now",
             process=process.name,
         )  # fmt: skip
         state.save(process)
@@ -303,5 +307,9 @@ def _tell_waits(
     if process.reason != reason:
         process.reason = reason
         state.record(
-            now, "waits", f"{process.name} waits: {reason}", process=process.name, facts=facts
+            now,
+            EventKind.WAITS,
+            f"{process.name} waits: {reason}",
+            process=process.name,
+            facts=facts,
         )

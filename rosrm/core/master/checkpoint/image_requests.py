@@ -22,12 +22,16 @@ from rosrm.core.master.state.migration import Run
 from rosrm.core.master.state.process import Image, Instance, Process, ProcessPhase, Wanted
 from rosrm.extensions.contracts import Imaging
 from rosrm.extensions.plugin_calls import implements
+from rosrm.model.event_kinds import EventKind
 from rosrm.model.plan import Aim, Commit, Execute, Move
 from rosrm.model.values import InstanceId
 from rosrm.wording import listed, standing
 
 #: Kinds of the records by which each begins.
-_BEGUN: Final = {Aim.CHECKPOINT: "checkpoint_begun", Aim.RESTORE: "restore_begun"}
+_BEGUN: Final = {
+    Aim.CHECKPOINT: EventKind.CHECKPOINT_BEGUN,
+    Aim.RESTORE: EventKind.RESTORE_BEGUN,
+}
 
 
 # --- checkpoint -------------------------------------------------------------------------------
@@ -229,7 +233,7 @@ def settle(state: MasterState, process: Process, run: Run, now: float) -> None:
         images.drop(state, process, run.destination.number)
         state.set_phase(process, ProcessPhase.CANCELLED, now)
         state.record(
-            now, "cancelled", f"{process.name} cancelled; its image is removed",
+            now, EventKind.CANCELLED, f"{process.name} cancelled; its image is removed",
             process=process.name,
         )  # fmt: skip
     else:
@@ -239,21 +243,21 @@ def settle(state: MasterState, process: Process, run: Run, now: float) -> None:
     state.save(process)
 
 
-def ending_of(run: Run) -> tuple[str, str]:
+def ending_of(run: Run) -> tuple[EventKind, str]:
     """The kind and the words of the record by which a plan ends."""
     name, done = run.process, run.undo is None
     here, there = run.source_host.name, run.destination_host.name
     if run.aim is Aim.CHECKPOINT:
         if done:
-            return "checkpointed", f"{name} is checkpointed: its image is on {here}"
+            return EventKind.CHECKPOINTED, f"{name} is checkpointed: its image is on {here}"
         return (
-            "checkpoint_failed",
+            EventKind.CHECKPOINT_FAILED,
             f"{name} was not checkpointed and still runs on {here}: {run.failure}",
         )
     if run.aim is Aim.RESTORE:
         if done:
-            return "restored", f"{name} was restored from its image on {here}"
-        return "restore_failed", f"{name} stays checkpointed on {here}: {run.failure}"
+            return EventKind.RESTORED, f"{name} was restored from its image on {here}"
+        return EventKind.RESTORE_FAILED, f"{name} stays checkpointed on {here}: {run.failure}"
     if done:
-        return "migrated", f"{name} moved from {here} to {there}"
-    return "stayed", f"{name} stayed on {here}: {run.failure}"
+        return EventKind.MIGRATED, f"{name} moved from {here} to {there}"
+    return EventKind.STAYED, f"{name} stayed on {here}: {run.failure}"

@@ -20,6 +20,7 @@ from rosrm.core.master.state.hosts import HostCondition
 from rosrm.core.master.state.images import Unwanted
 from rosrm.core.master.state.process import Image, Process, ProcessPhase
 from rosrm.extensions.contracts import Intent
+from rosrm.model.event_kinds import EventKind
 
 if TYPE_CHECKING:
     from rosrm.core.master.master_state import MasterState
@@ -124,14 +125,14 @@ def _note_answer(
     if event.accepted or event.code == happened.BAD_RESULT:  # it ran, though it answered nothing
         del state.images.unwanted[number]
         state.record(
-            now, "image_removed", f"the image of {one.process} was removed from {one.host}",
+            now, EventKind.IMAGE_REMOVED, f"the image of {one.process} was removed from {one.host}",
             process=one.process, host=one.host, facts={"number": number},
         )  # fmt: skip
         _save(state)
         return
     one.ask_at = now + _ASK_AGAIN
     state.record(
-        now, "image_left",
+        now, EventKind.IMAGE_LEFT,
         f"the image of {one.process} was not removed from {one.host}: "
         f"{event.message or event.code}; tried again",
         process=one.process, host=one.host, facts={"number": number},

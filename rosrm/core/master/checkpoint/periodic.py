@@ -27,6 +27,7 @@ from rosrm.core.master.state.process import Instance, Process, ProcessPhase
 from rosrm.errors import PluginError
 from rosrm.extensions.contracts import MemoryPacing, MemoryView, PeriodicImaging
 from rosrm.extensions.plugin_calls import implements, required
+from rosrm.model.event_kinds import EventKind
 from rosrm.model.plan import Execute
 from rosrm.model.plan_json import checked_step
 from rosrm.wording import size
@@ -203,7 +204,7 @@ def _note(state: MasterState, dumped: Dumped, event: happened.OrderAnswered, now
     dumped.made, dumped.trouble = True, ""
     if not told:
         state.record(
-            now, "periodic_checkpoint",
+            now, EventKind.PERIODIC_CHECKPOINT,
             f"the first periodic checkpoint of {dumped.process} is made ({size(dumped.size)}, "
             f"paused for {dumped.pause:.2f} s): a crash starts the process from the newest",
             process=dumped.process, host=dumped.host,
@@ -221,7 +222,8 @@ def _say_trouble(state: MasterState, dumped: Dumped, trouble: str, now: float) -
         return
     dumped.trouble = trouble
     state.record(
-        now, "periodic_failed", f"no periodic checkpoint of {dumped.process} was made: {trouble}",
+        now, EventKind.PERIODIC_FAILED,
+        f"no periodic checkpoint of {dumped.process} was made: {trouble}",
         process=dumped.process, host=dumped.host,
     )  # fmt: skip
 

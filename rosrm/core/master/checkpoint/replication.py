@@ -37,6 +37,7 @@ from rosrm.core.master.state.replicas import Holding, Told
 from rosrm.errors import PluginError
 from rosrm.extensions.contracts import CheckpointChoice, CheckpointView
 from rosrm.extensions.plugin_calls import required
+from rosrm.model.event_kinds import EventKind
 from rosrm.model.values import InstanceId, KeptState
 
 #: Seconds between two looks at the same process.
@@ -190,7 +191,7 @@ def _choose(
     if not known and (told is None or set(told.choice.hosts) != set(choice.hosts)):
         where = ", ".join(choice.hosts) or "no other host"
         state.record(
-            now, "kept_on", f"the state of {process.name} is kept on {where}",
+            now, EventKind.KEPT_ON, f"the state of {process.name} is kept on {where}",
             process=process.name, host=host.name,
             facts={"hosts": list(choice.hosts), "every": choice.every},
         )  # fmt: skip

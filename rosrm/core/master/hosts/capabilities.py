@@ -26,6 +26,7 @@ from rosrm.core.master.state.hosts import Host, HostCondition
 from rosrm.errors import PluginError
 from rosrm.extensions.contracts import HostChecking
 from rosrm.extensions.plugin_calls import implements, required
+from rosrm.model.event_kinds import EventKind
 from rosrm.wording import listed
 
 if TYPE_CHECKING:
@@ -107,7 +108,7 @@ def _note(
     else:
         answer.reason, answer.ask_at = event.message or event.code, inf
         state.record(
-            now, "strategy_absent", f"{strategy} does not work on {host}: {answer.reason}",
+            now, EventKind.STRATEGY_ABSENT, f"{strategy} does not work on {host}: {answer.reason}",
             host=host, facts={"strategy": strategy},
         )  # fmt: skip
 

@@ -20,6 +20,7 @@ from rosrm.core.master.hosts import loss
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.host_arrays import FloatArray
 from rosrm.core.master.state.hosts import Host, HostCondition
+from rosrm.model.event_kinds import EventKind
 
 #: Reports that a host may owe before it is suspect, however seldom it reports.
 _REPORTS_MISSED: Final = 3
@@ -74,7 +75,7 @@ def _note_company(state: MasterState, heard: bool, now: float) -> None:
 def _suspect(state: MasterState, host: Host, age: float, now: float) -> None:
     state.hosts.set_condition(host, HostCondition.SUSPECT)
     state.record(
-        now, "host_suspect",
+        now, EventKind.HOST_SUSPECT,
         f"{host.name} is suspect: it has not reported for {age:.1f} s and gets no new work",
         host=host.name,
     )  # fmt: skip
@@ -83,7 +84,7 @@ def _suspect(state: MasterState, host: Host, age: float, now: float) -> None:
 def _lose(state: MasterState, host: Host, age: float, lease: float, now: float) -> None:
     state.hosts.set_condition(host, HostCondition.LOST)
     state.record(
-        now, "host_lost",
+        now, EventKind.HOST_LOST,
         f"{host.name} is lost: it has not reported for {age:.1f} s, its lease is {lease:g} s",
         host=host.name,
     )  # fmt: skip
@@ -94,7 +95,7 @@ def welcome_back(state: MasterState, host: Host, now: float) -> None:
     """A host that was suspect or lost is heard again."""
     was_lost = state.hosts.condition_of(host) is HostCondition.LOST
     state.hosts.set_condition(host, HostCondition.UP)
-    state.record(now, "host_back", f"{host.name} reports again", host=host.name)
+    state.record(now, EventKind.HOST_BACK, f"{host.name} reports again", host=host.name)
     if was_lost:
         loss.regain_sight(state, host, now)
         state.hosts.set_untold(host, untold=True)

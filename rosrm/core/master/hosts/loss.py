@@ -41,6 +41,7 @@ from rosrm.core.master.master_state import (
 from rosrm.core.master.migration import failover, handoff
 from rosrm.core.master.state.hosts import Host, HostCondition
 from rosrm.core.master.state.process import LeftBehind
+from rosrm.model.event_kinds import EventKind
 from rosrm.model.plan import Aim
 
 _OUT_OF_REACH: Final = (HostCondition.LOST, HostCondition.DETACHED)
@@ -129,7 +130,7 @@ def _give_up(state: MasterState, instance: Instance, now: float) -> None:
     host, process = instance.host, state.processes.get(instance.id.process)
     why = f"{host.name} {state.hosts.why_unreachable(host)}"
     state.record(
-        now, "given_up", f"{instance.id} is given up: {why}",
+        now, EventKind.GIVEN_UP, f"{instance.id} is given up: {why}",
         process=instance.id.process, host=host.name, facts={"number": instance.id.number},
     )  # fmt: skip
     if process is not None and _may_be_taken_back(process, instance):

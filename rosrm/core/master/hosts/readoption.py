@@ -10,6 +10,7 @@ from rosrm.core.master.commands import Order
 from rosrm.core.master.master_state import WAITING, MasterState, Process, ProcessPhase
 from rosrm.core.master.state.hosts import Host
 from rosrm.core.master.state.process import LeftBehind
+from rosrm.model.event_kinds import EventKind
 from rosrm.model.values import InstanceId, InstanceState, InstanceStatus
 
 
@@ -47,7 +48,7 @@ def _take_back(
     process.owner, process.left_behind = left.number, None
     state.set_phase(process, ProcessPhase.STARTING, now)
     state.record(
-        now, "readopted", f"{host.name} reports again: {instance.id} still runs there",
+        now, EventKind.READOPTED, f"{host.name} reports again: {instance.id} still runs there",
         process=process.name, host=host.name, facts={"number": left.number},
     )  # fmt: skip
     state.save(process)

@@ -20,6 +20,7 @@ from rosrm.core.master.recovery.journal_gap import note_seen
 from rosrm.core.master.state.hosts import Host, HostCondition
 from rosrm.extensions.contracts import Intent
 from rosrm.model.description_checks import description_fault
+from rosrm.model.event_kinds import EventKind
 from rosrm.model.plan import Execute
 from rosrm.model.values import InstanceStatus
 from rosrm.wording import counted
@@ -49,7 +50,7 @@ def host_registered(state: MasterState, event: happened.HostRegistered, now: flo
     if is_new:
         save_host(state, host)
     state.record(
-        now, "host_registered", f"{host.name} registered with {_live(event.instances)}",
+        now, EventKind.HOST_REGISTERED, f"{host.name} registered with {_live(event.instances)}",
         host=host.name,
         facts={
             "host_id": host.host_id, "labels": dict(description.labels),
@@ -94,9 +95,9 @@ def _refuse_host(
 ) -> None:
     known = state.hosts.by_name.get(event.description.name)
     if known is None:
-        state.record(now, "host_refused", why, host=event.description.name)
+        state.record(now, EventKind.HOST_REFUSED, why, host=event.description.name)
     else:  # a slave whose name is taken asks again for a moment
-        _tell(state, known, "host_refused", now, why)
+        _tell(state, known, EventKind.HOST_REFUSED, now, why)
     state.emit(Reply(event.request, False, code, why))
 
 
@@ -170,7 +171,7 @@ def host_left(state: MasterState, event: happened.HostLeft, now: float) -> None:
         state.emit(Reply(event.request))
         return
     state.hosts.set_condition(host, HostCondition.LEFT)
-    state.record(now, "host_left", f"{host.name} leaves: its slave stops", host=host.name)
+    state.record(now, EventKind.HOST_LEFT, f"{host.name} leaves: its slave stops", host=host.name)
     for number in sorted(host.instances):
         process = state.owned_by(state.instances[number])
         if process is not None and process.wanted is Wanted.RUN:
@@ -183,7 +184,7 @@ def _detach(state: MasterState, host: Host, kept: tuple[InstanceStatus, ...], no
     """Take in what a slave that was stopped left running; what it does not hold has not begun."""
     state.hosts.set_condition(host, HostCondition.DETACHED)
     state.record(
-        now, "host_detached",
+        now, EventKind.HOST_DETACHED,
         f"{host.name} is detached: its slave was stopped and left {_live(kept)} running",
         host=host.name,
     )  # fmt: skip
@@ -210,7 +211,7 @@ def readings_received(state: MasterState, event: happened.ReadingsReceived, now:
         host = state.hosts.find(int(event.host_id[row]), int(event.incarnation[row]))
         if host is not None:
             _tell(
-                state, host, "reading_refused", now,
+                state, host, EventKind.READING_REFUSED, now,
                 f"a reading of {host.name} was refused (NaN, negative, absurd, or a limit outside "
                 f"0..1): usage {_shown(event.usage[row])}, limit {_shown(event.limit[row])}",
             )  # fmt: skip
@@ -220,7 +221,7 @@ def _shown(values: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> str:
     return "[" + ", ".join(f"{value:.3g}" for value in values[:8]) + ", …]"
 
 
-def _tell(state: MasterState, host: Host, kind: str, now: float, message: str) -> None:
+def _tell(state: MasterState, host: Host, kind: EventKind, now: float, message: str) -> None:
     if now - host.told.get(kind, float("-inf")) >= _TOLD_EVERY:
         host.told[kind] = now
         state.record(now, kind, message, host=host.name)
@@ -239,7 +240,7 @@ def usages_received(state: MasterState, event: happened.UsagesReceived, now: flo
             _tell(
                 state,
                 host,
-                "reading_refused",
+                EventKind.READING_REFUSED,
                 now,
                 f"a usage of {instance.id} was refused (NaN or negative)",
             )
@@ -252,4 +253,4 @@ def usages_received(state: MasterState, event: happened.UsagesReceived, now: flo
 
 def peer_refused(state: MasterState, event: happened.PeerRefused, now: float) -> None:
     """Somebody was turned away at the edge."""
-    state.record(now, "peer_refused", f"{event.who} was refused: {event.reason}")
+    state.record(now, EventKind.PEER_REFUSED, f"{event.who} was refused: {event.reason}")

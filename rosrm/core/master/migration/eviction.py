@@ -26,6 +26,7 @@ from rosrm.core.master.scheduling.decision import decide, may_ever_take, verdict
 from rosrm.core.master.scheduling.ranking import Ranking
 from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.hosts import Host
+from rosrm.model.event_kinds import EventKind
 from rosrm.model.values import InstanceState
 from rosrm.wording import counted, few, listed
 
@@ -65,7 +66,8 @@ def _note_limits(state: MasterState, now: float) -> None:
             host.over_since.setdefault(name, now)
             if name not in host.over_at:
                 state.record(
-                    now, "over_limit", f"{host.name} reached its limit of {name}", host=host.name,
+                    now, EventKind.OVER_LIMIT,
+                    f"{host.name} reached its limit of {name}", host=host.name,
                     facts={"resource": name},
                 )  # fmt: skip
             host.over_at[name] = now
@@ -85,7 +87,7 @@ def _note_under_limit(state: MasterState, host: Host, now: float) -> None:
             del host.over_at[name]
     if not host.over_at:
         host.blocked.clear()
-        state.record(now, "under_limit", f"{host.name} is under its limits", host=host.name)
+        state.record(now, EventKind.UNDER_LIMIT, f"{host.name} is under its limits", host=host.name)
 
 
 def _relieve(state: MasterState, host: Host, now: float) -> None:
@@ -275,7 +277,7 @@ def _note_drained(state: MasterState, host: Host, now: float) -> None:
     was, host.drained = host.drained, all(_why_it_stays(state, one) for one in held)
     if host.drained and not was:
         state.record(
-            now, "host_drained", f"{host.name} is drained: {departures(state, host)}",
+            now, EventKind.HOST_DRAINED, f"{host.name} is drained: {departures(state, host)}",
             host=host.name,
         )  # fmt: skip
 
@@ -317,6 +319,6 @@ def _tell_nothing_moves(
         return
     host.told[key], host.blocked[what] = now, why
     state.record(
-        now, "nothing_moves", f"nothing can leave {host.name}: {why}", host=host.name,
+        now, EventKind.NOTHING_MOVES, f"nothing can leave {host.name}: {why}", host=host.name,
         facts={"cause": what},
     )  # fmt: skip

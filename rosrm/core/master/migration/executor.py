@@ -42,6 +42,7 @@ from rosrm.core.master.migration.steps import (
 )
 from rosrm.core.master.state.hosts import HostCondition
 from rosrm.core.master.state.migration import End
+from rosrm.model.event_kinds import EventKind
 from rosrm.model.plan import Aim, AwaitReady, Commit, Configure, Execute, Start, Step, Stop
 from rosrm.model.values import InstanceId, InstanceState
 
@@ -147,7 +148,7 @@ def _outcome(state: MasterState, run: Run, step: Step, now: float) -> str | None
 def _next(state: MasterState, run: Run, step: Step, now: float) -> None:
     what = _COMMITTED[run.aim] if isinstance(step, Commit) else f"{title(step)}: done"
     state.record(
-        now, "migration_step", f"{run.process}: {what}", process=run.process,
+        now, EventKind.MIGRATION_STEP, f"{run.process}: {what}", process=run.process,
         facts={"step": title(step), "back": run.undo is not None},
     )  # fmt: skip
     process = state.processes[run.process]
@@ -210,7 +211,7 @@ def _not_stuck(state: MasterState, run: Run, now: float) -> None:
 def _failed(state: MasterState, run: Run, step: Step, reason: str, now: float) -> None:
     if not run.stuck:
         state.record(
-            now, "migration_step_failed", f"{run.process}: {reason}", process=run.process,
+            now, EventKind.MIGRATION_STEP_FAILED, f"{run.process}: {reason}", process=run.process,
             facts={"step": title(step), "back": run.undo is not None},
         )  # fmt: skip
     if run.undo is None and not run.committed:
@@ -227,7 +228,9 @@ def _failed(state: MasterState, run: Run, step: Step, reason: str, now: float) -
         process = state.processes[run.process]
         why = f"its {run.aim.value} cannot be {end} yet: {reason}; the master tries again"
         state.set_phase(process, ProcessPhase.STUCK, now, why)
-        state.record(now, "migration_stuck", f"{run.process} is stuck: {why}", process=run.process)
+        state.record(
+            now, EventKind.MIGRATION_STUCK, f"{run.process} is stuck: {why}", process=run.process
+        )
 
 
 def _turn_back(state: MasterState, run: Run, reason: str, now: float) -> None:
@@ -236,7 +239,7 @@ def _turn_back(state: MasterState, run: Run, reason: str, now: float) -> None:
     run.turn_back()
     state.record(
         now,
-        "migration_undone",
+        EventKind.MIGRATION_UNDONE,
         f"the {run.aim.value} of {run.process} is undone: {reason}",
         process=run.process,
     )
@@ -250,7 +253,7 @@ def _go_forward(state: MasterState, run: Run, now: float) -> None:
     if run.stuck:
         _not_stuck(state, run, now)
     state.record(
-        now, "migration_redone",
+        now, EventKind.MIGRATION_REDONE,
         f"the {run.aim.value} of {run.process} is finished after all: {run.destination} is active",
         process=run.process,
     )  # fmt: skip

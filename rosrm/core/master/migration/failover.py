@@ -13,6 +13,7 @@ from typing import Final
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.migration import End, Run
 from rosrm.core.master.state.process import Process, ProcessPhase, Wanted
+from rosrm.model.event_kinds import EventKind
 from rosrm.model.plan import Configure, HandoffPhase, ReportPhase, Step
 
 _OVER: Final = frozenset({ReportPhase.FAILED, ReportPhase.ABORTED})
@@ -57,7 +58,7 @@ def take_over(state: MasterState, process: Process, end: End, now: float) -> boo
     state.runs[process.name] = run
     state.set_phase(process, ProcessPhase.MIGRATING, now, f"its standby takes over: {run.cause}")
     state.record(
-        now, "failed_over",
+        now, EventKind.FAILED_OVER,
         f"the standby of {process.name} on {run.destination_host.name} takes over: {run.cause}"
         + (f" ({end.status.message})" if end.status.message else ""),
         process=process.name, host=run.destination_host.name,

@@ -15,6 +15,7 @@ from rosrm.core.master import lifecycle
 from rosrm.core.master.commands import PublishStateConfig
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.migration import Heard, Run
+from rosrm.model.event_kinds import EventKind
 from rosrm.model.plan import Configure, HandoffPhase, ReportPhase
 from rosrm.model.values import InstanceId, ProcessSpec
 
@@ -95,7 +96,8 @@ def _take_over(state: MasterState, run: Run, step: Configure, now: float) -> Non
         run.taking_over = True
         run.deadline = now + step.timeout
         state.record(
-            now, "take_over", f"{run.source} has ended: {run.destination} takes over from it",
+            now, EventKind.TAKE_OVER,
+            f"{run.source} has ended: {run.destination} takes over from it",
             process=run.process, host=run.destination_host.name,
         )  # fmt: skip
     run.order_at = now
@@ -122,7 +124,7 @@ def _note(state: MasterState, run: Run, event: happened.HandoffReported, now: fl
         said = f": {event.message}" if is_news else ""
         message = f"{run.process}#{event.instance} {_REPORTS[event.phase]}{said}"
         state.record(
-            now, "handoff_reported", message,
+            now, EventKind.HANDOFF_REPORTED, message,
             process=run.process,
             facts={"phase": event.phase.name, "sequence": event.sequence},
         )  # fmt: skip
@@ -243,7 +245,7 @@ def _stop_unheard(state: MasterState, run: Run, now: float) -> None:
     lifecycle.stop_instance(state, state.instances[run.destination.number], now)
     run.deadline = now + stop.timeout
     state.record(
-        now, "destination_unheard",
+        now, EventKind.DESTINATION_UNHEARD,
         f"{run.destination} does not confirm that the handoff is called off: the master stops it",
         process=run.process, host=run.destination_host.name,
     )  # fmt: skip

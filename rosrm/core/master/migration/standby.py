@@ -28,6 +28,7 @@ from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.hosts import Host
 from rosrm.core.master.state.migration import Run
 from rosrm.core.master.state.process import Process, ProcessPhase, Wanted
+from rosrm.model.event_kinds import EventKind
 from rosrm.model.plan import HandoffPhase, ReportPhase, Start
 
 #: Seconds until another standby is tried after one that failed; doubled with each.
@@ -74,7 +75,7 @@ def _begin(state: MasterState, process: Process, now: float) -> bool:
     state.standbys[process.name] = run
     state.charge_ranked(run.destination, host, now, ranking)
     state.record(
-        now, "standby_begun", f"the standby of {process.name} starts on {host.name}",
+        now, EventKind.STANDBY_BEGUN, f"the standby of {process.name} starts on {host.name}",
         process=process.name, host=host.name, facts={"number": run.destination.number},
     )  # fmt: skip
     process.standby_reason = f"its standby starts on {host.name}"
@@ -118,7 +119,7 @@ def _wait(state: MasterState, process: Process, why: str, now: float) -> None:
     process.standby_at = now + _FIRST_WAIT
     if process.standby_reason != why:
         process.standby_reason = why
-        state.record(now, "standby_waits", f"{process.name}: {why}", process=process.name)
+        state.record(now, EventKind.STANDBY_WAITS, f"{process.name}: {why}", process=process.name)
 
 
 def _order_start(state: MasterState, run: Run, now: float) -> None:
@@ -175,7 +176,7 @@ def _note_ready(state: MasterState, process: Process, run: Run, now: float) -> N
     if process.standby_reason != ready:
         process.standby_reason, process.standby_tries = ready, 0
         state.record(
-            now, "standby_ready", f"the standby of {process.name} is ready on {host}",
+            now, EventKind.STANDBY_READY, f"the standby of {process.name} is ready on {host}",
             process=process.name, host=host,
         )  # fmt: skip
 
@@ -194,7 +195,7 @@ def _lost(state: MasterState, process: Process, run: Run, why: str, now: float) 
     process.standby_tries = min(process.standby_tries + 1, 16)
     process.standby_at = now + wait
     state.record(
-        now, "standby_lost",
+        now, EventKind.STANDBY_LOST,
         f"{process.name} has no standby: {why}; the master starts another one in {wait:g} s",
         process=process.name, host=run.destination_host.name,
     )  # fmt: skip

@@ -13,6 +13,7 @@ from rosrm.core.master.scheduling.ranking import Ranking
 from rosrm.core.master.state.hosts import Host
 from rosrm.errors import PluginError, describe_fault
 from rosrm.extensions.plugin_calls import required
+from rosrm.model.event_kinds import EventKind
 from rosrm.model.plan import Aim, Commit, Move, Plan, Start, executors_of, plan_fault
 from rosrm.model.plan_json import checked_plan
 from rosrm.wording import listed, standing
@@ -30,7 +31,7 @@ def begin_move(
     state.charge_ranked(run.destination, destination, now, ranking)
     state.set_phase(process, ProcessPhase.MIGRATING, now, f"to {destination.name}: {cause}")
     state.record(
-        now, "migration_begun",
+        now, EventKind.MIGRATION_BEGUN,
         f"{process.name} moves from {run.source_host.name} to {destination.name} by "
         f"{run.strategy}: {cause}",
         process=process.name, host=destination.name,

@@ -24,6 +24,7 @@ from typing import Any, Final
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.hosts import HostCondition
 from rosrm.extensions.contracts import Intent
+from rosrm.model.event_kinds import EventKind
 from rosrm.wording import counted
 
 _KEY: Final = "unheard"
@@ -87,7 +88,7 @@ def note_seen(state: MasterState, host: str, seen: int, now: float) -> None:
     )
     records = counted(lost, "record is", "records are")
     state.record(
-        now, "journal_behind",
+        now, EventKind.JOURNAL_BEHIND,
         f"the journal has lost its newest records: {host} has seen record {seen}, and the journal "
         f"ended at {tail.newest} when this master started: {records} missing. Repeat the "
         f"requests that they held; processes that these started are stopped{wait}",

@@ -12,6 +12,7 @@ from rosrm.core.master.recovery import journal_gap
 from rosrm.core.master.state.migration import end_from_dict, way_back
 from rosrm.core.master.state.process import Image, LeftBehind
 from rosrm.extensions.contracts import Intent
+from rosrm.model.event_kinds import EventKind
 from rosrm.model.plan import Aim
 from rosrm.model.plan_json import plan_from_dict
 from rosrm.model.spec_json import spec_from_dict
@@ -167,7 +168,7 @@ def _restore_move(
         else f"continues: {run.course}"
     )
     state.record(
-        now, "migration_taken_up", f"{process.name} {goes_on}",
+        now, EventKind.MIGRATION_TAKEN_UP, f"{process.name} {goes_on}",
         process=process.name, host=run.destination_host.name,
     )  # fmt: skip
     return True
@@ -208,7 +209,8 @@ def _forget_move(
     for instance in state.instances_of(process):
         instance.stopping = instance.id.number != process.owner
     state.record(
-        now, "migration_forgotten", f"the move of {process.name} cannot be continued: {fault}",
+        now, EventKind.MIGRATION_FORGOTTEN,
+        f"the move of {process.name} cannot be continued: {fault}",
         process=process.name,
     )  # fmt: skip
     state.emit(Intent("migration", process.name, None))

@@ -12,6 +12,7 @@ from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.host_arrays import FloatArray
 from rosrm.core.master.state.hosts import Host
 from rosrm.core.master.state.lazy import Lazy
+from rosrm.model.event_kinds import EventKind
 from rosrm.model.spec_json import spec_to_dict
 from rosrm.model.values import InstanceId, InstanceState, ProcessSpec
 
@@ -215,7 +216,7 @@ class Process:
     standby_at: float = 0.0
     standby_tries: int = 0
     standby_reason: str = ""
-    history: list[tuple[float, str, str]] = field(default_factory=list)
+    history: list[tuple[float, EventKind, str]] = field(default_factory=list)
     demand: tuple[int, Demand] | None = None
     plain: PlainSpec = field(init=False)
 

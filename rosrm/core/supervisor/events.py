@@ -1,40 +1,10 @@
-"""What may happen to the supervisor's instances, and what it may have to do about it."""
+"""Events of the supervisor, in the past tense."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
-#: Process name and number: what `InstanceId` holds.
-Key = tuple[str, int]
-
-
-class RestartRule(NamedTuple):
-    """`rosrm.model.values.RestartPolicy`, without its weight."""
-
-    when: str = "never"
-    delay: float = 1.0
-    max_delay: float = 30.0
-    factor: float = 2.0
-    attempts: int = 5
-    window: float = 300.0
-
-
-class StopRule(NamedTuple):
-    """`rosrm.model.values.StopPolicy`, without its weight."""
-
-    interrupt_grace: float = 5.0
-    terminate_grace: float = 5.0
-
-
-class FenceRule(NamedTuple):
-    """`rosrm.model.values.Fence`, without its weight."""
-
-    after: float
-    grace: float
-    alive: bool = False
-
-
-# --- events: what happened --------------------------------------------------------------------
+from rosrm.core.supervisor.rules import FenceRule, Key, RestartRule, StopRule
 
 
 class StartOrdered(NamedTuple):
@@ -190,44 +160,3 @@ Event = (
     | ShutdownOrdered
     | ClientLost
 )
-
-
-# --- commands: what to do ---------------------------------------------------------------------
-
-
-class Spawn(NamedTuple):
-    """Start it; answered by Spawned or SpawnFailed."""
-
-    instance: Key
-
-
-class Unspawn(NamedTuple):
-    """Give up a spawn that was not tried yet; then answered by SpawnFailed."""
-
-    instance: Key
-
-
-class Signal(NamedTuple):
-    """Send a signal to every process of it."""
-
-    instance: Key
-    number: int
-
-
-class Tell(NamedTuple):
-    """Record its status, then tell the client."""
-
-    instance: Key
-
-
-class Drop(NamedTuple):
-    """Forget it durably."""
-
-    instance: Key
-
-
-class Leave(NamedTuple):
-    """All has ended (or cannot be ended): the supervisor ends too."""
-
-
-Command = Spawn | Unspawn | Signal | Tell | Drop | Leave

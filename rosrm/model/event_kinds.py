@@ -1,0 +1,149 @@
+"""The kinds of events in the event record, each with its meaning.
+
+`docs/reference/events.md` has the same table: `python scripts/event_table.py` writes it.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+
+class EventKind(str, Enum):
+    """Kind of an event.
+
+    Attributes:
+        meaning: one line for the reference page.
+    """
+
+    meaning: str
+
+    def __new__(cls, text: str, meaning: str = "") -> Self:
+        """Make a member from its name in the journal and its meaning."""
+        kind = str.__new__(cls, text)
+        kind._value_ = text
+        kind.meaning = meaning
+        return kind
+
+    # --- master and journal --------------------------------------------------------------
+
+    MASTER_STARTED = "master_started", "the master started, with its epoch"
+    MASTER_STOPPED = "master_stopped", "the master stopped, with the cause"
+    JOURNAL_RECOVERED = "journal_recovered", "a damaged journal was rebuilt: `master --recover`"
+    JOURNAL_BACK = (
+        "journal_back",
+        "the journal can be written again, after a time without decisions",
+    )
+    JOURNAL_BEHIND = "journal_behind", "the newest records of the journal are missing"
+    PEER_REFUSED = "peer_refused", "a message was refused: another version, or not valid"
+    PRUNED = "pruned", "ended processes were removed from the listings"
+
+    # --- processes -----------------------------------------------------------------------
+
+    SUBMITTED = "submitted", "a client submitted the process"
+    ASSIGNED = "assigned", "a host was chosen for the process; facts: the decision"
+    WAITS = "waits", "the head of the queue waits; facts: the decision"
+    QUEUED = "queued", "the process returns to the queue, with the cause"
+    SET_ASIDE = "set_aside", "no known host may ever take the process, with the reason"
+    STARTING = "starting", "the process was started and is not ready yet"
+    RUNNING = "running", "the job runs"
+    READY = "ready", "the process runs and is ready"
+    REACHABLE = "reachable", "the host of the process reports again, and the process still runs"
+    BACKOFF = "backoff", "the process ended and is started again after a delay"
+    STOPPING = "stopping", "the process is being stopped"
+    FINISHED = "finished", "the process ended with success"
+    FAILED = "failed", "the process ended and is not started again"
+    CANCEL_REQUESTED = "cancel_requested", "a client cancels the process"
+    CANCELLED = "cancelled", "the process ended because it was cancelled"
+    RESTART_REQUESTED = "restart_requested", "a client restarts the process"
+    INSTANCE_ENDED = "instance_ended", "an instance that does not own the name of its process ended"
+    UNASSIGNED_STOPPED = "unassigned_stopped", "a host runs an instance that the master stops"
+    FENCED = "fenced", "a host runs an instance that has a successor: it is killed"
+    GIVEN_UP = "given_up", "the host of the instance is lost, and the instance is written off"
+    READOPTED = "readopted", "the lost host is back, and the instance on it owns the name again"
+
+    # --- hosts ---------------------------------------------------------------------------
+
+    HOST_REGISTERED = "host_registered", "a host registered; facts: labels and resources"
+    HOST_REFUSED = "host_refused", "a host was not registered, with the reason"
+    HOST_SUSPECT = "host_suspect", "the host is silent and gets no new work"
+    HOST_BACK = "host_back", "a silent host reports again"
+    HOST_LOST = "host_lost", "the host was silent for its whole lease"
+    HOST_LEFT = "host_left", "the slave stops, and its processes with it"
+    HOST_DETACHED = "host_detached", "the slave stops and leaves its processes running"
+    HOST_PRUNED = "host_pruned", "a departed host was removed from the listings"
+    HOST_CORDONED = "host_cordoned", "a client cordoned the host: it gets no new work"
+    HOST_UNCORDONED = "host_uncordoned", "a client uncordoned the host"
+    HOST_DRAINING = "host_draining", "a client drains the host: its processes move away"
+    HOST_DRAINED = "host_drained", "nothing is left on the host that can leave"
+    READING_REFUSED = "reading_refused", "a reading is not a number, negative or out of range"
+    OVER_LIMIT = "over_limit", "the host reached a limit; facts: the resource"
+    UNDER_LIMIT = "under_limit", "the host is under all its limits again"
+    NOTHING_MOVES = "nothing_moves", "no process can leave the host, with the reasons"
+
+    # --- migration -----------------------------------------------------------------------
+
+    MIGRATION_BEGUN = "migration_begun", "a migration begins; facts: hosts, strategy, cause, steps"
+    MIGRATION_STEP = "migration_step", "a step of the plan is done"
+    MIGRATION_STEP_FAILED = "migration_step_failed", "a step of the plan failed, with the reason"
+    MIGRATION_UNDONE = "migration_undone", "the migration turns back, with the reason"
+    MIGRATION_REDONE = "migration_redone", "the destination is active: the migration is finished"
+    MIGRATION_STUCK = "migration_stuck", "a step that must be done failed: it is tried again"
+    MIGRATION_TAKEN_UP = "migration_taken_up", "a restarted master continues the migration"
+    MIGRATION_FORGOTTEN = "migration_forgotten", "a restarted master cannot continue the migration"
+    MIGRATION_REFUSED = "migration_refused", "a process is not moved as requested, with the reason"
+    MIGRATED = "migrated", "the process moved; facts: hosts, seconds, cause, strategy"
+    STAYED = "stayed", "the migration failed, and the process runs where it was"
+    HANDOFF_REPORTED = "handoff_reported", "source or destination reports its phase of the handoff"
+    TAKE_OVER = "take_over", "the source ended during the handoff: the destination takes over"
+    DESTINATION_UNHEARD = (
+        "destination_unheard",
+        "the destination does not confirm that the handoff is called off: it is stopped",
+    )
+
+    # --- snapshots and standbys ----------------------------------------------------------
+
+    KEPT_ON = "kept_on", "the hosts that keep replicas of the snapshots were chosen"
+    STANDBY_BEGUN = "standby_begun", "the standby starts on another host"
+    STANDBY_READY = "standby_ready", "the standby is ready to take over"
+    STANDBY_WAITS = "standby_waits", "no standby can be started now, with the reason"
+    STANDBY_LOST = "standby_lost", "the standby ended; another one is started"
+    FAILED_OVER = "failed_over", "the standby takes over from the process"
+
+    # --- checkpoint images ---------------------------------------------------------------
+
+    CHECKPOINT_BEGUN = "checkpoint_begun", "a client checkpoints the process; facts: steps"
+    CHECKPOINTED = "checkpointed", "the process ended, and its image is on its host"
+    CHECKPOINT_FAILED = "checkpoint_failed", "no image was made, and the process still runs"
+    RESTORE_BEGUN = "restore_begun", "the process is restored from its image; facts: steps"
+    RESTORED = "restored", "the process runs again from its image"
+    RESTORE_FAILED = "restore_failed", "the process was not restored, and stays checkpointed"
+    IMAGE_REMOVED = "image_removed", "an image that is no longer needed was removed"
+    IMAGE_LEFT = "image_left", "an image could not be removed: it is tried again"
+    PERIODIC_CHECKPOINT = "periodic_checkpoint", "the first periodic checkpoint was made"
+    PERIODIC_FAILED = "periodic_failed", "no periodic checkpoint was made, with the reason"
+
+    # --- plugins -------------------------------------------------------------------------
+
+    PLUGIN_FAILED = "plugin_failed", "a plugin fails, with its error"
+    PLUGIN_WORKS = "plugin_works", "a plugin that failed works again"
+    STRATEGY_ABSENT = "strategy_absent", "a migration strategy does not work on a host"
+
+    __str__ = str.__str__
+
+    @classmethod
+    def read(cls, text: str) -> EventKind:
+        """Return the kind of a journalled event.
+
+        A kind that only another version of rosrm knows is kept, so that its event is still shown.
+        """
+        try:
+            return cls(text)
+        except ValueError:
+            other = str.__new__(cls, text)
+            other._name_ = other._value_ = text
+            other.meaning = ""
+            return other
