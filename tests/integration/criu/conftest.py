@@ -115,7 +115,8 @@ def as_nobody() -> Callable[..., subprocess.CompletedProcess]:
     )
     python = sys.executable if seen.returncode == 0 else shutil.which("python3", path="/usr/bin")
     code = "import sys; assert sys.version_info >= (3, 10); import rosrm_criu.engine.probe"
-    variables = {"PYTHONPATH": str(ROOT)}
+    path = f"{ROOT}:{ROOT / 'plugins/criu'}"
+    variables = {"PYTHONPATH": path}
     if (
         python is None
         or subprocess.run([python, "-c", code], env=variables, check=False, **user).returncode
@@ -123,7 +124,7 @@ def as_nobody() -> Callable[..., subprocess.CompletedProcess]:
         pytest.skip("no Python and rosrm that every user can read")
 
     def run(*words: object, home: Path, **environment: object):
-        variables = {"PYTHONPATH": ROOT, "PATH": "/usr/bin:/bin", "HOME": home, "TMPDIR": home}
+        variables = {"PYTHONPATH": path, "PATH": "/usr/bin:/bin", "HOME": home, "TMPDIR": home}
         variables |= {"PYTHONDONTWRITEBYTECODE": 1, **environment}
         return subprocess.run(
             [python, *map(str, words)],
