@@ -27,8 +27,8 @@ from typing import Any, Final
 
 from benchmarks.machine import percentile, print_report, say
 from benchmarks.stopping import run
-from rosrm.criu.probe import ability
 from rosrm.errors import LabError
+from rosrm_criu.engine.probe import ability
 from rosrm_lab import DATA, GIB, HostPlan, Lab, uniform
 
 _ROOT: Final = Path(__file__).resolve().parents[1]

@@ -22,6 +22,7 @@ _DISTRIBUTIONS = (
     "rosrm-resources",
     "rosrm-migration",
     "rosrm-checkpoint",
+    "rosrm-criu",
     "ros-jazzy-rclpy",
     "ros-jazzy-rmw-fastrtps-cpp",
     "aiohttp",

@@ -20,7 +20,7 @@ from pathlib import Path
 
 from benchmarks.machine import median, print_report, say
 from benchmarks.stopping import run
-from rosrm.transfer import Fetcher, Sender
+from rosrm_criu.transfer import Fetcher, Sender
 
 SIZES_MB = (10, 100, 500)
 #: Bytes of random, then as many of nothing.

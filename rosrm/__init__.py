@@ -30,7 +30,9 @@ Plugins         hookimpl, NoOptions, SkipPlugin
   probes        ProbeOffer, Probe, ProbeContext, Sessions, ResourceDescription, Reading
   scoring       ScoringOffer, ScoringPolicy, HostView, ProcessView, Scores, FloatArray, BoolArray
   migration     MigrationOffer, MigrationStrategy, SpecChecking, HostChecking, Imaging,
-                PeriodicImaging, options_of
+                PeriodicImaging, Capabilities, options_of
+  launchers     LauncherOffer, Launcher, LauncherContext, Launch, ProcessTreeLauncher,
+                GraphDepartureLauncher, ImageLauncher
   plans         Move, Plan, Step, Start, AwaitReady, AwaitReleased, Stop, Configure, SetRestart,
                 Commit, Execute, HandoffPhase, InstanceId
   checkpoints   CheckpointOffer, CheckpointPolicy, CheckpointView, CheckpointChoice, MemoryPacing,
@@ -67,14 +69,21 @@ if TYPE_CHECKING:
     )
     from rosrm.extensions.contracts import (
         BoolArray,
+        Capabilities,
         CheckpointChoice,
         CheckpointOffer,
         CheckpointPolicy,
         CheckpointView,
         FloatArray,
+        GraphDepartureLauncher,
         HostChecking,
         HostView,
+        ImageLauncher,
         Imaging,
+        Launch,
+        Launcher,
+        LauncherContext,
+        LauncherOffer,
         MemoryPacing,
         MemoryView,
         MigrationOffer,
@@ -84,6 +93,7 @@ if TYPE_CHECKING:
         Probe,
         ProbeContext,
         ProbeOffer,
+        ProcessTreeLauncher,
         ProcessView,
         Scores,
         ScoringOffer,
@@ -146,18 +156,20 @@ if TYPE_CHECKING:
 # Written out, for the tools that read this file and do not run it. A test compares the three lists.
 __all__ = [
     "PROTOCOL_VERSION", "Amount", "AwaitReady", "AwaitReleased", "BoolArray", "Bytes",
-    "CheckpointChoice", "CheckpointOffer", "CheckpointPolicy", "CheckpointView", "Client",
-    "Commit", "ConfigError", "Configure", "Count", "EventRow", "Execute", "FloatArray",
-    "Fraction", "HandoffPhase", "Health", "HostChecking", "HostDescription", "HostLossPolicy",
-    "HostRow", "HostView", "Imaging", "InstanceId", "IsolationPolicy", "Kind", "LogChunk",
-    "MemoryPacing", "MemoryView", "MigrationOffer", "MigrationPolicy", "MigrationStrategy",
-    "Move", "NoMaster", "NoOptions", "PeriodicImaging", "Plan", "PluginError", "PluginRow",
-    "PositiveCount", "PositiveSeconds", "Probe", "ProbeContext", "ProbeOffer", "ProcessRow",
-    "ProcessSpec", "ProcessView", "Readiness", "Reading", "Refused", "ResourceDescription",
-    "ResourceName", "ResourceRow", "RestartPolicy", "RosSettings", "RosrmError", "Scores",
-    "ScoringOffer", "ScoringPolicy", "Seconds", "Sessions", "SetRestart", "SkipPlugin",
-    "Snapshot", "SpecChecking", "StandbyPolicy", "Start", "Step", "Stop", "StopPolicy",
-    "WaitResult", "__version__", "hookimpl", "load_work", "options_of",
+    "Capabilities", "CheckpointChoice", "CheckpointOffer", "CheckpointPolicy",
+    "CheckpointView", "Client", "Commit", "ConfigError", "Configure", "Count", "EventRow",
+    "Execute", "FloatArray", "Fraction", "GraphDepartureLauncher", "HandoffPhase", "Health",
+    "HostChecking", "HostDescription", "HostLossPolicy", "HostRow", "HostView",
+    "ImageLauncher", "Imaging", "InstanceId", "IsolationPolicy", "Kind", "Launch", "Launcher",
+    "LauncherContext", "LauncherOffer", "LogChunk", "MemoryPacing", "MemoryView",
+    "MigrationOffer", "MigrationPolicy", "MigrationStrategy", "Move", "NoMaster", "NoOptions",
+    "PeriodicImaging", "Plan", "PluginError", "PluginRow", "PositiveCount", "PositiveSeconds",
+    "Probe", "ProbeContext", "ProbeOffer", "ProcessRow", "ProcessSpec", "ProcessTreeLauncher",
+    "ProcessView", "Readiness", "Reading", "Refused", "ResourceDescription", "ResourceName",
+    "ResourceRow", "RestartPolicy", "RosSettings", "RosrmError", "Scores", "ScoringOffer",
+    "ScoringPolicy", "Seconds", "Sessions", "SetRestart", "SkipPlugin", "Snapshot",
+    "SpecChecking", "StandbyPolicy", "Start", "Step", "Stop", "StopPolicy", "WaitResult",
+    "__version__", "hookimpl", "load_work", "options_of",
 ]  # fmt: skip
 
 #: The public names of each module below `rosrm`.
@@ -168,10 +180,12 @@ _NAMES: Final = {
     "config.work": "load_work",
     "errors": "ConfigError NoMaster PluginError Refused RosrmError SkipPlugin",
     "extensions.contracts": (
-        "BoolArray CheckpointChoice CheckpointOffer CheckpointPolicy CheckpointView "
-        "FloatArray HostChecking HostView Imaging MemoryPacing MemoryView MigrationOffer "
-        "MigrationStrategy NoOptions PeriodicImaging Probe ProbeContext ProbeOffer "
-        "ProcessView Scores ScoringOffer ScoringPolicy Sessions SpecChecking"
+        "BoolArray Capabilities CheckpointChoice CheckpointOffer CheckpointPolicy "
+        "CheckpointView FloatArray GraphDepartureLauncher HostChecking HostView ImageLauncher "
+        "Imaging Launch Launcher LauncherContext LauncherOffer MemoryPacing MemoryView "
+        "MigrationOffer MigrationStrategy NoOptions PeriodicImaging Probe ProbeContext "
+        "ProbeOffer ProcessTreeLauncher ProcessView Scores ScoringOffer ScoringPolicy "
+        "Sessions SpecChecking"
     ),
     "extensions.hookspecs": "hookimpl",
     "extensions.options": "options_of",

@@ -19,17 +19,17 @@ from typing import Any
 
 import pytest
 
-from rosrm.criu import dumping, outcome, tree
-from rosrm.criu.image import Manifest
-from rosrm.criu.outcome import Outcome
-from rosrm.criu.probe import Ability, probe
-from rosrm.criu.program import Criu, find
 from rosrm.errors import CriuError
+from rosrm_criu.engine import dump, process_tree, restore_result
+from rosrm_criu.engine.binary import Criu, find
+from rosrm_criu.engine.image import Manifest
+from rosrm_criu.engine.probe import Ability, probe
+from rosrm_criu.engine.restore_result import Outcome
 
 #: Seconds for whatever a busy machine needs; nothing waits so long when all goes well.
 TIMEOUT = 60.0
 
-#: What a host tells of itself and its CRIU (`rosrm.criu.fitting.FACTS`).
+#: What a host tells of itself and its CRIU (`rosrm_criu.engine.compatibility.FACTS`).
 HOST_FACTS = {
     "version": "4.2.1",
     "kernel": "6.18.44",
@@ -108,10 +108,10 @@ class Theatre:
         self._processes.append(process)
         return Actor(process, log)
 
-    def dump(self, actor: Actor, name: str = "image", leave: dumping.Leave = "killed") -> Path:
+    def dump(self, actor: Actor, name: str = "image", leave: dump.Leave = "killed") -> Path:
         """The directory of its image."""
         directory = self.folder / name
-        self.manifest: Manifest = dumping.dump(
+        self.manifest: Manifest = dump.dump(
             self.criu, actor.pid, directory, leave=leave, timeout=TIMEOUT, process="actor",
             instance=1,
         )  # fmt: skip
@@ -135,14 +135,14 @@ class Theatre:
     ) -> tuple[str, ...]:
         """Its command line."""
         program = Path(self.criu.command[0])
-        return outcome.command(
+        return restore_result.command(
             sys.executable, directory, criu=program, remove=remove, timeout=TIMEOUT, then=then
         )
 
     def restore(self, directory: Path, *options: str, **named: Any) -> Actor:
         """The program that holds a restored process."""
         actor = self.hold(directory, *options, **named)
-        actor.outcome = outcome.wait(
+        actor.outcome = restore_result.wait(
             directory, timeout=TIMEOUT, ended=lambda: actor.process.poll() is not None
         )
         self._restored.append(os.pidfd_open(actor.outcome.pid))
@@ -152,8 +152,8 @@ class Theatre:
         """End them all."""
         for process in self._processes:
             if process.poll() is None:
-                members = tree.tree(process.pid)
-                tree.send(members, signal.SIGKILL)
+                members = process_tree.tree(process.pid)
+                process_tree.send(members, signal.SIGKILL)
                 process.wait(TIMEOUT)
         for pidfd in self._restored:
             with contextlib.suppress(ProcessLookupError):

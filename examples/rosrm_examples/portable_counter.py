@@ -17,7 +17,7 @@ from collections.abc import Sequence
 
 from std_msgs.msg import Int64MultiArray
 
-from rosrm.node import PortableNode, run_portable
+from rosrm_criu.node import PortableNode, run_portable
 
 #: Bytes that are read at each count, so that no count takes long.
 SLICE = 4_000_000

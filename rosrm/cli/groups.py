@@ -33,7 +33,7 @@ _ELSEWHERE: Final = {
     for word in words.split()
 }
 #: Commands that distributions of their own bring.
-DISTRIBUTIONS: Final = {"lab": "rosrm-lab", "simulate": "rosrm-simulate"}
+DISTRIBUTIONS: Final = {"criu": "rosrm-criu", "lab": "rosrm-lab", "simulate": "rosrm-simulate"}
 #: Wide enough that no summary of a command is cut.
 _UNCUT: Final = 1000
 #: "WORK......" and "[NAME...]..." say twice that a word may be repeated.

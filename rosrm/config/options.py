@@ -8,10 +8,12 @@ from typing import Any, Final, get_args, get_type_hints
 from rosrm.config.checking import near, validated
 from rosrm.config.documents import Node, Problems
 from rosrm.errors import ConfigError
+from rosrm.extensions.declared_fields import no_standby
 from rosrm.extensions.plugin_calls import TITLES
 from rosrm.extensions.registry import Registry
 from rosrm.extensions.units import IsResource
 from rosrm.model.codec import to_plain
+from rosrm.model.values import ProcessSpec
 
 #: Stands among `probes` for all that are read where the file names none.
 DEFAULT_PROBES: Final = "default"
@@ -36,6 +38,18 @@ class PluginCheck:
     def has(self, kind: str, name: str) -> bool:
         """Whether a plugin is installed; without a registry it is taken to be."""
         return self._registry is None or name in self._registry.names(kind)
+
+    def standby_fault(self, spec: ProcessSpec) -> str:
+        """Return why a process cannot have the standby that it asks for; "": it can, or may."""
+        strategy = spec.migration.strategy
+        if not spec.standby.wanted or (strategy and self._registry is None):
+            return ""
+        known = {} if self._registry is None else self._registry.capabilities()
+        if strategy and strategy not in known:
+            return ""  # `choice` has noted that it is not installed
+        if self._registry is not None and self._registry.capabilities_of()(spec).shadow:
+            return ""
+        return no_standby(strategy, known)
 
     def choice(
         self, kind: str, name: str, named: Node, options: Node | None, *, own: bool = False

@@ -245,9 +245,6 @@ def _about_restarts(process: ProcessInFile) -> Iterator[Complaint]:
 
 def _about_faults(process: ProcessInFile) -> Iterator[Complaint]:
     standby = process.standby
-    if standby.wanted and process.migration.strategy != "handoff":
-        text = "a standby follows the state as in a handoff: set `migration: handoff`"
-        yield Complaint(("standby",), text)
     if standby.wanted and process.kind == "job":
         yield Complaint(("standby",), "a job runs to completion; only a service has a standby")
     if standby.apart_by and not standby.wanted:

@@ -126,9 +126,13 @@ def _process(
     for complaint in complaints(process, wrong):
         problems.add(node.deepest(complaint.path).place, complaint.text)
     process = _on_host(process, path)
-    if options is None:
-        return process.spec()
-    return replace(process, migration=replace(process.migration, options=options)).spec()
+    if options is not None:
+        process = replace(process, migration=replace(process.migration, options=options))
+    spec = process.spec()
+    fault = plugins.standby_fault(spec) if wrong.isdisjoint(("standby", "migration")) else ""
+    if fault:
+        problems.add(node.deepest(("standby",)).place, fault)
+    return spec
 
 
 def _options_of_strategy(node: Node, plugins: PluginCheck) -> Mapping[str, Any] | None:

@@ -11,14 +11,21 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
 
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.plan import Execute, Move, Plan
-from rosrm.model.values import EMPTY, InstanceId, ProcessSpec, Reading, ResourceDescription
+from rosrm.model.values import (
+    EMPTY,
+    Assignment,
+    InstanceId,
+    ProcessSpec,
+    Reading,
+    ResourceDescription,
+)
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
@@ -281,10 +288,32 @@ class PeriodicImaging(Protocol):
 
 
 @dataclass(frozen=True)
+class Capabilities:
+    """Declares what a migration strategy can do for a process; by default it only moves it.
+
+    Attributes:
+        state: what outlives an instance. "topics": its node publishes its state by the handoff
+            protocol, so rosrm keeps snapshots and replicas of it. "memory": an image of its memory.
+        shadow: a second instance follows the state before it takes over, so a process may have a
+            standby.
+        restart_from_image: the strategy implements `PeriodicImaging`, and its launcher starts an
+            instance that has crashed from its newest image.
+        launcher: name of the launcher of its processes; "": a plain command.
+    """
+
+    state: Literal["none", "topics", "memory"] = "none"
+    shadow: bool = False
+    restart_from_image: bool = False
+    launcher: str = ""
+
+
+@dataclass(frozen=True)
 class MigrationOffer:
     """Registers a migration strategy; the fields are as in `ProbeOffer`.
 
     Attributes:
+        capabilities: what it can do; where that depends on options, a pure function of the options
+            that hold for one process. It must not change `launcher`.
         executors: what the open step of its plans may name; each runs on a slave with the step's
             arguments (a JSON object) and answers with one.
         own_options: what can be set for one process, where that is more than for all: a dataclass
@@ -299,6 +328,102 @@ class MigrationOffer:
         default_factory=lambda: EMPTY
     )
     own_options: type[Any] | None = None
+    capabilities: Capabilities | Callable[[Any], Capabilities] = Capabilities()
+
+
+# --- launchers (slave) ------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class LauncherContext:
+    """What a launcher may know of its host when it is made.
+
+    Attributes:
+        state: directory of the slave; executors get it as `here.state`.
+        python: interpreter of the slave.
+        slave: random number of this run of the slave.
+    """
+
+    state: Path
+    python: str
+    slave: int
+
+
+@dataclass(frozen=True)
+class Launch:
+    """The start of one instance, as the supervisor is about to carry it out.
+
+    Attributes:
+        assignment: what is to run; `assignment.restored`: from an image on this host.
+        cluster: name of the cluster whose master gives the order.
+        argv: command line, with all ROS arguments.
+        environment: all variables of the process.
+    """
+
+    assignment: Assignment
+    cluster: str
+    argv: tuple[str, ...]
+    environment: Mapping[str, str]
+
+
+class Launcher(Protocol):
+    """Starts instances in another way than by their plain command. Called in the slave's loop."""
+
+    def prepare(self, launch: Launch) -> Launch | None:
+        """Return the launch with another command line or environment.
+
+        None: there is no image of this instance here. A restored instance whose strategy has no
+        launcher is offered to each launcher in turn. An error of `rosrm.errors`, or a `ValueError`,
+        says why the instance cannot be started here.
+        """
+
+
+class ProcessTreeLauncher(Protocol):
+    """A launcher whose program stays the leader of the session, with the process below it.
+
+    The process may have a session and a pid namespace of its own. Each call takes the pid of an
+    instance's leader, whichever launcher has started it.
+    """
+
+    def leads(self, leader: int) -> bool | None:
+        """Return True if it runs this launcher's program; None: not yet, but it may in a moment."""
+
+    def members(self, leader: int) -> Sequence[int]:
+        """Return the leader and all processes of the instance."""
+
+    def root(self, leader: int) -> int:
+        """Return the pid of the process itself."""
+
+
+class GraphDepartureLauncher(Protocol):
+    """A launcher of nodes that leave the ROS graph for a while."""
+
+    def has_departed(self, leader: int) -> bool:
+        """Return True while a node is out of the graph; its health is not watched then."""
+
+
+class ImageLauncher(Protocol):
+    """A launcher that starts an instance from its newest image after a crash."""
+
+    def discard_images(self, instance: InstanceId) -> None:
+        """Have the next start begin from nothing: a user restarts the instance."""
+
+
+@dataclass(frozen=True)
+class LauncherOffer:
+    """Registers a launcher.
+
+    Attributes:
+        name: by which `Capabilities.launcher` chooses it.
+        create: makes it, once for each run of a slave; raises `SkipPlugin` where it cannot work.
+        summary: one line for `rosrm plugins`.
+        variables: environment variables that it sets; no process inherits them from the slave.
+    """
+
+    name: str
+    create: Callable[[LauncherContext], Launcher]
+    summary: str = ""
+    variables: tuple[str, ...] = ()
 
 
 # --- checkpoints (master, pure) ---------------------------------------------------------------

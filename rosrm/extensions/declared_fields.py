@@ -10,7 +10,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, Final, cast
 
+from rosrm.extensions.contracts import Capabilities
 from rosrm.model.values import EMPTY, ProcessSpec
+from rosrm.wording import listed
 
 #: Fields of a spec that a policy may always read: `Demand.key` holds them.
 STANDARD_FIELDS: Final = (
@@ -65,6 +67,19 @@ def no_options(_strategy: str, _spec: ProcessSpec) -> Any:
     return None
 
 
+def no_capabilities(_spec: ProcessSpec) -> Capabilities:
+    """Return the defaults: no offer says what the strategy of a process can do."""
+    return Capabilities()
+
+
+def no_standby(strategy: str | None, known: Mapping[str, Capabilities]) -> str:
+    """Return why a process has no standby, and which strategies of the known ones give it one."""
+    able = [f"`migration: {name}`" for name, it in known.items() if it.shadow]
+    why = f"{strategy} cannot do that" if strategy else "without a migration strategy none can"
+    remedy = f"say {listed(able, 'or')}" if able else "install a strategy that can"
+    return f"a standby follows the state of its process, and {why}: {remedy}"
+
+
 @dataclass(frozen=True)
 class Declared:
     """Declarations of the selected plugins' offers.
@@ -75,9 +90,17 @@ class Declared:
             `ValueError` for what the strategy does not take.
         executors: names by strategy, of the offers that are known.
         brought_by: the distribution by strategy, where it is known.
+        capabilities_of: returns what the strategy of a process can do for it; never raises.
+        capabilities: of each installed strategy, selected or not, with its options for all.
     """
 
     reads: tuple[str, ...] = ()
     options_of: Callable[[str, ProcessSpec], Any] = no_options
     executors: Mapping[str, frozenset[str]] = field(default_factory=lambda: EMPTY)
     brought_by: Mapping[str, str] = field(default_factory=lambda: EMPTY)
+    capabilities_of: Callable[[ProcessSpec], Capabilities] = no_capabilities
+    capabilities: Mapping[str, Capabilities] = field(default_factory=lambda: EMPTY)
+
+    def has_snapshots(self, spec: ProcessSpec) -> bool:
+        """Return True if the node of a process publishes a state of which snapshots are kept."""
+        return spec.ros_node and self.capabilities_of(spec).state == "topics"

@@ -14,20 +14,29 @@ from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import partial
 from pkgutil import resolve_name
 from types import SimpleNamespace
-from typing import Any, Final, TypeAlias, TypeVar
+from typing import Any, Final, TypeAlias, TypeVar, get_args, get_type_hints
 
 import pluggy
 
 from rosrm.errors import describe_plugin_fault
 from rosrm.extensions import hookspecs
-from rosrm.extensions.contracts import CheckpointOffer, MigrationOffer, ProbeOffer, ScoringOffer
+from rosrm.extensions.contracts import (
+    Capabilities,
+    CheckpointOffer,
+    LauncherOffer,
+    MigrationOffer,
+    ProbeOffer,
+    ScoringOffer,
+)
 from rosrm.extensions.declared_fields import SPEC_FIELDS
 from rosrm.extensions.installed import GROUP, PluginAddress
 from rosrm.extensions.time_limit import limited
 from rosrm.wording import get_close_matches
 
 T = TypeVar("T")
-Offer: TypeAlias = "ProbeOffer | ScoringOffer | MigrationOffer | CheckpointOffer"
+#: What the configuration chooses by name, with options.
+ChosenOffer: TypeAlias = "ProbeOffer | ScoringOffer | MigrationOffer | CheckpointOffer"
+Offer: TypeAlias = "ChosenOffer | LauncherOffer"
 
 #: What each hook registers, and of which type its offers are.
 HOOKS: Final[Mapping[str, tuple[str, type[Any]]]] = {
@@ -35,6 +44,7 @@ HOOKS: Final[Mapping[str, tuple[str, type[Any]]]] = {
     "register_scoring_policies": ("scoring", ScoringOffer),
     "register_migration_strategies": ("migration", MigrationOffer),
     "register_checkpoint_policies": ("checkpoint", CheckpointOffer),
+    "register_launchers": ("launcher", LauncherOffer),
 }
 
 #: Seconds after which a plugin that is still being loaded is named in the log.
@@ -61,7 +71,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Offered:
-    """One offer: its kind is "probe", "scoring", "migration" or "checkpoint"."""
+    """One offer: its kind is a key of `TITLES`, as "probe"."""
 
     kind: str
     offer: Offer
@@ -216,6 +226,8 @@ def _fault_of(offer: object, wanted: type[Any]) -> str:
         return f"offers something without a name: {name!r}"
     if not callable(getattr(offer, "create", None)):
         return f"{name!r}: `create` cannot be called"
+    if isinstance(offer, LauncherOffer):
+        return ""  # nobody chooses it by name, so it has no options
     options: object = getattr(offer, "options", None)
     if not (isinstance(options, type) and is_dataclass(options)):
         return f"{name!r}: `options` is not a dataclass but {options!r}"
@@ -227,7 +239,8 @@ def _fault_of(offer: object, wanted: type[Any]) -> str:
     if bare:
         return f"{name!r}: option {bare[0]!r} has no default"
     fault = _fault_of_reads(offer) if isinstance(offer, ScoringOffer) else ""
-    fault = _fault_of_executors(offer) if isinstance(offer, MigrationOffer) else fault
+    if isinstance(offer, MigrationOffer):
+        fault = _fault_of_executors(offer) or _fault_of_capabilities(offer)
     return f"{name!r}: {fault}" if fault else ""
 
 
@@ -242,6 +255,17 @@ def _fault_of_executors(offer: MigrationOffer) -> str:
         if not isinstance(name, str) or not callable(function)
     ]
     return wrong[0] if wrong else ""
+
+
+def _fault_of_capabilities(offer: MigrationOffer) -> str:
+    """Return why the capabilities of a migration strategy cannot be read; "": they can."""
+    declared: object = offer.capabilities
+    if not isinstance(declared, Capabilities) and not callable(declared):
+        return f"`capabilities` is {declared!r}; Capabilities(...) or a function is required"
+    states = get_args(get_type_hints(Capabilities)["state"])
+    if isinstance(declared, Capabilities) and declared.state not in states:
+        return f"`capabilities.state` is {declared.state!r}; allowed: {', '.join(states)}"
+    return ""
 
 
 def _fault_of_reads(offer: ScoringOffer) -> str:

@@ -17,7 +17,13 @@ from collections.abc import Sequence
 
 import pluggy
 
-from rosrm.extensions.contracts import CheckpointOffer, MigrationOffer, ProbeOffer, ScoringOffer
+from rosrm.extensions.contracts import (
+    CheckpointOffer,
+    LauncherOffer,
+    MigrationOffer,
+    ProbeOffer,
+    ScoringOffer,
+)
 from rosrm.extensions.installed import GROUP
 
 # The group of the entry points is the name of the pluggy project, too.
@@ -43,3 +49,8 @@ def register_migration_strategies() -> Sequence[MigrationOffer]:  # type: ignore
 @hookspec
 def register_checkpoint_policies() -> Sequence[CheckpointOffer]:  # type: ignore[empty-body]
     """Offer checkpoint policies: when and where state is kept (loaded by the master)."""
+
+
+@hookspec
+def register_launchers() -> Sequence[LauncherOffer]:  # type: ignore[empty-body]
+    """Offer launchers: what starts an instance in another way than a command (loaded by slaves)."""

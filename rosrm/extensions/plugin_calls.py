@@ -33,6 +33,7 @@ TITLES: Final[Mapping[str, str]] = {
     "scoring": "scoring policy",
     "migration": "migration strategy",
     "checkpoint": "checkpoint policy",
+    "launcher": "launcher",
 }
 
 #: Seconds without a failure after which a good answer ends the state "failing". Otherwise a plugin

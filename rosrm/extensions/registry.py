@@ -14,8 +14,12 @@ from typing import Any, Final, TypeVar, cast
 
 from rosrm.errors import ConfigError, PluginError, SkipPlugin, describe_fault, describe_plugin_fault
 from rosrm.extensions.contracts import (
+    Capabilities,
     CheckpointPolicy,
     HostChecking,
+    Launcher,
+    LauncherContext,
+    LauncherOffer,
     MigrationOffer,
     MigrationStrategy,
     PeriodicImaging,
@@ -29,6 +33,7 @@ from rosrm.extensions.declared_fields import Declared
 from rosrm.extensions.discovery import (
     FAULTS,
     Broken,
+    ChosenOffer,
     Loaded,
     Offer,
     Offered,
@@ -39,12 +44,19 @@ from rosrm.extensions.discovery import (
 )
 from rosrm.extensions.installed import PluginAddress, installed_plugins
 from rosrm.extensions.options import merged_options
-from rosrm.extensions.plugin_calls import TITLES, implements
+from rosrm.extensions.plugin_calls import TITLES, implements, required
 from rosrm.extensions.time_limit import limited
 from rosrm.model.codec import from_plain
 from rosrm.model.description_checks import resource_fault
 from rosrm.model.rows import PluginRow
-from rosrm.model.values import EMPTY, RESOURCE_SLOTS, ProcessSpec, Reading, ResourceDescription
+from rosrm.model.values import (
+    EMPTY,
+    RESOURCE_SLOTS,
+    MigrationPolicy,
+    ProcessSpec,
+    Reading,
+    ResourceDescription,
+)
 from rosrm.wording import counted, get_close_matches
 
 #: What the object of each kind must have.
@@ -53,6 +65,7 @@ _METHODS: Final[Mapping[str, tuple[str, ...]]] = {
     "scoring": ("score",),
     "migration": ("propose",),
     "checkpoint": ("choose",),
+    "launcher": ("prepare",),
 }
 
 #: Where rosrm's own plugins of a kind are, for who has none.
@@ -70,6 +83,8 @@ CREATE_LIMIT: Final = 30.0
 _FAILED_PERIOD: Final = 10.0
 #: Broken plugins that a message names where none of them is certainly meant.
 _MOST_BROKEN: Final = 3
+
+_NO_CAPABILITIES: Final = Capabilities()
 
 Executor = Callable[[Mapping[str, Any]], Mapping[str, Any]]
 NameToOptions = Mapping[str, Mapping[str, Any]]
@@ -124,6 +139,29 @@ class FailedProbe:
 
 
 @dataclass(frozen=True)
+class MadeLauncher:
+    """A launcher of this host, and the environment variables that it sets."""
+
+    launcher: Launcher
+    variables: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class MadeLaunchers:
+    """The launchers of a host.
+
+    Attributes:
+        made: by name.
+        absent: name to the reason, of those that say that they are absent here.
+        broken: name to the reason, of those that could not be made.
+    """
+
+    made: Mapping[str, MadeLauncher]
+    absent: Mapping[str, str]
+    broken: Mapping[str, str]
+
+
+@dataclass(frozen=True)
 class OfferedExecutor:
     """An executor, and the name of the migration strategy whose offer has it."""
 
@@ -170,9 +208,9 @@ class Registry:
         """The names on offer of one kind."""
         return tuple(sorted(name for of_kind, name in self._offers if of_kind == kind))
 
-    def offer(self, kind: str, name: str) -> Offer:
+    def offer(self, kind: str, name: str) -> ChosenOffer:
         """The offer of a name; raises `ConfigError` with what there is instead."""
-        return self._offered(kind, name).offer
+        return cast(ChosenOffer, self._offered(kind, name).offer)
 
     def resources(self) -> tuple[str, ...]:
         """Return the names of all resources that the installed probes may read."""
@@ -242,7 +280,7 @@ class Registry:
 
     def _check_executors(self, name: str, strategy: object) -> None:
         """Refuse a strategy whose `ability` or `discard` is no executor of its own offer."""
-        own = cast(MigrationOffer, self.offer("migration", name)).executors
+        own = self._strategy(name).executors
         for kind, named in ((HostChecking, "ability"), (PeriodicImaging, "discard")):
             fault = ""
             try:
@@ -257,11 +295,24 @@ class Registry:
 
     def declared(self, scoring: str, chosen: NameToOptions) -> Declared:
         """Return what the offers of a scoring policy and of migration strategies declare."""
-        offers = {name: cast(MigrationOffer, self.offer("migration", name)) for name in chosen}
+        offers = {name: self._strategy(name) for name in chosen}
+        return Declared(
+            reads=tuple(cast(ScoringOffer, self.offer("scoring", scoring)).reads),
+            options_of=self._options(chosen),
+            capabilities_of=self.capabilities_of(chosen),
+            capabilities=self.capabilities(chosen),
+            executors={name: frozenset(offer.executors) for name, offer in offers.items()},
+            brought_by={
+                name: self._offers["migration", name].source.distribution for name in offers
+            },
+        )
+
+    def _options(self, chosen: NameToOptions) -> Callable[[str, ProcessSpec], Any]:
+        """Return the function that merges and parses the options of a strategy for a process."""
 
         def merged(strategy: str, own: Mapping[str, Any]) -> Any:
-            offer = offers[strategy]
-            return merged_options(offer.own_options or offer.options, chosen[strategy], own)
+            offer, common = self._strategy(strategy), chosen.get(strategy, EMPTY)
+            return merged_options(offer.own_options or offer.options, common, own)
 
         common = cache(partial(merged, own=EMPTY))  # most processes set no option of their own
 
@@ -269,14 +320,59 @@ class Registry:
             own = spec.migration.options if spec.migration.strategy == strategy else EMPTY
             return merged(strategy, own) if own else common(strategy)
 
-        return Declared(
-            reads=tuple(cast(ScoringOffer, self.offer("scoring", scoring)).reads),
-            options_of=options,
-            executors={name: frozenset(offer.executors) for name, offer in offers.items()},
-            brought_by={
-                name: self._offers["migration", name].source.distribution for name in offers
-            },
-        )
+        return options
+
+    def capabilities(self, chosen: NameToOptions = EMPTY) -> dict[str, Capabilities]:
+        """Return what each installed strategy can do for a process without options of its own."""
+        of = self.capabilities_of(chosen)
+        names = self.names("migration")
+        return {name: of(ProcessSpec("", migration=MigrationPolicy(name))) for name in names}
+
+    def capabilities_of(
+        self, chosen: NameToOptions = EMPTY
+    ) -> Callable[[ProcessSpec], Capabilities]:
+        """Return the function that tells what the strategy of a process can do for it.
+
+        A strategy that is not installed here, or fails to tell, has no capabilities.
+
+        Args:
+            chosen: strategies with their options for all processes.
+        """
+        options = self._options(chosen)
+
+        def found(spec: ProcessSpec) -> Capabilities:
+            name = spec.migration.strategy or ""
+            if ("migration", name) not in self._offers:
+                return _NO_CAPABILITIES
+            declared = self._strategy(name).capabilities
+            if isinstance(declared, Capabilities):
+                return declared
+            try:
+                return required(declared(options(name, spec)), Capabilities)
+            except FAULTS:
+                return _NO_CAPABILITIES
+
+        return found
+
+    def _strategy(self, name: str) -> MigrationOffer:
+        return cast(MigrationOffer, self.offer("migration", name))
+
+    def launchers(self, context: LauncherContext) -> MadeLaunchers:
+        """Make the launchers of a host; one that cannot be made is left out with the reason."""
+        made: dict[str, MadeLauncher] = {}
+        absent: dict[str, str] = {}
+        broken: dict[str, str] = {}
+        for name in self.names("launcher"):
+            offer = cast(LauncherOffer, self._offered("launcher", name).offer)
+            try:
+                launcher = self._create("launcher", name, offer, context)
+                made[name] = MadeLauncher(launcher, tuple(offer.variables))
+            except SkipPlugin as skip:
+                absent[name] = str(skip)
+                self._outcome["launcher", name] = ("absent", str(skip))
+            except PluginError as fault:
+                broken[name] = str(fault)
+        return MadeLaunchers(made, absent, broken)
 
     def executors(self) -> dict[str, OfferedExecutor]:
         """Return what the open steps of plans may name on this host, from all migration offers."""
@@ -295,7 +391,7 @@ class Registry:
         }
 
     def _executors_of(self, name: str) -> Mapping[str, Executor]:
-        return cast(MigrationOffer, self.offer("migration", name)).executors
+        return self._strategy(name).executors
 
     def probes(self, chosen: NameToOptions | None, context: ProbeContext) -> Probes:
         """Make the probes of a host, the default ones for None.
@@ -375,6 +471,9 @@ class Registry:
         except FAULTS as fault:
             reason = f"its options cannot be read: {describe_fault(fault)}"
             raise self._fault(kind, name, reason) from fault
+        return self._create(kind, name, offer, settings, *more)
+
+    def _create(self, kind: str, name: str, offer: Offer, *given: Any) -> Any:
         create = cast(Callable[..., Any], offer.create)
 
         def late() -> str:
@@ -384,7 +483,7 @@ class Registry:
             )
 
         try:
-            thing = limited(CREATE_LIMIT, partial(create, settings, *more), late)
+            thing = limited(CREATE_LIMIT, partial(create, *given), late)
         except (SkipPlugin, ConfigError):  # its own word on this host, or on its options
             raise
         except FAULTS as fault:

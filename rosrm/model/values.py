@@ -202,23 +202,6 @@ class ProcessSpec:
     health: Health = Health()
 
     @property
-    def keeps_state(self) -> bool:
-        """Whether its node has a state that a successor takes over by rosrm's own protocol."""
-        migration = self.migration
-        protocol = migration.options.get("protocol", "rosrm")
-        return self.ros_node and migration.strategy == "handoff" and protocol == "rosrm"
-
-    @property
-    def portable(self) -> bool:
-        """Whether its node is asked to leave the ROS graph before its memory is dumped."""
-        return self.ros_node and self.migration.strategy == "criu"
-
-    @property
-    def checkpointed(self) -> bool:
-        """Whether its node asks for periodic checkpoints, to start from the last after a crash."""
-        return self.portable and bool(self.migration.options.get("checkpoint_every"))
-
-    @property
     def ros_node(self) -> bool:
         """Whether it is a ROS node, by its own word or as an executable of a ROS package."""
         return self.ros or self.package is not None
@@ -275,7 +258,8 @@ class Assignment:
             is told otherwise.
         fence: when its host stops it, if it and the master do not hear each other; None: never.
         kept_on: hosts that keep a state of the process, the newest first.
-        kept_from: states of instances with a lower number are of a former life of the name.
+        kept_from: snapshots of instances with a lower number are of a former life of the name; 0:
+            its node publishes no state, and there are none.
         restored: it starts from an image of a former instance that lies on the host, and is not
             restarted until its slave is told otherwise.
     """
@@ -289,6 +273,11 @@ class Assignment:
     kept_on: tuple[str, ...] = ()
     kept_from: int = 0
     restored: bool = False
+
+    @property
+    def has_snapshots(self) -> bool:
+        """Return True if its node publishes a state of which snapshots are kept."""
+        return self.kept_from > 0
 
     @property
     def on_trial(self) -> bool:

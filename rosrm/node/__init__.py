@@ -11,13 +11,9 @@
             self.keep_state("~/state", Int64, self.save, self.restore)
 
 `docs/how-to/stateful-node.md` has the rest; `docs/reference/handoff-protocol.md`, what happens.
-`PortableNode` and `run_portable` are for nodes whose memory moves as it is, by CRIU:
-`docs/how-to/portable-node.md`.
 """
 
 from rosrm.node.arrays import arrays_message, arrays_of
 from rosrm.node.migratable import Migratable, Node
-from rosrm.node.portable import PortableNode
-from rosrm.node.run_portable import run_portable
 
-__all__ = ["Migratable", "Node", "PortableNode", "arrays_message", "arrays_of", "run_portable"]
+__all__ = ["Migratable", "Node", "arrays_message", "arrays_of"]

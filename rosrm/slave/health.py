@@ -6,13 +6,11 @@ from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
 from rosrm.core.slave.reducer import Held, Look, LookedAt, Watch
-from rosrm.criu import tree
-from rosrm.errors import PortableError
 from rosrm.model.values import InstanceId
-from rosrm.portable import State, directory_of, status_of
 from rosrm.ros.participant import Participant
 from rosrm.ros.slave.graph import GraphWatch
 from rosrm.ros.slave.health import HealthEar
+from rosrm.slave.launch.launchers import Launchers
 from rosrm.slave.sessions import SessionTable
 from rosrm.supervisor.procfs import read_stat
 
@@ -27,13 +25,21 @@ class HealthWatch:
         participant: in which a node is made when the first one asks for a topic or a state.
         graph: tells whose a publisher is.
         sessions: the processes of each instance.
+        launchers: of this host.
 
     Attributes:
         watches: there was something to look at.
     """
 
-    def __init__(self, participant: Participant, graph: GraphWatch, sessions: SessionTable) -> None:
+    def __init__(
+        self,
+        participant: Participant,
+        graph: GraphWatch,
+        sessions: SessionTable,
+        launchers: Launchers,
+    ) -> None:
         self._participant, self._graph, self._sessions = participant, graph, sessions
+        self._launchers = launchers
         self.watches = False
         self._node: Any = None
         self._ears: dict[tuple[InstanceId, int], HealthEar] = {}
@@ -51,12 +57,12 @@ class HealthWatch:
             self._ears.pop(run).close()
         for instance, held in watched.items():
             watch = held.watched
-            if watch is not None and not _is_away(held.status.pid):
+            if watch is not None and not self._launchers.has_departed(held.status.pid):
                 look = self._look(instance, held.status.pid, watch, now)
                 yield LookedAt(instance, held.status.pid, look)
 
     def _look(self, instance: InstanceId, pid: int, watch: Watch, now: float) -> Look:
-        stat = read_stat(tree.root_of(pid))
+        stat = read_stat(self._launchers.root(pid))
         stopped = stat is not None and stat.state == _STOPPED
         if not watch.topics and not watch.services:
             return Look(stopped)
@@ -71,13 +77,3 @@ class HealthWatch:
             name = f"{self._participant.node.get_name()}_health"
             self._node = self._participant.unwatched_node(name)
         return HealthEar(self._node, self._graph, watch, now)
-
-
-def _is_away(leader: int) -> bool:
-    """A portable node has left the ROS graph for a move or a checkpoint: nothing is to be heard."""
-    try:
-        control = directory_of(tree.root_of(leader))
-        status = None if control is None else status_of(control)
-    except (OSError, PortableError):  # it has ended, or cannot be looked at: it is judged as ever
-        return False
-    return status is not None and status.state in (State.LEAVING, State.LEFT, State.JOINING)

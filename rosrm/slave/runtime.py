@@ -7,6 +7,7 @@ import logging
 import os
 import signal
 import socket
+import sys
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
@@ -18,7 +19,7 @@ import numpy as np
 from rosrm.config.settings import HostConfig
 from rosrm.core.slave import reducer as core
 from rosrm.errors import Refused
-from rosrm.extensions.contracts import ProbeContext
+from rosrm.extensions.contracts import LauncherContext, ProbeContext
 from rosrm.extensions.registry import Registry
 from rosrm.model.values import (
     RESOURCE_SLOTS,
@@ -39,6 +40,7 @@ from rosrm.runtime.bootstrap import handle_stop_signals
 from rosrm.runtime.state_lock import only_one
 from rosrm.slave.executors import Done, Executors, Here
 from rosrm.slave.health import HealthWatch
+from rosrm.slave.launch.launchers import Launchers
 from rosrm.slave.launch.starter import Starter
 from rosrm.slave.logs import newest_instance, nothing_yet, read_log
 from rosrm.slave.replication.service import Keeping
@@ -103,7 +105,11 @@ class SlaveRuntime:
                     config.state, "slave", code="name_taken", remedy="another `host:` and `state:`"
                 )
             )
-            sessions = SessionTable()
+            offered = registry.launchers(
+                LauncherContext(config.state, sys.executable, self._incarnation)
+            )
+            launchers = Launchers.of(offered, registry.capabilities_of(), self.say)
+            sessions = SessionTable(launchers=launchers)
             self._usage = UsageWatch(sessions)
             context = ProbeContext(config.scope, config.budget, config.state, sessions)
             probes = registry.probes(config.probes, context)
@@ -123,7 +129,7 @@ class SlaveRuntime:
             )
             opened.callback(self._participant.close)
             graph = GraphWatch(self._participant.node)
-            self._health = HealthWatch(self._participant, graph, sessions)
+            self._health = HealthWatch(self._participant, graph, sessions, launchers)
             self._limit = self._limits()
             self._endpoint = SlaveEndpoint(
                 self._participant,
@@ -134,6 +140,8 @@ class SlaveRuntime:
             )
             self._note_probes(first)
             self._endpoint.failing.update(self._executors.failing_plugins())
+            for name, reason in offered.broken.items():
+                self._endpoint.failing["launcher", name] = reason
             for strategy, reason in self._executors.failing.items():
                 self.say(f"migration strategy {strategy} is broken: {reason}")
             kept = config.state / "kept"
@@ -143,8 +151,8 @@ class SlaveRuntime:
                 post=self._post, say=self.say, publish=self._endpoint.publish_kept,
             )  # fmt: skip
             self._starter = Starter(
-                config, self._incarnation, kept, self._state, self._supervisor, self._endpoint,
-                self._keeping, graph, sessions, take=self.take, say=self.say,
+                config, kept, self._state, self._supervisor, self._endpoint, self._keeping, graph,
+                sessions, launchers, take=self.take, say=self.say,
             )  # fmt: skip
             self._ending = Ending(
                 config, self._state, self._starter, self._supervisor, self._endpoint,
@@ -363,7 +371,7 @@ class SlaveRuntime:
         if isinstance(command, core.Fail):
             self.say(f"{command.instance} is {command.reason}")
         if isinstance(command, core.Restart):  # by hand
-            self._starter.begin_anew(command.instance)
+            self._starter.launchers.discard_images(command.instance)
         self._supervisor.carry_out(command)
 
     def _wake(self) -> None:

@@ -2,8 +2,8 @@
 
 Told of each session's leader, it finds the other members by their session id in one walk a second:
 `getsid` for each process of the host, which costs a microsecond each and reads no file. A member
-that begins a session of its own (a daemon) leaves the tree, as it does for job control. What was
-restored from an image has a session of its own below the program that holds it, and belongs there.
+that begins a session of its own (a daemon) leaves the tree, as it does for job control. Where a
+launcher's program leads the session, the launcher knows the members: they may have another session.
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from rosrm.criu.tree import inner_pid, is_hold, may_hold, tree
+from rosrm.slave.launch.launchers import Launchers
+from rosrm.supervisor.procfs import inner_pid
 
 _TICKS: Final = float(os.sysconf("SC_CLK_TCK"))
 _PAGE: Final = os.sysconf("SC_PAGE_SIZE")
@@ -42,15 +43,20 @@ class SessionTable:
     Args:
         proc: where the process file system is mounted.
         session_of: session id of a process; raises `OSError` where it has ended.
+        launchers: of this host.
     """
 
     def __init__(
-        self, proc: Path = Path("/proc"), session_of: Callable[[int], int] = os.getsid
+        self,
+        proc: Path = Path("/proc"),
+        session_of: Callable[[int], int] = os.getsid,
+        launchers: Launchers | None = None,
     ) -> None:
         self._proc = str(proc)
         self._session_of = session_of
+        self._launchers = launchers or Launchers()
         self._members: dict[int, tuple[int, ...]] = {}
-        self._holds: set[int] = set()
+        self._led: set[int] = set()  # leaders that are, or may become, a launcher's program
         self._pids: tuple[int, ...] = ()
         self._ended_cpu_time = 0.0
         self._usage: dict[int, SessionUsage] = {}
@@ -70,12 +76,12 @@ class SessionTable:
         return self._members.get(leader, ())
 
     def known_as(self, leader: int) -> tuple[int, ...]:
-        """As `members`; those that were restored also by the pids that they see themselves.
+        """As `members`; below a launcher's program also by the pids that they see themselves.
 
         These are what Fast DDS writes into the names of endpoints.
         """
         members = self.members(leader)
-        if leader not in self._holds or not is_hold(leader):
+        if leader not in self._led or not self._launchers.leads(leader):
             return members
         own = []
         for pid in members:
@@ -90,8 +96,8 @@ class SessionTable:
             leader: pid, which is also the session id.
         """
         self._members[leader] = (leader,)
-        if may_hold(leader):
-            self._holds.add(leader)
+        if self._launchers.leads(leader) is not False:
+            self._led.add(leader)
         self._collect_pids()
 
     def remove(self, leader: int, cpu_time: float) -> None:
@@ -102,7 +108,7 @@ class SessionTable:
             cpu_time: seconds that it and its reaped children used, as `wait4` reports them.
         """
         self._members.pop(leader, None)
-        self._holds.discard(leader)
+        self._led.discard(leader)
         self._usage.pop(leader, None)
         self._cpu_time.pop(leader, None)
         self._collect_pids()
@@ -146,11 +152,12 @@ class SessionTable:
                 continue
             if leader != pid and leader in found:
                 found[leader].append(pid)
-        for leader in tuple(self._holds):
-            if is_hold(leader):
-                found[leader] = tree(leader)
-            elif not may_hold(leader):
-                self._holds.discard(leader)
+        for leader in tuple(self._led):
+            leads = self._launchers.leads(leader)
+            if leads:
+                found[leader] = list(self._launchers.members(leader))
+            elif leads is False:
+                self._led.discard(leader)
         self._members = {leader: tuple(pids) for leader, pids in found.items()}
         self._collect_pids()
 

@@ -54,6 +54,20 @@ def read_stat(pid: int) -> Stat | None:
     )
 
 
+def inner_pid(pid: int, thread: int = 0) -> int:
+    """Return the id of a process, or of one of its threads, in its own pid namespace.
+
+    Raises:
+        OSError: it has ended.
+    """
+    path = f"/proc/{pid}/task/{thread or pid}/status"
+    with open(path, encoding="utf-8", errors="replace") as file:
+        for line in file:
+            if line.startswith("NSpid:"):
+                return int(line.split()[-1])
+    return thread or pid
+
+
 def ticks_now() -> int:
     """The time that /proc would give as the start of a process that starts now."""
     return int(time.clock_gettime(time.CLOCK_BOOTTIME) * _TICKS_PER_SECOND)

@@ -17,6 +17,7 @@ says that it is absent (`SkipPlugin`), its contract is skipped with that reason.
 from rosrm.extensions.registry import Registry
 from rosrm.testing.checkpoints import CheckpointContract
 from rosrm.testing.journals import JournalContract, MemoryJournal
+from rosrm.testing.launchers import LauncherContract
 from rosrm.testing.migrations import MigrationContract, before_commit, with_options
 from rosrm.testing.probes import (
     FakeClock,
@@ -34,6 +35,7 @@ __all__ = [
     "FakeProbe",
     "FakeSessions",
     "JournalContract",
+    "LauncherContract",
     "MemoryJournal",
     "MigrationContract",
     "ProbeContract",

@@ -11,7 +11,7 @@ from unittest import SkipTest
 from rosrm.config.checking import validated
 from rosrm.config.documents import Problems, parse
 from rosrm.errors import ConfigError, PluginError
-from rosrm.extensions.discovery import HOOKS, Offer
+from rosrm.extensions.discovery import HOOKS, ChosenOffer
 from rosrm.extensions.hookspecs import hookimpl
 from rosrm.extensions.registry import FailedProbe, Registry
 from rosrm.extensions.time_limit import limited
@@ -70,7 +70,7 @@ def checked_options(wanted: type[Any], given: Mapping[str, Any]) -> Mapping[str,
     return dict(to_plain(value))
 
 
-def made(kind: str, offer: Offer, options: Mapping[str, Any], *context: Any) -> Any:
+def made(kind: str, offer: ChosenOffer, options: Mapping[str, Any], *context: Any) -> Any:
     """Return the object of an offer, made and checked as by master or slave.
 
     Args:

@@ -7,7 +7,7 @@ from pathlib import Path
 from types import ModuleType
 
 from rosrm.extensions.registry import Registry
-from rosrm.testing import CheckpointContract, ProbeContract
+from rosrm.testing import CheckpointContract, LauncherContract, ProbeContract
 
 PAGE = Path(__file__).resolve().parents[2] / "docs/reference/plugins.md"
 
@@ -18,7 +18,7 @@ def _module(text: str) -> ModuleType:
     return module
 
 
-PROBE, POLICY = map(
+PROBE, LAUNCHER, POLICY = map(
     _module,
     re.findall(
         r"<!-- plugin -->\n```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL
@@ -34,9 +34,14 @@ class TestCheckpointPolicyThatIsShown(CheckpointContract):
     offer = POLICY.register_checkpoint_policies()[0]
 
 
-def test_both_are_found_by_their_hooks():
+class TestLauncherThatIsShown(LauncherContract):
+    offer = LAUNCHER.register_launchers()[0]
+
+
+def test_all_are_found_by_their_hooks():
     """With the mark and the name that a hook needs."""
-    registry = Registry.of(probe=PROBE, policy=POLICY)
+    registry = Registry.of(probe=PROBE, launcher=LAUNCHER, policy=POLICY)
     assert not registry.broken
     assert registry.names("probe") == ("open_files",)
+    assert registry.names("launcher") == ("nice",)
     assert registry.names("checkpoint") == ("first-host",)

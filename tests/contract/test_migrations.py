@@ -20,9 +20,14 @@ from rosrm.model.plan import (
 )
 from rosrm.model.values import ProcessSpec, RestartPolicy
 from rosrm.testing import MigrationContract
+from rosrm_criu import plugin as criu
 from rosrm_migration import plugin
 
-OFFERS = {offer.name: offer for offer in plugin.register_migration_strategies()}
+OFFERS = {
+    offer.name: offer
+    for shipped in (plugin, criu)
+    for offer in shipped.register_migration_strategies()
+}
 
 
 class TestRelaunch(MigrationContract):

@@ -8,6 +8,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from rosrm.model.codec import from_plain, to_plain
 from rosrm_checkpoint.plugin import register_checkpoint_policies
+from rosrm_criu.plugin import register_migration_strategies as register_criu
 from rosrm_migration.plugin import register_migration_strategies
 from rosrm_resources.plugin import register_probes
 from rosrm_scoring.plugin import register_scoring_policies
@@ -18,6 +19,7 @@ OFFERS = {
         *register_probes(),
         *register_scoring_policies(),
         *register_migration_strategies(),
+        *register_criu(),
         *register_checkpoint_policies(),
     ]
 }

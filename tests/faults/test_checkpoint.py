@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from rosrm.config.settings import LivenessSettings, MigrationSettings, ProcessDefaults
-from rosrm.criu import outcome
 from rosrm.errors import Refused
+from rosrm_criu.engine import restore_result
 from tests.faults.watching import instances
 from tests.ros.clusters import MIB, PATIENCE, host, python, wait_until
 
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.timeout(180)
 #: What lies on the disk of the host at a moment of a checkpoint or a restore.
 _SIGNS = {
     "dump": "kept-*", "kept": "kept-*/manifest.json", "taken": "in-*/manifest.json",
-    "restored": f"in-*/{outcome.FILE}",
+    "restored": f"in-*/{restore_result.FILE}",
 }  # fmt: skip
 _ENDS = {"checkpointed", "checkpoint_failed", "restored", "restore_failed"}
 

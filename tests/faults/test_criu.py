@@ -16,8 +16,8 @@ from pathlib import Path
 import pytest
 
 from rosrm.config.settings import LivenessSettings
-from rosrm.criu import outcome
 from rosrm.model.values import HostLossPolicy
+from rosrm_criu.engine import restore_result
 from tests.faults.watching import instances
 from tests.ros.clusters import PATIENCE
 from tests.ros.portable_kit import NAME, Ear, ask, counter, nothing_left, two_hosts
@@ -73,7 +73,7 @@ class Scene:
             return there.glob(".rosrm-fetch-*/*")
         if moment == "restore":
             return there.glob("in-*/manifest.json")
-        return there.glob(f"in-*/{outcome.FILE}")
+        return there.glob(f"in-*/{restore_result.FILE}")
 
     def kill(self, victim: str) -> None:
         """SIGKILL, and what a service manager does then."""

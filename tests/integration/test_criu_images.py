@@ -13,10 +13,10 @@ from pathlib import Path
 
 import pytest
 
-from rosrm.criu import dumping, image, restoring, tree
-from rosrm.criu.image import MappedFile
 from rosrm.errors import CriuError
 from rosrm.model.values import RestartPolicy
+from rosrm_criu.engine import dump, image, process_tree, restore
+from rosrm_criu.engine.image import MappedFile
 from tests.criu_kit import TIMEOUT, eventually
 from tests.integration.supervisor.conftest import Host
 
@@ -232,8 +232,8 @@ def test_it_stands_still_until_it_is_resumed(theatre, counter):
     """Until the commit nothing is lost: who takes the move back resumes the source."""
     theatre.dump(counter, leave="stopped")
     seen = counter.numbers()
-    assert tree.is_stopped(counter.pid)
-    dumping.resume(counter.pid)
+    assert process_tree.is_stopped(counter.pid)
+    dump.resume(counter.pid)
     counter.counts()
     assert counter.numbers()[: len(seen) + 1] == list(range(1, len(seen) + 2))
 
@@ -241,9 +241,9 @@ def test_it_stands_still_until_it_is_resumed(theatre, counter):
 def test_who_stood_still_before_is_not_set_going(theatre, counter):
     """A process that somebody stopped stays stopped after its dump."""
     counter.process.send_signal(signal.SIGSTOP)
-    assert tree.wait_until_stopped([counter.pid], TIMEOUT)
+    assert process_tree.wait_until_stopped([counter.pid], TIMEOUT)
     theatre.dump(counter, leave="running")
-    assert tree.is_stopped(counter.pid)
+    assert process_tree.is_stopped(counter.pid)
 
 
 def test_a_pipe_to_outside_is_named_and_the_source_runs_on(theatre):
@@ -268,7 +268,7 @@ def test_whatever_fails_the_source_runs_on(theatre, counter, monkeypatch):
     with pytest.raises(ZeroDivisionError):
         theatre.dump(counter)
     counter.counts()
-    assert not tree.is_stopped(counter.pid)
+    assert not process_tree.is_stopped(counter.pid)
 
 
 @pytest.mark.parametrize("kind", [socket.SOCK_STREAM, socket.SOCK_DGRAM])
@@ -327,7 +327,7 @@ def test_a_device_is_named_and_the_source_runs_on(theatre):
 
 def test_an_image_that_has_no_room_is_not_begun(theatre, counter, monkeypatch):
     """The file system of the image keeps some space; the process is not touched."""
-    monkeypatch.setattr(tree, "memory_of", lambda pids: 1 << 60)
+    monkeypatch.setattr(process_tree, "memory_of", lambda pids: 1 << 60)
     with pytest.raises(CriuError, match=r"no room for the image .* MiB are free"):
         theatre.dump(counter)
     counter.counts()
@@ -349,7 +349,7 @@ def test_who_ends_at_once_was_restored_all_the_same(theatre, option):
     """A process that waits for nothing but its last instruction: its end comes through."""
     code = "import os, signal; os.kill(os.getpid(), signal.SIGSTOP); os._exit(9)"
     actor = theatre.start(code)
-    assert tree.wait_until_stopped([actor.pid], TIMEOUT)
+    assert process_tree.wait_until_stopped([actor.pid], TIMEOUT)
     directory = theatre.dump(actor)
     hold = theatre.hold(directory, *option)
     eventually((directory / "hold.json").exists, "the end of the restore")
@@ -411,7 +411,7 @@ def living_in(namespace: str) -> list[int]:
                 found.append(int(entry.name))
         except OSError:  # it has ended
             continue
-    return [pid for pid in found if tree.is_alive(pid)]
+    return [pid for pid in found if process_tree.is_alive(pid)]
 
 
 def test_what_the_process_leaves_behind_ends_with_it(theatre):
@@ -472,7 +472,7 @@ def test_below_a_supervisor(theatre, counter, host):
     client.start([host.order("actor", *theatre.hold_command(directory), number=2)])
     running = host.running(client, "actor", number=2)
     eventually((directory / "hold.json").exists, "the end of the restore")
-    assert tree.root_of(running.pid) != running.pid
+    assert process_tree.root_of(running.pid) != running.pid
     client.stop(running.instance)
     ended = host.ended(client, "actor", number=2)
     assert (ended.exit_code, ended.exit_signal) == (0, signal.SIGINT)
@@ -494,7 +494,7 @@ def test_a_supervisor_that_was_killed_takes_it_over(theatre, counter, host):
     client.stop(after.instance)
     host.ended(client, "actor", number=2)
     assert (after.state, after.pid) == (before.state, before.pid)
-    assert not tree.is_alive(before.pid)
+    assert not process_tree.is_alive(before.pid)
 
 
 def test_who_does_not_stop_is_killed_by_the_supervisor(theatre, host):
@@ -508,7 +508,7 @@ def test_who_does_not_stop_is_killed_by_the_supervisor(theatre, host):
     client.start([host.order("actor", *theatre.hold_command(directory), number=2)])
     running = host.running(client, "actor", number=2)
     eventually((directory / "hold.json").exists, "the end of the restore")
-    namespace = pid_namespace(tree.root_of(running.pid))
+    namespace = pid_namespace(process_tree.root_of(running.pid))
     client.stop(running.instance)
     ended = host.ended(client, "actor", number=2)
     assert ended.exit_signal == signal.SIGKILL
@@ -527,7 +527,7 @@ def test_below_a_supervisor_a_crash_starts_it_anew(theatre, counter, host):
     eventually((directory / "hold.json").exists, "the end of the restore")
     log = host.log("actor", 2)
     assert "\n1\n" not in log.read_text()
-    os.kill(tree.root_of(running.pid), signal.SIGKILL)
+    os.kill(process_tree.root_of(running.pid), signal.SIGKILL)
     eventually(lambda: "\n1\n2\n" in log.read_text(), "numbers from the first on")
     client.stop(running.instance)
     host.ended(client, "actor", number=2)
@@ -562,7 +562,9 @@ def test_without_a_namespace_a_guard_ends_it_with_its_hold(theatre, counter):
     """A SIGKILL of the hold's group reaches the restored process too."""
     restored = theatre.restore(theatre.dump(counter), "--no-namespace")
     os.killpg(restored.pid, signal.SIGKILL)
-    eventually(lambda: not tree.is_alive(restored.outcome.pid), "the end of the restored process")
+    eventually(
+        lambda: not process_tree.is_alive(restored.outcome.pid), "the end of the restored process"
+    )
 
 
 def test_without_a_namespace_a_pid_in_use_is_said(theatre, counter):
@@ -570,7 +572,7 @@ def test_without_a_namespace_a_pid_in_use_is_said(theatre, counter):
     directory = theatre.dump(counter, leave="stopped")
     with pytest.raises(CriuError, match=rf"its pid {counter.pid} is in use here"):
         theatre.restore(directory, "--no-namespace")
-    dumping.resume(counter.pid)
+    dump.resume(counter.pid)
     counter.counts()
 
 
@@ -618,7 +620,7 @@ def flip_a_bit(path: Path) -> None:
 def test_an_image_without_checksums_is_restored_all_the_same(theatre, counter):
     """As one that has just come from another host: the transfer has a checksum of its own."""
     directory = theatre.folder / "image"
-    manifest = dumping.dump(
+    manifest = dump.dump(
         theatre.criu, counter.pid, directory, leave="killed", timeout=TIMEOUT, checksums=False
     )
     counter.process.wait(TIMEOUT)
@@ -694,7 +696,7 @@ def test_what_tracing_maps_is_made_where_it_is_missing(theatre, counter):
 
 def test_criu_takes_no_id_that_it_is_to_restore():
     """In a fresh namespace ids begin small, where those of a container's processes are too."""
-    assert restoring.id_for_criu((), 32768) == 300
-    assert restoring.id_for_criu((12, 13, 310), 32768) == 310
-    assert restoring.id_for_criu(tuple(range(1, 32700, 100)), 32768) == 300
-    assert restoring.id_for_criu((301, 702, 1200), 2000) == 301
+    assert restore.id_for_criu((), 32768) == 300
+    assert restore.id_for_criu((12, 13, 310), 32768) == 310
+    assert restore.id_for_criu(tuple(range(1, 32700, 100)), 32768) == 300
+    assert restore.id_for_criu((301, 702, 1200), 2000) == 301

@@ -16,9 +16,9 @@ from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import Int64MultiArray
 
 from rosrm.config.settings import MigrationSettings, ProcessDefaults
-from rosrm.criu import outcome, tree
 from rosrm.errors import Refused
 from rosrm.model.values import MigrationPolicy, ProcessSpec, RestartPolicy
+from rosrm_criu.engine import process_tree, restore_result
 from tests.ros.clusters import MIB, PATIENCE, QUICK, Cluster, Make, host, wait_until
 
 NAME = "portable_counter"
@@ -133,7 +133,7 @@ def nothing_left(cluster: Cluster, *, but: str = "?") -> None:
         found = found_below(cluster, "**/*")
         # How a restore went stands there as long as what was restored.
         looked_at = [path for path in found if but not in path.parts]
-        return [path for path in looked_at if path.is_file() and path.name != outcome.FILE]
+        return [path for path in looked_at if path.is_file() and path.name != restore_result.FILE]
 
     wait_until(lambda: not images(), f"no image left: {images()}", UNUSED)
     slaves = {part.process.pid for part in cluster.slaves.values()}
@@ -144,7 +144,7 @@ def nothing_left(cluster: Cluster, *, but: str = "?") -> None:
     ]
     assert not serving
     for pid in pids(cluster):
-        assert not tree.is_stopped(tree.root_of(pid))
+        assert not process_tree.is_stopped(process_tree.root_of(pid))
 
 
 def pids(cluster: Cluster) -> list[int]:

@@ -11,7 +11,14 @@ from rclpy.parameter import Parameter
 from std_msgs.msg import Int64
 from std_srvs.srv import Trigger
 
-from rosrm.node.absence import Absence, absence_of, await_peers, others_of, peers_of, sees_again
+from rosrm_criu.node.graph_departure import (
+    Absence,
+    absence_of,
+    await_peers,
+    others_of,
+    peers_of,
+    sees_again,
+)
 from tests.ros.nodes import RELIABLE
 
 

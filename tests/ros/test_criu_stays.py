@@ -154,7 +154,7 @@ def test_a_node_that_cannot_leave_says_what_to_use(criu, cluster):
     cluster.wait("ordinary", "running")
     assert not ask(cluster, name="ordinary")
     event = cluster.wait_for_event("stayed", process="ordinary", timeout=60.0)
-    assert "does not use rosrm.node.run_portable" in event.message
+    assert "does not use rosrm_criu.node.run_portable" in event.message
     assert cluster.process("ordinary").state == "running"
     nothing_left(cluster)
     cluster.cancel("ordinary")

@@ -23,7 +23,10 @@ from rosrm.model.plan import AwaitReady, Commit, Execute, Plan, Start, Stop
 from rosrm.model.values import Reading, ResourceDescription
 from rosrm.extensions.hookspecs import hookimpl
 from rosrm.errors import SkipPlugin
-from rosrm.extensions.contracts import MigrationOffer, ProbeOffer, ScoringOffer, Scores
+from dataclasses import replace
+from rosrm.extensions.contracts import (
+    Capabilities, LauncherOffer, MigrationOffer, ProbeOffer, ScoringOffer, Scores
+)
 
 class Policy:
     def __init__(self, act): self.act = act
@@ -94,7 +97,62 @@ def register_migration_strategies():
         MigrationOffer("exits", lambda options: Acting(lambda: sys.exit(3))),
         *(MigrationOffer(name, lambda options, name=name: Executing(name), executors={name: act})
           for name, act in EXECUTORS.items()),
+        MigrationOffer(
+            "imager", lambda options: Imager(),
+            executors={"imager.save": save, "imager.take": take, "imager.drop": drop},
+            capabilities=Capabilities(state="memory", launcher="imager"),
+        ),
     ]
+
+# --- images, with a launcher of its own
+
+class Imager:
+    def propose(self, move): raise ValueError("it stays on its host")
+    def checkpoint(self, move):
+        here, seconds = move.source_host, 10.0
+        names = {"source": str(move.source), "destination": str(move.destination)}
+        undo = Execute("imager.drop", here, {"process": "", "numbers": []}, seconds)
+        return Plan((
+            Execute("imager.save", here, names, seconds, undo=undo),
+            Commit(image="imager.drop"), Stop(move.source, here, seconds),
+        ))
+    def restore(self, move):
+        here, seconds = move.destination_host, 10.0
+        names = {"source": str(move.source), "destination": str(move.destination)}
+        return Plan((
+            Execute("imager.take", here, names, seconds),
+            Start(move.destination, here, seconds, restored=True), Commit(),
+        ))
+
+def image(state, instance): return Path(state) / f"imager-{instance}"
+def save(arguments):
+    path = image(arguments["here"]["state"], arguments["source"])
+    path.write_text("what " + arguments["source"] + " knew")
+    return {}
+def take(arguments):
+    state = arguments["here"]["state"]
+    saved = image(state, arguments["source"])
+    if saved.exists(): saved.rename(image(state, arguments["destination"]))
+    return {}
+def drop(arguments): return {}
+
+class ByImage:
+    def __init__(self, context): self.state = context.state
+    def prepare(self, launch):
+        saved = image(self.state, launch.assignment.instance)
+        if launch.assignment.restored and not saved.exists(): return None
+        knows = saved.read_text() if launch.assignment.restored else "nothing yet"
+        return replace(launch, environment={**launch.environment, "IMAGER_KNOWS": knows})
+
+@hookimpl
+def register_launchers():
+    return [
+        LauncherOffer("imager", ByImage, variables=("IMAGER_KNOWS",)),
+        LauncherOffer("absent_launcher", absent_launcher),
+        LauncherOffer("broken_launcher", lambda context: None),
+    ]
+
+def absent_launcher(context): raise SkipPlugin("no container engine here")
 
 class Acting:
     def __init__(self, act): self.act = act
@@ -373,6 +431,44 @@ def test_an_executor_that_answers_none_to_a_master_that_was_killed(
     assert "answered None" in cluster.wait_for_event("stayed", process="p").message
     assert cluster.wait("p", "running").pid == before.pid
     cluster.cancel("p")
+
+
+# --- launchers --------------------------------------------------------------------------------
+
+KNOWS = ("sh", "-c", 'echo "knows ${IMAGER_KNOWS-no launcher}"; exec sleep 1000')
+
+
+@pytest.mark.parametrize(
+    ("strategy", "first"), [("imager", "nothing yet"), ("relaunch", "no launcher")]
+)
+def test_a_third_party_s_launcher_restores_from_its_image(
+    make_cluster, third_party, strategy, first
+) -> None:
+    """It starts the processes whose strategy declares it, and what any process is restored to."""
+    cluster = make_cluster(host("h0"), migration=MigrationSettings({"imager": {}, "relaunch": {}}))
+
+    def knows(said: str) -> None:
+        row = cluster.wait("p", "running")
+        wait_until(
+            lambda: cluster.client.read_log("h0", "p", row.number, 0, 0).content == said, said
+        )
+
+    cluster.submit(service("p", *KNOWS, migration=MigrationPolicy(strategy)))
+    knows(f"knows {first}\n".encode())
+    cluster.client.checkpoint("p")
+    cluster.wait("p", "checkpointed")
+    cluster.client.restore("p")
+    knows(b"knows what p#1 knew\n")
+    cluster.cancel("p")
+
+
+def test_a_launcher_that_cannot_be_used_is_named(cluster) -> None:
+    """In the log of its host, and listed as failing if it is broken; the host works without it."""
+    assert "launcher absent_launcher is absent: no container engine here" in cluster.log_of("h0")
+    (row,) = [row for row in plugins(cluster) if row.kind == "launcher"]
+    assert (row.name, row.host, row.state) == ("broken_launcher", "h0", "failing")
+    assert "an object with `prepare` is required" in row.reason
+    assert cluster.run(job("launched", "true"))[0].state == "finished"
 
 
 # --- at start ---------------------------------------------------------------------------------

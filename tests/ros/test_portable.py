@@ -18,7 +18,7 @@ from std_msgs.msg import Int64, Int64MultiArray
 from std_srvs.srv import Trigger
 
 from rosrm.errors import PortableError
-from rosrm.portable import (
+from rosrm_criu.control import (
     VARIABLE,
     State,
     ask_prepare,

@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import ast
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+import rosrm_checkpoint.plugin
+import rosrm_criu.plugin
+import rosrm_migration.plugin
+import rosrm_scoring.plugin
+from rosrm.extensions.registry import Registry
 
 ROOT = Path(__file__).resolve().parents[2]
 TOOLS = Path(sys.executable).parent
@@ -34,3 +41,25 @@ def test_repository_keeps(what: str) -> None:
 
     if run.returncode != 0:
         pytest.fail(f"{' '.join(COMMANDS[what])}\n{run.stdout}{run.stderr}", pytrace=False)
+
+
+def test_no_name_of_a_shipped_plugin_decides_anything():
+    """Core, configuration and slave ask for capabilities; the file of defaults alone has names."""
+    shipped = Registry.of(
+        checkpoint=rosrm_checkpoint.plugin,
+        criu=rosrm_criu.plugin,
+        migration=rosrm_migration.plugin,
+        scoring=rosrm_scoring.plugin,
+    )
+    kinds = ("migration", "launcher", "scoring", "checkpoint")
+    names = {name for kind in kinds for name in shipped.names(kind)}
+    assert {"criu", "handoff"} <= names
+    found = {
+        f"{path.relative_to(ROOT)}:{node.lineno}: {node.value!r}"
+        for part in ("core", "config", "extensions", "model", "slave", "supervisor")
+        for path in (ROOT / "rosrm" / part).rglob("*.py")
+        if path != ROOT / "rosrm/config/settings.py"
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Constant) and node.value in names
+    }
+    assert not found

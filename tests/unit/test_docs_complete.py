@@ -24,7 +24,7 @@ from rosrm.model import plan
 from rosrm.model import rows as listing_rows
 from rosrm.model.values import HostDescription
 from rosrm_checkpoint.other_host import OtherHostOptions
-from rosrm_migration.criu import CriuOptions
+from rosrm_criu.options import CriuOptions
 from rosrm_migration.handoff import HandoffOptions
 from rosrm_migration.relaunch import RelaunchOptions
 from rosrm_scoring.threshold import ThresholdOptions
@@ -162,6 +162,7 @@ def test_every_hook_and_its_parameters_are_documented(hook):
         contracts.ScoringOffer,
         contracts.MigrationOffer,
         contracts.CheckpointOffer,
+        contracts.LauncherOffer,
     ],
     ids=lambda offer: offer.__name__,
 )

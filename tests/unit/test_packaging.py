@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
+import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -74,6 +75,7 @@ def test_every_distribution_is_looked_at() -> None:
     assert {
         "rosrm",
         "rosrm-checkpoint",
+        "rosrm-criu",
         "rosrm-examples",
         "rosrm-lab",
         "rosrm-migration",
@@ -113,3 +115,27 @@ def test_the_readme_installs_all_that_runs() -> None:
     optional = (Path(), Path("examples"), Path("tools/lab"), Path("tools/simulate"))
     needed = [f"./{p.parent}" for p in PROJECTS if p.parent not in optional]
     assert sorted(shlex.split(line)) == sorted(["-c", "constraints.txt", ".[ros]", *needed])
+
+
+#: Shows the help as where none of these distributions is installed.
+ALONE = """
+import sys
+sys.modules.update(dict.fromkeys({absent!r}))
+from rosrm.cli.commands import app
+app(["--help"])
+"""
+
+
+def test_rosrm_alone_shows_its_help() -> None:
+    """Without any plugin, and without the libraries that only plugins need."""
+    plugins = [project.parent.name for project in PROJECTS if project.parent.parent.name]
+    absent = [f"rosrm_{name}" for name in plugins] + ["aiohttp", "cryptography", "urllib3"]
+    assert "rosrm_criu" in absent
+    done = subprocess.run(
+        [sys.executable, "-c", ALONE.format(absent=absent)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "submit" in done.stdout

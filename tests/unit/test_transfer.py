@@ -18,14 +18,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from rosrm.errors import TransferError
-from rosrm.transfer import Offer, starting
-from rosrm.transfer import archive as archive_module
-from rosrm.transfer.addresses import nearest_first, own_addresses
-from rosrm.transfer.archive import Archive
-from rosrm.transfer.form import DIGEST_SIZE, new_digest
-from rosrm.transfer.landing import Landing
-from rosrm.transfer.rate import Pace
-from rosrm.transfer.unpacking import unpack
+from rosrm_criu.transfer import Offer, starting
+from rosrm_criu.transfer import archive as archive_module
+from rosrm_criu.transfer.addresses import nearest_first, own_addresses
+from rosrm_criu.transfer.archive import Archive
+from rosrm_criu.transfer.form import DIGEST_SIZE, new_digest
+from rosrm_criu.transfer.landing import Landing
+from rosrm_criu.transfer.rate import Pace
+from rosrm_criu.transfer.unpacking import unpack
 
 OFFER = Offer(
     ("10.0.0.2", "127.0.0.1"), 4711, "ab" * 32, "secret-token", 10, 2, 2560, 30.0, to="cd" * 32
@@ -355,14 +355,14 @@ def test_an_address_in_a_network_of_this_host_is_tried_first():
 
 def test_what_is_not_installed_is_said_with_what_to_do(monkeypatch):
     monkeypatch.setattr(starting, "_NEEDED", ("aiohttp", "no_such_library"))
-    assert starting.missing() == "no_such_library is not installed: pip install 'rosrm[criu]'"
+    assert starting.missing() == "no_such_library is not installed: pip install rosrm-criu"
     with pytest.raises(TransferError, match="no_such_library is not installed"):
         starting.Sender()
 
 
 def test_who_starts_a_transfer_loads_nothing_of_its_libraries():
     """They are heavy, and a slave runs on every robot."""
-    code = "import sys, rosrm.transfer; print(*sys.modules)"
+    code = "import sys, rosrm_criu.transfer; print(*sys.modules)"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     loaded = {name.split(".")[0] for name in run.stdout.split()}
     assert not loaded & {"aiohttp", "asyncio", "backports", "cryptography", "ssl", "urllib3"}

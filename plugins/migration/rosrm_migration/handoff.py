@@ -15,6 +15,7 @@ from typing import Any, Final, Literal
 
 from rosrm import (
     AwaitReleased,
+    Capabilities,
     Commit,
     Configure,
     Execute,
@@ -86,6 +87,13 @@ class HandoffOptions:
                 f"type is {self.type!r}: with `protocol: paper` it is the type of {self.state}, as "
                 f"std_msgs/msg/Int64"
             )
+
+
+def capabilities(options: HandoffOptions) -> Capabilities:
+    """Return what the strategy can do for a process; a node of the paper publishes no snapshots."""
+    if options.protocol == "paper":
+        return Capabilities()
+    return Capabilities(state="topics", shadow=True)
 
 
 class Handoff:

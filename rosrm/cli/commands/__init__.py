@@ -20,7 +20,6 @@ from typing import Annotated, Any
 import typer
 
 from rosrm.cli.commands import change, check, follow, inspect, start
-from rosrm.cli.criu import criu
 from rosrm.cli.groups import DISTRIBUTIONS, PlainCommand, PlainGroup, add_command, hint_after
 from rosrm.cli.installed_commands import find_commands, load_command
 from rosrm.cli.options import Common, Domain
@@ -116,5 +115,4 @@ def common(
 for module in (start, change, inspect, follow):
     for function in module.COMMANDS:
         app.command(cls=PlainCommand)(function)
-for name, group in (("config", check.config), ("criu", criu)):
-    add_command(app, name, group)
+add_command(app, "config", check.config)

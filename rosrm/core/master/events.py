@@ -92,8 +92,9 @@ class ReadingsReceived:
 class StatusesReceived:
     """Changes of instances on a host; `complete`: these are all that the host holds.
 
-    Complete in each are `failing`, resource to the reason why its probe gives no readings, and
-    `failing_strategies`, migration strategy to the reason why its executors fail there.
+    Complete in each are `failing`, resource to the reason why its probe gives no readings,
+    `failing_strategies`, migration strategy to the reason why its executors fail there, and
+    `failing_launchers`, launcher to the reason why it could not be made.
     """
 
     host_id: int
@@ -103,10 +104,15 @@ class StatusesReceived:
     statuses: tuple[InstanceStatus, ...]
     failing: Mapping[str, str] = field(default_factory=lambda: EMPTY)
     failing_strategies: Mapping[str, str] = field(default_factory=lambda: EMPTY)
+    failing_launchers: Mapping[str, str] = field(default_factory=lambda: EMPTY)
 
     def failing_plugins(self) -> dict[tuple[str, str], str]:
         """Return all plugins that fail there by kind and name, and why."""
-        by_kind = (("probe", self.failing), ("migration", self.failing_strategies))
+        by_kind = (
+            ("probe", self.failing),
+            ("migration", self.failing_strategies),
+            ("launcher", self.failing_launchers),
+        )
         return {(kind, name): why for kind, found in by_kind for name, why in found.items()}
 
 

@@ -290,7 +290,7 @@ class MasterState:
     def remove_process(self, name: str) -> None:
         """Remove an ended process of which no instance may run from memory and journal."""
         del self.over[name]
-        if self.processes.pop(name).spec.keeps_state:
+        if self.declared.has_snapshots(self.processes.pop(name).spec):
             self._note_removed(name)
         self._unsaved.pop(name, None)
         self.emit(Intent("process", name, None))
@@ -406,11 +406,14 @@ class MasterState:
         """The order for a slave to run an instance."""
         fence = fence_of(spec, self.settings)
         kept_on: tuple[str, ...] = ()
-        born = self.processes[spec.name].born if spec.name in self.processes else 0
-        if spec.keeps_state and not shadow and not restored:
-            kept_on = self.keeping.in_reach(spec.name, born, self.hosts)
+        kept_from = 0
+        if self.declared.has_snapshots(spec):
+            born = self.processes[spec.name].born if spec.name in self.processes else 0
+            kept_from = max(1, born)  # 0 says that there are no snapshots
+            if not shadow and not restored:
+                kept_on = self.keeping.in_reach(spec.name, born, self.hosts)
         return Assignment(
-            instance, spec, self.epoch, node_name or spec.name, shadow, fence, kept_on, born,
+            instance, spec, self.epoch, node_name or spec.name, shadow, fence, kept_on, kept_from,
             restored,
         )  # fmt: skip
 

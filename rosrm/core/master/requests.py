@@ -19,6 +19,7 @@ from rosrm.core.master.migration.start import why_busy
 from rosrm.core.master.state.hosts import Host
 from rosrm.errors import PluginError
 from rosrm.extensions.contracts import SpecChecking
+from rosrm.extensions.declared_fields import no_standby
 from rosrm.extensions.plugin_calls import implements, required
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.values import ProcessSpec
@@ -134,6 +135,9 @@ def _submission_fault(state: MasterState, event: happened.SubmissionReceived) ->
         fault = _strategy_fault(state, spec)
         if fault:
             return f"{spec.name}: migration by {strategy!r}: {fault}. Nothing was queued"
+        if spec.standby.wanted and not state.declared.capabilities_of(spec).shadow:
+            fault = no_standby(strategy, state.declared.capabilities)
+            return f"{spec.name}: {fault}. Nothing was queued"
     return ""
 
 

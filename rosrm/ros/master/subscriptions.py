@@ -103,7 +103,7 @@ class Hearing:
             return
         try:
             statuses = tuple(convert.status_from_msg(status) for status in message.statuses)
-            failing = {one: _failing(message, one) for one in ("probe", "migration")}
+            failing = {one: _failing(message, one) for one in ("probe", "migration", "launcher")}
         except Refused as refusal:
             self._refuse(who, str(refusal))
             return
@@ -116,6 +116,7 @@ class Hearing:
                 statuses,
                 failing["probe"],
                 failing["migration"],
+                failing["launcher"],
             )
         )
 

@@ -2,24 +2,17 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Final
 
-from rosrm.criu import again, outcome
-from rosrm.criu.places import incoming, periodic
-from rosrm.criu.program import find
-from rosrm.errors import CriuError, LaunchError
+from rosrm.errors import LaunchError
+from rosrm.extensions.contracts import Launch
 from rosrm.model.values import Assignment, ProcessSpec, RestartPolicy
 from rosrm.slave.launch import ament_index
 from rosrm.slave.launch.environment import Whereabouts, process_environment
+from rosrm.slave.launch.launchers import Launchers
 from rosrm.slave.launch.ros_arguments import join_arguments, parameters_text, ros_arguments
 from rosrm.supervisor.client import LaunchOrder, log_path
-from rosrm.supervisor.spawn import SpawnError, find_executable
-
-#: Seconds for a restore, at most: whoever ordered it gives up sooner.
-_RESTORE: Final = 600.0
 
 
 def launch_order(
@@ -29,7 +22,7 @@ def launch_order(
     *,
     where: Whereabouts,
     state_directory: Path,
-    images: Path,
+    launchers: Launchers,
     heard: float = 0.0,
 ) -> LaunchOrder:
     """What the supervisor is to start for an assignment; its parameters are written to a file.
@@ -40,27 +33,27 @@ def launch_order(
         python: the interpreter for modules.
         where: it will run.
         state_directory: of this host's supervisor; the parameters lie beside the instance's log.
-        images: the slave's directory, where the image of one that is to be restored lies.
+        launchers: of this host.
         heard: when the master last heard this host, monotonic; 0.0: just now.
 
     Raises:
         LaunchError: what was looked for, and where.
     """
     spec = assignment.spec
-    environment = process_environment(assignment, base_environment, where)
+    environment = process_environment(assignment, base_environment, where, launchers.variables)
     command = _command(spec, environment, python)
-    if spec.checkpointed:  # else the program that restores it would start, and then fail
-        _check_program(command[0], environment)
     if spec.ros_node:
         parameters_file = _write_parameters(assignment, state_directory)
         ros = ros_arguments(spec, assignment.node_name, parameters_file)
         arguments = join_arguments(spec.arguments, ros)
     else:
         arguments = list(spec.arguments)
+    plain = Launch(assignment, where.cluster, (*command, *arguments), environment)
+    launch = launchers.prepare(plain)
     return LaunchOrder(
         instance=assignment.instance,
-        argv=_by_way_of_images(assignment, (*command, *arguments), python, images),
-        environment=environment,
+        argv=launch.argv,
+        environment=launch.environment,
         working_directory=_working_directory(spec),
         # One that ended in a move is never started again: the source is there, and may go on.
         restart=RestartPolicy("never") if assignment.on_trial else spec.restart,
@@ -68,29 +61,6 @@ def launch_order(
         fence=assignment.fence,
         heard=heard,
     )
-
-
-def _by_way_of_images(
-    assignment: Assignment, argv: tuple[str, ...], python: str, images: Path
-) -> tuple[str, ...]:
-    """The program that restores the instance and holds it, where there is an image, or will be."""
-    checkpointed = assignment.spec.checkpointed
-    if not (checkpointed or assignment.restored):
-        return argv
-    number = assignment.instance.number
-    try:
-        criu = Path(find().command[-1])
-    except CriuError as error:
-        if not assignment.restored:
-            return argv
-        raise LaunchError(f"{assignment.instance} cannot be restored: {error}") from None
-    if checkpointed:
-        argv = again.command(python, periodic(images, number), argv, criu=criu, timeout=_RESTORE)
-    if assignment.restored:
-        argv = outcome.command(
-            python, incoming(images, number), criu=criu, remove=True, timeout=_RESTORE, then=argv
-        )
-    return argv
 
 
 def _working_directory(spec: ProcessSpec) -> str | None:
@@ -123,16 +93,6 @@ def _command(spec: ProcessSpec, environment: Mapping[str, str], python: str) -> 
         raise LaunchError(f"{spec.name!r} has nothing to run: set package, module or command")
     program, *words = spec.command
     return (_at_home(program, "command"), *words)
-
-
-def _check_program(word: str, environment: Mapping[str, str]) -> None:
-    """Raise `LaunchError` if a command's program is missing on this host."""
-    try:
-        path = find_executable(word, environment)
-    except SpawnError as error:
-        raise LaunchError(str(error)) from None
-    if path.startswith("/") and not os.access(path, os.X_OK):
-        raise LaunchError(f"no executable {path!r} exists")
 
 
 def _write_parameters(assignment: Assignment, state_directory: Path) -> str | None:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from rosrm.core.slave.reducer import qualified_name
 from rosrm.model.values import Assignment
-from rosrm.portable import VARIABLE as PORTABLE
 from rosrm.ros.fast_dds import announcements
 from rosrm.ros.names import token
 from rosrm.runtime.ros_wheels import without_bootstrapper
@@ -31,7 +30,6 @@ _IDENTITY: Final = (
     SHADOW,
     KEEP,
     KEEP_EVERY,
-    PORTABLE,
 )
 
 
@@ -45,10 +43,6 @@ class Whereabouts:
         state_config: topic on which the master speaks of handoffs.
         kept: directory of the kept states of all processes; None: none are kept.
         keep_every: seconds by which a kept state may be behind.
-        portable: directory below which portable nodes are asked to leave and to join; it has the
-            same path on all hosts. None: none is asked.
-        slave: number by chance of this run of it: who is of another cluster of the same name, and
-            shares that directory, is spoken to apart.
     """
 
     host: str
@@ -56,8 +50,6 @@ class Whereabouts:
     state_config: str
     kept: Path | None = None
     keep_every: float = 1.0
-    portable: Path | None = None
-    slave: int = 0
 
 
 def kept_directory(kept: Path, process: str) -> Path:
@@ -66,7 +58,10 @@ def kept_directory(kept: Path, process: str) -> Path:
 
 
 def process_environment(
-    assignment: Assignment, base: Mapping[str, str], where: Whereabouts
+    assignment: Assignment,
+    base: Mapping[str, str],
+    where: Whereabouts,
+    not_inherited: Sequence[str] = (),
 ) -> dict[str, str]:
     """All variables of an instance; what its spec says goes last.
 
@@ -74,10 +69,11 @@ def process_environment(
         assignment: whose instance it is for.
         base: the slave's own environment, its ROS settings (ROS_DOMAIN_ID, ...) included.
         where: it will run.
+        not_inherited: variables that launchers set: those of the slave are its own.
     """
     spec = assignment.spec
     environment = without_bootstrapper(base)
-    for name in _IDENTITY:
+    for name in (*_IDENTITY, *not_inherited):
         environment.pop(name, None)
     environment["ROSRM_PROCESS"] = assignment.instance.process
     environment["ROSRM_INSTANCE"] = str(assignment.instance)
@@ -89,12 +85,9 @@ def process_environment(
         environment["ROSRM_NODE"] = qualified_name(spec.namespace, spec.name)
     if assignment.shadow:
         environment[SHADOW] = "1"
-    if spec.keeps_state and where.kept is not None:
+    if assignment.has_snapshots and where.kept is not None:
         environment[KEEP] = str(kept_directory(where.kept, spec.name))
         environment[KEEP_EVERY] = f"{where.keep_every:g}"
-    if spec.portable and where.portable is not None:
-        own = token(f"{assignment.instance} {where.cluster} {where.slave:x}")
-        environment[PORTABLE] = str(where.portable / own)
     environment["PYTHONUNBUFFERED"] = "1"
     environment.update(spec.environment)
     if assignment.shadow:  # a move waits until it has found everybody

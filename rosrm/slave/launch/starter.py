@@ -10,15 +10,14 @@ from pathlib import Path
 
 from rosrm.config.settings import HostConfig
 from rosrm.core.slave import reducer as core
-from rosrm.criu import periodic, places
 from rosrm.errors import LaunchError
 from rosrm.model.values import Assignment, InstanceId, InstanceState
-from rosrm.portable import control_root
 from rosrm.ros.names import STATE_CONFIG, Names
 from rosrm.ros.slave.endpoint import SlaveEndpoint
 from rosrm.ros.slave.graph import GraphWatch
 from rosrm.slave.launch.command import launch_order
 from rosrm.slave.launch.environment import Whereabouts
+from rosrm.slave.launch.launchers import Launchers
 from rosrm.slave.memos import to_memo
 from rosrm.slave.replication.service import Keeping
 from rosrm.slave.sessions import SessionTable
@@ -32,7 +31,6 @@ class Starter:
 
     Attributes:
         config: of the host.
-        incarnation: of this run of the slave.
         kept: directory of the kept states.
         state: what the slave holds; it is only looked at here.
         supervisor: carries the orders out.
@@ -40,12 +38,12 @@ class Starter:
         keeping: has the kept states.
         graph: where nodes are seen.
         sessions: which processes an instance has.
+        launchers: of this host.
         take: is told what has happened.
         say: tells the user.
     """
 
     config: HostConfig
-    incarnation: int
     kept: Path
     state: core.SlaveState
     supervisor: SupervisorLink
@@ -53,6 +51,7 @@ class Starter:
     keeping: Keeping
     graph: GraphWatch
     sessions: SessionTable
+    launchers: Launchers
     take: Callable[[core.Event], None]
     say: Callable[[str], None]
     _environment: Mapping[str, str] = field(init=False)
@@ -89,10 +88,6 @@ class Starter:
             refusal = "it was stopped before it was started"
             self.take(core.LaunchRefused(command.instance, refusal))
         return True
-
-    def begin_anew(self, instance: InstanceId) -> None:
-        """It is about to be restarted by hand: not from an image."""
-        periodic.begin_anew(places.periodic(self.config.state, instance.number))
 
     def close(self) -> None:
         """Nothing more is started."""
@@ -131,7 +126,7 @@ class Starter:
             try:
                 order = launch_order(
                     assignment, self._environment, sys.executable, where=where,
-                    state_directory=self.supervisor.state, images=self.config.state,
+                    state_directory=self.supervisor.state, launchers=self.launchers,
                     heard=self.state.heard_at,
                 )  # fmt: skip
                 orders.append(replace(order, memo=to_memo(held.memo)))
@@ -145,5 +140,5 @@ class Starter:
         config = self.config
         return Whereabouts(
             config.host, self.endpoint.cluster, Names(config.ros.namespace)(STATE_CONFIG),
-            self.kept, config.keep.every, control_root(os.geteuid()), self.incarnation,
+            self.kept, config.keep.every,
         )  # fmt: skip

@@ -313,7 +313,7 @@ class Keeping:
             True: it may start now; else `done` is called when the state is here, or does not come
             in time.
         """
-        if not assignment.spec.keeps_state:
+        if not assignment.has_snapshots:
             return True
         self._preparing[assignment.instance] = None
         self._in_thread(

@@ -14,10 +14,10 @@ from pathlib import Path
 
 import pytest
 
-from rosrm.criu import installing, packages
-from rosrm.criu.probe import probe
-from rosrm.criu.program import Criu, default_prefix, find, opened
 from rosrm.errors import CriuError
+from rosrm_criu.engine import install, packages
+from rosrm_criu.engine.binary import Criu, default_prefix, find, opened
+from rosrm_criu.engine.probe import probe
 
 ROOT = Path(__file__).parents[3]
 #: Older ones are fetched once, beside the environment's own.
@@ -63,7 +63,7 @@ def older() -> Callable[[str], Path]:
                     _fetch(suite, Path(new))
                     shutil.rmtree(place, ignore_errors=True)
                     Path(new, suite).rename(place)
-                installing.bound(place / "tree")
+                install.bound(place / "tree")
         return place
 
     return of
@@ -108,14 +108,15 @@ def as_nobody() -> Callable[..., subprocess.CompletedProcess]:
     user = {"user": NOBODY, "group": NOBODY, "extra_groups": [], "cwd": "/"}
     # The interpreter of the environment may lie where nobody else may look.
     seen = subprocess.run(
-        ["/usr/bin/env", "-i", sys.executable, "-c", "import rosrm.criu.probe"],
+        ["/usr/bin/env", "-i", sys.executable, "-c", "import rosrm_criu.engine.probe"],
         capture_output=True,
         check=False,
         **user,
     )
     python = sys.executable if seen.returncode == 0 else shutil.which("python3", path="/usr/bin")
-    code = "import sys; assert sys.version_info >= (3, 10); import rosrm.criu.probe"
-    variables = {"PYTHONPATH": str(ROOT)}
+    code = "import sys; assert sys.version_info >= (3, 10); import rosrm_criu.engine.probe"
+    path = f"{ROOT}:{ROOT / 'plugins/criu'}"
+    variables = {"PYTHONPATH": path}
     if (
         python is None
         or subprocess.run([python, "-c", code], env=variables, check=False, **user).returncode
@@ -123,7 +124,7 @@ def as_nobody() -> Callable[..., subprocess.CompletedProcess]:
         pytest.skip("no Python and rosrm that every user can read")
 
     def run(*words: object, home: Path, **environment: object):
-        variables = {"PYTHONPATH": ROOT, "PATH": "/usr/bin:/bin", "HOME": home, "TMPDIR": home}
+        variables = {"PYTHONPATH": path, "PATH": "/usr/bin:/bin", "HOME": home, "TMPDIR": home}
         variables |= {"PYTHONDONTWRITEBYTECODE": 1, **environment}
         return subprocess.run(
             [python, *map(str, words)],

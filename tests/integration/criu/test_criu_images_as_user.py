@@ -13,8 +13,8 @@ import pytest
 HOPS = """
 import json, os, subprocess, sys, time
 from pathlib import Path
-from rosrm.criu import dumping, outcome
-from rosrm.criu.program import opened
+from rosrm_criu.engine import dump, restore_result
+from rosrm_criu.engine.binary import opened
 
 program, folder = Path(sys.argv[1]), Path(sys.argv[2])
 COUNTER = '''
@@ -46,12 +46,12 @@ try:
     for log in logs[1:]:
         grown(logs[logs.index(log) - 1])
         image = folder / log.stem
-        dumping.dump(opened(program), process.pid, image, leave="killed", timeout=60)
+        dump.dump(opened(program), process.pid, image, leave="killed", timeout=60)
         process.wait(60)
-        words = outcome.command(sys.executable, image, criu=program, remove=True, timeout=60)
+        words = restore_result.command(sys.executable, image, criu=program, remove=True, timeout=60)
         process = start(words, log)
         over = lambda: process.poll() is not None
-        restored = outcome.wait(image, timeout=60, ended=over)
+        restored = restore_result.wait(image, timeout=60, ended=over)
     grown(logs[-1])
     process.terminate()
     code = process.wait(60)

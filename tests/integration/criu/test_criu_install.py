@@ -12,11 +12,11 @@ from pathlib import Path
 
 import pytest
 
-from rosrm.criu import packages
-from rosrm.criu.installing import install
-from rosrm.criu.probe import probe
-from rosrm.criu.program import opened
 from rosrm.errors import CriuError
+from rosrm_criu.engine import packages
+from rosrm_criu.engine.binary import opened
+from rosrm_criu.engine.install import install
+from rosrm_criu.engine.probe import probe
 
 
 def quiet(step: str) -> None:
@@ -69,7 +69,7 @@ def test_a_broken_one_is_made_anew_from_the_packages_that_were_kept(installed):
 
 def test_a_user_without_rights_installs_it(cached, as_nobody, public):
     code = (
-        "import sys; from pathlib import Path; from rosrm.criu.installing import install\n"
+        "import sys; from pathlib import Path; from rosrm_criu.engine.install import install\n"
         "print(*install(Path(sys.argv[1]), lambda step: None, given=Path(sys.argv[2])).command)"
     )
     done = as_nobody("-c", code, public / "prefix", cached, home=public)

@@ -12,12 +12,11 @@ from typing import Any
 
 import pytest
 
-from rosrm.criu import image, outcome, tree
-from rosrm.criu.places import incoming, kept, kept_numbers, ports_of_kept
 from rosrm.errors import CriuError
-from rosrm_migration import criu_asked
-from rosrm_migration import criu_kept_steps as steps
-from rosrm_migration import criu_luggage as luggage
+from rosrm_criu.engine import image, process_tree, restore_result
+from rosrm_criu.engine.paths import incoming, kept, kept_numbers, ports_of_kept
+from rosrm_criu.executors import artifacts, request
+from rosrm_criu.executors import checkpoint as steps
 from tests.criu_kit import TIMEOUT, eventually
 
 pytestmark = pytest.mark.timeout(240)
@@ -71,15 +70,15 @@ class Slave:
         return actor
 
     def end(self, actor: Any) -> None:
-        tree.send(reversed(tree.tree(actor.pid)), 9)
+        process_tree.send(reversed(process_tree.tree(actor.pid)), 9)
         actor.process.wait(TIMEOUT)
 
 
 @pytest.fixture
 def slave(theatre, tmp_path):
     """A slave that was just started: it has no attempt in mind."""
-    luggage._flights.clear()
-    criu_asked._turned_back.clear()
+    artifacts._flights.clear()
+    request._turned_back.clear()
     return Slave(theatre, tmp_path / "state")
 
 
@@ -157,7 +156,7 @@ def test_a_checkpoint_that_is_undone_lets_it_run_on(slave, counter):
     """It stood still; nothing of the image is left. A second asking does it no harm."""
     slave.ask("keep")
     assert slave.ask("keep") == slave.results["criu_keep"]
-    assert tree.is_stopped(counter.pid)
+    assert process_tree.is_stopped(counter.pid)
     slave.ask("run_on")
     slave.ask("run_on")
     counter.counts()
@@ -238,7 +237,7 @@ def test_a_restored_process_is_not_put_back(slave, counter):
     checkpointed(slave, counter)
     slave.ask("take")
     restored = slave.hold()
-    eventually(lambda: outcome.read(incoming(slave.state, 2)), "the restore")
+    eventually(lambda: restore_result.read(incoming(slave.state, 2)), "the restore")
     assert slave.ask("put_back") == {"active": True}
     nothing_left(slave)
     restored.counts()
@@ -253,8 +252,8 @@ def test_a_restored_process_that_ended_at_once_is_not_put_back(slave, counter):
     checkpointed(slave, counter)
     slave.ask("take")
     restored = slave.hold()
-    eventually(lambda: outcome.read(incoming(slave.state, 2)), "the restore")
-    os.kill(tree.root_of(restored.pid), signal.SIGKILL)
+    eventually(lambda: restore_result.read(incoming(slave.state, 2)), "the restore")
+    os.kill(process_tree.root_of(restored.pid), signal.SIGKILL)
     restored.process.wait(TIMEOUT)
     assert slave.ask("put_back") == {"active": True}
     nothing_left(slave)
@@ -265,13 +264,13 @@ def test_that_it_was_restored_is_known_as_long_as_its_image_is_kept(slave, count
     checkpointed(slave, counter)
     slave.ask("take")
     restored = slave.hold()
-    eventually(lambda: outcome.read(incoming(slave.state, 2)), "the restore")
+    eventually(lambda: restore_result.read(incoming(slave.state, 2)), "the restore")
     slave.end(restored)
-    luggage.sweep(slave.state, [])
+    artifacts.sweep(slave.state, [])
     assert slave.ask("take") == {"taken": True}
     assert not (incoming(slave.state, 2) / image.MANIFEST).exists()
     assert slave.ask("put_back") == {"active": True}
-    luggage.sweep(slave.state, [])
+    artifacts.sweep(slave.state, [])
     assert not incoming(slave.state, 2).exists()
 
 

@@ -13,9 +13,9 @@ from pathlib import Path
 import psutil
 import pytest
 
-from rosrm.criu.fitting import FACTS
-from rosrm.criu.probe import ability, probe
-from rosrm.criu.program import Criu
+from rosrm_criu.engine.binary import Criu
+from rosrm_criu.engine.compatibility import FACTS
+from rosrm_criu.engine.probe import ability, probe
 
 
 def test_one_that_works(criu):
@@ -27,7 +27,10 @@ def test_one_that_works(criu):
 
 def test_as_a_program_it_says_so_in_one_line(criu):
     done = subprocess.run(
-        [sys.executable, "-m", "rosrm.criu.probe"], capture_output=True, text=True, check=True
+        [sys.executable, "-m", "rosrm_criu.engine.probe"],
+        capture_output=True,
+        text=True,
+        check=True,
     )
     assert done.stdout.count("\n") == 1
     assert json.loads(done.stdout).keys() == {"works", "reason", "facts"}
@@ -53,7 +56,7 @@ def test_too_old_ones_are_told_apart(old, suite, version):
 def test_none_says_where_it_was_looked_for(tmp_path, monkeypatch):
     monkeypatch.delenv("ROSRM_CRIU", raising=False)
     monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.setattr("rosrm.criu.program._PLACES", str(tmp_path))
+    monkeypatch.setattr("rosrm_criu.engine.binary._PLACES", str(tmp_path))
     able = ability(tmp_path)
     assert (able.works, able.facts) == (False, {})
     assert able.reason == (
@@ -64,7 +67,7 @@ def test_none_says_where_it_was_looked_for(tmp_path, monkeypatch):
 
 def test_a_user_without_rights_reads_what_gives_them(criu, as_nobody, public):
     program = reachable(criu, public)
-    done = as_nobody("-m", "rosrm.criu.probe", home=public, ROSRM_CRIU=program)
+    done = as_nobody("-m", "rosrm_criu.engine.probe", home=public, ROSRM_CRIU=program)
     able = json.loads(done.stdout)
     assert able["works"] is False
     assert able["reason"].startswith(f"CRIU {criu.version} has no right to dump and restore")
@@ -75,11 +78,13 @@ def test_a_user_without_rights_reads_what_gives_them(criu, as_nobody, public):
 
 def test_what_the_user_reads_gives_the_rights(criu, as_nobody, public):
     program = reachable(criu, public)
-    asked = json.loads(as_nobody("-m", "rosrm.criu.probe", home=public, ROSRM_CRIU=program).stdout)
+    asked = json.loads(
+        as_nobody("-m", "rosrm_criu.engine.probe", home=public, ROSRM_CRIU=program).stdout
+    )
     command = asked["reason"].split("`")[1].removeprefix("sudo ").split()
     if shutil.which(command[0]) is None or subprocess.run(command, check=False).returncode != 0:
         pytest.skip("no setcap, or no capabilities on this file system")
-    done = as_nobody("-m", "rosrm.criu.probe", home=public, ROSRM_CRIU=program)
+    done = as_nobody("-m", "rosrm_criu.engine.probe", home=public, ROSRM_CRIU=program)
     able = json.loads(done.stdout)
     assert (able["works"], able["reason"]) == (True, "")
     assert (able["facts"]["uid"], able["facts"]["all_users"]) == ("65534", "no")
@@ -102,7 +107,7 @@ def test_root_of_a_container_reads_which_capability_is_missing(criu, added):
     if subprocess.run([*contained, "true"], check=False).returncode != 0:
         pytest.skip("no setpriv, or not all rights to give away")
     done = subprocess.run(
-        [*contained, sys.executable, "-m", "rosrm.criu.probe"],
+        [*contained, sys.executable, "-m", "rosrm_criu.engine.probe"],
         capture_output=True,
         text=True,
         check=True,
@@ -116,7 +121,7 @@ def test_root_of_a_container_reads_which_capability_is_missing(criu, added):
 def test_a_killed_probe_leaves_nothing_behind(criu, tmp_path, moment):
     """Killed as soon as it has its folder, in the dump, and in the restore."""
     asking = subprocess.Popen(
-        [sys.executable, "-m", "rosrm.criu.probe"],
+        [sys.executable, "-m", "rosrm_criu.engine.probe"],
         env={**os.environ, "TMPDIR": str(tmp_path)},
         stdout=subprocess.DEVNULL,
     )

@@ -7,7 +7,7 @@ import signal
 
 import pytest
 
-from rosrm.criu import outcome
+from rosrm_criu.engine import restore_result
 from tests.criu_kit import TIMEOUT, eventually
 
 pytestmark = pytest.mark.timeout(240)
@@ -36,12 +36,14 @@ def test_that_it_was_restored_is_known_after_its_end(theatre, directory, victim)
     """However it ended and however soon; of its memory nothing is left."""
     restored = theatre.restore(directory, remove=True)
     told = restored.outcome
-    eventually(lambda: [path.name for path in directory.iterdir()] == [outcome.FILE], "its removal")
+    eventually(
+        lambda: [path.name for path in directory.iterdir()] == [restore_result.FILE], "its removal"
+    )
     pid = restored.pid if victim == "its hold" else restored.outcome.pid
     os.kill(pid, signal.SIGKILL)
     assert restored.process.wait(TIMEOUT) == -signal.SIGKILL
-    assert [path.name for path in directory.iterdir()] == [outcome.FILE]
-    assert outcome.wait(directory, timeout=TIMEOUT, ended=lambda: True) == told
+    assert [path.name for path in directory.iterdir()] == [restore_result.FILE]
+    assert restore_result.wait(directory, timeout=TIMEOUT, ended=lambda: True) == told
 
 
 def test_its_program_begins_anew_after_its_end(theatre, directory):

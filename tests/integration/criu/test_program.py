@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from rosrm.criu.program import Criu, default_prefix, find, opened
 from rosrm.errors import CriuError
+from rosrm_criu.engine.binary import Criu, default_prefix, find, opened
 
 ANSWERS = 'if [ "$1" = --version ]; then echo "Version: {}"; exit; fi\n'
 
@@ -27,7 +27,7 @@ def script(path: Path, body: str = "", version: str = "4.2.1") -> Path:
 def nothing_else(tmp_path, monkeypatch):
     """No other CRIU of this machine is found, and a folder in PATH is ours."""
     monkeypatch.delenv("ROSRM_CRIU", raising=False)
-    monkeypatch.setattr("rosrm.criu.program._PLACES", str(tmp_path / "sbin"))
+    monkeypatch.setattr("rosrm_criu.engine.binary._PLACES", str(tmp_path / "sbin"))
     monkeypatch.setenv("PATH", str(tmp_path / "path"))
 
 
@@ -170,7 +170,7 @@ def test_it_asks_for_all_rights_only_where_it_has_them(tmp_path):
     told = tmp_path / "told"
     program = script(tmp_path / "criu", f'echo "$@" >{told}')
     code = (
-        "import sys; from pathlib import Path; from rosrm.criu.program import Criu\n"
+        "import sys; from pathlib import Path; from rosrm_criu.engine.binary import Criu\n"
         "Criu((sys.argv[1],), '4.2').run(['dump'], timeout=30, log=Path(sys.argv[2]))"
     )
     words = [sys.executable, "-c", code, program, tmp_path / "log"]

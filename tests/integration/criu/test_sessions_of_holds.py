@@ -3,10 +3,15 @@
 import os
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
+from rosrm.extensions.contracts import LauncherContext
+from rosrm.extensions.registry import MadeLauncher
+from rosrm.slave.launch.launchers import Launchers
 from rosrm.slave.sessions import SessionTable
+from rosrm_criu.launcher import CriuLauncher
 
 #: It has a child in a session of its own, and waits for it.
 PROGRAM = """
@@ -14,6 +19,8 @@ import subprocess
 subprocess.run(["sleep", "60"], start_new_session=True)
 """
 ROUNDS = 5
+LAUNCHER = CriuLauncher(LauncherContext(Path("/nowhere"), sys.executable, 1))
+BY_CRIU = Launchers({"criu": MadeLauncher(LAUNCHER, ())})
 PATIENCE = 30.0
 
 
@@ -51,9 +58,9 @@ def child_of(pid):
 
 def test_a_hold_is_known_as_one_however_early_it_was_added(spawn):
     """A process that was spawned just now has no command line yet, for most of the tries."""
-    table = SessionTable()
+    table = SessionTable(launchers=BY_CRIU)
     for _ in range(ROUNDS):
-        hold = spawn("rosrm/criu/hold.py")
+        hold = spawn("plugins/criu/rosrm_criu/engine/shim.py")
         table.add(hold)
         child = child_of(hold)
         table.refresh(0.0)
@@ -63,7 +70,7 @@ def test_a_hold_is_known_as_one_however_early_it_was_added(spawn):
 
 def test_of_any_other_program_a_daemon_is_no_member(spawn):
     """However early it was added, too."""
-    table = SessionTable()
+    table = SessionTable(launchers=BY_CRIU)
     for _ in range(ROUNDS):
         other = spawn("other.py")
         table.add(other)

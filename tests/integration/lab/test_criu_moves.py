@@ -8,7 +8,7 @@ import time
 import pytest
 
 from benchmarks.criu import parts, play
-from rosrm.criu import outcome
+from rosrm_criu.engine import restore_result
 from rosrm_lab import DATA, GIB, HostPlan, Lab, uniform
 from tests.integration.lab.conftest import PATIENCE
 
@@ -58,7 +58,7 @@ def test_a_node_counts_on_at_another_address(hosts):
     for host in HOSTS:
         left = hosts.outside(host, f"{DATA}/slave/images").rglob("*")
         # That it was restored is known as long as it lives.
-        assert not [one.name for one in left if one.is_file() and one.name != outcome.FILE]
+        assert not [one.name for one in left if one.is_file() and one.name != restore_result.FILE]
 
 
 def cut_off_who_fetches(lab: Lab) -> None:

@@ -19,7 +19,7 @@ SIZE = 12_000_000
 _SOURCE = """
 import hashlib, json, os, sys
 from pathlib import Path
-from rosrm.transfer import Sender
+from rosrm_criu.transfer import Sender
 directory = Path(sys.argv[1])
 directory.mkdir()
 content = os.urandom(int(sys.argv[2]))
@@ -33,7 +33,7 @@ _DESTINATION = """
 import hashlib, json, sys
 from pathlib import Path
 from rosrm.errors import TransferError
-from rosrm.transfer import Fetcher, Offer
+from rosrm_criu.transfer import Fetcher, Offer
 target = Path(sys.argv[1])
 fetcher = Fetcher()
 print(json.dumps(fetcher.introduce()), flush=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rosrm.transfer import Fetcher, Sender
+from rosrm_criu.transfer import Fetcher, Sender
 from tests.integration.transfer.trees import Destination, fill
 
 

@@ -20,9 +20,9 @@ from pathlib import Path
 import pytest
 
 from rosrm.errors import TransferError
-from rosrm.transfer import Offer, Sent, archive, serving
-from rosrm.transfer.archive import Archive
-from rosrm.transfer.serving import serve
+from rosrm_criu.transfer import Offer, Sent, archive, serving
+from rosrm_criu.transfer.archive import Archive
+from rosrm_criu.transfer.serving import serve
 from tests.faults.disks import small_disk
 from tests.integration.transfer.trees import (
     PATIENCE,

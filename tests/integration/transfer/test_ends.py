@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from rosrm.errors import TransferError
-from rosrm.transfer import Fetcher, Offer, Sender, Sent
+from rosrm_criu.transfer import Fetcher, Offer, Sender, Sent
 from tests.integration.transfer.trees import PATIENCE, digests, listens, nothing_left, slowly, until
 
 
@@ -70,7 +70,7 @@ def test_what_was_stopped_before_it_began_says_so(source, target, sender):
 _OFFERS = """
 import json, sys, time
 from pathlib import Path
-from rosrm.transfer import Sender
+from rosrm_criu.transfer import Sender
 sender = Sender()
 offer = sender.offer(Path(sys.argv[1]), seconds=600.0, max_rate=500e3, to=sys.argv[2])
 print(json.dumps(offer.as_json()))
@@ -80,7 +80,7 @@ time.sleep(600)
 _FETCHES = """
 import json, sys
 from pathlib import Path
-from rosrm.transfer import Fetcher, Offer
+from rosrm_criu.transfer import Fetcher, Offer
 fetcher = Fetcher()
 print(json.dumps([fetcher._process.pid, fetcher.introduce()]), flush=True)
 offer = Offer.from_json(json.loads(sys.stdin.readline()))

@@ -17,7 +17,7 @@ def test_a_fetch_that_is_ended_while_it_tells_its_fault_tells_it() -> None:
     """Who has read it closes the process's input, which ends it: that is no fault of its own."""
     heard, said = os.pipe()
     with subprocess.Popen(
-        [sys.executable, "-m", "rosrm.transfer", "fetch"],
+        [sys.executable, "-m", "rosrm_criu.transfer", "fetch"],
         stdin=subprocess.PIPE, stdout=said, stderr=subprocess.PIPE,
     ) as fetch, os.fdopen(heard) as answers:  # fmt: skip
         assert fetch.stdin is not None

@@ -14,7 +14,7 @@ import psutil
 import pytest
 
 from rosrm.errors import TransferError
-from rosrm.transfer import Offer, Sender, Sent
+from rosrm_criu.transfer import Offer, Sender, Sent
 from tests.integration.transfer.trees import (
     PATIENCE,
     Destination,

@@ -9,9 +9,9 @@ import socket
 import time
 from pathlib import Path
 
-from rosrm.transfer import DEFAULT_RESERVE, Fetched, Offer, Sender
-from rosrm.transfer.certificate import new_identity
-from rosrm.transfer.receiving import receive
+from rosrm_criu.transfer import DEFAULT_RESERVE, Fetched, Offer, Sender
+from rosrm_criu.transfer.certificate import new_identity
+from rosrm_criu.transfer.receiving import receive
 
 #: Generous: a busy machine may take its time.
 PATIENCE = 60.0

@@ -12,7 +12,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Int64
 from std_srvs.srv import Trigger
 
-from rosrm.node import PortableNode, run_portable
+from rosrm_criu.node import PortableNode, run_portable
 
 RELIABLE = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 FAULT = sys.argv[1] if len(sys.argv) > 1 else ""

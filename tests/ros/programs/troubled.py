@@ -11,7 +11,7 @@ import sys
 import time
 from pathlib import Path
 
-from rosrm.node import run_portable
+from rosrm_criu.node import run_portable
 from rosrm_examples.portable_counter import PortableCounter
 
 

@@ -6,9 +6,9 @@ import json
 
 import pytest
 
-from rosrm.criu.probe import Ability
-from rosrm.criu.program import Criu
 from rosrm.errors import CriuError
+from rosrm_criu.engine.binary import Criu
+from rosrm_criu.engine.probe import Ability
 from tests.criu_kit import HOST_FACTS
 
 
@@ -23,8 +23,8 @@ def here(monkeypatch):
             return Criu((f"{prefix}/bin/criu",), version)
 
         able = Ability(not reason, reason, {**HOST_FACTS, "version": version})
-        monkeypatch.setattr("rosrm.criu.program.find", find)
-        monkeypatch.setattr("rosrm.criu.probe.probe", lambda criu: able)
+        monkeypatch.setattr("rosrm_criu.engine.binary.find", find)
+        monkeypatch.setattr("rosrm_criu.engine.probe.probe", lambda criu: able)
 
     return pretend
 
@@ -48,7 +48,7 @@ def test_one_that_works_is_told_line_by_line(rosrm, here):
 def test_without_the_libraries_of_a_transfer_no_image_can_be_sent(rosrm, here, monkeypatch):
     """A host where CRIU works is no host to move to or from without them."""
     here()
-    monkeypatch.setattr("rosrm.transfer.missing", lambda: "aiohttp is not installed: pip ...")
+    monkeypatch.setattr("rosrm_criu.transfer.missing", lambda: "aiohttp is not installed: pip ...")
     result = rosrm("criu", "check")
     assert result.code == 1
     assert result.out.splitlines()[-1] == "NO  to other hosts    aiohttp is not installed: pip ..."

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 from rosrm.config import load_work
-from rosrm.extensions.contracts import MigrationOffer
+from rosrm.extensions.contracts import Capabilities, MigrationOffer
 from rosrm.extensions.hookspecs import hookimpl
 from rosrm.extensions.registry import Registry
 from rosrm.extensions.units import PositiveSeconds
@@ -391,6 +391,27 @@ def test_with_a_registry_the_strategy_and_its_options_are_checked(refusal):
     )
     assert "f.yaml:3:38: unknown migration strategy 'relunch'; did you mean 'relaunch'?" in said
     assert "f.yaml:4:69: unknown key 'fast' in options of migration strategy 'relaunch'" in said
+
+
+@hookimpl(specname="register_migration_strategies")
+def register_a_follower():
+    follows = Capabilities(shadow=True)
+    return [MigrationOffer("follow", lambda options: options, capabilities=follows)]
+
+
+def test_a_standby_needs_a_strategy_that_can_shadow(file, refusal):
+    """Whatever its name is; without a registry the master refuses it."""
+    text = "processes: [{name: a, command: x, standby: true, migration: STRATEGY}]"
+    ours = SimpleNamespace(register_migration_strategies=register_migration_strategies)
+    theirs = SimpleNamespace(register_migration_strategies=register_a_follower)
+    registry = Registry.of(ours=ours, theirs=theirs)
+    said = refusal(load_work, text.replace("STRATEGY", "relaunch"), registry)
+    assert "f.yaml:1:44: a standby follows the state of its process, and relaunch cannot" in said
+    assert "say `migration: follow`" in said
+    assert "without a migration strategy" in refusal(load_work, text.replace("STRATEGY", "null"))
+    for known in (registry, None):
+        (spec,) = load_work(file(text.replace("STRATEGY", "follow")), known)
+        assert spec.standby.wanted
 
 
 @dataclass(frozen=True)

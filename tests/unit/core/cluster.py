@@ -16,6 +16,8 @@ from typing import Any
 
 import numpy as np
 
+import rosrm_criu.plugin
+import rosrm_migration.plugin
 from rosrm.core.master import events as happened
 from rosrm.core.master import listing
 from rosrm.core.master.commands import (
@@ -35,6 +37,7 @@ from rosrm.core.slave import reducer
 from rosrm.extensions.contracts import HostView, Intent, ProcessView, Record, Scores
 from rosrm.extensions.declared_fields import Declared
 from rosrm.extensions.options import merged_options
+from rosrm.extensions.registry import Registry
 from rosrm.model.codec import to_plain
 from rosrm.model.plan import (
     AwaitReady,
@@ -58,7 +61,6 @@ from rosrm.model.values import (
     Readiness,
     RestartPolicy,
 )
-from rosrm_migration.plugin import register_migration_strategies
 from tests.unit.core.machine import GIB, MIB, Machine
 from tests.unit.core.nodes import Air, Node
 
@@ -161,11 +163,13 @@ class HandOver:
         )
 
 
-_SHIPPED = {offer.name: offer for offer in register_migration_strategies()}
+_REGISTRY = Registry.of(migration=rosrm_migration.plugin, criu=rosrm_criu.plugin)
+_SHIPPED = {name: _REGISTRY.offer("migration", name) for name in _REGISTRY.names("migration")}
+_CAPABILITIES, _CAPABILITIES_OF = _REGISTRY.capabilities(), _REGISTRY.capabilities_of()
 
 
 def declared_by(strategies: Mapping[str, Any]) -> Declared:
-    """Return the declarations of the shipped strategies among these: their options."""
+    """Return the declarations of the shipped strategies: their options and capabilities."""
 
     def options_of(name: str, spec: ProcessSpec) -> Any:
         offer = _SHIPPED.get(name)
@@ -175,7 +179,9 @@ def declared_by(strategies: Mapping[str, Any]) -> Declared:
         own = spec.migration.options if spec.migration.strategy == name else {}
         return merged_options(offer.own_options or offer.options, to_plain(cluster), own)
 
-    return Declared(options_of=options_of)
+    return Declared(
+        options_of=options_of, capabilities_of=_CAPABILITIES_OF, capabilities=_CAPABILITIES
+    )
 
 
 # --- the cluster ------------------------------------------------------------------------------

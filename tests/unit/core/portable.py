@@ -8,20 +8,11 @@ from typing import Any
 
 from rosrm.core.master import events as happened
 from rosrm.core.master.commands import Order
-from rosrm.criu.fitting import FACTS
 from rosrm.model.values import InstanceId, InstanceState
-from rosrm_migration.criu import (
-    ABILITY,
-    AWAIT_RESTORED,
-    CHECKPOINT,
-    END,
-    FETCH,
-    GO_ON,
-    INTRODUCE,
-    JOIN,
-    Criu,
-    CriuOptions,
-)
+from rosrm_criu.engine.compatibility import FACTS
+from rosrm_criu.options import CriuOptions
+from rosrm_criu.plans import ABILITY, AWAIT_RESTORED, CHECKPOINT, END, FETCH, GO_ON, INTRODUCE, JOIN
+from rosrm_criu.strategy import Criu
 from tests.unit.core.machine import Machine
 from tests.unit.core.nodes import Node
 

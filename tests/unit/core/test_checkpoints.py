@@ -197,10 +197,13 @@ def test_what_cannot_be_checkpointed_is_refused_with_its_reason() -> None:
     cluster.submit(
         process("p"),
         process("waits", memory=1e9),
-        movable("watched", standby=StandbyPolicy(wanted=True)),
+        process(
+            "watched", ros=True, migration=MigrationPolicy("handoff"), standby=StandbyPolicy(True)
+        ),
         process("stateful", ros=True, migration=MigrationPolicy("handoff")),
     )  # fmt: skip
-    shelf.machine.seen_in_graph("stateful", cluster.now)
+    for name in ("watched", "stateful"):
+        shelf.machine.seen_in_graph(name, cluster.now)
     cluster.settle()
     cases = [
         ("x", "no such process: 'x'"),

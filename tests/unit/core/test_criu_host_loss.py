@@ -12,7 +12,7 @@ import pytest
 
 from rosrm.model.plan import Commit, Execute, Move, Plan, Start, Stop
 from rosrm.model.values import HostLossPolicy, MigrationPolicy
-from rosrm_migration.criu import AWAIT_RESTORED, END, FETCH, GO_ON, JOIN
+from rosrm_criu.plans import AWAIT_RESTORED, END, FETCH, GO_ON, JOIN
 from tests.unit.core.cluster import Cluster, Machine, node, process
 from tests.unit.core.portable import Portable, by_criu
 

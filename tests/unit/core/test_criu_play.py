@@ -13,7 +13,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 
 from rosrm.core.master import events as happened
 from rosrm.core.master.state.hosts import HostCondition
-from rosrm_migration.criu import AWAIT_RESTORED, CHECKPOINT, END, FETCH, GO_ON, INTRODUCE, JOIN
+from rosrm_criu.plans import AWAIT_RESTORED, CHECKPOINT, END, FETCH, GO_ON, INTRODUCE, JOIN
 from tests.unit.core.cluster import Cluster
 from tests.unit.core.portable import Portable
 from tests.unit.core.test_checkpoints import Killed, kill_at

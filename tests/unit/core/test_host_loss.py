@@ -14,6 +14,7 @@ from rosrm.model.values import (
     HostLossPolicy,
     InstanceState,
     IsolationPolicy,
+    MigrationPolicy,
     ProcessSpec,
     RestartPolicy,
     StandbyPolicy,
@@ -316,7 +317,10 @@ def test_by_default_nothing_is_fenced() -> None:
 def test_what_may_have_a_successor_is_fenced_where_its_slave_is_not_at_work() -> None:
     """A host that is only cut off goes on, whatever it hears."""
     cluster = Cluster("a")
-    cluster.submit(process("p", host_loss=ELSEWHERE), process("q", standby=StandbyPolicy(True)))
+    followed = process(
+        "q", ros=True, migration=MigrationPolicy("handoff"), standby=StandbyPolicy(True)
+    )
+    cluster.submit(process("p", host_loss=ELSEWHERE), followed)
     machine = cluster.machines["a"]
     for name in ("p", "q"):
         given = machine.programs[machine.find(name)].assignment.fence

@@ -12,7 +12,8 @@ import pytest
 from rosrm.extensions.contracts import CheckpointChoice, CheckpointView, MemoryView
 from rosrm.model.plan import Execute
 from rosrm.model.values import MigrationPolicy, ProcessSpec, Readiness, RestartPolicy
-from rosrm_migration.criu import Criu, CriuOptions
+from rosrm_criu.options import CriuOptions
+from rosrm_criu.strategy import Criu
 from tests.criu_kit import HOST_FACTS
 from tests.unit.core.cluster import Cluster, process
 from tests.unit.core.machine import Machine

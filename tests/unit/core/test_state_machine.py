@@ -182,7 +182,7 @@ class Play(RuleBasedStateMachine):
                 if kept.instance.process == one.instance.process
                 and kept.instance.number >= one.kept_from
             }
-            if one.spec.keeps_state:
+            if one.has_snapshots:
                 assert keepers <= set(one.kept_on), "assigned to begin from less than is kept"
 
     def look_at_order(self, given: list[Assign]) -> None:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from rosrm.criu.facts import facts_of, features
-from rosrm.criu.fitting import FACTS, mismatch
-from rosrm.criu.program import Criu
+from rosrm_criu.engine.binary import Criu
+from rosrm_criu.engine.compatibility import FACTS, mismatch
+from rosrm_criu.engine.compatibility_facts import facts_of, features
 from tests.criu_kit import HOST_FACTS as HERE
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from rosrm.criu import held_files, image
-from rosrm.criu.image import HeldFile
+from rosrm_criu.engine import image, open_files
+from rosrm_criu.engine.image import HeldFile
 
 
 @pytest.fixture
@@ -28,7 +28,7 @@ def directory(tmp_path):
 
 def held(directory: Path, working_directory: object) -> dict[str, HeldFile]:
     """What this process holds open, by path."""
-    found = held_files.open_files([os.getpid()], (), str(working_directory), directory)
+    found = open_files.open_files([os.getpid()], (), str(working_directory), directory)
     return {one.path: one for one in found}
 
 

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from rosrm.criu import image, outcome
-from rosrm.criu.outcome import Outcome
+from rosrm_criu.engine import image, restore_result
+from rosrm_criu.engine.restore_result import Outcome
 
 #: A plain restore that failed, as `hold.FAILED`.
 FAILED = 125
@@ -29,7 +29,7 @@ def directory(tmp_path):
 
 def start(directory: Path, *then: str, remove: bool = True) -> subprocess.CompletedProcess[str]:
     """As the supervisor starts it, at first and after each crash."""
-    command = outcome.command(
+    command = restore_result.command(
         sys.executable, directory, criu=Path("/none"), remove=remove, timeout=5.0, then=then
     )
     return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
@@ -38,11 +38,11 @@ def start(directory: Path, *then: str, remove: bool = True) -> subprocess.Comple
 def test_after_a_life_that_was_restored_the_process_begins_anew(directory):
     """What an earlier life told stays; a memory that a SIGKILL left on the disk goes."""
     told = Outcome(pid=7, inner_pid=7)
-    outcome.write(directory, told)
+    restore_result.write(directory, told)
     for _ in range(2):
         assert start(directory, "echo", "anew").stdout == "anew\n"
-        assert outcome.read(directory) == told
-        assert [path.name for path in directory.iterdir()] == [outcome.FILE]
+        assert restore_result.read(directory) == told
+        assert [path.name for path in directory.iterdir()] == [restore_result.FILE]
 
 
 def test_without_an_image_nothing_begins_anew(tmp_path):
@@ -56,18 +56,18 @@ def test_without_an_image_nothing_begins_anew(tmp_path):
 def test_a_restore_that_never_worked_does_not_begin_anew(directory, told):
     """It fails, and says why, as often as it is started."""
     if told is not None:
-        outcome.write(directory, told)
+        restore_result.write(directory, told)
     for _ in range(2):
         ended = start(directory, "echo", "anew")
         assert (ended.returncode, ended.stdout) == (FAILED, "")
-        assert "damaged" in outcome.read(directory).reason
+        assert "damaged" in restore_result.read(directory).reason
 
 
 def test_an_image_without_a_command_is_for_one_life_too(directory):
     """Nothing else can be started; it stays known that the image was used up."""
     told = Outcome(pid=7, inner_pid=7)
-    outcome.write(directory, told)
+    restore_result.write(directory, told)
     ended = start(directory)
     assert ended.returncode == FAILED
     assert "was restored before" in ended.stderr
-    assert outcome.read(directory) == told
+    assert restore_result.read(directory) == told

@@ -15,9 +15,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosrm.criu import image
-from rosrm.criu.image import HeldFile, Manifest, MappedFile
 from rosrm.errors import CriuError
+from rosrm_criu.engine import image
+from rosrm_criu.engine.image import HeldFile, Manifest, MappedFile
 
 #: A large file of pages, a small one of CRIU's, and one that follows the process.
 FILES: Mapping[str, bytes] = {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rosrm.criu.log_reading import causes, first_words
+from rosrm_criu.engine.log_reader import causes, first_words
 
 SOCKET = """\
 (00.000074) Version: 4.2.1 (gitid 0)

@@ -9,9 +9,9 @@ import sys
 
 import pytest
 
-from rosrm.criu import again, periodic
-from rosrm.criu.periodic import Rejoin
 from rosrm.errors import CriuError
+from rosrm_criu.engine import restart_from_image, slots
+from rosrm_criu.engine.slots import Rejoin
 
 REJOIN = Rejoin("/tmp/rosrm-0/portable/x", "p#1-periodic-1", 0)
 
@@ -23,7 +23,7 @@ def parent(tmp_path):
 
 def image(parent):
     """One that is dumped, and does not count yet."""
-    slot = periodic.new_slot(parent)
+    slot = slots.new_slot(parent)
     slot.mkdir(parents=True)
     (slot / "manifest.json").write_text("{}")
     return slot
@@ -31,33 +31,33 @@ def image(parent):
 
 def test_the_newest_complete_image_counts(parent):
     """Not one that is still being dumped; the one before goes when the next is complete."""
-    assert periodic.newest(parent) is None
+    assert slots.newest(parent) is None
     first = image(parent)
-    assert periodic.newest(parent) is None
-    periodic.complete(first, REJOIN)
+    assert slots.newest(parent) is None
+    slots.complete(first, REJOIN)
     second = image(parent)
-    assert periodic.newest(parent) == (first, REJOIN)
-    periodic.complete(second, REJOIN)
-    assert periodic.newest(parent) == (second, REJOIN)
+    assert slots.newest(parent) == (first, REJOIN)
+    slots.complete(second, REJOIN)
+    assert slots.newest(parent) == (second, REJOIN)
     assert not first.exists()
 
 
 def test_an_image_is_started_from_twice_at_most(parent):
     """Who crashes again and again for what it remembers begins anew; a newer image counts again."""
     slot = image(parent)
-    periodic.complete(slot, REJOIN)
-    assert [periodic.newest(parent) is not None for _ in range(4)] == [True, True, False, False]
+    slots.complete(slot, REJOIN)
+    assert [slots.newest(parent) is not None for _ in range(4)] == [True, True, False, False]
     newer = image(parent)
-    periodic.complete(newer, REJOIN)
-    assert periodic.newest(parent) == (newer, REJOIN)
+    slots.complete(newer, REJOIN)
+    assert slots.newest(parent) == (newer, REJOIN)
 
 
 def test_what_a_dump_has_left_goes(parent):
     """The image that counts stays."""
     whole = image(parent)
-    periodic.complete(whole, REJOIN)
+    slots.complete(whole, REJOIN)
     torn = image(parent)
-    periodic.discard_unfinished(parent)
+    slots.discard_unfinished(parent)
     assert (whole.exists(), torn.exists()) == (True, False)
 
 
@@ -67,35 +67,37 @@ def test_a_damaged_one_is_named(parent, content):
     slot = image(parent)
     (slot / "rejoin.json").write_text(content)
     with pytest.raises(CriuError, match="is damaged: rejoin"):
-        periodic.newest(parent)
+        slots.newest(parent)
 
 
 def test_who_is_to_begin_anew_does_so_once(parent):
     """Not even from an image that became complete meanwhile; those of its next life count."""
     slot = image(parent)
-    periodic.begin_anew(parent)
-    periodic.complete(slot, REJOIN)
-    assert periodic.newest(parent) is None
+    slots.begin_anew(parent)
+    slots.complete(slot, REJOIN)
+    assert slots.newest(parent) is None
     assert not parent.exists()
     later = image(parent)
-    periodic.complete(later, REJOIN)
-    assert periodic.newest(parent) == (later, REJOIN)
+    slots.complete(later, REJOIN)
+    assert slots.newest(parent) == (later, REJOIN)
 
 
 def test_numbers_grow(parent):
     """The tenth is newer than the ninth."""
     for _ in range(10):
         slot = image(parent)
-        periodic.complete(slot, REJOIN)
+        slots.complete(slot, REJOIN)
     assert slot.name == "10"
-    assert periodic.newest(parent) == (slot, REJOIN)
+    assert slots.newest(parent) == (slot, REJOIN)
 
 
 # --- the program that starts a process ----------------------------------------------------------
 
 
 def start(parent, *then):
-    words = again.command(sys.executable, parent, then, criu=parent / "criu", timeout=5.0)
+    words = restart_from_image.command(
+        sys.executable, parent, then, criu=parent / "criu", timeout=5.0
+    )
     return subprocess.run(words, check=False, capture_output=True, text=True, timeout=60)
 
 
@@ -138,7 +140,7 @@ def test_it_asks_the_node_to_join_before_it_is_restored(parent, tmp_path):
     """The request lies there; that there is no CRIU here is said by who restores."""
     control = tmp_path / "control"
     slot = image(parent)
-    periodic.complete(slot, Rejoin(str(control), "p#1-periodic-1", os.geteuid()))
+    slots.complete(slot, Rejoin(str(control), "p#1-periodic-1", os.geteuid()))
     done = start(parent, "echo", "anew")
     assert done.returncode == 125
     assert "not restored" in done.stderr

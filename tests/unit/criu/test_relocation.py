@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosrm.criu import relocation
 from rosrm.errors import CriuError
+from rosrm_criu.engine import relocation
 
 
 def varint(number: int) -> bytes:

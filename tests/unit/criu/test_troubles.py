@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from rosrm.criu import troubles
+from rosrm_criu.engine import log_messages
 
 
 @pytest.mark.parametrize(
@@ -25,7 +25,9 @@ from rosrm.criu import troubles
 )  # fmt: skip
 def test_why_it_could_not_be_dumped(said, meaning):
     """The resource is named."""
-    assert meaning in troubles.of_dump(f"CRIU 4.2.1 could not dump: {said} (its log: /a/dump.log)")
+    assert meaning in log_messages.of_dump(
+        f"CRIU 4.2.1 could not dump: {said} (its log: /a/dump.log)"
+    )
 
 
 @pytest.mark.parametrize(
@@ -41,9 +43,9 @@ def test_why_it_could_not_be_dumped(said, meaning):
 )
 def test_why_it_could_not_be_restored(said, meaning):
     """What this host lacks is named."""
-    assert re.search(meaning, troubles.of_restore(f"CRIU 4.2.1 could not restore: {said}"))
+    assert re.search(meaning, log_messages.of_restore(f"CRIU 4.2.1 could not restore: {said}"))
 
 
 def test_what_is_not_in_the_table_is_passed_on():
     """No guess is made."""
-    assert troubles.of_dump("something new") == troubles.of_restore("something new") == ""
+    assert log_messages.of_dump("something new") == log_messages.of_restore("something new") == ""

@@ -7,7 +7,7 @@ import socket
 
 import pytest
 
-from rosrm.criu import udp_ports
+from rosrm_criu.engine import udp_ports
 
 
 @pytest.fixture

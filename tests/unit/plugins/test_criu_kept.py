@@ -7,9 +7,10 @@ from rosrm.extensions.plugin_calls import implements
 from rosrm.model.plan import Aim, Execute, Move, Plan, Start, plan_fault
 from rosrm.model.values import InstanceId, MigrationPolicy, ProcessSpec
 from rosrm.testing import with_options
-from rosrm_migration.criu import Criu, CriuOptions
-from rosrm_migration.criu_kept import DROP, KEEP
-from rosrm_migration.plugin import register_migration_strategies
+from rosrm_criu.options import CriuOptions
+from rosrm_criu.plans import DROP, KEEP
+from rosrm_criu.plugin import register_migration_strategies
+from rosrm_criu.strategy import Criu
 
 OFFER = next(one for one in register_migration_strategies() if one.name == "criu")
 CRIU = Criu(CriuOptions(dump_timeout=7.0))

@@ -8,11 +8,11 @@ from itertools import count
 
 import pytest
 
-from rosrm.criu import image, outcome
-from rosrm.criu.outcome import Outcome
-from rosrm.criu.places import incoming, outgoing
 from rosrm.errors import CriuError
-from rosrm_migration import criu_luggage as luggage
+from rosrm_criu.engine import image, restore_result
+from rosrm_criu.engine.paths import incoming, outgoing
+from rosrm_criu.engine.restore_result import Outcome
+from rosrm_criu.executors import artifacts
 
 PATIENCE = 20.0
 _numbers = count()
@@ -35,13 +35,13 @@ def test_a_step_that_is_asked_for_twice_is_done_once(attempt):
         return {"n": len(done)}
 
     with ThreadPoolExecutor(2) as threads:
-        first = threads.submit(luggage.once, "step", attempt, work)
+        first = threads.submit(artifacts.once, "step", attempt, work)
         assert begun.wait(PATIENCE)
-        second = threads.submit(luggage.once, "step", attempt, work)
+        second = threads.submit(artifacts.once, "step", attempt, work)
         may_end.set()
         assert first.result(PATIENCE) == second.result(PATIENCE) == {"n": 1}
-    assert luggage.once("step", attempt, work) == {"n": 1}
-    assert luggage.once("other step", attempt, work) == {"n": 2}
+    assert artifacts.once("step", attempt, work) == {"n": 1}
+    assert artifacts.once("other step", attempt, work) == {"n": 2}
 
 
 def test_a_step_that_failed_is_done_anew(attempt):
@@ -49,9 +49,9 @@ def test_a_step_that_failed_is_done_anew(attempt):
         raise CriuError("no room")
 
     with pytest.raises(CriuError, match="no room"):
-        luggage.once("step", attempt, fails)
-    luggage.after("step", attempt, 0.0)  # it is over
-    assert luggage.once("step", attempt, dict) == {}
+        artifacts.once("step", attempt, fails)
+    artifacts.after("step", attempt, 0.0)  # it is over
+    assert artifacts.once("step", attempt, dict) == {}
 
 
 def test_a_step_under_way_is_waited_for_no_longer_than_is_said(attempt):
@@ -63,12 +63,12 @@ def test_a_step_under_way_is_waited_for_no_longer_than_is_said(attempt):
         raise CriuError("it failed in the end")
 
     with ThreadPoolExecutor(1) as threads:
-        going = threads.submit(luggage.once, "step", attempt, work)
+        going = threads.submit(artifacts.once, "step", attempt, work)
         assert begun.wait(PATIENCE)
         with pytest.raises(CriuError, match=r"still under way after 0\.01 s"):
-            luggage.after("step", attempt, 0.01)
+            artifacts.after("step", attempt, 0.01)
         may_end.set()
-        luggage.after("step", attempt, PATIENCE)  # its failure is for who asked for it
+        artifacts.after("step", attempt, PATIENCE)  # its failure is for who asked for it
         with pytest.raises(CriuError, match="in the end"):
             going.result(PATIENCE)
 
@@ -76,11 +76,11 @@ def test_a_step_under_way_is_waited_for_no_longer_than_is_said(attempt):
 def test_what_a_former_slave_has_left_goes(tmp_path, monkeypatch):
     """What it offered, at once; what it fetched, after a time; what runs keeps what is its own."""
     later = []
-    monkeypatch.setattr(luggage, "_later", lambda *call: later.append(call))
+    monkeypatch.setattr(artifacts, "_later", lambda *call: later.append(call))
     for place in (outgoing(tmp_path, 1), incoming(tmp_path, 2), incoming(tmp_path, 3)):
         place.mkdir(parents=True)
         (place / "manifest.json").touch()
-    luggage.sweep(tmp_path, ["p#3"])
+    artifacts.sweep(tmp_path, ["p#3"])
     assert not outgoing(tmp_path, 1).exists()
     assert [directory for _, _, directory in later] == [incoming(tmp_path, 2)]
     for _, do, directory in later:
@@ -95,7 +95,7 @@ def test_an_unused_image_goes_and_that_there_was_a_restore_stays(tmp_path, reaso
     directory = incoming(tmp_path, 1)
     directory.mkdir(parents=True)
     (directory / image.MANIFEST).write_text("{}")
-    outcome.write(directory, Outcome(reason=reason, pid=7))
-    luggage.remove_unused(directory)
-    assert luggage.was_restored(directory) is known
+    restore_result.write(directory, Outcome(reason=reason, pid=7))
+    artifacts.remove_unused(directory)
+    assert artifacts.was_restored(directory) is known
     assert not (directory / image.MANIFEST).exists()

@@ -10,11 +10,11 @@ import sys
 
 import pytest
 
-from rosrm.criu import places
 from rosrm.errors import CriuError
-from rosrm.portable import VARIABLE, control_directory
-from rosrm_migration import criu_periodic_steps
-from rosrm_migration.criu_absence import owner_of
+from rosrm_criu.control import VARIABLE, control_directory
+from rosrm_criu.engine import paths
+from rosrm_criu.executors import periodic
+from rosrm_criu.executors.freeze import owner_of
 
 
 def started() -> subprocess.Popen[bytes]:
@@ -36,7 +36,7 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path):
             "here": here, "seconds": {},
         }  # fmt: skip
         with pytest.raises(CriuError, match=r"no image can be made in .*images.*: "):
-            criu_periodic_steps.dump(arguments)
+            periodic.dump(arguments)
         process.communicate()
 
 
@@ -50,11 +50,11 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path):
 )
 def test_images_that_were_taken_away_are_no_fault_of_the_disk(tmp_path, number, there, said):
     """Who restarts a process by hand has its images removed, also one that is just being made."""
-    parent = places.periodic(tmp_path, 1)
+    parent = paths.periodic(tmp_path, 1)
     if there:
         parent.mkdir(parents=True)
     error = OSError(number, os.strerror(number))
-    assert re.search(said, criu_periodic_steps.why_not_written(parent, error))
+    assert re.search(said, periodic.why_not_written(parent, error))
 
 
 def test_a_process_that_has_ended_is_called_so():

@@ -6,7 +6,7 @@ import pytest
 
 from rosrm.extensions.options import options_of
 from rosrm.model.values import MigrationPolicy, ProcessSpec
-from rosrm_migration.criu import CriuOptions, OwnCriuOptions
+from rosrm_criu.options import CriuOptions, OwnCriuOptions
 
 
 def options(**given: object) -> OwnCriuOptions:

@@ -12,7 +12,7 @@ import time
 import pytest
 
 from rosrm.errors import PortableError
-from rosrm.portable import (
+from rosrm_criu.control import (
     SIGNAL,
     VARIABLE,
     Request,
@@ -29,8 +29,8 @@ from rosrm.portable import (
     remove_directory,
     status_of,
 )
-from rosrm.portable.form import read_request, write_request, write_status
-from rosrm.portable.listening import Listener
+from rosrm_criu.control.listener import Listener
+from rosrm_criu.control.messages import read_request, write_request, write_status
 
 PATIENCE = 20.0
 

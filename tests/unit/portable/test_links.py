@@ -11,20 +11,20 @@ from pathlib import Path
 import pytest
 
 from rosrm.errors import PortableError
-from rosrm.portable import (
+from rosrm_criu.control import (
     Request,
     State,
     Status,
     Want,
     ask_resume,
-    control,
+    client,
     control_directory,
     make_directory,
     remove_directory,
     status_of,
 )
-from rosrm.portable.form import write_request, write_status
-from rosrm.portable.listening import Listener
+from rosrm_criu.control.listener import Listener
+from rosrm_criu.control.messages import write_request, write_status
 
 #: A user who owns nothing.
 NOBODY = 65534
@@ -51,7 +51,7 @@ def of_nobody(tmp_path, monkeypatch):
     """A control directory of another user, which is not made yet; root alone can make it."""
     if os.geteuid() != 0:
         pytest.skip("only root can give a directory to another user")
-    monkeypatch.setattr(control, "control_root", lambda uid: tmp_path / f"rosrm-{uid}" / "portable")
+    monkeypatch.setattr(client, "control_root", lambda uid: tmp_path / f"rosrm-{uid}" / "portable")
     return control_directory("c", NOBODY)
 
 

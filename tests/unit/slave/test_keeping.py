@@ -137,7 +137,7 @@ def net(tmp_path):
     return Net(tmp_path)
 
 
-def assignment(*kept_on: str, kept_from: int = 0, number: int = 9, **fields) -> Assignment:
+def assignment(*kept_on: str, kept_from: int = 1, number: int = 9, **fields) -> Assignment:
     spec = ProcessSpec("p", command=("x",), ros=True, migration=MigrationPolicy("handoff"))
     return Assignment(
         InstanceId("p", number), spec, 1, "p", kept_on=kept_on, kept_from=kept_from, **fields

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import hypothesis.strategies as st
 import pytest
@@ -16,7 +15,6 @@ from rosrm.errors import LaunchError
 from rosrm.model.values import (
     Assignment,
     InstanceId,
-    MigrationPolicy,
     ProcessSpec,
     RestartPolicy,
     StopPolicy,
@@ -24,6 +22,7 @@ from rosrm.model.values import (
 from rosrm.slave.launch.ament_index import find_executable
 from rosrm.slave.launch.command import launch_order
 from rosrm.slave.launch.environment import Whereabouts, process_environment, without_bootstrapper
+from rosrm.slave.launch.launchers import Launchers
 from rosrm.slave.launch.ros_arguments import join_arguments, parameters_text
 
 HERE = Whereabouts("robot1", "fleet", "/rosrm/state_config")
@@ -52,7 +51,7 @@ def order(tmp_path, environment=None, **fields):
         sys.executable,
         where=HERE,
         state_directory=tmp_path,
-        images=tmp_path,
+        launchers=Launchers(),
     )
 
 
@@ -87,15 +86,6 @@ def test_the_home_of_a_program_and_directory_is_that_of_the_slaves_user(tmp_path
     assert made.working_directory == "/home/robot/maps"
 
 
-@pytest.mark.parametrize("program", ["no-such-program", "/no/such/program"])
-def test_a_program_that_is_to_be_checkpointed_is_looked_for(tmp_path, program):
-    """The wrapper that is started in its place would fail on each host, one after the other."""
-    options = {"checkpoint_every": 10.0}
-    migration = MigrationPolicy("criu", options=options)
-    with pytest.raises(LaunchError, match=f"'{program}' (is not on the PATH|exists)"):
-        order(tmp_path, command=(program,), ros=True, migration=migration)
-
-
 def test_a_module_is_run_by_the_given_python(tmp_path):
     """`module` is `python -m`."""
     assert order(tmp_path, module="a.b", arguments=("x",)).argv == (
@@ -125,7 +115,7 @@ def test_a_ros_node_gets_its_name_namespace_and_remappings(tmp_path):
 def test_an_alias_names_the_node(tmp_path):
     """In a handoff the node's name is the assignment's, not the spec's."""
     made = launch_order(
-        shadow(), {}, "python3", where=HERE, state_directory=tmp_path, images=tmp_path
+        shadow(), {}, "python3", where=HERE, state_directory=tmp_path, launchers=Launchers()
     )
     assert "__node:=talker_1700000000" in made.argv
     (file,) = (tmp_path / "logs").glob("*.yaml")
@@ -135,11 +125,13 @@ def test_an_alias_names_the_node(tmp_path):
 def test_a_shadow_is_not_restarted(tmp_path):
     """Its end is final, whatever its spec says; what is no shadow follows its spec."""
     made = launch_order(
-        shadow(), {}, "python3", where=HERE, state_directory=tmp_path, images=tmp_path
+        shadow(), {}, "python3", where=HERE, state_directory=tmp_path, launchers=Launchers()
     )
     assert made.restart == RestartPolicy("never")
     plain = replace(shadow(), shadow=False)
-    made = launch_order(plain, {}, "python3", where=HERE, state_directory=tmp_path, images=tmp_path)
+    made = launch_order(
+        plain, {}, "python3", where=HERE, state_directory=tmp_path, launchers=Launchers()
+    )
     assert made.restart == RestartPolicy("always")
 
 
@@ -189,7 +181,7 @@ def test_packages_lie_in_the_prefix_of_python_too(tmp_path, prefix):
         str(prefix / "bin" / "python3"),
         where=HERE,
         state_directory=tmp_path,
-        images=tmp_path,
+        launchers=Launchers(),
     )
     assert made.argv[0] == str(prefix / "lib" / "demo_nodes" / "talker")
 
@@ -364,22 +356,6 @@ def test_a_node_is_told_by_which_name_it_is_known():
     assert made["ROSRM_EPOCH"] == "3"
     packaged = assignment(package="demo_nodes", executable="talker", namespace="/")
     assert process_environment(packaged, {}, HERE)["ROSRM_NODE"] == "/talker"
-
-
-def test_a_portable_node_is_told_where_it_is_asked_to_leave(tmp_path):
-    """Each instance has a directory of its own; others are told nothing.
-
-    Nor is it that of another cluster, not even of the same name.
-    """
-    where = replace(HERE, portable=tmp_path)
-    moves = {"migration": MigrationPolicy(strategy="criu"), "ros": True}
-    made = process_environment(assignment(command=("x",), **moves), {}, where)
-    for elsewhere in (replace(where, cluster="other"), replace(where, slave=7)):
-        other = process_environment(assignment(command=("x",), **moves), {}, elsewhere)
-        for told in (made, other):
-            assert Path(told["ROSRM_PORTABLE"]).parent == tmp_path
-        assert made["ROSRM_PORTABLE"] != other["ROSRM_PORTABLE"]
-    assert "ROSRM_PORTABLE" not in process_environment(assignment(command=("x",)), made, where)
 
 
 def test_who_the_slave_is_itself_is_not_handed_on():

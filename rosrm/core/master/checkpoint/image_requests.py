@@ -25,7 +25,7 @@ from rosrm.extensions.plugin_calls import implements
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.plan import Aim, Commit, Execute, Move
 from rosrm.model.values import InstanceId
-from rosrm.wording import standing
+from rosrm.wording import listed, standing
 
 #: Kinds of the records by which each begins.
 _BEGUN: Final = {
@@ -48,10 +48,7 @@ def begin_checkpoint(state: MasterState, process: Process, cause: str, now: floa
         return refusal
     owner, name = state.instances[process.owner], _strategy_of(state, process)
     if not name:
-        return (
-            f"nothing that is selected here can checkpoint {process.name}: name `criu` below "
-            f"`migration: strategies:` in the cluster's file, and start the master again"
-        )
+        return _why_no_strategy(state, process)
     refusal = capabilities.fault(state, name, owner.host, owner.host)
     if refusal:
         return f"{process.name} cannot be checkpointed: {refusal}"
@@ -72,10 +69,10 @@ def _why_no_checkpoint(state: MasterState, process: Process) -> str:
             f"{process.name} has a standby, which would take over: submit the process without "
             f"`standby` to checkpoint it"
         )
-    if process.spec.keeps_state:
+    if state.declared.has_snapshots(process.spec):
         return (
-            f"{process.name} moves by handoff: its node is identified by the number of its "
-            f"instance, and the restored instance would have another one"
+            f"{process.name} moves by {process.spec.migration.strategy}: its node is identified by "
+            f"the number of its instance, and the restored instance would have another one"
         )
     if process.instances - {process.owner}:
         return f"an earlier instance of {process.name} is still being stopped"
@@ -87,6 +84,15 @@ def _strategy_of(state: MasterState, process: Process) -> str:
     own = process.spec.migration.strategy or ""
     names = [*([own] if own in state.strategies else []), *state.strategies]
     return next((name for name in names if implements(state.strategies[name], Imaging)), "")
+
+
+def _why_no_strategy(state: MasterState, process: Process) -> str:
+    able = [f"`{name}`" for name, it in state.declared.capabilities.items() if it.state == "memory"]
+    remedy = f"name {listed(able, 'or')}" if able else "install a strategy that can, and name it"
+    return (
+        f"nothing that is selected here can checkpoint {process.name}: {remedy} below "
+        f"`migration: strategies:` in the cluster's file, and start the master again"
+    )
 
 
 # --- restore ----------------------------------------------------------------------------------

@@ -52,7 +52,7 @@ def review(state: MasterState, now: float) -> None:
             del known.of[number]
     if any(implements(one, PeriodicImaging) for one in state.strategies.values()):
         for process in state.processes.values():
-            if process.spec.checkpointed:
+            if state.declared.capabilities_of(process.spec).restart_from_image:
                 _review(state, process, now)
 
 

@@ -74,7 +74,7 @@ def awaits_states(state: MasterState, process: Process, now: float) -> bool:
     not come back since the master started, until they are lost; and, where nobody else is in reach
     who keeps its state, for a host that was lost beside its own, for one lease.
     """
-    if not process.spec.keeps_state:
+    if not state.declared.has_snapshots(process.spec):
         return False
     if (state.hosts.condition == HostCondition.EXPECTED).any():
         return True

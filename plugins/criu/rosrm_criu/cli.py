@@ -1,0 +1,158 @@
+"""`rosrm criu`: the program that dumps and restores processes, for the strategy `criu`."""
+
+# Each command imports what it needs when it runs, so that `rosrm --help` is quick.
+# ruff: noqa: PLC0415
+
+from __future__ import annotations
+
+import os
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from rosrm.cli.options import AsJson
+
+if TYPE_CHECKING:
+    from rosrm_criu.engine.binary import Criu
+    from rosrm_criu.engine.probe import Ability
+
+criu = typer.Typer(
+    no_args_is_help=True,
+    help="Install or check CRIU, which moves a process with its whole memory.",
+)
+
+Prefix = Annotated[
+    Path | None,
+    typer.Option(
+        "--prefix",
+        metavar="FOLDER",
+        help="Folder of CRIU; default: ROSRM_CRIU_PREFIX, or below the user's data.",
+    ),
+]
+
+
+@criu.callback()
+def _group() -> None:
+    """Install or check CRIU, which moves a process with its whole memory."""
+
+
+@criu.command()
+def install(
+    prefix: Prefix = None,
+    given: Annotated[
+        Path | None,
+        typer.Option(
+            "--from",
+            metavar="PATH",
+            help="Packages (*.deb) instead of a download: a file, or a folder of them.",
+        ),
+    ] = None,
+    mirror: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--mirror",
+            metavar="URL",
+            help="Archive of the distribution to download from; default: apt's sources.",
+        ),
+    ] = None,
+) -> None:
+    """Install a working CRIU into a folder of its own; the system stays unchanged.
+
+    Needs no root. Does nothing if a working CRIU is found.
+    """
+    from rosrm_criu.engine import install as installer
+    from rosrm_criu.engine.binary import PREFIX_VARIABLE, PROGRAM_VARIABLE, default_prefix
+    from rosrm_criu.engine.probe import probe
+
+    where = (prefix or default_prefix()).absolute()
+    if given is None:
+        found, able = _tried(where)
+        if found and able.works:
+            typer.echo(f"CRIU {found.version} works here: {found.command[0]}; nothing to install")
+            return
+    new = installer.install(where, _say, given=given, mirrors=mirror or ())
+    typer.echo(f"CRIU {new.version} is installed: {new.command[0]}")
+    if where != default_prefix():
+        typer.echo(f"rosrm finds it there with {PREFIX_VARIABLE}={where}")
+    if os.environ.get(PROGRAM_VARIABLE):
+        _note(f"{PROGRAM_VARIABLE} is set, so that rosrm uses that program instead")
+    able = probe(new)
+    if able.works:
+        typer.echo("it works: a process was dumped and restored")
+    else:
+        _note(f"it does not work yet: {able.reason}")
+
+
+@criu.command()
+def check(prefix: Prefix = None, as_json: AsJson = False) -> None:
+    """Dump and restore a process on this machine, and report what works.
+
+    The exit code is 0 only if it works, and images can be sent.
+    """
+    from rosrm.cli.output import json_forms
+    from rosrm_criu.engine.binary import default_prefix
+    from rosrm_criu.transfer import missing
+
+    found, able = _tried((prefix or default_prefix()).absolute())
+    lacking = missing()
+    if as_json:
+        program = found.command[0] if found else None
+        json_forms.show({"program": program, "no_transfer": lacking, **asdict(able)})
+    else:
+        sent = (not lacking, "to other hosts", lacking or "images can be sent and fetched")
+        for good, what, said in [*_lines(found, able), sent]:
+            typer.echo(f"{'ok' if good else 'NO':4}{what:18}{said}")
+    if lacking or not able.works:
+        raise typer.Exit(1)
+
+
+# --- inner parts ------------------------------------------------------------------------------
+
+
+def _tried(prefix: Path) -> tuple[Criu | None, Ability]:
+    """The CRIU to use here, if there is one, and what it can do."""
+    from rosrm.errors import CriuError
+    from rosrm_criu.engine.binary import find
+    from rosrm_criu.engine.probe import Ability, probe
+
+    try:
+        found = find(prefix)
+    except CriuError as error:
+        return None, Ability(False, str(error), {})
+    return found, probe(found)
+
+
+def _lines(found: Criu | None, able: Ability) -> list[tuple[bool, str, str]]:
+    """Line by line: whether it is well, what is looked at, what is said."""
+    if found is None:
+        return [(False, "program", able.reason)]
+    from rosrm_criu.engine.binary import OLDEST
+
+    facts = able.facts
+    whose = "every user" if facts["all_users"] == "yes" else f"the user {facts['uid']} alone"
+    enough = found.number >= OLDEST
+    wanted = "" if enough else f" ({'.'.join(map(str, OLDEST))} or newer is meant)"
+    said = "a process with a UDP socket was dumped, restored and went on" if able.works else ""
+    python = f"{facts['python']} ({facts['python_version']}), {facts['libc']}"
+    return [
+        (True, "program", found.command[0]),
+        (enough, "version", found.version + wanted),
+        (True, "processes", f"of {whose}"),
+        (able.works, "dump and restore", said or able.reason),
+        (True, "kernel", f"{facts['kernel']} on {facts['machine']}"),
+        (
+            True,
+            "same elsewhere",
+            f"Python {python}, {len(facts['cpu'].split())} processor features",
+        ),
+    ]
+
+
+def _say(step: str) -> None:
+    typer.echo(f"  {step}")
+
+
+def _note(text: str) -> None:
+    typer.echo(f"rosrm: note: {text}", err=True)

@@ -1,0 +1,202 @@
+"""The two files of a control directory: `request`, what a node is asked; `status`, how it stands.
+
+    RUNNING -> LEAVING -> LEFT -> JOINING -> RUNNING
+                  |                  |
+                  +-> (refused)      +-> FAILED
+                      RUNNING
+
+Each is one JSON object, at most 64 KiB, and is replaced as a whole. Standard library alone.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+from pathlib import Path
+from typing import Any, Final
+
+from rosrm.errors import PortableError
+from rosrm_criu.control.directory import opened
+
+#: Names the control directory in the environment of a process.
+VARIABLE: Final = "ROSRM_PORTABLE"
+
+#: Wakes a node that was asked something. A real-time signal: SIGUSR1 and SIGUSR2 belong to authors
+#: and their libraries (faulthandler, loggers). Its default is to end a process, so it goes only to
+#: one that catches it. The first real-time signals are debuggers' and libraries' favourites.
+SIGNAL: Final = int(signal.SIGRTMIN) + 5
+
+FORMAT: Final = 1
+_REQUEST: Final = "request"
+_STATUS: Final = "status"
+_LARGEST: Final = 1 << 16
+_NEW: Final = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+_PRESENT: Final = os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC
+
+
+class Want(Enum):
+    """What a node is asked for."""
+
+    LEAVE = "leave"
+    JOIN = "join"
+
+
+class State(Enum):
+    """Where a node stands."""
+
+    RUNNING = "running"
+    LEAVING = "leaving"
+    LEFT = "left"
+    JOINING = "joining"
+    FAILED = "failed"
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """What a node is asked.
+
+    Attributes:
+        id: of one absence: the same for leaving and for joining again, and never used anew.
+        want: of the two.
+    """
+
+    id: str
+    want: Want
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """How a node stands.
+
+    Attributes:
+        state: of its part in the ROS graph.
+        request: id of the newest request that it has taken up; "": none yet.
+        fault: why that was refused, or why it has failed; "": neither.
+        seconds: how long the steps of the last absence took: "leave"; "enter" the graph and see the
+            other ends again, with "entries", how many it took; "join", until its peers are found.
+        missing: peers that it had before it left, and did not find again in time.
+    """
+
+    state: State
+    request: str = ""
+    fault: str = ""
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    missing: tuple[str, ...] = ()
+
+
+def write_request(directory: Path, request: Request) -> None:
+    """Ask; raises `OSError`."""
+    _write(directory, _REQUEST, {"id": request.id, "want": request.want.value})
+
+
+def read_request(directory: Path) -> Request | None:
+    """What is asked; None: nothing.
+
+    Raises:
+        PortableError: what lies there is no request.
+    """
+    found = _read(directory, _REQUEST)
+    if found is None:
+        return None
+    try:
+        return Request(_text(found["id"]), Want(found["want"]))
+    except (KeyError, TypeError, ValueError) as error:
+        raise PortableError(f"{directory / _REQUEST} is no request: {error!r}") from None
+
+
+def edition_of_request(directory: Path) -> tuple[int, ...]:
+    """Another one for each request that is written; (): there is none. It opens no file."""
+    try:
+        found = os.lstat(directory / _REQUEST)
+    except OSError:
+        return ()
+    return (found.st_ino, found.st_mtime_ns, found.st_size)
+
+
+def write_status(directory: Path, status: Status) -> None:
+    """Say how a node stands; raises `OSError`."""
+    content = {
+        "state": status.state.value,
+        "request": status.request,
+        "fault": status.fault,
+        "seconds": dict(status.seconds),
+        "missing": list(status.missing),
+    }
+    _write(directory, _STATUS, content)
+
+
+def read_status(directory: Path) -> Status | None:
+    """How the node stands; None: there is none that says so.
+
+    Raises:
+        PortableError: what lies there is no status.
+    """
+    found = _read(directory, _STATUS)
+    if found is None:
+        return None
+    try:
+        seconds = {_text(name): float(value) for name, value in found["seconds"].items()}
+        return Status(
+            State(found["state"]), _text(found["request"]), _text(found["fault"]), seconds,
+            tuple(_text(one) for one in found["missing"]),
+        )  # fmt: skip
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise PortableError(f"{directory / _STATUS} is no status: {error!r}") from None
+
+
+def remove_status(directory: Path) -> None:
+    """No node stands here any more."""
+    _remove(directory, _STATUS)
+
+
+def remove_request(directory: Path) -> None:
+    """Nothing is asked."""
+    _remove(directory, _REQUEST)
+
+
+def _remove(directory: Path, name: str) -> None:
+    with contextlib.suppress(OSError), opened(directory) as place:
+        os.unlink(name, dir_fd=place)
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str):
+        raise TypeError(f"{value!r} is no text")
+    return value
+
+
+def _write(directory: Path, name: str, content: Mapping[str, Any]) -> None:
+    """Replace a file as a whole: who reads it finds the old one or the new one."""
+    beside = f".{name}.new"
+    with opened(directory) as place:
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(beside, dir_fd=place)  # whatever it was, it is not written through
+        with os.fdopen(os.open(beside, _NEW, 0o666, dir_fd=place), "w", encoding="utf-8") as file:
+            json.dump({"format": FORMAT, **content}, file)
+        os.replace(beside, name, src_dir_fd=place, dst_dir_fd=place)
+
+
+def _read(directory: Path, name: str) -> dict[str, Any] | None:
+    path = directory / name
+    try:
+        # Whatever somebody put there, it neither blocks nor fills the memory.
+        with opened(directory) as place:
+            descriptor = os.open(name, _PRESENT, dir_fd=place)
+        with os.fdopen(descriptor, "rb") as file:
+            data = file.read(_LARGEST + 1)
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except OSError as error:
+        raise PortableError(f"{path} cannot be read: {error.strerror}") from None
+    try:
+        found = json.loads(data)
+    except ValueError:
+        raise PortableError(f"{path} holds no JSON") from None
+    if not isinstance(found, dict) or found.get("format") != FORMAT:
+        raise PortableError(f"{path} is not of format {FORMAT}, which this rosrm speaks")
+    return found

@@ -1,0 +1,209 @@
+"""The program CRIU: where it is, and how it is run.
+
+Looked for in this order: the environment variable `ROSRM_CRIU` (a path), the private prefix that
+`rosrm criu install` fills, and PATH.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import shutil
+import signal
+import subprocess
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from rosrm.errors import CriuError
+from rosrm_criu.engine.log_reader import causes, first_words
+
+#: Names the program itself; nothing else is looked at then.
+PROGRAM_VARIABLE: Final = "ROSRM_CRIU"
+#: Names the private prefix.
+PREFIX_VARIABLE: Final = "ROSRM_CRIU_PREFIX"
+#: Below a prefix.
+PROGRAM: Final = "bin/criu"
+#: Older ones cannot dump a process with an internet socket, which every ROS node has.
+OLDEST: Final = (4, 2)
+
+#: Seconds for `criu --version`.
+_ANSWER: Final = 10.0
+_CAP_SYS_ADMIN: Final = 21  # linux/capability.h
+#: An ordinary user's PATH leaves out where Debian has it.
+_PLACES: Final = "/usr/local/sbin:/usr/sbin:/sbin"
+
+
+@dataclass(frozen=True)
+class Criu:
+    """A CRIU that starts; what it can do here is for `rosrm_criu.engine.probe` to say.
+
+    Args:
+        command: the program, and what has to stand before every argument.
+        version: as it says itself: "4.2.1".
+    """
+
+    command: tuple[str, ...]
+    version: str
+
+    @property
+    def number(self) -> tuple[int, ...]:
+        """The version, to compare it."""
+        return tuple(map(int, re.findall(r"\d+", self.version)))
+
+    def run(
+        self,
+        arguments: Sequence[str],
+        *,
+        timeout: float,
+        log: Path,
+        pass_fds: Sequence[int] = (),
+    ) -> None:
+        """Run CRIU and wait for its end; with `--unprivileged`, unless we may do all.
+
+        It has a session of its own: a Ctrl-C that is meant for us does not cut a dump in two.
+        A process whose dump is cut off goes on; but where CRIU was to kill it after the dump, it
+        may have done so by then.
+
+        Args:
+            arguments: the first one is what it shall do: `dump`, `restore`, ...
+            timeout: seconds; it is killed when they have passed.
+            log: its log, written anew; an absolute path.
+            pass_fds: open files that it gets under the same numbers.
+
+        Raises:
+            CriuError: it failed, with the lines of its log that say why; or its time passed.
+        """
+        unprivileged = () if may_do_all() else ("--unprivileged",)
+        log.unlink(missing_ok=True)  # an older one would be taken for the cause
+        words = [*self.command, *arguments, *unprivileged, "--log-file", str(log)]
+        with tempfile.TemporaryFile("w+", errors="replace") as said:
+            try:
+                process = subprocess.Popen(
+                    words,
+                    stdin=subprocess.DEVNULL,
+                    stdout=said,
+                    stderr=said,
+                    pass_fds=pass_fds,
+                    start_new_session=True,
+                )
+            except OSError as error:
+                raise CriuError(f"CRIU cannot be started: {words[0]}: {error.strerror}") from None
+            code = _end_of(process, timeout)
+            said.seek(0)
+            output = said.read()
+        if code == 0:
+            return
+        what = f"CRIU {self.version} could not {arguments[0]}"
+        if code is None:
+            why = f"it was not done after {timeout:g} s and was ended"
+        else:
+            why = _why(log, output) or f"it ended with code {code} and said nothing of the cause"
+        raise CriuError(f"{what}: {why} (its log: {log})")
+
+
+def find(prefix: Path | None = None) -> Criu:
+    """The CRIU to use here.
+
+    Args:
+        prefix: the private prefix, instead of the default one.
+
+    Raises:
+        CriuError: there is none that starts: where it was looked for, and what to do.
+    """
+    named = os.environ.get(PROGRAM_VARIABLE, "")
+    if named:
+        try:
+            return opened(Path(named))
+        except CriuError as error:
+            raise CriuError(
+                f"{PROGRAM_VARIABLE} names a CRIU that cannot be used: {error}"
+            ) from None
+    private = (default_prefix() if prefix is None else prefix) / PROGRAM
+    in_path = shutil.which("criu", path=f"{os.environ.get('PATH', '')}:{_PLACES}")
+    broken = []
+    for place in (private, Path(in_path) if in_path else None):
+        if place is not None and place.exists():
+            try:
+                return opened(place)
+            except CriuError as error:
+                broken.append(str(error))
+    looked = f"looked for: {PROGRAM_VARIABLE} (not set), {private}, `criu` in PATH"
+    raise CriuError("; ".join([*broken, f"there is no CRIU here ({looked})"]) + f". {REMEDY}")
+
+
+#: What to do where there is none.
+REMEDY: Final = "`rosrm criu install` brings one, without touching the system"
+
+
+def opened(program: Path) -> Criu:
+    """A program that is to be a CRIU; raises `CriuError` where it does not answer as one."""
+    try:
+        answer = subprocess.run(
+            [program, "--version"],
+            capture_output=True,
+            text=True,
+            errors="replace",
+            stdin=subprocess.DEVNULL,
+            timeout=_ANSWER,
+            check=False,
+        )
+    except OSError as error:
+        why = error.strerror
+        if isinstance(error, FileNotFoundError) and program.exists():
+            why = "the C library that it names is missing; if it was moved, install it anew"
+        raise CriuError(f"{program} cannot be started: {why}") from None
+    except subprocess.TimeoutExpired:
+        raise CriuError(f"{program} --version did not answer within {_ANSWER:g} s") from None
+    version = re.search(r"^Version:\s*v?(\d+(?:\.\d+)+)", answer.stdout, re.MULTILINE)
+    if answer.returncode != 0 or version is None:
+        said = (answer.stderr.strip() or answer.stdout.strip() or "nothing").splitlines()[-1]
+        raise CriuError(
+            f"{program} is no CRIU that works: `--version` ended with code {answer.returncode} "
+            f"and said {said!r}"
+        )
+    return Criu((str(program),), version[1])
+
+
+def may_do_all() -> bool:
+    """Whether this process has CAP_SYS_ADMIN: root does, but not in every container."""
+    status = Path("/proc/self/status").read_text(encoding="ascii", errors="replace")
+    effective = re.search(r"^CapEff:\s*([0-9a-f]+)", status, re.MULTILINE)
+    return effective is not None and bool(int(effective[1], 16) >> _CAP_SYS_ADMIN & 1)
+
+
+def default_prefix() -> Path:
+    """Where `rosrm criu install` puts it: below the user's data directory, or as it is told."""
+    told = os.environ.get(PREFIX_VARIABLE, "")
+    if told:
+        return Path(told).absolute()
+    data = os.environ.get("XDG_DATA_HOME", "")
+    below = Path(data) if data.startswith("/") else Path.home() / ".local/share"
+    return below / "rosrm/criu"
+
+
+def _end_of(process: subprocess.Popen[bytes], timeout: float) -> int | None:
+    """Its exit code; None where its time passed: then it and its children have been ended."""
+    code = None
+    try:
+        code = process.wait(timeout)
+    except subprocess.TimeoutExpired:
+        pass
+    finally:
+        if code is None:  # also where we are interrupted: nobody would wait for it
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+    return code
+
+
+def _why(log: Path, output: str) -> str:
+    """The cause, from the log, or from what it said before it had one."""
+    try:
+        written = log.read_text(errors="replace")
+    except OSError:
+        written = ""
+    return "; ".join(causes(written) or causes(output) or first_words(output))

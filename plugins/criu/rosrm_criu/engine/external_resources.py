@@ -1,0 +1,171 @@
+"""What ties a process to others outside of what is dumped: pipes, Unix sockets, a debugger.
+
+CRIU dumps most of them without a word; the restore fails, or the process finds nobody there.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import struct
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Final
+
+from rosrm.supervisor.procfs import everyone
+from rosrm_criu.engine.open_files import Descriptor, descriptors
+
+#: Of linux/netlink.h, linux/sock_diag.h and linux/unix_diag.h.
+_NETLINK_SOCK_DIAG: Final = 4
+_SOCK_DIAG_BY_FAMILY: Final = 20
+_REQUEST_ALL: Final = 0x301
+_SHOW_PEER: Final = 4
+_PEER: Final = 2
+_DONE: Final = 3
+_ERROR: Final = 2
+
+#: How Fast DDS names its files in shared memory.
+_OF_FAST_DDS: Final = "/dev/shm/fastrtps_"  # noqa: S108 - not a file of ours
+
+
+def outward(pids: Iterable[int]) -> str:
+    """What a process of the tree shares with one outside, in words; "" where there is nothing.
+
+    Args:
+        pids: all processes of the tree.
+    """
+    inside = list(pids)
+    for pid in inside:
+        holder = tracer(pid)
+        if holder:
+            return f"pid {pid} ({program(pid)}) is held by pid {holder} ({program(holder)})"
+    held = [one for one in descriptors(inside) if one.target.startswith(("pipe:", "socket:"))]
+    for one in _half_pipes(held):
+        other = _holder_outside(one.target, inside)
+        if other:
+            return f"{_named(one)} is a pipe that it shares with {other}"
+    peers = _unix_peers() if any(one.target.startswith("socket:") for one in held) else {}
+    own = {_inode(one) for one in held}
+    for one in held:
+        peer = peers.get(_inode(one)) if one.target.startswith("socket:") else None
+        if peer is not None and peer not in own:
+            other = _holder_outside(f"socket:[{peer}]", inside) or "a process outside"
+            return f"{_named(one)} is a Unix socket that is connected to {other}"
+    return ""
+
+
+def tracer(pid: int) -> int:
+    """Who follows it by ptrace, as a debugger does; 0: nobody."""
+    try:
+        lines = Path(f"/proc/{pid}/status").read_text(errors="replace").splitlines()
+    except OSError:
+        return 0
+    return next((int(line.split()[1]) for line in lines if line.startswith("TracerPid:")), 0)
+
+
+def shared_memory(pids: Iterable[int]) -> str:
+    """What of Fast DDS a tree shares with its peers in memory, in words; "" where there is nothing.
+
+    The peers of one that stands still, or has ended, clear that away.
+    """
+    for pid in pids:
+        try:
+            maps = Path(f"/proc/{pid}/maps").read_text(errors="replace")
+        except OSError:  # it has ended
+            continue
+        found = next((line for line in maps.splitlines() if _OF_FAST_DDS in line), "")
+        if found:
+            path = found.split(None, 5)[5]
+            return (
+                f"its ROS participant has shared memory ({path}), which its peers remove while it "
+                f"is frozen: set `FASTDDS_BUILTIN_TRANSPORTS: UDPv4` in its `environment`, "
+                f"or `transports: UDPv4` below `ros:` in the file of its host, and restart it"
+            )
+    return ""
+
+
+def _half_pipes(held: Iterable[Descriptor]) -> Iterator[Descriptor]:
+    """One end of each pipe whose other end is not among them."""
+    ends: dict[str, list[Descriptor]] = {}
+    for one in held:
+        if one.target.startswith("pipe:"):
+            ends.setdefault(one.target, []).append(one)
+    for found in ends.values():
+        if len({one.writes for one in found}) == 1:
+            yield found[0]
+
+
+def _holder_outside(target: str, inside: list[int]) -> str:
+    others = [stat.pid for stat in everyone() if stat.pid not in inside]
+    for one in descriptors(others):
+        if one.target == target:
+            return f"pid {one.pid} ({program(one.pid)})"
+    return ""
+
+
+def program(pid: int) -> str:
+    """The name of what a process runs."""
+    try:
+        return Path(f"/proc/{pid}/comm").read_text(errors="replace").strip()
+    except OSError:
+        return "ended"
+
+
+def _named(one: Descriptor) -> str:
+    return f"file descriptor {one.number} of pid {one.pid} ({program(one.pid)})"
+
+
+def _inode(one: Descriptor) -> int:
+    return int(one.target.partition("[")[2].rstrip("]"))
+
+
+def _unix_peers() -> Mapping[int, int]:
+    """For each connected Unix socket of this network, by inode, the one that it is connected to."""
+    request = struct.pack("=BBHIIIII", socket.AF_UNIX, 0, 0, 0xFFFFFFFF, 0, _SHOW_PEER, 0, 0)
+    header = struct.pack("=IHHII", 16 + len(request), _SOCK_DIAG_BY_FAMILY, _REQUEST_ALL, 0, 0)
+    peers: dict[int, int] = {}
+    try:
+        with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, _NETLINK_SOCK_DIAG) as kernel:
+            kernel.settimeout(5.0)
+            kernel.sendto(header + request, (0, 0))
+            while _read_peers(kernel.recv(1 << 17), peers):
+                pass
+    except OSError:  # a kernel that does not tell: CRIU could not dump any socket then
+        return {}
+    return peers
+
+
+def _read_peers(answer: bytes, peers: dict[int, int]) -> bool:
+    """Take one datagram of the kernel's; False: it was the last."""
+    offset = 0
+    while offset + 16 <= len(answer):
+        length, kind = struct.unpack_from("=IH", answer, offset)
+        if kind in (_DONE, _ERROR):
+            return False
+        inode = struct.unpack_from("=I", answer, offset + 20)[0]
+        position = offset + 32
+        while position + 4 <= offset + length:
+            size, name = struct.unpack_from("=HH", answer, position)
+            if name == _PEER:
+                peers[inode] = struct.unpack_from("=I", answer, position + 4)[0]
+            position += max(4, (size + 3) & ~3)
+        offset += (length + 3) & ~3
+    return True
+
+
+def odd_descriptors(pids: Iterable[int]) -> Iterator[tuple[Descriptor, str]]:
+    """Those that CRIU has most likely stumbled over, with what they are."""
+    for one in descriptors(pids):
+        if one.target.startswith("anon_inode:[io_uring]"):
+            yield one, "an io_uring"
+        elif one.target.startswith("/dev/") and _is_device(one):
+            yield one, f"the device {one.target}"
+
+
+def _is_device(one: Descriptor) -> bool:
+    """Not one of those of memory and chance (`/dev/null`), which are everywhere the same."""
+    try:
+        status = os.stat(f"/proc/{one.pid}/fd/{one.number}")  # noqa: PTH116 - a link into nothing
+    except OSError:
+        return False
+    return status.st_rdev != 0 and os.major(status.st_rdev) != 1

@@ -1,0 +1,332 @@
+"""An image: a directory with all that is needed to restore a process, readable by its owner alone.
+
+manifest.json     what it is (see `Manifest`); written last, so what has none is incomplete
+criu/             what CRIU wrote
+files/            copies of the files that follow the process
+dump.log          what CRIU said; restore.log likewise
+hold.json         how the restore went (see `rosrm_criu.engine.shim`)
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import zlib
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any, Final
+
+from rosrm.errors import CriuError
+
+#: What is written; another one is refused, but for the one before it.
+FORMAT: Final = 2
+#: Its manifest has neither checksums of the files nor one of its own.
+_WITHOUT_CHECKSUMS: Final = 1
+
+MANIFEST: Final = "manifest.json"
+PAGES: Final = "criu"
+COPIES: Final = "files"
+#: While it is restored: as `PAGES`, with the paths of this host.
+HERE: Final = f"{PAGES}.here"
+DUMP_LOG: Final = "dump.log"
+RESTORE_LOG: Final = "restore.log"
+
+#: Bytes that stay free on the file system of an image.
+_SPARE: Final = 16 << 20
+#: Bytes of a file that are in memory at a time for its checksum.
+_PIECE: Final = 1 << 20
+
+
+@dataclass(frozen=True)
+class HeldFile:
+    """A regular file that the process has open.
+
+    Args:
+        path: absolute, as the process knows it.
+        size: bytes, when it was dumped.
+        mode: its permissions.
+        grows: the process only appends to it, so it may have another size at the restore, and is
+            made anew where it is missing.
+        copy: its copy below the image, which is put back; "": it has to lie there.
+    """
+
+    path: str
+    size: int
+    mode: int
+    grows: bool
+    copy: str
+
+
+@dataclass(frozen=True)
+class MappedFile:
+    """A program, library or shared-memory file that the process has mapped.
+
+    Args:
+        path: absolute.
+        size: bytes.
+        mode: its permissions.
+    """
+
+    path: str
+    size: int
+    mode: int
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """What an image is, and what its restore needs.
+
+    Args:
+        process: name of the process.
+        instance: number of the instance that was dumped.
+        host: where, by its network name.
+        made_at: seconds since 1970.
+        criu: version that dumped it.
+        kernel: release of the kernel.
+        machine: "x86_64", ...
+        pid: of the root, in its own pid namespace.
+        ids: of all its processes and threads there.
+        logs: files that were its standard output and error.
+        working_directory: of the root.
+        shelter: where the supervisor runs those that name no working directory; "": not known.
+        interpreter: the program that the root runs.
+        files: that were open.
+        mapped: files that were mapped.
+        sizes: bytes of each file below the image but the manifest.
+        checksums: CRC-32 of each of them; empty: none were made.
+    """
+
+    process: str
+    instance: int
+    host: str
+    made_at: float
+    criu: str
+    kernel: str
+    machine: str
+    pid: int
+    ids: tuple[int, ...]
+    logs: tuple[str, ...]
+    working_directory: str
+    shelter: str
+    interpreter: str
+    files: tuple[HeldFile, ...] = ()
+    mapped: tuple[MappedFile, ...] = ()
+    sizes: Mapping[str, int] = field(default_factory=dict)
+    checksums: Mapping[str, int] = field(default_factory=dict)
+
+    @property
+    def size(self) -> int:
+        """Bytes of the image, without the manifest."""
+        return sum(self.sizes.values())
+
+
+def create(directory: Path) -> None:
+    """An empty image; raises CriuError where there is something already, or it cannot be made."""
+    try:
+        directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+        directory.chmod(0o700)
+        if any(directory.iterdir()):
+            raise CriuError(f"the image directory {directory} is not empty")
+        (directory / PAGES).mkdir(mode=0o700)
+    except OSError as error:
+        raise CriuError(f"no image can be made in {directory}: {error.strerror}") from None
+
+
+def check_room(directory: Path, needed: int) -> None:
+    """Raise CriuError where an image of so many bytes has no room."""
+    free = shutil.disk_usage(directory).free
+    if free < needed + _SPARE:
+        raise CriuError(
+            f"there is no room for the image in {directory}: it takes about {needed >> 20} MiB, "
+            f"{free >> 20} MiB are free (at least {_SPARE >> 20} MiB shall stay free)"
+        )
+
+
+def file_sizes(directory: Path) -> dict[str, int]:
+    """Bytes of each file that belongs to an image, by its path below it; makes them private."""
+    sizes = {}
+    for path in sorted(directory.rglob("*")):
+        name = path.relative_to(directory).as_posix()
+        if path.is_file() and name.startswith((f"{PAGES}/", f"{COPIES}/")):
+            path.chmod(0o600)
+            sizes[name] = path.stat().st_size
+    return sizes
+
+
+def file_checksums(directory: Path, names: Iterable[str]) -> dict[str, int]:
+    """CRC-32 of files of an image, by their paths below it; raises OSError."""
+    return {name: _checksum_of_file(directory / name) for name in names}
+
+
+def _checksum_of_file(path: Path) -> int:
+    checksum, piece = 0, memoryview(bytearray(_PIECE))
+    with path.open("rb", buffering=0) as file:
+        while count := file.readinto(piece):
+            checksum = zlib.crc32(piece[:count], checksum)
+    return checksum
+
+
+def write(directory: Path, manifest: Manifest) -> None:
+    """Write the manifest, which makes the image complete."""
+    values = asdict(manifest)
+    own = _checksum_of_values(values)
+    text = json.dumps({"format": FORMAT, "checksum": own, **values}, indent=1)
+    new = directory / f"{MANIFEST}.new"
+    new.touch(mode=0o600)
+    new.write_text(text, encoding="utf-8")
+    new.replace(directory / MANIFEST)
+
+
+def read(directory: Path) -> Manifest:
+    """The manifest of an image whose files are all there, at their sizes.
+
+    Raises:
+        CriuError: it is no image, is incomplete or damaged, or of another format.
+    """
+    try:
+        open_to_others = directory.stat().st_mode & 0o077
+        text = (directory / MANIFEST).read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise CriuError(f"{directory} holds no complete image: there is no {MANIFEST}") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise CriuError(f"{directory / MANIFEST} cannot be read: {error}") from None
+    if open_to_others:
+        raise CriuError(f"the image {directory} is open to others: its mode has to be 0700")
+    try:
+        values = json.loads(text)
+        written = values.pop("format", None)
+        known = written in (FORMAT, _WITHOUT_CHECKSUMS)
+        manifest = _manifest(_whole(values, written)) if known else None
+    except KeyError as error:
+        raise CriuError(f"the image {directory} is damaged: {MANIFEST}: no {error}") from None
+    except (ValueError, TypeError, AttributeError) as error:
+        raise CriuError(f"the image {directory} is damaged: {MANIFEST}: {error}") from None
+    if manifest is None:
+        raise CriuError(
+            f"the image {directory} has format {written!r}; this rosrm reads format {FORMAT}"
+        )
+    _check_files(directory, manifest)
+    return manifest
+
+
+def _check_files(directory: Path, manifest: Manifest) -> None:
+    for name, size in manifest.sizes.items():
+        try:
+            found = (directory / name).lstat().st_size
+        except OSError as error:
+            raise CriuError(
+                f"the image {directory} is damaged: {name}: {error.strerror}{_advice(manifest)}"
+            ) from None
+        if found != size:
+            raise CriuError(
+                f"the image {directory} is damaged: {name} has {found} bytes instead of {size}"
+                f"{_advice(manifest)}"
+            )
+
+
+def check_contents(directory: Path, manifest: Manifest) -> None:
+    """Compare each file with its checksum, where there are some; it reads the whole image.
+
+    Args:
+        directory: of the image.
+        manifest: as it was read.
+
+    Raises:
+        CriuError: which file has changed, or cannot be read.
+    """
+    for name, checksum in manifest.checksums.items():
+        try:
+            found = _checksum_of_file(directory / name)
+        except OSError as error:
+            raise CriuError(
+                f"the image {directory} is damaged: {name}: {error.strerror}{_advice(manifest)}"
+            ) from None
+        if found != checksum:
+            raise CriuError(
+                f"the image {directory} is damaged: {name} has changed since it was written "
+                f"(CRC-32 {found:08x} instead of {checksum:08x}){_advice(manifest)}"
+            )
+
+
+def _advice(manifest: Manifest) -> str:
+    """An image without checksums is one of a move: its process is still there."""
+    if not manifest.checksums:
+        return ""
+    return (
+        f". Its memory is lost: `rosrm restart {manifest.process or 'NAME'}` starts the process "
+        f"without it"
+    )
+
+
+def remove(directory: Path, *, logs: bool = True) -> None:
+    """Remove what an image is made of; the directory, and how its restore went, stay.
+
+    Args:
+        directory: of the image.
+        logs: CRIU's too.
+    """
+    for name in (MANIFEST, f"{MANIFEST}.new", *((DUMP_LOG, RESTORE_LOG) if logs else ())):
+        (directory / name).unlink(missing_ok=True)
+    for name in (PAGES, COPIES, HERE):
+        shutil.rmtree(directory / name, ignore_errors=True)
+
+
+# --- reading strictly ---------------------------------------------------------------------------
+
+_KINDS: Final[Mapping[str, type]] = {"str": str, "int": int, "float": float, "bool": bool}
+
+
+def _whole(values: dict[str, Any], written: int) -> dict[str, Any]:
+    """What a manifest says, if that is what was written; in the format before nothing tells."""
+    if written == _WITHOUT_CHECKSUMS:
+        return {**values, "checksums": {}}
+    own = values.pop("checksum")
+    if own != _checksum_of_values(values):
+        raise ValueError("it has changed since it was written")
+    return values
+
+
+def _checksum_of_values(values: dict[str, Any]) -> int:
+    """The same for what was read as for what was written."""
+    return zlib.crc32(json.dumps(values, sort_keys=True).encode())
+
+
+def _manifest(values: dict[str, Any]) -> Manifest:
+    values["ids"] = tuple(_all(int, values, "ids"))
+    values["logs"] = tuple(_all(str, values, "logs"))
+    values["files"] = tuple(_plain(HeldFile, one) for one in _all(dict, values, "files"))
+    values["mapped"] = tuple(_plain(MappedFile, one) for one in _all(dict, values, "mapped"))
+    sizes, checksums = _numbers(values, "sizes"), _numbers(values, "checksums")
+    manifest: Manifest = _plain(Manifest, values)
+    names = [*sizes, *checksums, *(one.copy for one in manifest.files)]
+    for name in names:
+        if name.startswith("/") or ".." in name.split("/"):
+            raise ValueError(f"{name!r} does not lie in the image")
+    return manifest
+
+
+def _all(kind: type, values: dict[str, Any], name: str) -> list[Any]:
+    found = values[name]
+    if not isinstance(found, list) or not all(type(one) is kind for one in found):
+        raise TypeError(f"{name}: not a list of {kind.__name__}")
+    return found
+
+
+def _numbers(values: dict[str, Any], name: str) -> dict[str, int]:
+    found = values[name]
+    if not isinstance(found, dict) or not all(type(one) is int for one in found.values()):
+        raise TypeError(f"{name}: not a number for each file")
+    return found
+
+
+def _plain(kind: type[Any], values: dict[str, Any]) -> Any:
+    """A dataclass from an object that has exactly its fields, each of its type."""
+    for one in fields(kind):
+        wanted = _KINDS.get(str(one.type))
+        found = values[one.name]
+        if wanted is float and type(found) is int:
+            continue
+        if wanted is not None and type(found) is not wanted:
+            raise TypeError(f"{one.name} is {found!r}, which is no {one.type}")
+    return kind(**values)

@@ -1,0 +1,352 @@
+"""Holds a restored process: the supervisor starts this program in place of the process.
+
+It is the instance's leader. It enters a new pid namespace, in which the ids of the image are free
+on every host, restores the image there, and from then on passes on: the signals that it gets to the
+restored process, and the end of that, exit code or signal, to the supervisor. Its own SIGKILL ends
+the namespace, and so every process of the instance, however these have daemonised.
+
+Who is who: the hold; its child, the init of the namespace, which runs CRIU and reaps; the restored
+process, a child of the init. Where no namespace may be entered (no CAP_SYS_ADMIN), the hold is the
+parent itself, the ids have to be free on the host, and a guard beside it does the kernel's part.
+
+Standard library only; it runs as `python -I -S shim.py FOLDER DIRECTORY` (see
+`restore_result.command`), where FOLDER is the one in which `rosrm` lies.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import ctypes
+import json
+import os
+import resource
+import select
+import signal
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, NoReturn
+
+if not __package__:
+    sys.path += [str(Path(__file__).resolve().parents[2]), sys.argv.pop(1)]
+
+from rosrm.errors import CriuError
+from rosrm.supervisor.procfs import INSTANCE_MARK, SUPERVISOR_MARK
+from rosrm_criu.engine import image, process_tree, restore, restore_result
+from rosrm_criu.engine.binary import Criu, opened
+from rosrm_criu.engine.image import Manifest
+from rosrm_criu.engine.restore_result import Outcome
+
+#: Exit code of a restore that failed.
+FAILED: Final = 125
+
+#: Of linux/sched.h, linux/mount.h and linux/prctl.h.
+_NEW_MOUNTS: Final = 0x00020000
+_NEW_PIDS: Final = 0x20000000
+_SLAVE: Final = 1 << 19
+_RECURSIVE: Final = 1 << 14
+_SET_PDEATHSIG: Final = 1
+_SET_CHILD_SUBREAPER: Final = 36
+
+#: What cannot be caught, tells of our own children, or is our own fault.
+_OWN: Final = {
+    signal.SIGKILL, signal.SIGSTOP, signal.SIGCHLD, signal.SIGSEGV, signal.SIGBUS, signal.SIGFPE,
+    signal.SIGILL, signal.SIGTRAP, signal.SIGSYS, signal.SIGABRT, signal.SIGPIPE, signal.SIGTTIN,
+    signal.SIGTTOU,
+}  # fmt: skip
+_PASSED_ON: Final = frozenset(set(signal.valid_signals()) - _OWN)
+
+_libc = ctypes.CDLL(None, use_errno=True)
+
+
+def main() -> None:
+    """Restore, hold, and end as the restored process ends."""
+    began = time.monotonic()
+    words, then = _split(sys.argv[1:])
+    options = _options(words)
+    directory = Path(options.directory).absolute()
+    if (then or options.remove) and _was_restored(directory):
+        if options.remove:
+            image.remove(directory)  # what a SIGKILL has left of it
+        _start_anew(directory, then)
+    # What comes while it is restored waits for it; SIGKILL alone does not.
+    signal.pthread_sigmask(signal.SIG_BLOCK, _PASSED_ON)
+    try:
+        manifest = image.read(directory)
+        here = restore.moved_here(manifest)
+        restore.check(here)
+        criu = opened(Path(options.criu))
+    except CriuError as error:
+        _fail(directory, str(error))
+    os.chdir("/")
+    task = _Restore(criu, directory, manifest, here, options.timeout, options.remove, began)
+    if not options.no_namespace and _libc.unshare(_NEW_PIDS) == 0:
+        _hold_namespace(task)
+    _hold_child(task)
+
+
+def _split(words: list[str]) -> tuple[list[str], list[str]]:
+    """Our own words, and behind the first "--" the command line of the process itself."""
+    end = words.index("--") if "--" in words else len(words)
+    return words[:end], words[end + 1 :]
+
+
+def _options(words: list[str]) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description="Restores a process and holds it.")
+    parser.add_argument("directory", help="of the image")
+    parser.add_argument("--criu", required=True, help="the program")
+    parser.add_argument("--timeout", type=float, default=120.0, help="seconds for the restore")
+    parser.add_argument("--remove", action="store_true", help="the image, once it is restored")
+    parser.add_argument("--no-namespace", action="store_true", help="where its pids are free")
+    return parser.parse_args(words)
+
+
+def _was_restored(directory: Path) -> bool:
+    """An earlier life of ours told so. That there is no image says nothing: others remove it."""
+    with contextlib.suppress(CriuError):
+        told = restore_result.read(directory)
+        return told is not None and not told.reason
+    return False
+
+
+def _start_anew(directory: Path, command: list[str]) -> NoReturn:
+    """Become the program itself: it was restored, has ended, and an image is for one life."""
+    if not command:
+        sys.stderr.write(f"not restored: the image {directory} was restored before\n")
+        sys.exit(FAILED)
+    for number in (signal.SIGPIPE, signal.SIGXFSZ, signal.SIGINT):  # Python's own ways
+        signal.signal(number, signal.SIG_DFL)
+    try:
+        os.execvp(command[0], command)  # noqa: S606 - as the supervisor would start it
+    except OSError as error:
+        sys.exit(f"{command[0]} cannot be started: {error.strerror}")
+
+
+@dataclass(frozen=True)
+class _Restore:
+    """One restore: what it needs, and what is told of it."""
+
+    criu: Criu
+    directory: Path
+    manifest: Manifest
+    here: Manifest
+    timeout: float
+    remove: bool
+    began: float
+
+    def run(self, marks: dict[str, str]) -> int:
+        """Restore here and now; returns the pid in this namespace, raises CriuError."""
+        restore.prepare(self.directory, self.here)
+        log = _reopened_log()
+        try:
+            pid = restore.restore(
+                self.criu, self.directory, self.manifest, self.here.shelter, log=log,
+                timeout=self.timeout,
+            )  # fmt: skip
+        finally:
+            os.close(log)
+        for member in process_tree.tree(pid):
+            restore.mark_anew(member, marks)
+        return pid
+
+    def tell(self, pid: int, *, namespace: bool) -> None:
+        """That it is done: first so that everybody knows, for ever, and then the image may go."""
+        seconds = round(time.monotonic() - self.began, 3)
+        told = Outcome(pid=pid, inner_pid=self.manifest.pid, namespace=namespace, seconds=seconds)
+        try:
+            restore_result.write(self.directory, told)
+            if self.remove:
+                image.remove(self.directory)
+        except OSError as error:  # the process lives; who waits for the word has a time-out
+            sys.stderr.write(f"restored, but {self.directory} cannot be written: {error}\n")
+
+
+def _reopened_log() -> int:
+    """Our standard output, opened by its path.
+
+    Only then does it belong to our mount namespace: the next dump could not tell its mount else.
+    """
+    with contextlib.suppress(OSError):
+        path = os.readlink("/proc/self/fd/1")  # noqa: PTH115 - it may be no path
+        return os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CLOEXEC)
+    return os.dup(1)
+
+
+def _fail(directory: Path, reason: str) -> NoReturn:
+    """Say why there is no process, in the log and to who waits."""
+    sys.stderr.write(f"not restored: {reason}\n")
+    with contextlib.suppress(OSError):
+        restore_result.write(directory, Outcome(reason=reason))
+    sys.exit(FAILED)
+
+
+# --- with a namespace ---------------------------------------------------------------------------
+
+
+def _hold_namespace(task: _Restore) -> NoReturn:
+    """The hold: our next child is the init of a pid namespace."""
+    living, end_of_life = os.pipe()
+    hearing, saying = os.pipe()
+    init = os.fork()
+    if init == 0:
+        os.close(end_of_life)
+        os.close(hearing)
+        _be_init(task, living, saying)
+    os.close(living)
+    os.close(saying)
+    with os.fdopen(hearing) as said:
+        first = json.loads(said.readline() or "{}")
+        if "restored" not in first:
+            os.waitpid(init, 0)
+            _fail(task.directory, first.get("failed", "the restore was killed"))
+        root = process_tree.children(init)[0]
+        os.write(end_of_life, b"seen")
+        task.tell(root, namespace=True)
+        _attend(root, init)
+        last = said.readline()
+    _end_as(int(last) if last else int(signal.SIGKILL))
+
+
+def _be_init(task: _Restore, living: int, saying: int) -> NoReturn:
+    """The init: restores, reaps whoever ends, and goes with the restored process."""
+    code = FAILED
+    try:
+        _libc.prctl(_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+        poll = select.poll()
+        poll.register(living, 0)
+        if poll.poll(0):  # the hold ended before it could take us along
+            os._exit(code)
+        with os.fdopen(saying, "w", buffering=1) as said:
+            try:
+                _own_mounts()
+                _skip_ids(task.manifest)
+                # Contained by the namespace: what it was elsewhere must not be taken for a mark.
+                root = task.run({INSTANCE_MARK: "", SUPERVISOR_MARK: ""})
+            except (CriuError, OSError) as error:
+                said.write(json.dumps({"failed": str(error)}) + "\n")
+                os._exit(code)
+            said.write(json.dumps({"restored": root}) + "\n")
+            os.read(living, 16)  # until the hold has seen it: it may end at once
+            said.write(f"{_reap_until(root)}\n")
+        code = 0
+    except Exception:  # noqa: BLE001 - a bug: it is told in the log, and the hold told of the end
+        sys.excepthook(*sys.exc_info())
+    finally:
+        sys.stderr.flush()
+        os._exit(code)
+
+
+def _own_mounts() -> None:
+    """A /proc that shows this namespace; what is mounted on the host later is seen here too."""
+    done = (
+        _libc.unshare(_NEW_MOUNTS) == 0
+        and _libc.mount(b"none", b"/", None, _RECURSIVE | _SLAVE, None) == 0
+        and _libc.mount(b"proc", b"/proc", b"proc", 0, None) == 0
+    )
+    if not done:
+        number = ctypes.get_errno()
+        raise CriuError(f"no /proc of its own could be mounted: {os.strerror(number)}")
+
+
+def _skip_ids(manifest: Manifest) -> None:
+    """CRIU's own processes must not take ids that it is to restore."""
+    most = int(Path("/proc/sys/kernel/pid_max").read_text())
+    behind = restore.id_for_criu(manifest.ids, most)
+    Path("/proc/sys/kernel/ns_last_pid").write_text(str(behind))
+
+
+# --- without a namespace ------------------------------------------------------------------------
+
+
+def _hold_child(task: _Restore) -> NoReturn:
+    """The restored process becomes a child of our own."""
+    _libc.prctl(_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+    own = {name: os.environ.get(name, "") for name in (INSTANCE_MARK, SUPERVISOR_MARK)}
+    try:
+        root = task.run(own)
+    except (CriuError, OSError) as error:
+        process_tree.send(
+            process_tree.tree(os.getpid())[1:], signal.SIGKILL
+        )  # what CRIU had begun with
+        _fail(task.directory, str(error))
+    guard, guarding = _start_guard(root)
+    task.tell(root, namespace=False)
+    status = _attend(root, root)
+    os.write(guarding, b"ended")
+    with contextlib.suppress(ChildProcessError):  # it was reaped already: somebody killed it
+        os.waitpid(guard, 0)
+    _end_as(status)
+
+
+def _start_guard(root: int) -> tuple[int, int]:
+    """Beside us, to end the restored process with us; its pid, and where it is told to go."""
+    living, end_of_life = os.pipe()
+    hearing, saying = os.pipe()
+    guard = os.fork()
+    if guard == 0:
+        os.setsid()  # a SIGKILL to our group shall not reach it
+        os.close(end_of_life)
+        os.close(saying)
+        if not os.read(living, 16):
+            process_tree.send(reversed(process_tree.tree(root)), signal.SIGKILL)
+        os._exit(0)
+    os.close(living)
+    os.close(saying)
+    os.read(hearing, 1)  # until it stands apart
+    os.close(hearing)
+    return guard, end_of_life
+
+
+# --- both ---------------------------------------------------------------------------------------
+
+
+def _attend(root: int, child: int) -> int:
+    """Pass on signals until our child has ended; returns its wait status.
+
+    Args:
+        root: the restored process; it leads a group, as everything that the supervisor starts.
+        child: whose end is awaited.
+    """
+    awaited = {*_PASSED_ON, signal.SIGCHLD}
+    signal.pthread_sigmask(signal.SIG_BLOCK, awaited)
+    while (status := _reap(child, os.WNOHANG)) is None:
+        number = signal.sigwaitinfo(awaited).si_signo
+        if number != signal.SIGCHLD:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(root, number)
+    return status
+
+
+def _reap_until(root: int) -> int:
+    status = None
+    while status is None:
+        status = _reap(root, 0)
+    return status
+
+
+def _reap(child: int, flags: int) -> int | None:
+    """Take the end of whoever has ended; the wait status, if that was the child."""
+    while True:
+        pid, status = os.waitpid(-1, flags)
+        if pid == child:
+            return status
+        if pid == 0:
+            return None
+
+
+def _end_as(status: int) -> NoReturn:
+    """As the restored process ended."""
+    number = os.WTERMSIG(status) if os.WIFSIGNALED(status) else 0
+    if number:
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # its core is not ours
+        if number != signal.SIGKILL:
+            signal.signal(number, signal.SIG_DFL)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {number})
+        os.kill(os.getpid(), number)
+    sys.exit(os.waitstatus_to_exitcode(status) if not number else 128 + number)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,100 @@
+"""Keeps the UDP ports of a process free while it waits in its image.
+
+Fast DDS takes the lowest ports that are free on a host, so the next participant there (a node, or a
+`rosrm` that asks for the restore) would take those of the process, and CRIU could not bind its
+sockets any more. What is reserved here is bound first, as Fast DDS binds it, and only then allows
+others beside it that say so themselves (SO_REUSEADDR): CRIU's sockets do, and multicast sockets.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import socket
+import struct
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from rosrm_criu.engine.open_files import descriptors
+
+_TABLES: Final = (("udp", socket.AF_INET), ("udp6", socket.AF_INET6))
+
+
+class Port(NamedTuple):
+    """Where a UDP socket is bound.
+
+    Attributes:
+        family: AF_INET or AF_INET6.
+        address: "0.0.0.0", ...
+        port: its number.
+    """
+
+    family: int
+    address: str
+    port: int
+
+
+def bound(pids: Iterable[int]) -> list[Port]:
+    """What the UDP sockets of some processes are bound to."""
+    found: set[Port] = set()
+    for pid in pids:
+        own = {one.target for one in descriptors([pid]) if one.target.startswith("socket:")}
+        for name, family in _TABLES:
+            found.update(port for inode, port in _table(pid, name, family) if inode in own)
+    return sorted(found)
+
+
+def _table(pid: int, name: str, family: int) -> Iterator[tuple[str, Port]]:
+    """Each socket in the network of a process, as /proc names it in its descriptors."""
+    try:
+        lines = Path(f"/proc/{pid}/net/{name}").read_text().splitlines()[1:]
+    except OSError:  # it has ended, or the kernel has no IPv6
+        return
+    for line in lines:
+        words = line.split()
+        address, port = words[1].split(":")
+        yield f"socket:[{words[9]}]", Port(family, _address(address, family), int(port, 16))
+
+
+def _address(text: str, family: int) -> str:
+    """An address from the kernel's words, each in the byte order of this machine."""
+    words = [int(text[at : at + 8], 16) for at in range(0, len(text), 8)]
+    return socket.inet_ntop(family, struct.pack(f"={len(words)}I", *words))
+
+
+def write(path: Path, ports: Iterable[Port]) -> None:
+    """Remember them."""
+    path.write_text(json.dumps([list(one) for one in ports]), encoding="utf-8")
+
+
+def read(path: Path) -> list[Port]:
+    """What was remembered; nothing where that cannot be read."""
+    with contextlib.suppress(OSError, ValueError, TypeError):
+        return [Port(*one) for one in json.loads(path.read_text(encoding="utf-8"))]
+    return []
+
+
+def reserve(ports: Iterable[Port]) -> list[socket.socket]:
+    """Sockets that keep these ports until they are closed; none for a port that is in use."""
+    held = []
+    for one in ports:
+        try:
+            held.append(_reserved(one))
+        except OSError:  # shared with others, or taken meanwhile: the restore will tell
+            continue
+    return held
+
+
+def _reserved(port: Port) -> socket.socket:
+    one = socket.socket(port.family, socket.SOCK_DGRAM)
+    try:
+        if port.family == socket.AF_INET6:
+            one.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
+        one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 0)  # nobody reads what comes
+        one.bind((port.address, port.port))
+        one.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    except OSError:
+        one.close()
+        raise
+    return one

@@ -1,0 +1,1 @@
+"""What slaves do in the plans of `criu`: each function is an executor."""

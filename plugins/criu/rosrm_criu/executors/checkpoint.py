@@ -1,0 +1,197 @@
+"""What a slave does for checkpoints and restores by `criu`: each function is an executor.
+
+Every one may be asked for twice, as those of `move`. The image of a checkpoint lies apart
+from those of moves. What a restore uses up is a second name of it (hard links): until the process
+is there again, whatever fails on the way leaves the image as it was.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import signal
+import socket
+import threading
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from rosrm.errors import CriuError
+from rosrm_criu.engine import dump, external_resources, image, process_tree, udp_ports
+from rosrm_criu.engine.binary import find
+from rosrm_criu.engine.paths import incoming, kept, kept_numbers, ports_of_kept
+from rosrm_criu.executors import artifacts
+from rosrm_criu.executors.request import Asked, check_wanted, turn_back, without_log_names
+from rosrm_criu.plans import KEEP, TAKE
+
+#: Sockets that keep the ports of processes that wait in their images, by the instance's number.
+_reserved: Final[dict[int, list[socket.socket]]] = {}
+_changing: Final = threading.Lock()
+#: Seconds between two looks at what nothing tells of.
+_LOOK: Final = 0.005
+
+
+# --- checkpoint -------------------------------------------------------------------------------
+
+
+def keep(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Dump the process into an image; it stands still from then on."""
+    asked = Asked.of(arguments)
+    return artifacts.once(KEEP, asked.attempt, lambda: _keep(asked))
+
+
+def _keep(asked: Asked) -> Mapping[str, Any]:
+    with artifacts.alone(asked.source, asked.timeout):
+        return _keep_alone(asked)
+
+
+def _keep_alone(asked: Asked) -> Mapping[str, Any]:
+    pid = asked.leader(asked.source)
+    root = process_tree.root_of(pid)
+    if process_tree.is_stopped(root):  # by an earlier asking, whose slave was killed
+        dump.resume(pid)
+    pids = process_tree.tree(root)
+    trouble = external_resources.shared_memory(pids)
+    if trouble:
+        raise CriuError(f"{asked.process} cannot be checkpointed: {trouble}")
+    directory, began = kept(asked.state, asked.source), time.monotonic()
+    artifacts.discard(directory)
+    check_wanted(asked.attempt)
+    try:
+        with without_log_names():
+            manifest = dump.dump(
+                find(), pid, directory, leave="stopped", timeout=asked.timeout,
+                process=asked.process, instance=asked.source,
+            )  # fmt: skip
+        udp_ports.write(ports_of_kept(asked.state, asked.source), udp_ports.bound(pids))
+    except BaseException:  # whatever it was, the process goes on and nothing is left behind
+        _discard(asked.state, asked.source)
+        dump.resume(pid)
+        raise
+    return {"size": manifest.size, "seconds": {"dump": time.monotonic() - began}}
+
+
+def run_on(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The checkpoint has failed: the process goes on, unless it has ended."""
+    asked = Asked.of(arguments)
+    turn_back(asked.attempt)
+    artifacts.after(KEEP, asked.attempt, asked.timeout)
+    _discard(asked.state, asked.source)
+    pid = asked.pid(asked.source)
+    if pid:
+        dump.resume(pid)
+    return {}
+
+
+def kill(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The image owns the name: the process ends at once, and its ports are kept for it."""
+    asked = Asked.of(arguments)
+    pid = asked.pid(asked.source)
+    if pid:
+        members = process_tree.tree(process_tree.root_of(pid))
+        dump.kill(pid)
+        deadline = time.monotonic() + asked.timeout
+        while not all(map(process_tree.is_gone, members)):
+            if time.monotonic() > deadline:
+                raise CriuError(f"{asked.process}#{asked.source} does not end")
+            time.sleep(_LOOK)
+    _reserve(asked.state, asked.source)
+    return {}
+
+
+# --- restore ----------------------------------------------------------------------------------
+
+
+def take(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Lay the image out for the start that follows."""
+    asked = Asked.of(arguments)
+    if asked.pid(asked.destination):
+        return {"taken": True}  # by an earlier asking: it is being restored
+    if artifacts.was_restored(incoming(asked.state, asked.destination)):
+        return {"taken": True}  # likewise, and it has ended since: an image is for one life
+    source, target = kept(asked.state, asked.source), incoming(asked.state, asked.destination)
+    image.read(source)
+    artifacts.discard(target)
+    artifacts.forget_restored(asked.state, asked.instances)
+    try:
+        target.mkdir(mode=0o700)
+        shutil.copytree(source, target, copy_function=_link, dirs_exist_ok=True)
+        artifacts.note_origin(target, asked.source)
+    except (OSError, shutil.Error) as error:
+        artifacts.discard(target)
+        raise CriuError(f"the image {source} cannot be laid out as {target}: {error}") from None
+    return {"taken": True}
+
+
+def _link(source: str, target: str) -> None:
+    try:
+        os.link(source, target)
+    except OSError:  # a file system without
+        shutil.copy2(source, target)
+
+
+def await_kept(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Wait until the image is a process again; it is used up then."""
+    asked = Asked.of(arguments)
+    found = artifacts.await_restored(asked)
+    _discard(asked.state, asked.source)
+    return {"seconds": {"restore": found.seconds}}
+
+
+def put_back(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The restore is to be undone: the image is as it was, unless the process is there again.
+
+    A restore under way is waited for: it is not ended while it may succeed.
+    """
+    asked = Asked.of(arguments)
+    directory = incoming(asked.state, asked.destination)
+    if not directory.exists():
+        gone = not kept(asked.state, asked.source).exists()
+        return {"active": True} if gone and TAKE in asked.results else {}
+    pid = asked.pid(asked.destination)
+    try:
+        artifacts.await_restored(asked)
+    except CriuError:
+        if asked.pid(asked.destination):
+            process_tree.send([pid], signal.SIGKILL)  # the shim, and so what it holds
+            raise
+        artifacts.discard(directory)
+        return {}
+    _discard(asked.state, asked.source)
+    return {"active": True}
+
+
+# --- both -------------------------------------------------------------------------------------
+
+
+def drop(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Nobody wants the image any more."""
+    state = Path(arguments["here"]["state"])
+    for number in map(int, arguments["numbers"]):
+        _discard(state, number)
+        artifacts.discard(incoming(state, number))
+    return {}
+
+
+def reserve_all(state: Path) -> None:
+    """A slave has come up: the ports of what waits in images here are kept again."""
+    for number in kept_numbers(state):
+        _reserve(state, number)
+
+
+def _reserve(state: Path, number: int) -> None:
+    with _changing:
+        if number not in _reserved:
+            _reserved[number] = udp_ports.reserve(udp_ports.read(ports_of_kept(state, number)))
+
+
+def _discard(state: Path, number: int) -> None:
+    """Nothing is left of an image, and its ports are anybody's."""
+    artifacts.discard(kept(state, number))
+    with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+        ports_of_kept(state, number).unlink()
+    with _changing:
+        for one in _reserved.pop(number, ()):
+            one.close()

@@ -1,0 +1,234 @@
+"""What the slaves do for `criu`: each function is an executor, given JSON and answering with it.
+
+Every one may be asked for twice: a master that was killed gives the step in hand once more, and so
+does one whose slave was started again. `artifacts` has what is kept from one to the next.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+from rosrm.errors import CriuError, PortableError
+from rosrm_criu.control import (
+    State,
+    Status,
+    ask_resume,
+    await_joined,
+    control_directory,
+    make_directory,
+    remove_directory,
+    status_of,
+)
+from rosrm_criu.engine import dump, process_tree
+from rosrm_criu.engine.binary import find
+from rosrm_criu.engine.paths import incoming, outgoing
+from rosrm_criu.engine.probe import ability
+from rosrm_criu.executors import artifacts, periodic
+from rosrm_criu.executors.artifacts import Answer
+from rosrm_criu.executors.checkpoint import reserve_all
+from rosrm_criu.executors.freeze import call_back, control_of, has_failed, leave, owner_of
+from rosrm_criu.executors.request import Asked, check_wanted, turn_back, without_log_names
+from rosrm_criu.plans import CHECKPOINT, FETCH, INTRODUCE
+from rosrm_criu.transfer import Offer, Sender, missing
+
+
+def say_ability(arguments: Answer) -> Answer:
+    """Whether CRIU works here, and what an image of this host needs elsewhere.
+
+    A slave is asked for it when it has registered: what one before it has left, goes.
+    """
+    here = arguments["here"]
+    state = Path(here["state"])
+    artifacts.sweep(state, here["instances"])
+    periodic.sweep(arguments)
+    periodic.call_back_all(state, here["pids"])
+    reserve_all(state)
+    found = ability()
+    if not found.works:
+        raise CriuError(found.reason)
+    return {**found.facts, "host": arguments["here"]["host"], "no_transfer": missing()}
+
+
+# --- the source -------------------------------------------------------------------------------
+
+
+def checkpoint(arguments: Answer) -> Answer:
+    """Have the node leave the ROS graph, dump it, and offer the image.
+
+    It stands still from then on; whatever fails, it is asked to go on.
+    """
+    asked = Asked.of(arguments)
+    return artifacts.once(CHECKPOINT, asked.attempt, lambda: _checkpoint(asked))
+
+
+def _checkpoint(asked: Asked) -> Answer:
+    with artifacts.alone(asked.source, asked.timeout):
+        return _checkpoint_alone(asked)
+
+
+def _checkpoint_alone(asked: Asked) -> Answer:
+    pid = asked.leader(asked.source)
+    control = control_of(pid)
+    try:
+        sender = artifacts.open_sender(asked.source)
+        began = time.monotonic()
+        left = leave(pid, control, asked.attempt, float(asked.arguments["seconds"]["leave"]))
+        dumped = time.monotonic()
+        directory = _dump(pid, asked)
+        offered = time.monotonic()
+        offer = _offer(sender, directory, asked)
+    except Exception:  # whatever it was, the node comes back
+        artifacts.withdraw(asked.state, asked.source)
+        call_back(pid, control, asked.attempt)
+        raise
+    return {
+        "offer": offer.as_json(), "control": str(control), "uid": owner_of(pid), "size": offer.size,
+        "seconds": {
+            "prepare": dumped - began, "leave": left, "dump": offered - dumped,
+            "offer": time.monotonic() - offered,
+        },
+    }  # fmt: skip
+
+
+def go_on(arguments: Answer) -> Answer:
+    """The move has failed: the node goes on where it stands still.
+
+    One that has ended meanwhile does not: its restart policy says what follows.
+    """
+    asked = Asked.of(arguments)
+    turn_back(asked.attempt)
+    artifacts.after(CHECKPOINT, asked.attempt, asked.timeout)
+    artifacts.withdraw(asked.state, asked.source)
+    pid = asked.pid(asked.source)
+    if not pid:
+        return {"fault": "it has ended"}
+    try:
+        control = control_of(pid)
+    except CriuError:  # for the same reason it was never asked to leave
+        dump.resume(pid)
+        return {}
+    before = status_of(control)
+    if not call_back(pid, control, asked.attempt) or (before and before.state is State.RUNNING):
+        return {}  # it had not left: what it does just now, it does to its end
+    status = await_joined(control, asked.attempt, asked.timeout, process_tree.root_of(pid))
+    return {"missing": list(status.missing)}
+
+
+def end(arguments: Answer) -> Answer:
+    """The destination owns the name: what is left of the source goes."""
+    asked = Asked.of(arguments)
+    artifacts.withdraw(asked.state, asked.source)
+    pid = asked.pid(asked.source)
+    if pid:
+        control = control_of(pid)
+        status = status_of(control)
+        dump.kill(pid)
+        # Where both hosts share it, it says by now that the node runs.
+        if status is not None and status.state is State.LEFT:
+            remove_directory(control)
+    return {}
+
+
+def _dump(pid: int, asked: Asked) -> Path:
+    directory = outgoing(asked.state, asked.source)
+    artifacts.discard(directory)
+    check_wanted(asked.attempt)
+    with without_log_names():
+        dump.dump(
+            find(), pid, directory, leave="stopped",
+            timeout=float(asked.arguments["seconds"]["dump"]),
+            process=asked.process, instance=asked.source, checksums=False,
+        )  # fmt: skip
+    return directory
+
+
+def _offer(sender: Sender, directory: Path, asked: Asked) -> Offer:
+    seconds = float(asked.arguments["seconds"]["offer"])
+    check_wanted(asked.attempt)
+    offer = sender.offer(
+        directory, seconds=seconds, max_rate=float(asked.arguments["max_rate"]),
+        to=str(asked.results[INTRODUCE]["certificate"]),
+    )  # fmt: skip
+    artifacts.remove_when_over(asked.state, asked.source, sender, seconds)
+    return offer
+
+
+# --- the destination --------------------------------------------------------------------------
+
+
+def introduce(arguments: Answer) -> Answer:
+    """Be ready for the image, before anything stands still; say who alone may fetch it."""
+    asked = Asked.of(arguments)
+    named = arguments.get("working_directory")
+    if named and not Path(named).expanduser().is_dir():
+        raise CriuError(f"its working directory {named} does not exist on {asked.host}: make it")
+    certificate = artifacts.open_fetcher(asked.destination, float(arguments["keep"]))
+    return {"certificate": certificate}
+
+
+def fetch_image(arguments: Answer) -> Answer:
+    """Bring the image here, for the start that follows."""
+    asked = Asked.of(arguments)
+    return artifacts.once(FETCH, asked.attempt, lambda: _fetch(asked))
+
+
+def _fetch(asked: Asked) -> Answer:
+    told = asked.results[CHECKPOINT]
+    uid, control = int(told["uid"]), Path(told["control"])
+    if control != control_directory(control.name, uid):
+        raise PortableError(f"{control} is no control directory of user {uid}")
+    directory = incoming(asked.state, asked.destination)
+    artifacts.discard(directory)
+    artifacts.forget_restored(asked.state, asked.instances)
+    fetcher = artifacts.take_fetcher(asked.destination)
+    if fetcher is None:
+        raise CriuError(
+            f"the slave of {asked.host} was started again in the midst of the move, or that took "
+            f"too long, and the image is for the former end alone: ask for the move again"
+        )
+    try:
+        fetched = fetcher.fetch(
+            Offer.from_json(told["offer"]), directory, timeout=asked.timeout,
+            reserve=int(asked.arguments["reserve"]),
+        )  # fmt: skip
+    finally:
+        artifacts.close_soon(fetcher)
+        artifacts.remove_unused_later(directory, float(asked.arguments["keep"]))
+    make_directory(control, uid)
+    return {"seconds": {"transfer": fetched.seconds}, "received": fetched.received}
+
+
+def await_restored(arguments: Answer) -> Answer:
+    """Wait until the image is a process again; there is nothing left of one that cannot be."""
+    asked = Asked.of(arguments)
+    try:
+        found = artifacts.await_restored(asked)
+    except CriuError:
+        artifacts.remove_unused(incoming(asked.state, asked.destination))
+        raise
+    return {"seconds": {"restore": found.seconds}}
+
+
+def join(arguments: Answer) -> Answer:
+    """Have the node join the ROS graph here; one that never can is ended: its policy goes on."""
+    asked = Asked.of(arguments)
+    pid = asked.pid(asked.destination)
+    root, began = process_tree.root_of(pid), time.monotonic()
+    try:
+        control = control_of(pid)
+        ask_resume(control, root, asked.attempt)
+        status = await_joined(control, asked.attempt, asked.timeout, root)
+    except (CriuError, PortableError) as error:
+        if not (process_tree.is_alive(root) and process_tree.is_alive(pid)):
+            return {"fault": "it has ended"}
+        if not has_failed(control_of(pid)):
+            raise
+        dump.kill(pid)
+        return {"fault": str(error)}
+    return {"seconds": _of_joining(status, began), "missing": list(status.missing)}
+
+
+def _of_joining(status: Status, began: float) -> dict[str, float]:
+    own = {f"node_{name}": value for name, value in status.seconds.items()}
+    return {"join": time.monotonic() - began, **own}

@@ -1,0 +1,119 @@
+"""CRIU's launcher: starts portable nodes, and what is restored from an image.
+
+A portable node is told in which directory it is asked to leave the ROS graph. What has an image, or
+will have one, is started by a program that restores the process and stays its parent.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+from rosrm import InstanceId, Launch, LauncherContext, ProcessSpec, options_of
+from rosrm.errors import CriuError, LaunchError, PortableError
+from rosrm.ros.names import token
+from rosrm.supervisor.spawn import SpawnError, find_executable
+from rosrm_criu.control import VARIABLE, State, control_root, directory_of, status_of
+from rosrm_criu.engine import paths, process_tree, restart_from_image, restore_result, slots
+from rosrm_criu.engine.binary import find
+from rosrm_criu.options import NAME, CriuOptions, OwnCriuOptions
+
+#: Seconds for a restore, at most: the master gives up sooner.
+_RESTORE: Final = 600.0
+
+
+class CriuLauncher:
+    """Implements the contract of a launcher and all optional ones."""
+
+    def __init__(self, context: LauncherContext) -> None:
+        self._state, self._python, self._slave = context.state, context.python, context.slave
+
+    def prepare(self, launch: Launch) -> Launch | None:
+        """Name the control directory of a portable node, and restore what has an image."""
+        spec, instance = launch.assignment.spec, launch.assignment.instance
+        restored, portable = launch.assignment.restored, _is_portable(spec)
+        incoming = paths.incoming(self._state, instance.number)
+        if restored and not portable and not incoming.exists():
+            return None
+        environment, argv = dict(launch.environment), launch.argv
+        if portable and VARIABLE not in spec.environment:
+            # Of another cluster of the same name, which may share that directory, it differs.
+            own = token(f"{instance} {launch.cluster} {self._slave:x}")
+            environment[VARIABLE] = str(control_root(os.geteuid()) / own)
+        again_from_image = _is_periodic(spec)
+        if again_from_image:  # else the program that restores it would start, and then fail
+            _check_program(argv[0], environment)
+        if again_from_image or restored:
+            criu = self._criu(instance, restored)
+            if criu is None:
+                return replace(launch, environment=environment)
+            if again_from_image:
+                images = paths.periodic(self._state, instance.number)
+                argv = restart_from_image.command(
+                    self._python, images, argv, criu=criu, timeout=_RESTORE
+                )
+            if restored:
+                argv = restore_result.command(
+                    self._python, incoming, criu=criu, remove=True, timeout=_RESTORE, then=argv
+                )
+        return replace(launch, argv=argv, environment=environment)
+
+    @staticmethod
+    def _criu(instance: InstanceId, restored: bool) -> Path | None:
+        """Return the program; None: there is none, and the instance starts without it."""
+        try:
+            return Path(find().command[-1])
+        except CriuError as error:
+            if not restored:
+                return None
+            raise LaunchError(f"{instance} cannot be restored: {error}") from None
+
+    def discard_images(self, instance: InstanceId) -> None:
+        """Have the next start be from no periodic image."""
+        slots.begin_anew(paths.periodic(self._state, instance.number))
+
+    def leads(self, leader: int) -> bool | None:
+        """Return True if it holds a restored process."""
+        return process_tree.leads(leader)
+
+    def members(self, leader: int) -> Sequence[int]:
+        """Return the holding program and all that descends from it."""
+        return process_tree.tree(leader)
+
+    def root(self, leader: int) -> int:
+        """Return the restored process; while it is being restored, CRIU."""
+        return process_tree.root_of(leader)
+
+    def has_departed(self, leader: int) -> bool:
+        """Return True while the node is out of the graph for a move or a checkpoint."""
+        try:
+            control = directory_of(process_tree.root_of(leader))
+            status = None if control is None else status_of(control)
+        except (OSError, PortableError):  # it has ended, or cannot be read: judge it as any other
+            return False
+        return status is not None and status.state in (State.LEAVING, State.LEFT, State.JOINING)
+
+
+def _is_portable(spec: ProcessSpec) -> bool:
+    """Return True if its node is asked to leave the ROS graph before its memory is dumped."""
+    return spec.ros_node and spec.migration.strategy == NAME
+
+
+def _is_periodic(spec: ProcessSpec) -> bool:
+    """Return True if a process asks for periodic checkpoints."""
+    if not _is_portable(spec):
+        return False
+    return options_of(spec, CriuOptions(), OwnCriuOptions).checkpoint_every > 0.0
+
+
+def _check_program(word: str, environment: dict[str, str]) -> None:
+    """Raise `LaunchError` if a command's program is missing on this host."""
+    try:
+        path = find_executable(word, environment)
+    except SpawnError as error:
+        raise LaunchError(str(error)) from None
+    if path.startswith("/") and not os.access(path, os.X_OK):
+        raise LaunchError(f"no executable {path!r} exists")

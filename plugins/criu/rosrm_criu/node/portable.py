@@ -1,0 +1,144 @@
+"""`PortableNode`: a node that can leave the ROS graph and join it again, with its memory as it was.
+
+Between the two the process may be dumped by CRIU and restored on another host.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterator
+from typing import Any, Final
+
+import rclpy.node
+from rclpy.event_handler import EventHandler
+
+from rosrm.ros.fast_dds import announcing
+from rosrm.ros.graph_remains import close_leaked, open_sockets
+from rosrm_criu.control import VARIABLE
+from rosrm_criu.node.graph_departure import Absence, absence_of, await_peers, await_readers
+
+#: Seconds in which what was published arrives at its readers, before the node leaves.
+_READERS: Final = 0.5
+
+
+class PortableNode(rclpy.node.Node):  # type: ignore[misc]  # rclpy brings no types
+    """rclpy's `Node`, whose part in the ROS graph can be made anew: run it with `run_portable`.
+
+    What it keeps in its attributes stays through a move. What it has of ROS is made in `join`, and
+    nowhere else, as it is gone after a move: publishers, subscriptions, timers, services, clients,
+    callbacks for parameters. Parameters keep their values, whoever set them.
+
+    Args:
+        arguments, named: as rclpy's node has them, but for `context`.
+
+    Raises:
+        TypeError: a `context` was given; a portable node is of the default one.
+    """
+
+    def __init__(self, *arguments: Any, **named: Any) -> None:
+        if named.get("context") is not None:
+            raise TypeError(
+                "context: a portable node uses rclpy's default context, which is created again "
+                "when it joins; leave it out"
+            )
+        self._portable_arguments = arguments, named
+        self._portable_made: frozenset[int] = frozenset()
+        self._portable_declared: tuple[str, ...] = ()
+        self._portable_enter(named)
+        self._portable_made = frozenset(id(one) for one in self._portable_entities())
+        self._portable_given = dict(self._parameter_overrides)
+
+    def join(self) -> None:
+        """Make all that this node has of ROS: at the start, and anew after each move."""
+        raise NotImplementedError(
+            f"{type(self).__name__} has no method join(self): there it makes its publishers, "
+            f"subscriptions, timers, services and clients"
+        )
+
+    def leave(self) -> None:
+        """Let go of what is neither memory nor a ROS entity: devices, sockets, threads.
+
+        Called between two callbacks, before the node leaves; `join` follows, whatever happens.
+        """
+
+    # --- for run_portable ------------------------------------------------------------------
+
+    def _portable_join_first(self) -> None:
+        """The constructor is done.
+
+        Raises:
+            TypeError: it made what has to be made in `join`.
+        """
+        for entity in self._portable_entities():
+            if id(entity) not in self._portable_made:
+                raise TypeError(
+                    f"{type(self).__name__}.__init__ makes {_described(entity)}: it would be gone "
+                    f"after a move. Make it in join(self), which is called at the start, too"
+                )
+        self._portable_declared = tuple(self.get_parameters_by_prefix(""))
+        self.join()
+
+    def _portable_leave(self) -> tuple[Absence, str]:
+        """Leave the graph: how the node was, and what was wrong about leaving ("": nothing)."""
+        absence = absence_of(self)
+        fault = ""
+        try:
+            self.leave()
+        except Exception as error:  # noqa: BLE001 - the author's code: anything may come
+            fault = f"{type(self).__name__}.leave raised {type(error).__name__}: {error}"
+        await_readers(self, _READERS)
+        self.destroy_node()
+        close_leaked(self._portable_sockets)
+        return absence, fault
+
+    def _portable_enter_again(self, absence: Absence) -> None:
+        """Be in the graph, with nothing but a name and parameters."""
+        named = dict(self._portable_arguments[1])
+        # Files of parameters need not be at the new host: what they said counts nevertheless.
+        given = [*self._portable_given.values(), *(named.get("parameter_overrides") or ())]
+        named["parameter_overrides"] = absence.overrides(given)
+        self._portable_enter(named)
+
+    def _portable_join_again(self, absence: Absence) -> None:
+        absence.declare_missing(self, self._portable_declared)
+        self.join()
+        absence.declare_missing(self)
+
+    def _portable_go_on(self, absence: Absence, patience: float) -> tuple[str, ...]:
+        """Wait for the peers, and start the timers; returns the peers that are missing."""
+        missing = await_peers(self, absence.peers, patience)
+        absence.start_timers(self)
+        return missing
+
+    def _portable_enter(self, named: dict[str, Any]) -> None:
+        controlled = VARIABLE in os.environ
+        # Shared memory of a participant would lie in the dumped process; over UDP none is left.
+        profile = announcing(os.environ, "steady", udp=True)
+        before = open_sockets()
+        with profile if controlled else contextlib.nullcontext():
+            super().__init__(*self._portable_arguments[0], **named)
+        self._portable_sockets = {
+            number: one for number, one in open_sockets().items() if before.get(number) != one
+        }
+
+    def _portable_entities(self) -> Iterator[Any]:
+        for kind in ("publishers", "subscriptions", "timers", "services", "clients", "guards"):
+            yield from getattr(self, kind)
+        yield from self.waitables
+
+    def destroy_node(self) -> None:
+        """As rclpy's; and with it action servers and clients, which would hold the node."""
+        for waitable in list(self.waitables):
+            destroy = getattr(waitable, "destroy", None)
+            # Event handlers go with their publishers and inputs; an author's own may have nothing.
+            if destroy is not None and not isinstance(waitable, EventHandler):
+                destroy()
+        super().destroy_node()
+
+
+def _described(entity: Any) -> str:
+    """What a user knows it by."""
+    name = getattr(entity, "topic_name", "") or getattr(entity, "srv_name", "")
+    kind = type(entity).__name__.lower()
+    return f"a {kind} of {name}" if name else f"a {kind}"

@@ -1,0 +1,348 @@
+"""`run_portable`: runs a portable node, and has it leave and join again when rosrm asks for it."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+import rclpy
+from rclpy._rclpy_pybind11 import RCLError
+from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
+from rclpy.signals import uninstall_signal_handlers
+
+from rosrm.errors import PortableError
+from rosrm.ros import fast_dds_relocation
+from rosrm.ros.graph_remains import what_is_left
+from rosrm_criu.control import SIGNAL, VARIABLE, Request, State, Status, Want
+from rosrm_criu.control.listener import Listener
+from rosrm_criu.node.graph_departure import Absence, sees_again
+from rosrm_criu.node.portable import PortableNode
+
+#: Seconds between two looks at what is asked: while it runs, and while it is away. An idle node is
+#: woken as often; one that works notices the signal after its callback.
+_LOOK: Final = 0.25
+_LOOK_AWAY: Final = 0.01
+#: What ends a process; rclpy takes these while there is a context.
+_ENDING: Final = (signal.SIGINT, signal.SIGTERM)
+#: Seconds in which a participant is greeted by its neighbours, if it hears them at all.
+_GREETED: Final = 0.3
+#: Most entries: who is not seen then may have gone, and others have found the node meanwhile.
+_ENTRIES: Final = 4
+#: Seconds within which what the callbacks have begun (threads, coroutines) has to end.
+_REST: Final = 5.0
+
+
+def run_portable(
+    make: Callable[[], PortableNode],
+    *,
+    args: Sequence[str] | None = None,
+    executor: Callable[[], Executor] = SingleThreadedExecutor,
+    patience: float = 2.0,
+) -> None:
+    """Run a node until the process is told to end; call it last, in the main thread.
+
+    Started by hand, it is `rclpy.init`, the node, `rclpy.spin`. Under rosrm it leaves the ROS graph
+    between two callbacks when it is asked to, and joins again when it is asked to.
+
+    Args:
+        make: returns the node, a `PortableNode`; called once.
+        args: command line; None: the process's own.
+        executor: makes what runs the callbacks, anew after each move.
+        patience: seconds that a node waits after a move, before its callbacks go on, until it has
+            found as many readers and writers of its topics as it had before.
+
+    Raises:
+        PortableError: it cannot join again, or its control directory cannot be used.
+        TypeError: the node makes in its constructor what belongs into `join`.
+        Exception: what a callback raised.
+    """
+    given = list(sys.argv if args is None else args)
+    directory = os.environ.get(VARIABLE, "")
+    run = _Run(given, executor, patience, Path(directory) if directory else None)
+    try:
+        run.begin(make)
+        run.until_the_end()
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except Exception as error:
+        if run.was_ended_in(error):
+            return
+        run.say_failed(error)
+        raise
+    finally:
+        run.end()
+
+
+class _Ended(Exception):
+    """The process was told to end while its node was away."""
+
+
+class _Run:
+    """One portable node in its process."""
+
+    def __init__(
+        self,
+        args: list[str],
+        make_executor: Callable[[], Executor],
+        patience: float,
+        directory: Path | None,
+    ) -> None:
+        self._args = args
+        self._make_executor = make_executor
+        self._patience = patience
+        self._listener = None if directory is None else Listener(directory)
+        self._woken = False
+        self._looked = 0.0
+        self._node: Any = None
+        self._is_in = False  # the node has its part in the graph
+        self._signals: dict[int, Any] = {}  # handlers, while ours are in their place
+        self._executor: Any = None
+        if self._listener is not None:
+            signal.signal(SIGNAL, self._wake)
+
+    def _wake(self, *_: object) -> None:
+        """The signal came, between any two steps of the main thread: note it, and no more."""
+        self._woken = True
+
+    # --- the course of a life --------------------------------------------------------------
+
+    def begin(self, make: Callable[[], PortableNode]) -> None:
+        """Join for the first time."""
+        rclpy.init(args=self._args)
+        self._node = make()
+        self._is_in = True
+        self._node._portable_join_first()  # noqa: SLF001 - the other half of one thing
+        self._add_executor()
+        if self._listener is not None:
+            self._listener.say(Status(State.RUNNING))
+
+    def until_the_end(self) -> None:
+        """Run, leave, wait and join again, until the context is shut down."""
+        with contextlib.suppress(_Ended):
+            while (request := self._spin()) is not None:
+                absence, fault = self._leave(request)
+                if not fault:
+                    request = self._wait_away()
+                self._join(request, absence, fault)
+
+    def end(self) -> None:
+        """The process ends; the log says why, where it is not in good order."""
+        if self._is_in:
+            self._node.destroy_node()
+        if self._executor is not None:
+            self._executor.shutdown()
+        rclpy.try_shutdown()
+        if self._listener is not None and self._listener.status.state is not State.FAILED:
+            self._listener.close()
+
+    def was_ended_in(self, error: Exception) -> bool:
+        """A signal took the context away under a callback that was about to publish."""
+        return isinstance(error, RCLError) and self._is_in and not rclpy.ok()
+
+    def say_failed(self, error: Exception) -> None:
+        """Tell whoever waits; the traceback is in the log."""
+        if self._listener is not None:
+            said = str(error) if isinstance(error, PortableError) else _said(error)
+            self._listener.say(Status(State.FAILED, self._listener.status.request, said))
+
+    # --- running ---------------------------------------------------------------------------
+
+    def _add_executor(self) -> None:
+        self._executor = self._make_executor()
+        self._executor.add_node(self._node)
+
+    def _spin(self) -> Request | None:
+        """Run callbacks until the node shall leave; None: it is over."""
+        timeout = None if self._listener is None else _LOOK
+        while self._executor.context.ok():
+            self._executor.spin_once(timeout_sec=timeout)
+            request = self._asked()
+            if request is not None:
+                return request
+        return None
+
+    def _asked(self) -> Request | None:
+        now = time.monotonic()
+        if self._listener is None or not (self._woken or now >= self._looked + _LOOK):
+            return None
+        self._looked, self._woken = now, False
+        return self._listener.asked()
+
+    # --- leaving ---------------------------------------------------------------------------
+
+    def _leave(self, request: Request) -> tuple[Absence | None, str]:
+        """Leave the graph: how the node was, and why it cannot stay away ("": it can).
+
+        Nothing was done (and no absence is returned) where that is known beforehand.
+        """
+        began = time.monotonic()
+        listener = self._its_listener()
+        listener.say(Status(State.LEAVING, request.id))
+        try:
+            fast_dds_relocation.check()
+            self._come_to_rest()
+        except PortableError as error:
+            return None, str(error)
+        absence, fault = self._depart()
+        fault = fault or _not_clean()
+        if not fault:
+            seconds = {"leave": round(time.monotonic() - began, 6)}
+            listener.say(Status(State.LEFT, request.id, seconds=seconds))
+        return absence, fault
+
+    def _come_to_rest(self) -> None:
+        """Wait for what the callbacks have begun: none is cut in half."""
+        deadline = time.monotonic() + _REST
+        while unfinished := _unfinished(self._executor):
+            if time.monotonic() > deadline:
+                raise PortableError(
+                    f"{len(unfinished)} callbacks have begun and not ended in {_REST:g} s (async "
+                    f"functions that wait, or goals that are executed); the node stays as it was"
+                )
+            if any(one.executing() for one in unfinished):
+                time.sleep(0.001)  # another thread's: rclpy has nothing to wait on
+            else:
+                self._executor.spin_once(timeout_sec=0.01)
+
+    def _depart(self) -> tuple[Absence | None, str]:
+        node = self._node
+        absence, fault = node._portable_leave()  # noqa: SLF001 - the other half of one thing
+        self._is_in = False
+        ended = not self._executor.context.ok()  # by a signal; ROS answers it up to here
+        self._executor.shutdown()
+        self._executor = None
+        rclpy.try_shutdown()
+        if ended:
+            raise _Ended
+        uninstall_signal_handlers()  # they need a context; in between there are ours
+        self._signals = {one: signal.signal(one, _end) for one in _ENDING}
+        return absence, fault
+
+    def _give_signals_back(self) -> None:
+        for one, handler in self._signals.items():
+            signal.signal(one, handler)
+        self._signals = {}
+
+    # --- away ------------------------------------------------------------------------------
+
+    def _wait_away(self) -> Request:
+        """Nothing of ROS is here, until the node shall join again."""
+        listener = self._its_listener()
+        while True:
+            request = listener.asked()
+            if request is not None and request.want is Want.JOIN:
+                return request
+            # Not SimpleQueue.get, which a signal handler may fill: where its time-out passes
+            # while the process is dumped, CPython before 3.13 waits for ever after the restore.
+            time.sleep(_LOOK_AWAY)
+
+    # --- joining ---------------------------------------------------------------------------
+
+    def _join(self, request: Request, absence: Absence | None, fault: str) -> None:
+        """Join again: because it is asked for, or because the node cannot leave.
+
+        Args:
+            request: that is answered by it.
+            absence: what the node was; None: it never left.
+            fault: why it cannot leave; "": it had left.
+        """
+        listener = self._its_listener()
+        missing: tuple[str, ...] = ()
+        if absence is not None:
+            missing = self._arrive(request, absence)
+        if fault:
+            self._node.get_logger().error(f"rosrm asked this node to leave; it stays: {fault}")
+        seconds = listener.status.seconds
+        listener.done(Status(State.RUNNING, request.id, fault, seconds, missing))
+
+    def _arrive(self, request: Request, absence: Absence) -> tuple[str, ...]:
+        listener = self._its_listener()
+        began = time.monotonic()
+        listener.enter(State.JOINING, request.id)
+        guids_are_new = fast_dds_relocation.look_again()
+        entries = self._enter(absence)
+        seen = time.monotonic()
+        node = self._node
+        node._portable_join_again(absence)  # noqa: SLF001 - the other half of one thing
+        self._add_executor()
+        left = max(0.0, began + self._patience - time.monotonic())
+        missing: tuple[str, ...] = node._portable_go_on(absence, left)  # noqa: SLF001
+        found = time.monotonic()
+        times = {
+            "enter": round(seen - began, 6), "entries": entries, "join": round(found - seen, 6),
+        }  # fmt: skip
+        status = listener.status
+        listener.status = replace(status, seconds={**status.seconds, **times})
+        if not guids_are_new:
+            self._node.get_logger().warning("Fast DDS keeps its GUIDs: restore an image only once")
+        if missing:
+            self._node.get_logger().warning(
+                f"continues without some of its former peers: {', '.join(missing)}"
+            )
+        return missing
+
+    def _enter(self, absence: Absence) -> int:
+        """Be in the graph, and see the other ends again; returns how many entries it took.
+
+        A neighbour answers the first word of a participant within 0.1 ms. Fast DDS 2.14 may not be
+        ready to hear it then, and is told again only after the neighbour's period of 3 s: a new
+        participant, which everybody greets anew, is there in 0.02 s (docs/decisions/0024).
+        """
+        entries = 0
+        deadline = time.monotonic() + self._patience
+        while True:
+            entries += 1
+            self._give_signals_back()
+            rclpy.init(args=without_parameter_files(self._args))
+            self._node._portable_enter_again(absence)  # noqa: SLF001 - the other half of one thing
+            last = entries == _ENTRIES or deadline - time.monotonic() <= _GREETED
+            if last or sees_again(self._node, absence.others, _GREETED):
+                self._is_in = True
+                return entries
+            self._node.destroy_node()
+            rclpy.try_shutdown()
+
+    def _its_listener(self) -> Listener:
+        assert self._listener is not None  # nobody else asks
+        return self._listener
+
+
+def _unfinished(executor: Any) -> list[Any]:
+    """What an executor of rclpy has begun; rclpy has no public way to ask."""
+    return [task for task, *_ in getattr(executor, "_tasks", ()) if not task.done()]
+
+
+def _not_clean() -> str:
+    """What would keep this process from being dumped; "": nothing."""
+    if not what_is_left():
+        return ""
+    gc.collect()  # an entity in a cycle of references
+    return what_is_left()
+
+
+def _end(*_: object) -> None:
+    raise _Ended
+
+
+def without_parameter_files(args: Sequence[str]) -> list[str]:
+    """A command line without `--params-file FILE`: at another host the file may be missing."""
+    kept: list[str] = []
+    words = iter(args)
+    for word in words:
+        if word == "--params-file":
+            next(words, None)
+        else:
+            kept.append(word)
+    return kept
+
+
+def _said(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}"

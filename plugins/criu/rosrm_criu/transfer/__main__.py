@@ -1,0 +1,114 @@
+"""The process of one transfer: `python -m rosrm_criu.transfer send` or `… fetch`.
+
+It reads a line of JSON from standard input, works, and answers with lines of JSON on standard
+output. Before that it may be asked whether it is ready, and before it fetches it is asked for the
+certificate that it will show. It ends when standard input does: so it outlives neither its work nor
+who started it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import signal
+import sys
+import threading
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from rosrm.errors import TransferError
+from rosrm_criu.transfer.form import Offer
+
+
+def main() -> int:
+    """Do what is asked for; the exit status says whether it worked."""
+    os.umask(0o077)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal's Ctrl-C is for who started this
+    work = {"send": _send, "fetch": _fetch}[sys.argv[1]]
+    # Started before there is anything to do, a process has its libraries by the time there is.
+    if sys.argv[1] == "send":
+        import rosrm_criu.transfer.serving  # noqa: PLC0415
+    else:
+        import rosrm_criu.transfer.receiving  # noqa: F401, PLC0415
+    line = sys.stdin.readline()
+    if line and json.loads(line) == {"ready": True}:
+        _say({})
+        line = sys.stdin.readline()
+    if not line:
+        return 0
+    try:
+        _say(work(json.loads(line)))
+    except TransferError as error:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # who has heard it ends this
+        _say({"error": str(error)})
+        return 1
+    return 0
+
+
+def _say(answer: Mapping[str, Any]) -> None:
+    try:
+        sys.stdout.write(json.dumps(answer) + "\n")
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os._exit(1)  # nobody is there to hear it
+
+
+def _send(asked: dict[str, Any]) -> Mapping[str, Any]:
+    return asyncio.run(_serve(asked))
+
+
+async def _serve(asked: dict[str, Any]) -> Mapping[str, Any]:
+    from rosrm_criu.transfer.serving import serve  # noqa: PLC0415
+
+    withdrawn = asyncio.Event()
+
+    def read() -> None:
+        if not os.read(0, 1024):
+            loop.remove_reader(0)
+            withdrawn.set()
+
+    loop = asyncio.get_running_loop()
+    loop.add_signal_handler(signal.SIGTERM, withdrawn.set)
+    loop.add_reader(0, read)
+    directory = Path(asked.pop("directory"))
+    sent = await serve(
+        directory, **asked, withdrawn=withdrawn, announce=lambda offer: _say(offer.as_json())
+    )
+    return sent.as_json()
+
+
+def _fetch(asked: dict[str, Any]) -> Mapping[str, Any]:
+    from rosrm_criu.transfer.certificate import new_identity  # noqa: PLC0415
+    from rosrm_criu.transfer.receiving import receive  # noqa: PLC0415
+
+    def stop(*_: object) -> None:
+        ignore()
+        raise TransferError("the fetch was stopped before all had come")
+
+    def ignore() -> None:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+
+    signal.signal(signal.SIGTERM, stop)
+    if "introduce" not in asked:
+        raise TransferError("the destination was not introduced: nobody would speak with it")
+    identity = new_identity()
+    _say({"certificate": identity.certificate})
+    line = sys.stdin.readline()
+    if not line:
+        raise TransferError("the fetch was stopped before it began")
+    asked = json.loads(line)
+    threading.Thread(target=_stop_when_input_ends, daemon=True).start()
+    offer, target = Offer.from_json(asked.pop("offer")), Path(asked.pop("target"))
+    return receive(offer, target, **asked, identity=identity, before_placing=ignore).as_json()
+
+
+def _stop_when_input_ends() -> None:
+    while os.read(0, 1024):
+        pass
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

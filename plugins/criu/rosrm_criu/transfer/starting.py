@@ -1,0 +1,228 @@
+"""The two ends of a transfer, each a process of its own, as who starts them has them."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import json
+import subprocess
+import sys
+import tarfile
+import threading
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from rosrm.errors import TransferError
+from rosrm_criu.transfer.form import Fetched, Offer, Sent
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+#: Bytes a second: a transfer leaves something of a gigabit network to others.
+DEFAULT_RATE: Final = 100e6
+#: Bytes that stay free on the file system of a target.
+DEFAULT_RESERVE: Final = 256 << 20
+#: Seconds for a process to start and answer, and to end, on a busy machine.
+_START: Final = 30.0
+_END: Final = 10.0
+_NEEDED: Final = ("aiohttp", "cryptography", "urllib3")
+
+
+def missing() -> str:
+    """What this Python lacks for a transfer, and what to do; "": nothing."""
+    names = [*_NEEDED, "compression" if sys.version_info >= (3, 14) else "backports.zstd"]
+    absent = [name for name in names if not _is_there(name)]
+    if absent:
+        return f"{', '.join(absent)} is not installed: pip install rosrm-criu"
+    if not hasattr(tarfile, "data_filter"):
+        return "this Python cannot check archives: it needs 3.10.12, 3.11.4, or a newer one"
+    return ""
+
+
+def _is_there(name: str) -> bool:
+    try:
+        return importlib.util.find_spec(name) is not None
+    except ModuleNotFoundError:
+        return False  # of backports.zstd, where there is no backports
+
+
+class _End:
+    """The process of one end; it ends with this one, however that ends.
+
+    It may be started before there is anything to do: its libraries take a while to load.
+
+    Raises:
+        TransferError: something is missing here.
+    """
+
+    def __init__(self, kind: str) -> None:
+        if lack := missing():
+            raise TransferError(lack)
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "rosrm_criu.transfer", kind],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            cwd="/",
+            start_new_session=True,
+        )
+        self._closing = threading.Lock()
+        self._begun = False
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._end()
+
+    def ready(self) -> None:
+        """Wait until it has its libraries, before anything is to be quick.
+
+        Raises:
+            TransferError: it has ended, or is not ready in time.
+        """
+        self._ask({"ready": True}, _START)
+
+    def _begin(self) -> None:
+        if self._begun:
+            raise RuntimeError("one process makes one transfer: start another one")
+        self._begun = True
+
+    def _ask(self, asked: Mapping[str, Any], timeout: float) -> dict[str, Any]:
+        """The process's next answer; raises `TransferError` for an error and for none."""
+        assert self._process.stdin is not None
+        with contextlib.suppress(OSError, ValueError):  # it has ended: then there is no answer
+            self._process.stdin.write(json.dumps(asked).encode() + b"\n")
+            self._process.stdin.flush()
+        answer = self._answer(timeout)
+        if "error" in answer:
+            raise TransferError(answer["error"])
+        return answer
+
+    def _answer(self, timeout: float) -> dict[str, Any]:
+        assert self._process.stdout is not None
+        late = threading.Timer(timeout, self._process.kill)
+        late.start()
+        try:
+            line = self._process.stdout.readline()
+        finally:
+            late.cancel()
+        if not line:
+            status = self._process.wait()
+            raise TransferError(
+                f"the process of the transfer ended with status {status} and no answer: the log of "
+                "who started it may say why"
+            )
+        answer: dict[str, Any] = json.loads(line)
+        return answer
+
+    def _end(self) -> None:
+        """Have it end, and wait for that. From any thread, also while another one waits."""
+        with self._closing:
+            assert self._process.stdin is not None
+            with contextlib.suppress(OSError):
+                self._process.stdin.close()
+            try:
+                self._process.wait(_END)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait()
+
+
+class Sender(_End):
+    """The source's end: nothing listens before `offer` and after `close`.
+
+    Keep it: an offer ends when its sender is forgotten.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("send")
+        self._sent: Sent | None = None
+
+    def offer(
+        self, directory: Path, *, seconds: float, to: str, max_rate: float = DEFAULT_RATE
+    ) -> Offer:
+        """Offer a directory, once.
+
+        Args:
+            directory: of files and directories; it stays, and must not change meanwhile.
+            seconds: after which the offer ends.
+            to: what the destination's `Fetcher.introduce` said: it alone may fetch.
+            max_rate: bytes a second that go out, as compressed; 0: there is no bound.
+
+        Raises:
+            TransferError: the directory cannot be offered.
+        """
+        self._begin()
+        asked = {
+            "directory": str(directory.absolute()), "seconds": seconds, "max_rate": max_rate,
+            "to": to,
+        }  # fmt: skip
+        return Offer.from_json(self._ask(asked, _START))
+
+    def wait(self, timeout: float) -> Sent | None:
+        """What became of the offer, once it is over; None: it is not, after so many seconds."""
+        try:
+            self._process.wait(timeout)
+        except subprocess.TimeoutExpired:
+            return None
+        return self.close()
+
+    def close(self) -> Sent:
+        """End the offer, if it stands, and say what became of it."""
+        self._end()
+        with self._closing:
+            if self._sent is None:
+                self._sent = self._read_sent()
+        return self._sent
+
+    def _read_sent(self) -> Sent:
+        assert self._process.stdout is not None
+        with self._process.stdout as output, contextlib.suppress(ValueError, TypeError, KeyError):
+            told = json.loads(output.readline())
+            return Sent(told["outcome"], told["bytes"])
+        return Sent("failed", 0)
+
+
+class Fetcher(_End):
+    """The destination's end, for one fetch."""
+
+    def __init__(self) -> None:
+        super().__init__("fetch")
+
+    def introduce(self) -> str:
+        """A certificate, which only this fetch can show: for `Sender.offer`, to be called before.
+
+        It is no secret; the key stays in the process.
+
+        Raises:
+            TransferError: the process has ended.
+        """
+        return str(self._ask({"introduce": True}, _START)["certificate"])
+
+    def fetch(
+        self, offer: Offer, target: Path, *, timeout: float, reserve: int = DEFAULT_RESERVE
+    ) -> Fetched:
+        """Fetch what a source offers; for the owner alone (0700, 0600), or nothing of it.
+
+        The source was told of this end by what `introduce` gave.
+
+        Args:
+            offer: as the source has made it.
+            target: where the directory shall be; nothing may be there.
+            timeout: seconds for all of it.
+            reserve: bytes that stay free on the file system of the target.
+
+        Raises:
+            TransferError: it cannot be had, not whole, not in time, or there is no room.
+        """
+        self._begin()
+        asked = {
+            "offer": offer.as_json(), "target": str(target.absolute()), "timeout": timeout,
+            "reserve": reserve,
+        }  # fmt: skip
+        return Fetched(**self._ask(asked, timeout + _START))
+
+    def close(self) -> None:
+        """Stop it; a fetch under way raises `TransferError` and leaves nothing."""
+        self._end()

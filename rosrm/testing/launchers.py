@@ -1,0 +1,98 @@
+"""What the slave relies on in a launcher."""
+
+from __future__ import annotations
+
+import os
+import sys
+from functools import partial
+from pathlib import Path
+from tempfile import mkdtemp
+from types import SimpleNamespace
+from typing import ClassVar
+from unittest import SkipTest
+
+from rosrm.extensions.contracts import (
+    GraphDepartureLauncher,
+    ImageLauncher,
+    Launch,
+    Launcher,
+    LauncherContext,
+    LauncherOffer,
+    ProcessTreeLauncher,
+)
+from rosrm.extensions.hookspecs import hookimpl
+from rosrm.extensions.plugin_calls import implements, required
+from rosrm.extensions.registry import Registry
+from rosrm.extensions.time_limit import CALL_LIMIT
+from rosrm.model.values import Assignment, InstanceId, ProcessSpec
+from rosrm.slave.launch.launchers import PREPARE_LIMIT
+from rosrm.testing.calls import ContractBroken, call
+
+
+class LauncherContract:
+    """What the slave relies on in a launcher.
+
+    Attributes:
+        offer: what is tested.
+        spec: of a process whose strategy declares this launcher.
+    """
+
+    offer: ClassVar[LauncherOffer]
+    spec: ClassVar[ProcessSpec] = ProcessSpec("p", command=("sleep", "60"))
+
+    def make(self) -> Launcher:
+        """Return a new launcher of a slave with an empty directory."""
+        hook = hookimpl(specname="register_launchers")(lambda: [self.offer])
+        registry = Registry.of(tested=SimpleNamespace(register_launchers=hook))
+        if registry.broken:
+            raise ContractBroken(registry.broken[0].reason)
+        context = LauncherContext(Path(mkdtemp(prefix="rosrm-")), sys.executable, 1)
+        found = registry.launchers(context)
+        if found.absent:
+            raise SkipTest(f"{self.offer.name} is absent: {found.absent[self.offer.name]}")
+        if found.broken:
+            raise ContractBroken(found.broken[self.offer.name])
+        return found.made[self.offer.name].launcher
+
+    def launch(self, number: int = 1, *, restored: bool = False) -> Launch:
+        """Return the start of one instance, as the slave has it before any launcher."""
+        instance = InstanceId(self.spec.name, number)
+        assignment = Assignment(instance, self.spec, 1, self.spec.name, restored=restored)
+        return Launch(assignment, "rosrm", self.spec.command, {"PATH": os.environ["PATH"]})
+
+    def _prepared(self, launcher: Launcher, launch: Launch) -> Launch | None:
+        """Return what a launcher prepares; the limit and the check are those of the slave."""
+        prepared = call("prepare", PREPARE_LIMIT, partial(launcher.prepare, launch))
+        return None if prepared is None else required(prepared, Launch)
+
+    def test_prepares_a_command_line_of_text(self) -> None:
+        """The supervisor starts it, with an environment of text."""
+        prepared = self._prepared(self.make(), self.launch())
+        if prepared is not None:
+            assert prepared.argv, "the command line is empty"
+            assert all(isinstance(word, str) for word in prepared.argv), prepared.argv
+            for item in prepared.environment.items():
+                assert all(isinstance(text, str) for text in item), f"environment: {item}"
+
+    def test_starts_the_same_instance(self) -> None:
+        """The order stays as the master gave it."""
+        launch = self.launch()
+        prepared = self._prepared(self.make(), launch)
+        assert prepared is None or prepared.assignment == launch.assignment
+
+    def test_says_nothing_of_a_process_that_it_has_not_started(self) -> None:
+        """Each launcher is asked about the instances of all others."""
+        launcher: object = self.make()
+        if implements(launcher, ProcessTreeLauncher):
+            leads = call("leads", CALL_LIMIT, partial(launcher.leads, os.getpid()))
+            assert leads is False, f"leads answered {leads} for another process"
+        if implements(launcher, GraphDepartureLauncher):
+            gone = call("has_departed", CALL_LIMIT, partial(launcher.has_departed, os.getpid()))
+            assert gone is False, f"has_departed answered {gone} for another process"
+
+    def test_discards_images_that_are_not_there(self) -> None:
+        """A user may restart any process."""
+        launcher: object = self.make()
+        if implements(launcher, ImageLauncher):
+            instance = InstanceId(self.spec.name, 999)
+            call("discard_images", CALL_LIMIT, partial(launcher.discard_images, instance))

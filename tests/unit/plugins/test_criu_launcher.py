@@ -1,0 +1,54 @@
+"""What the launcher of `criu` makes of a start."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rosrm.errors import LaunchError
+from rosrm.extensions.contracts import Launch, LauncherContext
+from rosrm.model.values import Assignment, InstanceId, MigrationPolicy, ProcessSpec
+from rosrm_criu.launcher import CriuLauncher
+
+
+def prepared(
+    state: Path, *, slave: int = 1, cluster: str = "fleet", **fields: Any
+) -> Launch | None:
+    restored = fields.pop("restored", False)
+    spec = ProcessSpec(**{"name": "p", "command": ("true",), "ros": True, **fields})
+    assignment = Assignment(InstanceId("p", 7), spec, 1, "p", restored=restored)
+    launch = Launch(assignment, cluster, spec.command, {"PATH": "/usr/bin:/bin"})
+    return CriuLauncher(LauncherContext(state, sys.executable, slave)).prepare(launch)
+
+
+def test_a_portable_node_is_told_where_it_is_asked_to_leave(tmp_path):
+    """Each instance has a directory of its own, other than that of a cluster of the same name."""
+    moves = {"migration": MigrationPolicy("criu")}
+    made = prepared(tmp_path, **moves)
+    for other in (
+        prepared(tmp_path, cluster="other", **moves),
+        prepared(tmp_path, slave=7, **moves),
+    ):
+        paths = [Path(one.environment["ROSRM_PORTABLE"]) for one in (made, other)]
+        assert paths[0].parent == paths[1].parent
+        assert paths[0] != paths[1]
+    assert (
+        "ROSRM_PORTABLE" not in prepared(tmp_path, migration=MigrationPolicy("handoff")).environment
+    )
+
+
+@pytest.mark.parametrize("program", ["no-such-program", "/no/such/program"])
+def test_a_program_that_is_to_be_checkpointed_is_looked_for(tmp_path, program):
+    """The wrapper that is started in its place would fail on each host, one after the other."""
+    migration = MigrationPolicy("criu", options={"checkpoint_every": 10.0})
+    with pytest.raises(LaunchError, match=f"'{program}' (is not on the PATH|exists)"):
+        prepared(tmp_path, command=(program,), migration=migration)
+
+
+def test_a_restored_instance_without_an_image_here_is_left_to_other_launchers(tmp_path):
+    """Of a process that moves by another strategy, the image may be of another launcher."""
+    asked = {"restored": True, "migration": MigrationPolicy("relaunch")}
+    assert prepared(tmp_path, **asked) is None

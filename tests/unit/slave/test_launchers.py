@@ -1,0 +1,179 @@
+"""The slave asks the launchers of third parties; one that fails costs a start or an answer."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from rosrm.errors import CriuError, LaunchError
+from rosrm.extensions.contracts import Capabilities, Launch, LauncherOffer, MigrationOffer
+from rosrm.extensions.hookspecs import hookimpl
+from rosrm.extensions.registry import MadeLauncher, Registry
+from rosrm.model.values import Assignment, InstanceId, MigrationPolicy, ProcessSpec
+from rosrm.slave.launch.launchers import Launchers
+from rosrm.slave.sessions import SessionTable
+
+
+class Wrapper:
+    """Starts each process by a program of its own."""
+
+    def prepare(self, launch):
+        return replace(launch, argv=("wrap", *launch.argv))
+
+
+class Restorer(Wrapper):
+    """Knows images of some instances, and leads a session in which the process is."""
+
+    def __init__(self, *images: int) -> None:
+        self.images = set(images)
+
+    def prepare(self, launch):
+        known = launch.assignment.instance.number in self.images
+        return super().prepare(launch) if known else None
+
+    def discard_images(self, instance):
+        self.images.discard(instance.number)
+
+    def leads(self, leader):
+        return {10: True, 20: None}.get(leader, False)
+
+    def members(self, leader):
+        return [leader, 11, 12]
+
+    def root(self, leader):
+        return 11
+
+    def has_departed(self, leader):
+        return leader == 10
+
+
+class Faulty(Restorer):
+    def _raise(self, *_: Any) -> Any:
+        raise RuntimeError("out of order")
+
+    prepare = discard_images = leads = has_departed = _raise
+
+
+def launchers(log=None, unusable=None, **made: Any) -> Launchers:
+    """The strategy of a process has the name of its launcher."""
+    return Launchers(
+        {name: MadeLauncher(one, ()) for name, one in made.items()},
+        unusable or {},
+        lambda spec: Capabilities(launcher=spec.migration.strategy or ""),
+        (log if log is not None else []).append,
+    )
+
+
+def launch(strategy: str | None = None, **fields: Any) -> Launch:
+    spec = ProcessSpec("p", command=("x",), migration=MigrationPolicy(strategy))
+    return Launch(Assignment(InstanceId("p", 7), spec, 1, "p", **fields), "fleet", ("x",), {})
+
+
+def test_the_launcher_that_the_strategy_declares_prepares_the_start():
+    """Processes of other strategies are started as they are."""
+    known = launchers(ours=Wrapper())
+    assert known.prepare(launch("ours")).argv == ("wrap", "x")
+    assert known.prepare(launch()).argv == ("x",)
+
+
+def test_a_restored_instance_goes_to_the_launcher_that_has_its_image():
+    """Whatever strategy its process moves by; without an image it does not start."""
+    known = launchers(first=Restorer(), second=Restorer(7))
+    assert known.prepare(launch(restored=True)).argv == ("wrap", "x")
+    with pytest.raises(LaunchError, match="no launcher here has an image of it"):
+        launchers(first=Restorer()).prepare(launch(restored=True))
+
+
+def test_a_missing_launcher_refuses_the_start_with_its_reason():
+    """Started by its plain command the process would not be what its strategy expects."""
+    with pytest.raises(LaunchError, match="p#7 needs the launcher 'ours', which is not installed"):
+        launchers().prepare(launch("ours"))
+    with pytest.raises(LaunchError, match="'ours', which is absent: no such engine"):
+        launchers(unusable={"ours": "absent: no such engine"}).prepare(launch("ours"))
+
+
+@pytest.mark.parametrize(
+    ("act", "said"),
+    [
+        (CriuError("the disk is full"), "^p#7: the disk is full$"),
+        (
+            ZeroDivisionError("a bug"),
+            "the launcher 'ours' fails: prepare: ZeroDivisionError: a bug",
+        ),
+        (SystemExit(3), "SystemExit: 3"),
+        ("a text", "answered a str; Launch is required"),
+    ],
+)
+def test_a_launcher_that_cannot_prepare_refuses_the_start(act, said):
+    """An error of rosrm is an answer, and everything else a fault of the plugin."""
+
+    class Odd:
+        def prepare(self, launch):
+            if isinstance(act, BaseException):
+                raise act
+            return act
+
+    with pytest.raises(LaunchError, match=said):
+        launchers(ours=Odd()).prepare(launch("ours"))
+
+
+def test_a_launcher_that_leads_a_session_names_its_members(tmp_path):
+    """They count to the instance, wherever they are; of other sessions the table finds them."""
+    known = launchers(ours=Restorer())
+    table = SessionTable(tmp_path, lambda pid: pid, known)
+    for leader in (10, 30):
+        table.add(leader)
+    table.refresh(0.0)
+    assert (table.members(10), table.members(30)) == ((10, 11, 12), (30,))
+    assert (known.root(10), known.root(30)) == (11, 30)
+    assert (known.has_departed(10), known.has_departed(30)) == (True, False)
+
+
+def test_a_launcher_that_fails_leaves_an_instance_as_any_other():
+    """Its fault is logged once."""
+    log: list[str] = []
+    known = launchers(log, ours=Faulty())
+    for _ in range(2):
+        assert known.leads(10) is False
+        assert known.members(10) == (10,)
+        assert known.root(10) == 10
+    (line,) = log
+    assert "the launcher 'ours' fails: leads: RuntimeError: out of order" in line
+    known.discard_images(InstanceId("p", 7))
+    assert not known.has_departed(10)
+
+
+# --- of plugins ------------------------------------------------------------------------------
+
+
+def registry(create) -> Registry:
+    class Plugin:
+        @hookimpl
+        def register_launchers(self):
+            return [LauncherOffer("ours", create, "wraps", variables=("OURS",))]
+
+        @hookimpl
+        def register_migration_strategies(self):
+            return [MigrationOffer("moves", lambda options: None, capabilities=self.capabilities)]
+
+        capabilities = Capabilities(launcher="ours")
+
+    return Registry.of(mine=Plugin())
+
+
+def test_a_plugin_brings_a_launcher_that_its_strategy_declares():
+    """It is listed like any offer."""
+    known = registry(lambda context: Wrapper())
+    made = known.launchers(None).made
+    own = Launchers(made, {}, known.capabilities_of())
+    assert own.prepare(launch("moves")).argv == ("wrap", "x")
+    assert own.variables == ("OURS",)
+    assert [(row.name, row.state) for row in known.rows("launcher")] == [("ours", "selected")]
+
+
+def test_a_launcher_that_cannot_be_made_is_named_with_the_reason():
+    """The slave starts without it."""
+    known = registry(lambda context: None)
+    assert "an object with `prepare` is required" in known.launchers(None).broken["ours"]
