@@ -39,7 +39,7 @@ class Drawn:
     quantity: Quantity
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
-        """Tells pydantic to call `parse`."""
+        """Tell pydantic to call `parse`."""
         from pydantic_core import core_schema  # noqa: PLC0415 - as in `Quantity`
 
         return core_schema.no_info_plain_validator_function(self.parse)
