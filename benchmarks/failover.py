@@ -69,7 +69,7 @@ class GoneOn:
 
     Attributes:
         said: last cycle of the predecessor with a received output.
-        published: last cycle of the predecessor with a published state.
+        published: last cycle of the predecessor with a received state.
         first: cycle of the successor's first output.
     """
 

@@ -75,7 +75,7 @@ class Harm:
         restarts: a part had to be restarted.
         forgets: the end of a job there in this time may be unknown.
         fills: the full disk there took no more snapshots.
-        deafens: fences there, or the master, had no contact with the slave.
+        deafens: fences there had no proof that the slave works, or that the master reaches it.
     """
 
     kind: str
@@ -110,7 +110,7 @@ def _is_parted(promise: Promise, run: Run, harms: Sequence[Harm]) -> bool:
     here = [harm for harm in harms if harm.concerns(run.host)]
     hidden = _silence([harm for harm in here if harm.hides], until)
     deaf = _silence([harm for harm in here if harm.deafens], until)
-    # In a cut, a host stops a process that is not isolated only where its slave has no contact.
+    # In a cut, a host stops a process that is not isolated only if it cannot reach its slave.
     return deaf >= _FENCED or hidden >= (_FENCED if promise.isolated else _LOST)
 
 

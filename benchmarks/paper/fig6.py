@@ -71,7 +71,7 @@ def measure(options: Options) -> Result:
 
 
 def replayed_otherwise(simulation: Mapping[str, Any]) -> list[str]:
-    """Return the decisions that a replay of the run's record takes otherwise, as sentences."""
+    """Return an objection where a replay of the run's record decides otherwise."""
     differently, decisions = simulation["replayed_differently"], simulation["replayed_decisions"]
     if not differently and decisions:
         return []

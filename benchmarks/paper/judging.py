@@ -131,8 +131,8 @@ def over(trace: Trace, limit: float) -> dict[str, float]:
 def wrong_move(look: Look, move: Move, limit: float, headroom: float) -> str:
     """Return the error of a migration, by the last look before it; "": none.
 
-    The source must have reached the limit. Of the hosts with room for the
-    usage of the process, the destination must have the largest margin.
+    The source must have reached the limit. Of the hosts with room for the usage of the process,
+    the destination must have the largest margin.
 
     Args:
         look: at the cluster, right before.

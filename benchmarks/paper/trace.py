@@ -115,7 +115,7 @@ class Trace:
 
     @property
     def hosts(self) -> list[str]:
-        """Return the names of all hosts ever seen, by number."""
+        """Return the names of all hosts ever seen, in natural order (host2 before host10)."""
         names = {name for look in self.looks for name in look.hosts}
         return sorted(names, key=lambda name: (len(name), name))
 

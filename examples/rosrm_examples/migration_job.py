@@ -72,7 +72,7 @@ class LiveDrive:
 
 
 def usual_rate(drive: Drive) -> float:
-    """Return 1, or less where the drive is too short for a migration in real time."""
+    """Return the rate of playing: 1, or less where the drive is too short for a migration."""
     return min(1.0, float(drive.times[-1] - drive.times[0]) / _SHORTEST_S)
 
 

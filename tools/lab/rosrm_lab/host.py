@@ -1,4 +1,4 @@
-"""A virtual host as processes: the first one, the entrance for others, and the power switch."""
+"""A virtual host as processes: the first one, the entrance for others, and the end of all."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Extraction of a workload from a record: arrivals, usages, and hosts with their times.
 
 The usage of a process is known only as far as it ran: its memory by its age, once a second; its CPU
-as the mean of the cores that it got, which on a crowded host is less than it needed. Only behaviour
-in the record, which must be complete, is simulated.
+as the mean of the cores that it got, which on a crowded host is less than it needed. Behaviour
+that is not in the record (the end of a process that was still running) is not simulated either.
 """
 
 from __future__ import annotations

@@ -67,7 +67,7 @@ def _cells(run: Run) -> dict[str, str]:
 
 
 def _seconds(seconds: float) -> str:
-    """Return seconds, not minutes, because minutes would hide differences between rows."""
+    """Return a time in seconds, because minutes would hide differences between rows."""
     return f"{seconds:.1f} s" if seconds < 999.95 else f"{seconds:.0f} s"
 
 
