@@ -41,7 +41,7 @@ def _explained(what: str) -> Iterator[None]:
     """
     try:
         yield
-    except (NetlinkError, OSError, RuntimeError) as error:  # the last: its child was killed
+    except (NetlinkError, OSError, RuntimeError) as error:  # the last: pyroute2's child was killed
         raise LabError(
             f"{what}: {_reason(error)}. A lab needs network namespaces, bridges and veth pairs: "
             "`modprobe -a bridge veth` brings what the kernel has as modules; a container needs "

@@ -66,7 +66,7 @@ class Simulation:
         settings: of the master's core.
         policy: that orders the hosts, with its name.
         strategies: by name.
-        declared: needs that their offers declare. A simulated host has all executors.
+        declared: declarations of their offers. A simulated host has all executors.
     """
 
     def __init__(

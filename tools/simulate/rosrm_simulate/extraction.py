@@ -82,7 +82,7 @@ class Extraction:
         self._stops: list[float] = []
         self._stops_since: dict[int, float] = {}
         for name, item in recording.header.intents.get("process", {}).items():
-            if not ProcessPhase(item["phase"]).over:  # the master re-adopted it at its start
+            if not ProcessPhase(item["phase"]).over:  # the master restored it at its start
                 self._processes[name] = _Process(spec_from_dict(item["spec"]), 0.0)
 
     def watch(self, state: MasterState, one: Happened, commands: Sequence[Command]) -> None:

@@ -79,7 +79,7 @@ def replay(
         watcher: is called with each event and its commands.
         until: seconds from the beginning of the record: the run is measured up to here. All of it
             is replayed nonetheless.
-        declared: needs that the offers of policy and strategies declare.
+        declared: declarations of the offers of policy and strategies.
     """
     header = recording.header
     state = MasterState(settings, policy[0], policy[1], strategies, header.epoch, declared=declared)

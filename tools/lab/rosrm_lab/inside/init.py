@@ -48,7 +48,7 @@ def set_up(settings: dict[str, str]) -> None:
     mount("-t", "tmpfs", "-o", "mode=755,nosuid,nodev", "tmpfs", "/run")
     own_sysfs()
     shared = ",".join(["mode=1777,nosuid,nodev", *settings["shm_options"].split()])
-    mount("-t", "tmpfs", "-o", shared, "tmpfs", "/dev/shm")  # noqa: S108 - a mount point, not a temporary file
+    mount("-t", "tmpfs", "-o", shared, "tmpfs", "/dev/shm")  # noqa: S108 - a mount point
     if os.path.isdir("/dev/mqueue"):
         mount("-t", "mqueue", "mqueue", "/dev/mqueue")
     own_data(settings["image"])
