@@ -18,7 +18,7 @@ _PROCESSES = 60
 
 
 def placed() -> dict[str, int]:
-    """Processes by host, once all of them run."""
+    """Return the number of processes by host, once all of them run."""
     specs = [ProcessSpec(f"equal{i}", command=("sleep", "600")) for i in range(_PROCESSES)]
     with (
         tempfile.TemporaryDirectory(prefix="rosrm-balance-") as folder,

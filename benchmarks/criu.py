@@ -35,14 +35,14 @@ _ROOT: Final = Path(__file__).resolve().parents[1]
 _ROSRM: Final = (sys.executable, "-m", "rosrm.cli")
 _HOSTS: Final = ("host1", "host2")
 _DESK: Final = "desk"
-#: Room for two images of the largest heap, and for what the transfer leaves free.
+#: Room for two checkpoint images of the largest heap, and for the reserve of the transfer.
 _DISK: Final = 4 * GIB
-#: Moves of each strategy beside.
+#: Migrations by each of the other strategies.
 _BESIDE: Final = 10
-#: Seconds for a part to end in good order, and for the desk.
+#: Seconds for a part to shut down, and for the desk.
 _END: Final = 30.0
 
-#: The parts of a move: executor and name of each one's own seconds.
+#: The parts of a migration: executor and name of each one's own seconds.
 _PARTS: Final = {
     "prepare": (("criu_checkpoint", "prepare"),),
     "dump": (("criu_checkpoint", "dump"),),
@@ -54,35 +54,35 @@ _PARTS: Final = {
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of the moves of one heap.
+    """The migrations of one heap, with their outcomes.
 
     Attributes:
-        hops: as `benchmarks.criu_desk` tells them.
+        hops: as `benchmarks.criu_desk` prints them.
     """
 
     hops: Sequence[Mapping[str, Any]]
 
     @property
     def failures(self) -> list[str]:
-        """Why moves failed."""
+        """Return the reasons of failed migrations."""
         return [hop["why"] for hop in self.hops if hop["end"] != "migrated"]
 
     @property
     def repeated(self) -> int:
-        """Cycles that were executed twice."""
+        """Return the number of cycles that were executed twice."""
         return sum(hop["repeated"] for hop in self.hops)
 
     @property
     def heap_ok(self) -> bool:
-        """All that was ever found in the memory was the same."""
+        """Return True if every read of the memory found the same content."""
         return len({one for hop in self.hops for one in hop["checksums"]}) == 1
 
     def silences(self) -> list[float]:
-        """Seconds without a count, of each move."""
+        """Return the seconds without a count, of each migration."""
         return [hop["silence"] for hop in self.hops if hop["end"] == "migrated"]
 
     def part(self, name: str) -> list[float]:
-        """Seconds of one part, of each move."""
+        """Return the seconds of one part, of each migration."""
         return [
             sum(hop["parts"][executor][word] for executor, word in _PARTS[name])
             for hop in self.hops
@@ -90,7 +90,7 @@ class Outcome:
         ]
 
     def figures(self) -> dict[str, Any]:
-        """All of it."""
+        """Return all figures."""
         return {
             "hops": len(self.hops), "failures": len(self.failures),
             **quantiles("blackout", self.silences()),
@@ -102,7 +102,7 @@ class Outcome:
 
 
 def quantiles(name: str, seconds: Sequence[float]) -> dict[str, float | None]:
-    """Median and 99th percentile; None where there is nothing."""
+    """Return median and 99th percentile; None where there is no value."""
     return {
         f"{name}_p{percent}_s": round(percentile(seconds, percent / 100), 3) if seconds else None
         for percent in (50, 99)
@@ -110,7 +110,7 @@ def quantiles(name: str, seconds: Sequence[float]) -> dict[str, float | None]:
 
 
 def shared(hops: int, heaps: Sequence[float]) -> list[int]:
-    """How often each heap is moved: the first one, of which most is said, most often."""
+    """Return the number of migrations of each heap: most for the first, which is reported most."""
     others = max(1, hops // (len(heaps) + 2))
     return [max(1, hops - others * (len(heaps) - 1)), *[others] * (len(heaps) - 1)]
 
@@ -120,7 +120,7 @@ def shared(hops: int, heaps: Sequence[float]) -> list[int]:
 
 @contextlib.contextmanager
 def parts(lab: Lab, folder: Path) -> Iterator[None]:
-    """The master on the desk, and a slave on each other host."""
+    """Run the master on the desk, and a slave on each other host."""
     settings: dict[str, dict[str, Any]] = {
         _DESK: {
             "name": "criu", "state": f"{DATA}/master",
@@ -129,7 +129,7 @@ def parts(lab: Lab, folder: Path) -> Iterator[None]:
             },
         },
         **{
-            # Without cpu: the processor is shared by all hosts, and a busy one takes no work.
+            # Without cpu: the hosts share the processor, and a busy one would make all refuse work.
             host: {"host": host, "state": f"{DATA}/slave", "probes": {"memory": {}, "disk": {}}}
             for host in _HOSTS
         },
@@ -159,14 +159,14 @@ def parts(lab: Lab, folder: Path) -> Iterator[None]:
 
 
 def play(lab: Lab, asked: Sequence[Mapping[str, Any]]) -> Iterator[dict[str, Any]]:
-    """The hops that the desk has made, one after the other; raises `LabError` where it fails."""
+    """Yield each hop when the desk has made it; raises `LabError` where the desk fails."""
     command = [sys.executable, "-m", "benchmarks.criu_desk", *map(json.dumps, asked)]
     process = lab.popen(_DESK, command, cwd=str(_ROOT), stdout=subprocess.PIPE)
     assert process.stdout is not None
     try:
         for line in process.stdout:
             yield json.loads(line)
-    except BaseException:  # nobody wants to hear more
+    except BaseException:  # the caller takes no more
         process.kill()
         raise
     finally:
@@ -177,7 +177,7 @@ def play(lab: Lab, asked: Sequence[Mapping[str, Any]]) -> Iterator[dict[str, Any
 
 
 def measure(hops: int, heaps: Sequence[float]) -> list[dict[str, Any]]:
-    """Every hop, of every strategy."""
+    """Return every hop, of every strategy."""
     asked: list[dict[str, Any]] = [
         {"strategy": "criu", "mb": mb, "hops": number}
         for mb, number in zip(heaps, shared(hops, heaps), strict=True)
@@ -212,7 +212,7 @@ def _story(number: int, hop: Mapping[str, Any]) -> str:
 
 
 def beside(hops: Sequence[Mapping[str, Any]], strategy: str) -> dict[str, Any]:
-    """What the other strategies cost: how long nobody is heard, and what is lost."""
+    """Return the costs of another strategy: seconds of silence, and losses."""
     own = [hop for hop in hops if hop["strategy"] == strategy]
     silences = [hop["silence"] for hop in own if hop["end"] == "migrated"]
     return {
@@ -224,7 +224,7 @@ def beside(hops: Sequence[Mapping[str, Any]], strategy: str) -> dict[str, Any]:
 
 
 def table(by_heap: Mapping[str, Mapping[str, Any]], others: Mapping[str, Any]) -> str:
-    """For reading."""
+    """Return the figures as a table for a terminal."""
     words = ["", "p50 s", "p99 s", *_PARTS, "lost"]
     rows = [words]
     for mb, found in by_heap.items():
@@ -240,7 +240,7 @@ def table(by_heap: Mapping[str, Mapping[str, Any]], others: Mapping[str, Any]) -
 
 
 def main() -> int:
-    """Measure and print one JSON object; returns the exit status."""
+    """Measure and print one JSON object; return the exit status."""
     os.environ.setdefault("ROSRM_CRIU_PREFIX", str(_ROOT / ".venv/criu"))
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--hops", type=int, default=50, help="moves in all")

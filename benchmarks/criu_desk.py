@@ -1,9 +1,9 @@
-"""Moves a counter to and fro and listens to it: on the desk of the lab of `benchmarks.criu`.
+"""Observer that migrates a counter to and fro, on the desk of the lab of `benchmarks.criu`.
 
     python -m benchmarks.criu_desk '{"strategy": "criu", "mb": 10, "hops": 4}' ...
 
-For each of what it is given it starts a process, moves it `hops` times, and ends it; `options` are
-those of the strategy. It prints one line of JSON for each hop: see `Hop`.
+For each argument it starts a process, migrates it `hops` times, and ends it; `options` are those
+of the strategy. It prints one line of JSON for each hop: see `Hop`.
 """
 
 from __future__ import annotations
@@ -32,22 +32,22 @@ from rosrm.ros.client import MasterClient
 _ROOT: Final = Path(__file__).resolve().parents[1]
 #: Hz, of the counters.
 RATE: Final = 50.0
-#: Seconds for whatever a busy machine needs; a move of 500 MB is done in some seconds.
+#: Seconds for anything on a busy machine; a migration of 500 MB takes some seconds.
 _PATIENCE: Final = 180.0
-#: Seconds between two moves, at least.
+#: Seconds between two migrations, at least.
 _SETTLE: Final = 0.5
 _NAME: Final = "portable_counter"
 _NS: Final = 1e9
 
 
 class Heard(NamedTuple):
-    """One count as it was heard.
+    """One count as the observer received it.
 
     Attributes:
         at: when DDS received it, unix time in seconds.
         number: the count: 1, 2, 3, ...
-        passes: how often the node had read all its memory; 0 of one without.
-        checksum: of what it found there.
+        passes: how often the node had read all its memory; 0 for a node without memory to read.
+        checksum: of the content found by the last complete read.
     """
 
     at: float
@@ -58,19 +58,19 @@ class Heard(NamedTuple):
 
 @dataclass(frozen=True)
 class Hop:
-    """One move, as it was heard.
+    """One migration, as seen by the observer.
 
     Attributes:
-        strategy, mb: what was moved, and how.
+        strategy, mb: of the process.
         end: "migrated", "stayed" or "refused".
-        why: it was not "migrated".
-        silence: seconds of the longest time in which no count was heard.
-        seconds: of the whole move, as the master says.
-        parts: of it, by executor, likewise.
-        repeated: counts that were heard again, or out of order.
-        missed: counts that nobody heard.
+        why: the reason where it was not "migrated".
+        silence: seconds of the longest time without a count.
+        seconds: of the whole migration, by the master's record.
+        parts: of it, by executor, by the same record.
+        repeated: counts that were received twice, or out of order.
+        missed: counts that were not received.
         checksums: of its memory; more than one: it has changed.
-        began_anew: it counts from 1 again.
+        began_anew: the successor counts from 1 again.
     """
 
     strategy: str
@@ -87,7 +87,7 @@ class Hop:
 
 
 class Ear:
-    """Hears every count, in a thread of its own."""
+    """Receiver of all counts, in a thread of its own."""
 
     def __init__(self) -> None:
         self.heard: list[Heard] = []
@@ -107,7 +107,7 @@ class Ear:
         self.heard.append(Heard(info["received_timestamp"] / _NS, message.data[1]))
 
     def wait_for(self, counts: int, passes: int = 0) -> None:
-        """Until so many more counts have come, and its memory was read so often meanwhile."""
+        """Wait for so many more counts, and for so many complete reads of the memory."""
         begin, deadline = len(self.heard), time.monotonic() + _PATIENCE
         while not self._has(begin, counts, passes):
             if time.monotonic() > deadline:
@@ -125,16 +125,16 @@ class Ear:
 
 
 class Desk:
-    """Moves one process after the other."""
+    """Driver of the migrations, one process after the other."""
 
     def __init__(self, ear: Ear, client: MasterClient) -> None:
         self._ear, self._client = ear, client
 
     def play(self, strategy: str, mb: float, hops: int, options: Mapping[str, Any]) -> None:
-        """Start a counter, move it to and fro, and end it."""
+        """Start a counter, migrate it to and fro, and end it."""
         self._client.submit([_spec(strategy, mb, options)])
         self._wait("running")
-        passes = 2 if strategy == "criu" else 0  # the second one began after the move
+        passes = 2 if strategy == "criu" else 0  # the second one began after the migration
         self._ear.wait_for(int(RATE * _SETTLE), passes)
         for _ in range(hops):
             hop = self._hop(strategy, mb, passes)
@@ -146,7 +146,7 @@ class Desk:
     def _hop(self, strategy: str, mb: float, passes: int) -> Hop:
         self._wait("running")
         before = self._client.list().last_sequence
-        del self._ear.heard[:-2]  # the last ones of before
+        del self._ear.heard[:-2]  # the last ones before the migration
         if refusal := self._ask():
             return Hop(strategy, mb, "refused", refusal)
         end = self._end_after(before)
@@ -165,7 +165,10 @@ class Desk:
         )  # fmt: skip
 
     def _ask(self) -> str:
-        """Why it cannot be moved; "": it is on its way. Hosts may have to be asked first."""
+        """Request a migration; return the reason where it is refused, "" where it begins.
+
+        Retries while the hosts' capabilities are not known yet.
+        """
         deadline = time.monotonic() + _PATIENCE
         while True:
             try:
@@ -178,7 +181,7 @@ class Desk:
                 return ""
 
     def _end_after(self, before: int) -> Any:
-        """The event with which a move ends."""
+        """Wait for the end of a migration; return its event."""
         deadline = time.monotonic() + _PATIENCE
         while time.monotonic() < deadline:
             for event in self._client.list(events=True, process=_NAME, after=before).events:
@@ -211,7 +214,7 @@ def _spec(strategy: str, mb: float, options: Mapping[str, Any]) -> ProcessSpec:
 
 
 def main() -> None:
-    """Play what is asked for, one after the other."""
+    """Carry out the arguments, one after the other."""
     ear = Ear()
     try:
         with MasterClient.connect(RosSettings(), name="criu desk", timeout=_PATIENCE) as client:

@@ -1,16 +1,16 @@
 """The master's whole decision in the core: filter, score, veto, pick, account.
 
-Two figures, both through `rosrm.core.master.reducer.step` with the policy `weighted`, as the
-master's runtime does it, without the wires and the journal:
+Two figures, both through `rosrm.core.master.reducer.step` with the policy `weighted`, as in the
+master's runtime, without the transport and the journal:
 
 - `us_per_host`: one process is submitted right after fresh readings of all hosts, so that every
-  host is judged anew: microseconds from SubmissionReceived to the commands, by host. The paper's
-  master took 84 us a slave for its whole cycle. `readings_us_per_host` is what taking in those
-  readings cost before, beside it.
+  host is judged again: microseconds from SubmissionReceived to the commands, by host. The paper's
+  master took 84 us a slave for its whole cycle. `readings_us_per_host`: the cost of the readings
+  before, beside it.
 - `assignments_per_s`: many processes are submitted at once; from SubmissionReceived to the
-  commands, queue, record and intent of each included. `assignments_per_s` is for equal processes,
-  `mixed_assignments_per_s` for ten different demands by turns (a map of pieces, say), where each
-  assignment makes the scores of other demands stale.
+  commands, with the queue, the record and the intent of each. `assignments_per_s` is for equal
+  processes, `mixed_assignments_per_s` for ten different demands by turns (a map of pieces, say),
+  where each assignment makes the scores of other demands stale.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class Bench:
             self.step(happened.ProcessRequested(number, number + 1, number + 1))
 
     def step(self, event: happened.Event) -> tuple[float, int]:
-        """Seconds that the core takes for an event, and how many assignments come of it."""
+        """Process an event; return the seconds that it took, and the number of assignments."""
         self.now += 0.001
         began = time.perf_counter()
         commands = step(self.state, event, self.now)
@@ -77,7 +77,7 @@ class Bench:
         return took, sum(isinstance(command, Assign) for command in commands)
 
     def read(self) -> float:
-        """Fresh readings of all hosts; seconds that the core takes for them."""
+        """Process fresh readings of all hosts; return the seconds that it took."""
         self._sequence += 1
         n = self._hosts
         usage, limit = np.zeros((n, RESOURCE_SLOTS)), np.ones((n, RESOURCE_SLOTS))
@@ -94,7 +94,7 @@ class Bench:
         return took
 
     def submit(self, demands: Sequence[dict[str, float]]) -> tuple[float, int]:
-        """Submit one process for each demand."""
+        """Submit one process for each demand; return as `step`."""
         specs = []
         for needs in demands:
             self._names += 1
@@ -104,7 +104,7 @@ class Bench:
 
 
 def decision(hosts: int, runs: int) -> tuple[float, float]:
-    """Median microseconds by host of one decision, and of the readings before it."""
+    """Return the median microseconds by host of one decision, and of the readings before it."""
     bench = Bench(hosts)
     decisions, readings = [], []
     for _ in range(runs):
@@ -117,7 +117,7 @@ def decision(hosts: int, runs: int) -> tuple[float, float]:
 
 
 def rate(hosts: int, runs: int, needs_of: Callable[[int], dict[str, float]]) -> float:
-    """Median assignments a second of many processes submitted at once."""
+    """Return the median assignments a second of many processes submitted at once."""
     rates = []
     for _ in range(runs):
         bench = Bench(hosts)

@@ -55,7 +55,7 @@ _ROOT = Path(__file__).resolve().parents[1]
 _HOSTS = ("h0", "h1", "h2", "h3")
 _PATIENCE = 60.0
 _NS = 1e9
-#: A lease below a second wants a beat to match.
+#: A lease below a second needs a shorter beat.
 _SHORT = (
     LivenessSettings(suspect=0.3, lease=0.8),
     ControlSettings(beat_period=0.1),
@@ -65,11 +65,11 @@ _GUARDED, _KEPT = "guarded", "kept"
 
 @dataclass(frozen=True)
 class GoneOn:
-    """Where a successor went on.
+    """The cycle from which a successor continued.
 
     Attributes:
-        said: last cycle whose output of the former one was heard.
-        published: the same, whose state was.
+        said: last cycle of the predecessor with a received output.
+        published: last cycle of the predecessor with a received state.
         first: cycle of the successor's first output.
     """
 
@@ -79,25 +79,25 @@ class GoneOn:
 
     @property
     def lost(self) -> int:
-        """States that were published, and from which it did not go on.
+        """Return the number of published states after the one from which it continued.
 
-        Before a cycle spoke, the state of the one before it was published, heard or not.
+        Before a cycle's output, the state of the cycle before was published, received or not.
         """
         return max(0, max(self.published, self.said - 1) + 1 - self.first)
 
     @property
     def repeated(self) -> int:
-        """Outputs that it said again."""
+        """Return the number of repeated outputs."""
         return max(0, self.said + 1 - self.first)
 
     @property
     def skipped(self) -> int:
-        """Outputs that nobody heard, between the last and the first one."""
+        """Return the number of outputs that were not received, between the last and the first."""
         return max(0, self.first - self.said - 1)
 
 
 class Witness(Observer):
-    """Hears the states as well as the outputs."""
+    """Observer of the states as well as of the outputs."""
 
     def __init__(self, domain: int) -> None:
         super().__init__(domain)
@@ -106,7 +106,7 @@ class Witness(Observer):
         self._topics: set[str] = set()
 
     def find_states(self) -> None:
-        """Listen to the topics of states that there are by now."""
+        """Subscribe to the topics of states that exist by now."""
         for topic, types in self._node.get_topic_names_and_types():
             is_state = topic.endswith("/state") and "std_msgs/msg/Int64MultiArray" in types
             if is_state and topic not in self._topics:
@@ -118,19 +118,19 @@ class Witness(Observer):
         self.states[number] = max(sequence, self.states.get(number, 0))
 
     def gone_on(self, former: int, after: Output) -> GoneOn:
-        """Where the successor of an instance went on, by its first output."""
+        """Return the cycle from which a successor continued, by its first output."""
         said = max(one.sequence for one in self.outputs if one.instance == former)
         return GoneOn(said, self.states.get(former, 0), after.sequence)
 
 
 @dataclass
 class Outcome:
-    """What came of the rounds; seconds from the fault.
+    """The outcome of all rounds; seconds from the fault.
 
     Attributes:
         detect: until the host was lost.
-        standby, restart: until the successor was heard.
-        standby_gone_on, restart_gone_on: where it went on.
+        standby, restart: until the successor's first output.
+        standby_gone_on, restart_gone_on: the cycles from which the successors continued.
     """
 
     detect: list[float] = field(default_factory=list)
@@ -150,7 +150,7 @@ def _process(name: str, rate: float, **fields: object) -> ProcessSpec:
 
 
 def _hosts() -> list[HostConfig]:
-    # Without cpu: the processor is shared by all hosts, and where it is busy none would have room.
+    # Without cpu: the hosts share the processor, and a busy one would leave room on none.
     probes: dict[str, dict[str, object]] = {"memory": {}, "disk": {}}
     limits = {"memory": 0.98, "disk": 1.0}
     return [HostConfig(host=name, probes=probes, limits=limits) for name in _HOSTS]
@@ -168,10 +168,10 @@ def _cluster(liveness: LivenessSettings, control: ControlSettings) -> Iterator[L
 
 
 def measure(rounds: int, rate: float) -> Outcome:
-    """Switch hosts off, one a round, in turn that of the one process and of the other.
+    """Switch hosts off, one a round, by turns the host of the one process and of the other.
 
     Raises:
-        TimeoutError: something did not come about; the message says what.
+        TimeoutError: a successor or a state did not come; the message names it.
     """
     outcome = Outcome()
     with contextlib.ExitStack() as stack:
@@ -217,7 +217,7 @@ def _round(cluster: LocalCluster, observer: Witness, name: str, outcome: Outcome
 
 
 def _wait_until_calm(cluster: LocalCluster) -> None:
-    """Both run, on hosts that are there, the standby is ready, and a new state is elsewhere."""
+    """Wait until both processes run, the standby is ready, and a new replica is elsewhere."""
 
     def calm(view: object) -> bool:
         rows = {row.name: row for row in view.processes}  # type: ignore[attr-defined]
@@ -238,7 +238,7 @@ def _wait_until_calm(cluster: LocalCluster) -> None:
 
 
 def _copies(cluster: LocalCluster, own: str, number: int) -> dict[str, int]:
-    """Hosts other than its own that keep a state of an instance on their disks, and the cycle."""
+    """Return the other hosts with a replica of an instance's state on disk, and its cycle."""
     heads = {
         name: snapshots.newest_head(cluster.directory / "hosts" / name / "kept" / token(_KEPT))
         for name in _HOSTS
@@ -248,7 +248,7 @@ def _copies(cluster: LocalCluster, own: str, number: int) -> dict[str, int]:
 
 
 def _of(cluster: LocalCluster, name: str, former: int) -> int:
-    """The number of the instance that follows another one."""
+    """Wait for the successor of an instance; return its number."""
 
     def followed(view: object) -> bool:
         rows = view.processes  # type: ignore[attr-defined]
@@ -269,7 +269,7 @@ def _wait_for_successor(observer: Observer, former: int, number: int) -> Output:
 
 
 def _lost_at(cluster: LocalCluster, host: str, after: int) -> float:
-    """When the master took a host for lost, unix time."""
+    """Return the unix time at which the master declared a host lost."""
     deadline = time.monotonic() + _PATIENCE
     while time.monotonic() < deadline:
         events = cluster.client.list(events=True, host=host, after=after).events
@@ -284,7 +284,7 @@ def _lost_at(cluster: LocalCluster, host: str, after: int) -> float:
 
 
 def false_losses(minutes: float) -> dict[str, int]:
-    """How many hosts are taken for lost while every core is busy with something else.
+    """Return the number of hosts that are declared lost while other programs occupy every core.
 
     Returns:
         by lease: there is a cluster for each, and all are under the same load at once.
@@ -306,7 +306,7 @@ def _lost(cluster: LocalCluster) -> int:
 
 @contextlib.contextmanager
 def _load() -> Iterator[None]:
-    """One process a core that does nothing but count."""
+    """Run one counting process for each core."""
     counting = "while True: pass"
     burners = [
         subprocess.Popen([sys.executable, "-c", counting])
@@ -321,7 +321,7 @@ def _load() -> Iterator[None]:
 
 
 def main() -> int:
-    """Measure and print one JSON object; returns the exit status."""
+    """Measure and print one JSON object; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rounds", type=int, default=40, help="hosts that are switched off")
     parser.add_argument("--rate", type=float, default=50.0, help="Hz, of the nodes")

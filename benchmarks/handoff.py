@@ -42,20 +42,20 @@ from rosrm.testing.loopback import enter_private_network
 
 _ROOT = Path(__file__).resolve().parents[1]
 _NS = 1e9
-#: Seconds of undisturbed output before and after each move.
+#: Seconds of undisturbed output before and after each migration.
 _SETTLE = 0.5
-#: Seconds within which a move must have ended, one way or the other.
+#: Seconds within which a migration must have ended, with success or not.
 _PATIENCE = 60.0
 _NAME = "moving"
 
 
 class Output(NamedTuple):
-    """One output as the observer got it.
+    """One output as the observer received it.
 
     Attributes:
         received: by DDS, unix time in ns.
-        instance: who said it.
-        sequence: outputs of the node so far, this one included; 0 of one without state.
+        instance: the number of its publisher.
+        sequence: outputs of the node so far, with this one; 0 for a stateless node.
         answered: the input that it answers, numbered from 1.
     """
 
@@ -67,12 +67,12 @@ class Output(NamedTuple):
 
 @dataclass
 class Outcome:
-    """What came of the moves: how each ended, and what they were seen to cost.
+    """The ends of the migrations, and their costs as seen by the observer.
 
     Attributes:
-        ends: "migrated" or "stayed", of each move.
-        gaps: seconds beyond one period, of each change of the speaker.
-        lost, repeated, out_of_order: outputs, or inputs that nobody answered or somebody twice.
+        ends: "migrated" or "stayed", of each migration.
+        gaps: seconds beyond one period, of each change of the publisher.
+        lost, repeated, out_of_order: outputs, or inputs without an answer or with several.
     """
 
     ends: list[str]
@@ -83,7 +83,7 @@ class Outcome:
 
 
 class Observer:
-    """Records every output, in a participant and a thread of its own."""
+    """Recorder of every output, in a participant and a thread of its own."""
 
     def __init__(self, domain: int) -> None:
         self.outputs: list[Output] = []
@@ -102,7 +102,7 @@ class Observer:
         self.outputs.append(Output(info["received_timestamp"], *message.data))
 
     def wait_for(self, count: int, timeout: float = _PATIENCE) -> None:
-        """Until so many more outputs have come."""
+        """Wait for so many more outputs."""
         wanted, deadline = len(self.outputs) + count, time.monotonic() + timeout
         while len(self.outputs) < wanted:
             if time.monotonic() >= deadline:
@@ -118,7 +118,7 @@ class Observer:
 
 @contextlib.contextmanager
 def driver(cluster: LocalCluster, rate: float) -> Iterator[None]:
-    """Inputs at a rate, from a process of its own."""
+    """Run the driver, which publishes inputs at a rate, in a process of its own."""
     environment = {**os.environ, **cluster.ros.environment(), "ROS_DOMAIN_ID": str(cluster.domain)}
     process = subprocess.Popen(
         [sys.executable, "-m", "benchmarks.handoff_nodes", "drive", "--rate", str(rate)],
@@ -136,7 +136,7 @@ def driver(cluster: LocalCluster, rate: float) -> Iterator[None]:
 
 
 def process_of(strategy: str, program: str, rate: float) -> ProcessSpec:
-    """The node that is moved; `rate` in Hz."""
+    """Return the node that is migrated; `rate` in Hz."""
     return ProcessSpec(
         _NAME, module="benchmarks.handoff_nodes", arguments=(program, "--rate", str(rate)),
         environment={"PYTHONPATH": str(_ROOT)}, ros=True,
@@ -145,7 +145,7 @@ def process_of(strategy: str, program: str, rate: float) -> ProcessSpec:
 
 
 def move(cluster: LocalCluster) -> str:
-    """Move the process to the other host; returns "migrated" or "stayed"."""
+    """Migrate the process to the other host; return "migrated" or "stayed"."""
     cluster.wait_until("the process running", lambda view: view.processes[0].state == "running")
     last = cluster.client.list(events=True, newest=1).events[-1].sequence
     here = cluster.process(_NAME).host
@@ -164,7 +164,7 @@ def move(cluster: LocalCluster) -> str:
 
 
 def gaps_of_handoff(outputs: Sequence[Output], period: float) -> list[float]:
-    """Seconds beyond one period, from the last output of one instance to the next one's first."""
+    """Return the gaps: seconds beyond one period between the outputs of two instances."""
     return [
         (after.received - before.received) / _NS - period
         for before, after in itertools.pairwise(outputs)
@@ -173,7 +173,7 @@ def gaps_of_handoff(outputs: Sequence[Output], period: float) -> list[float]:
 
 
 def outcome_of_handoff(ends: list[str], outputs: Sequence[Output], period: float) -> Outcome:
-    """Of a node that counts its outputs; `period` in seconds."""
+    """Return the outcome for a node that counts its outputs; `period` in seconds."""
     answered = [output.answered for output in outputs]
     sequence = [output.sequence for output in outputs]
     # Both must be gapless: no input without an answer, and no answer that the observer missed.
@@ -186,7 +186,7 @@ def outcome_of_handoff(ends: list[str], outputs: Sequence[Output], period: float
 
 
 def outcome_of_relaunch(ends: list[str], outputs: Sequence[Output], period: float) -> Outcome:
-    """Of a node that says the same in each cycle; `period` in seconds."""
+    """Return the outcome for a node with the same output in each cycle; `period` in seconds."""
     by_instance: dict[int, list[float]] = {}
     for output in outputs:
         by_instance.setdefault(output.instance, []).append(output.received / _NS)
@@ -199,10 +199,10 @@ def outcome_of_relaunch(ends: list[str], outputs: Sequence[Output], period: floa
 
 
 def measure(strategy: str, driven: str, rate: float, runs: int) -> Outcome:
-    """Move a node to and fro, `runs` times, on a cluster of two hosts; `rate` in Hz.
+    """Migrate a node to and fro, `runs` times, on a cluster of two hosts; `rate` in Hz.
 
     Raises:
-        TimeoutError: a move did not end, or the node fell silent.
+        TimeoutError: a migration did not end, or the node's outputs ceased.
     """
     program = "tick" if strategy == "relaunch" else {"input": "echo", "timer": "count"}[driven]
     period = 1.0 / rate

@@ -24,17 +24,17 @@ from rosrm.node import Node
 QOS = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE)
 INPUT = "handoff_input"
 OUTPUT = "handoff_output"
-#: Seconds for which the driver waits for the first listener.
+#: Seconds for which the driver waits for the first subscriber.
 _MATCH = 30.0
 
 
 def instance() -> int:
-    """The number of this instance, as its slave told it; 0: not started by rosrm."""
+    """Return the number of this instance, set by its slave; 0: not started by rosrm."""
     return int(os.environ.get("ROSRM_INSTANCE", "#0").rpartition("#")[2])
 
 
 class Echo(Node):
-    """Stateful: answers each input with a number that grows by one."""
+    """A stateful node that answers each input with a number that grows by one."""
 
     def __init__(self) -> None:
         super().__init__("echo")
@@ -55,9 +55,10 @@ class Echo(Node):
 
 
 class Count(Node):
-    """Stateful: counts by a timer of its own.
+    """A stateful node that counts by a timer of its own.
 
-    A cycle speaks first, and its state follows: [instance, sequence], for who looks at both.
+    A cycle publishes the output first, and then the state, [instance, sequence], for an observer of
+    both.
     """
 
     def __init__(self, rate: float) -> None:
@@ -79,7 +80,7 @@ class Count(Node):
 
 
 class Tick(rclpy.node.Node):  # type: ignore[misc]  # rclpy brings no types
-    """Stateless: says the same in each cycle."""
+    """A stateless node with the same output in each cycle."""
 
     def __init__(self, rate: float) -> None:
         super().__init__("tick")
@@ -91,7 +92,7 @@ class Tick(rclpy.node.Node):  # type: ignore[misc]  # rclpy brings no types
 
 
 def drive(rate: float) -> None:
-    """Publish 1, 2, 3, ... at a rate, from the first listener on, until the process is stopped."""
+    """Publish 1, 2, 3, ... at a rate, from the first subscriber on, until the process stops."""
     node = rclpy.node.Node("handoff_driver")
     inputs = node.create_publisher(Int64, INPUT, QOS)
     deadline = time.monotonic() + _MATCH

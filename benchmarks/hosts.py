@@ -1,4 +1,4 @@
-"""Hosts for the benchmarks: slices of this machine, with room enough not to be what is measured."""
+"""Hosts for the benchmarks: slices of this machine, large enough not to limit a measurement."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ GIB = 2.0**30
 
 
 def three_hosts(*, max_processes: int = 0) -> list[HostConfig]:
-    """Three equal slices.
+    """Return the configurations of three equal slices.
 
     Args:
         max_processes: most processes held at a time; 0: no bound.

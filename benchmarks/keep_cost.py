@@ -32,7 +32,7 @@ SIZES = (100, 100_000, 1_000_000, 5_000_000)
 
 
 def node(size: int, cycles: int) -> None:
-    """Runs in the child: prints what a cycle took."""
+    """Print the seconds of each cycle; runs in the child process."""
     enter_private_network()
     rclpy.init()
 
@@ -83,7 +83,7 @@ def node(size: int, cycles: int) -> None:
 
 
 def measured(size: int, cycles: int, *, keep: bool) -> dict[str, float]:
-    """The figures of one run."""
+    """Return the figures of one run."""
     with tempfile.TemporaryDirectory() as directory:
         environment = {
             **os.environ, "ROSRM_PROCESS": "changing", "ROSRM_INSTANCE": "changing#1",

@@ -30,7 +30,7 @@ _NS_PER_MS = 1e6
 
 
 def bare_spawn_ms(folder: Path) -> float:
-    """Milliseconds from the call to the stamp of a process without rosrm."""
+    """Return the milliseconds from the call to the stamp of a process without rosrm."""
     out = folder / "bare"
     with out.open("wb") as sink:
         called = time.time_ns()
@@ -42,7 +42,7 @@ def bare_spawn_ms(folder: Path) -> float:
 
 
 def submitted_ms(cluster: LocalCluster, number: int) -> float:
-    """Milliseconds from `submit` called to the stamp of the process."""
+    """Return the milliseconds from the call of `submit` to the stamp of the process."""
     name = f"stamp{number}"
     called = time.time_ns()
     cluster.client.submit([ProcessSpec(name, command=_STAMP, kind=Kind.JOB)])
@@ -51,7 +51,7 @@ def submitted_ms(cluster: LocalCluster, number: int) -> float:
 
 
 def _wait_for_end(cluster: LocalCluster, name: str, timeout: float = 10.0) -> None:
-    """Look seldom, so that looking is no part of what is measured."""
+    """Wait for a job's end; poll seldom, so that polling does not affect the measurement."""
     deadline = time.monotonic() + timeout
     while True:
         cluster.client.spin(0.02)
@@ -81,7 +81,7 @@ def main() -> None:
         with LocalCluster(directory, hosts=three_hosts()) as cluster:
             spawns, totals = [], []
             for number in range(arguments.warm_up + arguments.runs):
-                # Interleaved: what the machine does meanwhile hits both alike.
+                # Interleaved: other load on the machine affects both alike.
                 spawns.append(bare_spawn_ms(directory))
                 totals.append(submitted_ms(cluster, number))
     spawns, totals = spawns[arguments.warm_up :], totals[arguments.warm_up :]

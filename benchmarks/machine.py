@@ -1,4 +1,4 @@
-"""What a figure was measured on: the machine, the versions, the load beside it, how often."""
+"""Conditions of a measurement: the machine, the versions, the load beside it, the runs."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _DISTRIBUTIONS = (
 
 
 def machine() -> dict[str, Any]:
-    """This machine, as far as it can be read without root."""
+    """Return a description of this machine, as far as it is readable without root."""
     return {
         "processor": _processor(),
         "cores": len(os.sched_getaffinity(0)),
@@ -44,7 +44,7 @@ def machine() -> dict[str, Any]:
 
 
 def versions() -> dict[str, str]:
-    """Python, rosrm and what it rests on."""
+    """Return the versions of Python, rosrm and the distributions below it."""
     found = {"python": platform.python_version(), "rosrm": __version__}
     for name in _DISTRIBUTIONS:
         try:
@@ -57,8 +57,8 @@ def versions() -> dict[str, str]:
 def print_report(benchmark: str, figures: Mapping[str, Any], *, runs: int) -> None:
     """Print the figures as one JSON object: the last line of a benchmark.
 
-    `load_average` tells how busy the machine was beside the measurement: on a busy one the medians
-    say more than the means, and all of them too much.
+    `load_average` shows how busy the machine was. On a busy machine the medians are more reliable
+    than the means, and all times are too long.
     """
     print(
         json.dumps(
@@ -77,12 +77,12 @@ def say(message: str) -> None:
 
 
 def median(values: Iterable[float]) -> float:
-    """The middle value."""
+    """Return the median."""
     return statistics.median(values)
 
 
 def percentile(values: Sequence[float], fraction: float) -> float:
-    """The value below which a fraction of the sorted values lies (nearest rank)."""
+    """Return the value below which a fraction of the sorted values lies (nearest rank)."""
     ordered = sorted(values)
     return ordered[min(len(ordered) - 1, int(fraction * len(ordered)))]
 

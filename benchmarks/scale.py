@@ -1,19 +1,19 @@
 """A master with a thousand slaves at 10 Hz: what comes, what is missed, what it costs.
 
-The master is the real one, started as `rosrm master` starts it. The slaves are simulated
-(`benchmarks/simulated_slaves.py`), many in each of a few processes, and say what real slaves say,
-by the same code. What the master takes in it tells itself on `master_load`, by its own clock:
+The master is the real one, started as by `rosrm master`. The slaves are simulated
+(`benchmarks/simulated_slaves.py`), many in each of a few processes; their messages come from a real
+slave's code. The master publishes its own figures on `master_load`, by its own clock:
 
-- `received_per_s`: slave-cycles that messages account for; `missed`: those that none did, by the
-  slaves' own counting. `offered_per_s`: cycles that the simulated slaves carried out.
+- `received_per_s`: slave-cycles that messages account for; `missed`: those without a message, by
+  the slaves' own counting. `offered_per_s`: cycles that the simulated slaves carried out.
 - `us_per_message`: CPU of all threads of the master, by slave-cycle: reception, decoding, decision.
 - `oldest_reading_p99_s`: at each look of the master, the age of the oldest among the newest
   readings of all hosts.
-- `request_process_*_ms`: one job at a time, from `submit` called to the assignment at the slave.
-  The master answers one request; the answer reaches the reader of each slave.
+- `request_process_*_ms`: one job at a time, from the call of `submit` to the assignment at the
+  slave. The master answers one request; the answer reaches the reader of each slave.
 
-Where it is allowed, all of it is in a network namespace of its own and speaks UDP, as real hosts
-do; `transports` says which it was.
+Where permitted, everything runs in a network namespace of its own and uses UDP, as real hosts do;
+`transports` names the transports used.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ from rosrm.testing.loopback import enter_private_network
 from rosrm_msgs import msg
 
 _ROOT = Path(__file__).resolve().parents[1]
-#: Seconds at the full rate before anything is counted: in the first half minute a slave asks for
-#: work again and again, ever more seldom.
+#: Seconds at the full rate before the count: in the first half minute slaves ask for work
+#: repeatedly, with growing intervals.
 _SETTLE = 30.0
-#: Seconds for a word of the master, which comes once a second.
+#: Seconds for a message on `master_load`, which comes once a second.
 _PATIENCE = 30.0
 _END = 15.0
 _JOBS = 30
@@ -57,10 +57,10 @@ _PAUSE = 0.1
 
 
 class Loads:
-    """What the master says of how it keeps up.
+    """Receiver of the master's `master_load`.
 
     Attributes:
-        heard: the particulars of each word, oldest first.
+        heard: the content of each message, oldest first.
     """
 
     def __init__(self, settings: RosSettings) -> None:
@@ -75,10 +75,10 @@ class Loads:
         self.heard.append({**json.loads(word.data), "elapsed": word.elapsed})
 
     def wait(self, seconds: float) -> list[dict[str, Any]]:
-        """The words of so many seconds, from one that comes next on.
+        """Return the messages of so many seconds, from the next one on.
 
         Raises:
-            TimeoutError: no further word came.
+            TimeoutError: no further message came.
         """
         self.heard.clear()
         deadline = time.monotonic() + seconds + _PATIENCE
@@ -89,7 +89,7 @@ class Loads:
         return list(self.heard)
 
     def close(self) -> None:
-        """Leave ROS."""
+        """Leave the ROS graph."""
         self._participant.close()
 
 
@@ -102,7 +102,7 @@ class Crowd:
     """The processes of the simulated slaves; they end when they are closed.
 
     Attributes:
-        domain: in which the master is.
+        domain: of the master.
         hz, step: of a slave's cycles, and of its readings.
         timeout: seconds for all slaves of a process to register.
     """
@@ -126,13 +126,13 @@ class Crowd:
                 subprocess.Popen(
                     [sys.executable, "-m", "benchmarks.simulated_slaves", *words],
                     stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=_ROOT,
-                    start_new_session=True,  # a Ctrl-C is for whoever closes their input
+                    start_new_session=True,  # a Ctrl-C is for the parent, which closes their input
                 )
             )  # fmt: skip
         self.hear()
 
     def hear(self) -> list[dict[str, Any]]:
-        """One report of each.
+        """Return the next report of each process.
 
         Raises:
             RosrmError: a process has ended instead.
@@ -140,7 +140,7 @@ class Crowd:
         return [_next_report(process) for process in self._processes]
 
     def tell(self) -> None:
-        """Begin to count, or end it.
+        """Start the count, or end it.
 
         Raises:
             RosrmError: a process has ended.
@@ -154,10 +154,10 @@ class Crowd:
                 raise _ended(process) from None
 
     def close(self) -> None:
-        """End all, by pid."""
+        """End all processes, by pid."""
         for process in self._processes:
             if process.stdin is not None:
-                with contextlib.suppress(BrokenPipeError):  # it has ended before
+                with contextlib.suppress(BrokenPipeError):  # it has ended already
                     process.stdin.close()
         for process in self._processes:
             try:
@@ -168,7 +168,7 @@ class Crowd:
 
 
 def _next_report(process: subprocess.Popen[str]) -> dict[str, Any]:
-    """The next line of JSON; Fast DDS writes to the standard output as well."""
+    """Return the next line of JSON; Fast DDS writes to the standard output as well."""
     assert process.stdout is not None
     for line in process.stdout:
         if line.startswith("{"):
@@ -181,10 +181,10 @@ def _ended(process: subprocess.Popen[str]) -> RosrmError:
 
 
 def readings(crowd: Crowd, loads: Loads, seconds: float) -> dict[str, float]:
-    """What comes of the readings of all slaves in so many seconds.
+    """Return the figures of the readings of all slaves over so many seconds.
 
     Raises:
-        RosrmError: there was none.
+        RosrmError: there was no reading.
     """
     crowd.tell()
     words = loads.wait(seconds)
@@ -217,7 +217,7 @@ def readings(crowd: Crowd, loads: Loads, seconds: float) -> dict[str, float]:
 
 
 def requests(cluster: LocalCluster, crowd: Crowd) -> dict[str, float]:
-    """How long an assignment takes to its slave, one job at a time."""
+    """Return the delays from submission to the assignment at the slave, one job at a time."""
     crowd.tell()
     called = {}
     for number in range(_JOBS):
@@ -240,7 +240,7 @@ def requests(cluster: LocalCluster, crowd: Crowd) -> dict[str, float]:
 
 
 def _wait_for_end(cluster: LocalCluster, name: str) -> None:
-    """Until a job has finished; jobs are served in order. One that is stuck shows as unanswered."""
+    """Wait for a job's end; jobs run in order. A job that is stuck counts as unanswered."""
     deadline = time.monotonic() + _END
     while time.monotonic() < deadline:
         (row,) = cluster.client.list(processes=True, process=name).processes
@@ -250,11 +250,11 @@ def _wait_for_end(cluster: LocalCluster, name: str) -> None:
 
 
 def measure(arguments: argparse.Namespace, folder: Path) -> dict[str, float]:
-    """All figures of one run.
+    """Return all figures of one run.
 
     Raises:
-        RosrmError: a part ended, or nothing came of the readings or of the jobs.
-        TimeoutError: the master said nothing.
+        RosrmError: a part ended, or readings or assignments are missing.
+        TimeoutError: no message of the master came.
     """
     with ExitStack() as opened:
         cluster = LocalCluster(folder)
@@ -277,7 +277,7 @@ def measure(arguments: argparse.Namespace, folder: Path) -> dict[str, float]:
 
 
 def main() -> int:
-    """Measure and print one JSON object; returns the exit status."""
+    """Measure and print one JSON object; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--slaves", type=_positive(int), default=1000)
     parser.add_argument("--hz", type=_positive(float), default=10.0)

@@ -1,4 +1,4 @@
-"""One DDS participant that many simulated slaves share, and each one's place in it."""
+"""DDS participant that many simulated slaves share, and the place of each in it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rosrm_msgs import msg, srv
 class Berth:
     """One slave's place in the participant that it shares with others.
 
-    Stands in for a `Participant` and for its node towards one `SlaveEndpoint`.
+    It replaces a `Participant` and its node for one `SlaveEndpoint`.
     """
 
     def __init__(self, shared: SharedParticipant) -> None:
@@ -24,36 +24,36 @@ class Berth:
         self.guard = shared.participant.guard
 
     def create_client(self, kind: Any, name: str, *, qos_profile: Any) -> Any:
-        """A client; of its own only where answers come to many."""
+        """Return a client; an own one only where answers reach many."""
         return self._shared.client(kind, name, qos_profile)
 
     def create_publisher(self, kind: Any, name: str, qos: Any) -> Any:
-        """A publisher; of its own for the readings."""
+        """Return a publisher; an own one for the readings."""
         return self._shared.publisher(kind, name, qos)
 
     def create_subscription(
         self, kind: Any, name: str, take: Callable[[Any], None], qos: Any
     ) -> None:
-        """A place among those that hear a topic."""
+        """Add a callback to those of a topic."""
         self._shared.hear(kind, name, take, qos)
 
     def counted(self, callback: Callable[..., None]) -> Callable[..., None]:
-        """As the participant's."""
+        """Wrap a callback as the participant does."""
         return self._shared.participant.counted(callback)
 
     def serve(self, kind: Any, name: str, handle: Callable[[Any, OpenRequest], None]) -> None:
-        """A service of its own; none where there is nothing to ask for."""
+        """Offer an own service; none for `ReadLog`, because there are no logs."""
         if kind is not srv.ReadLog:
             self._shared.participant.serve(kind, name, handle)
 
 
 @dataclass
 class Tally:
-    """What the slaves of a process did.
+    """The counts of all slaves of a process.
 
     Attributes:
         cycles: of all slaves that are registered.
-        late: of those, more than a period after they were due; what fell due meanwhile is left out.
+        late: of those, more than a period after they were due; cycles skipped by them do not count.
         messages: readings that were sent.
         lost: times that a slave lost its master.
         taken: unix times at which assignments came.
@@ -66,13 +66,13 @@ class Tally:
     taken: dict[str, float] = field(default_factory=dict)
 
     def begin(self) -> None:
-        """Count anew."""
+        """Reset the counts."""
         self.cycles = self.late = self.messages = self.lost = 0
 
 
 @dataclass
 class CountedPublisher:
-    """A publisher of readings, and a tally of what it sends."""
+    """A publisher of readings that counts them in a tally."""
 
     publisher: Any
     tally: Tally
@@ -94,7 +94,7 @@ class SharedParticipant:
         self._hearers: dict[Any, list[Callable[[Any], None]]] = {}
 
     def client(self, kind: Any, name: str, qos_profile: Any) -> Any:
-        """The shared client of a service, or a new one for `request_process`."""
+        """Return the shared client of a service, or a new one for `request_process`."""
         if kind in self._clients:
             return self._clients[kind]
         made = self.participant.node.create_client(kind, name, qos_profile=qos_profile)
@@ -103,7 +103,7 @@ class SharedParticipant:
         return made
 
     def publisher(self, kind: Any, name: str, qos: Any) -> Any:
-        """The shared publisher of a topic, or a new one for `resource_info`."""
+        """Return the shared publisher of a topic, or a new one for `resource_info`."""
         if kind in self._publishers:
             return self._publishers[kind]
         made = self.participant.node.create_publisher(kind, name, qos)

@@ -51,21 +51,21 @@ from rosrm.testing.loopback import settings_on_this_machine
 
 #: Most seconds between two looks at standard input.
 _LOOK = 0.05
-#: Slaves that shake hands at a time: each answer reaches all readers of this process.
+#: Slaves that do the handshake at a time: each answer reaches all readers of this process.
 _AT_ONCE = 20
-#: Seconds from one round of cycles to the next: whoever is due within them is served together, as
-#: each look at what has come costs at least 60 us of waiting.
+#: Seconds between two rounds of cycles. Slaves that are due in that time are served together,
+#: because each poll for messages costs at least 60 us of waiting.
 _ROUND = 0.005
-#: Most turns of taking in between two rounds; the seconds of a turn that finds nothing; how many
-#: such turns say that there is nothing more.
+#: Most turns of reception between two rounds; the seconds of a turn that received nothing; number
+#: of such turns after which the queues are empty.
 _TURNS = 1000
 _NOTHING = 50e-6
 _SLOW_TURNS = 3
-#: Seconds between two cycles while slaves come up, which takes the machine's time.
+#: Seconds between two cycles of a slave during start-up, which occupies the machine.
 _GENTLY = 0.25
 _LIMIT = 0.8
-#: Standard deviation of a usage's change from one cycle to the next: as many messages come of it as
-#: of a real slave that measures a busy machine.
+#: Standard deviation of a usage's change from one cycle to the next: it causes as many messages as
+#: a real slave that measures a busy machine.
 STEP = 0.005
 #: Bounds of the usages, below the limit.
 _BETWEEN = (0.05, 0.7)
@@ -74,7 +74,7 @@ _PRESENT = (1 << len(_RESOURCES)) - 1
 
 
 class Walks:
-    """The readings of many slaves: each usage wanders between two bounds.
+    """The readings of many slaves: a random walk of each usage between two bounds.
 
     Args:
         slaves: how many.
@@ -91,14 +91,14 @@ class Walks:
         self.go_on()
 
     def go_on(self) -> None:
-        """One more cycle of all."""
+        """Advance all readings by one cycle."""
         self._used += self._random.normal(0.0, self._step, self._used.shape)
         np.clip(self._used, *_BETWEEN, out=self._used)
         self.usage[:, : len(_RESOURCES)] = self._used
 
 
 class SimulatedSlave:
-    """A slave whose readings and processes are made up."""
+    """A slave with simulated readings and processes."""
 
     def __init__(self, berth: Berth, name: str, period: float, tally: Tally) -> None:
         self.name = name
@@ -114,13 +114,13 @@ class SimulatedSlave:
 
     @property
     def registered(self) -> bool:
-        """Whether the master has taken it in."""
+        """Return True if the master has accepted its registration."""
         return self.endpoint.link is Link.REGISTERED
 
     def cycle(
         self, usage: npt.NDArray[np.float32], limit: npt.NDArray[np.float32], now: float
     ) -> None:
-        """What a slave does at the rate of `resource_info`."""
+        """Do a slave's work of one period of `resource_info`."""
         self.endpoint.go_on(now)
         accepting = core.under_limits(usage, limit, _PRESENT, 0)
         self.endpoint.publish_reading(
@@ -130,7 +130,7 @@ class SimulatedSlave:
         self.work(now)
 
     def work(self, now: float) -> None:
-        """Let the core decide about what happened, and say that what it launches runs and ends."""
+        """Process the queued events; report each launched process as running, then as ended."""
         while self._events:
             events, self._events = self._events, []
             for command in core.step_all(self._state, events, now):
@@ -147,54 +147,54 @@ class SimulatedSlave:
                 status = InstanceStatus(instance, state, pid=os.getpid())
                 self._events.append(core.SupervisorReported((status,)))
 
-    # --- what the endpoint asks ----------------------------------------------------------
+    # --- callbacks of the endpoint --------------------------------------------------------
 
     def take(self, event: core.Event) -> None:
-        """Something happened; work is begun at once, as a slave's loop does."""
+        """Queue an event; process assignments at once, as a slave's loop does."""
         self._events.append(event)
         self._tally.lost += isinstance(event, core.MasterLost)
         if isinstance(event, core.AssignmentsReceived):
             self.work(time.monotonic())
 
     def statuses(self) -> Sequence[InstanceStatus]:
-        """All that this slave holds."""
+        """Return the statuses of all instances that this slave holds."""
         return self._state.statuses()
 
     def kept_states(self) -> Sequence[KeptState]:
-        """None: its processes have no state."""
+        """Return none: its processes have no state."""
         return ()
 
-    # ruff: noqa: ARG002 - the endpoint calls them so, with or without a process
+    # ruff: noqa: ARG002 - the endpoint passes these arguments in any case
 
     def read_log(self, query: LogQuery) -> LogSlice:
-        """No process, no log."""
+        """Refuse: there is no process, so no log."""
         raise Refused(f"{self.name} is simulated: it has no logs", "unknown")
 
     def set_restart(
         self, instance: InstanceId, restart: RestartPolicy, settled: Callable[[str], None]
     ) -> None:
-        """No process, no policy."""
+        """Refuse: there is no process, so no policy."""
         settled(f"{self.name} is simulated: {instance} does not run")
 
     def execute(
         self, executor: str, arguments: dict[str, Any], done: Callable[[str, str, str], None]
     ) -> None:
-        """No executors."""
+        """Refuse: there are no executors."""
         raise Refused(f"{self.name} is simulated: it has no executor {executor!r}", "unknown")
 
     def say(self, message: str) -> None:
-        """Nobody listens to one of a thousand."""
+        """Drop a log line: thousands of slaves would flood the output."""
 
 
 class Fleet:
-    """The slaves of this process, each in its own time.
+    """The slaves of this process, each with its own schedule.
 
     Args:
         settings: the domain.
         first: number of the first slave.
         count: how many.
         period: seconds between two cycles of a slave.
-        step: of a usage in one cycle, as `Walks` says.
+        step: of a usage in one cycle, as in `Walks`.
     """
 
     def __init__(
@@ -211,10 +211,10 @@ class Fleet:
         self._due: list[tuple[float, int]] = []
 
     def bring_up(self, timeout: float) -> None:
-        """Make and register all, a few at a time.
+        """Make and register all slaves, a few at a time.
 
         Raises:
-            TimeoutError: not all were taken in in time.
+            TimeoutError: not all were registered in time.
             RosrmError: the master refused one.
         """
         deadline = time.monotonic() + timeout
@@ -240,7 +240,7 @@ class Fleet:
             heapq.heappush(self._due, (now + self._period * index / self._count, index))
 
     def go_on(self, seconds: float) -> None:
-        """Do what falls due for a while."""
+        """Serve due cycles and messages for so many seconds."""
         end = time.monotonic() + seconds
         while (now := time.monotonic()) < end:
             while self._due and self._due[0][0] <= now:
@@ -251,11 +251,11 @@ class Fleet:
                 self._shared.participant.spin(left)
 
     def _drain(self) -> None:
-        """Take in what has come, also when the next cycles are due already.
+        """Process the received messages, also when the next cycles are due already.
 
-        Each turn takes one event at least, and answers to other slaves are events as well: by one
-        for each round of cycles they would pile up. A turn that took its time found nothing, or
-        was interrupted: several in a row found nothing.
+        Each turn takes at least one event, and answers to other slaves are events as well. One turn
+        for each round of cycles would let them pile up. A long turn received nothing or was
+        interrupted, so that only several in a row show that the queues are empty.
         """
         slow = 0
         for _ in range(_TURNS):
@@ -271,26 +271,26 @@ class Fleet:
             self.tally.late += 1
             due = now
         heapq.heapreplace(self._due, (due + self._pace, index))
-        if index == 0:  # whose next cycle comes when each of the others has had one
+        if index == 0:  # its next cycle comes after one of each other slave
             self._walks.go_on()
         slave = self.slaves[index]
         slave.cycle(self._walks.usage[index], self._walks.limit, now)
         self.tally.cycles += slave.registered
 
     def close(self) -> None:
-        """Leave ROS."""
+        """Leave the ROS graph."""
         self._shared.participant.close()
 
 
 def _told_to_go_on(fleet: Fleet) -> bool:
-    """Go on until a line comes on standard input; False: it was closed."""
+    """Serve the slaves until a line comes on standard input; False: it was closed."""
     while not select.select([sys.stdin], [], [], 0.0)[0]:
         fleet.go_on(_LOOK)
     return bool(sys.stdin.readline())
 
 
 def main() -> int:
-    """Be so many slaves until standard input is closed; returns the exit status."""
+    """Simulate the slaves until standard input is closed; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--domain", type=int, required=True)
     parser.add_argument("--first", type=int, required=True)

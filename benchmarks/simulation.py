@@ -1,10 +1,10 @@
 """How fast `rosrm simulate` is, and what a record costs the master.
 
-- `events_per_s`: events that the simulated master takes in a second of real time, for a thousand
-  jobs on fifty hosts in ten minutes; `seconds` for all of it.
-- `note_us`: what the master's loop pays for one event that is recorded, CPU of its thread; and
-  `written_us`, what the thread that encodes and writes pays, for a batch of readings of
-  `hosts_in_a_batch` hosts. `bytes_per_reading` is what comes of one reading in the file.
+- `events_per_s`: events that the simulated master processes in a second of real time, for a
+  thousand jobs on fifty hosts in ten minutes; `seconds` for all of it.
+- `note_us`: CPU time of the master's loop for one event that is recorded. `written_us`: CPU time of
+  the thread that encodes and writes, for a batch of readings of `hosts_in_a_batch` hosts.
+  `bytes_per_reading`: size of one reading in the file.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _RESOURCES = 3
 
 
 def fleet(seed: int) -> Workload:
-    """A thousand jobs, drawn by chance, on fifty equal hosts."""
+    """Return a thousand random jobs on fifty equal hosts."""
     random = np.random.default_rng(seed)
     resources = (
         ResourceDescription("memory", "B", 8.0 * 2**30),
@@ -60,7 +60,7 @@ def fleet(seed: int) -> Workload:
 
 
 def simulated(seed: int) -> tuple[float, int]:
-    """Seconds of CPU and events of one run."""
+    """Return the seconds of CPU and the events of one run."""
     policy = ("weighted", Weighted(WeightedOptions()))
     simulation = Simulation(fleet(seed), CoreSettings(), policy, {})
     began = time.process_time()
@@ -71,7 +71,7 @@ def simulated(seed: int) -> tuple[float, int]:
 
 
 def recorded() -> tuple[float, float, float]:
-    """Microseconds in the loop and in the thread for a batch, and bytes for a reading."""
+    """Return microseconds in the loop and in the thread for a batch, and bytes for a reading."""
     random = np.random.default_rng(1)
     ids = np.arange(1, _IN_A_BATCH + 1)
     usage = np.zeros((_IN_A_BATCH, RESOURCE_SLOTS))

@@ -47,7 +47,7 @@ class Instance:
             topic.restore(deserialize_message(state[topic.name], topic.type))
 
     def knows_the_same_as(self, other: Instance) -> bool:
-        """Motion and map, to the last bit."""
+        """Return True if motion and map are equal to the last bit."""
         pairs = (
             (self.live.slam.motion_state(newest=1), other.live.slam.motion_state(newest=1)),
             (self.live.slam.map_state(), other.live.slam.map_state()),
@@ -60,7 +60,7 @@ class Instance:
 
 
 def full_differences(drive: Drive) -> int:
-    """At how many scans a successor with the full state would not go on as the original."""
+    """Return the number of scans at which a successor with the full state would differ."""
     original, differing = Instance("full"), 0
     original.add(drive, 0)
     for index in range(1, len(drive.times)):
@@ -73,7 +73,10 @@ def full_differences(drive: Drive) -> int:
 
 
 def pose_deviations(drive: Drive, every: int) -> list[float]:
-    """Metres: the worst of the rest of the drive, for each scan before which the pose moved."""
+    """Return the largest deviation over the rest of the drive, metres, for each migrated scan.
+
+    The pose moves before that scan.
+    """
     original, states = Instance("pose"), []
     for index in range(len(drive.times)):
         states.append(original.state())
@@ -93,7 +96,7 @@ def pose_deviations(drive: Drive, every: int) -> list[float]:
 
 
 def main() -> int:
-    """Measure, and end with the report."""
+    """Measure and print the report; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--drive", default="street", help="name or path of the drive")
     parser.add_argument("--every", type=int, default=1, help="pose: move at each n-th scan")

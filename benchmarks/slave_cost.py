@@ -39,17 +39,17 @@ _MIB = 2.0**20
 
 
 def cpu_seconds(processes: Sequence[psutil.Process]) -> float:
-    """User and system time of these processes so far."""
+    """Return the user and system time of these processes so far."""
     return sum(sum(process.cpu_times()[:2]) for process in processes)
 
 
 def pss_mib(processes: Sequence[psutil.Process]) -> float:
-    """Proportional set size, summed."""
+    """Return the proportional set size, summed."""
     return float(sum(process.memory_full_info().pss for process in processes)) / _MIB
 
 
 def supervisor_of(slave: psutil.Process, directory: Path) -> psutil.Process:
-    """The supervisor that serves the slave's state directory."""
+    """Return the supervisor that serves the slave's state directory."""
     for process in psutil.process_iter(["cmdline"]):
         line = process.info["cmdline"] or []
         if any("supervisor" in word for word in line) and any(str(directory) in w for w in line):

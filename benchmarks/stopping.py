@@ -12,7 +12,7 @@ from rosrm.errors import RosrmError
 
 
 class Stopped(BaseException):
-    """A signal came; no `except Exception` on the way may swallow it.
+    """A signal came; not an `Exception`, so that no handler on the way catches it.
 
     Attributes:
         number: of the signal.
@@ -24,16 +24,16 @@ class Stopped(BaseException):
 
 
 def raise_signals() -> None:
-    """From now on SIGINT, SIGTERM and SIGHUP raise `Stopped`, the first of them only."""
+    """Make SIGINT, SIGTERM and SIGHUP raise `Stopped`; only the first one does."""
     main_process = os.getpid()
 
     def stop(number: int, _: FrameType | None) -> None:
-        if os.getpid() != main_process:  # pyroute2 forks, and ends what it forked by SIGTERM
+        if os.getpid() != main_process:  # pyroute2 forks, and ends its children by SIGTERM
             signal.signal(number, signal.SIG_DFL)
             os.kill(os.getpid(), number)
             return
         for one in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            signal.signal(one, signal.SIG_IGN)  # what is under way is cleaned up, undisturbed
+            signal.signal(one, signal.SIG_IGN)  # a second signal does not interrupt the clean-up
         raise Stopped(number)
 
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
@@ -43,7 +43,7 @@ def raise_signals() -> None:
 def run(name: str, main: Callable[[], int | None]) -> int:
     """Run a benchmark; return its exit status.
 
-    It is 2 where something is missing or failed, 128 + signal number where a signal stopped it.
+    The status is 2 where something is missing or failed, 128 + signal number after a signal.
     """
     raise_signals()
     try:

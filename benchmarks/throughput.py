@@ -27,7 +27,7 @@ _SLEEPS, _SLEEP_S = 150, 0.1
 
 
 def makespan(cluster: LocalCluster, specs: Sequence[ProcessSpec]) -> float:
-    """Seconds from `submit` called to the last process finished, by the master's record."""
+    """Return the seconds from the call of `submit` to the last end, by the master's record."""
     before = cluster.client.list().last_sequence
     started = time.time()
     cluster.client.submit(specs)
@@ -40,7 +40,7 @@ def makespan(cluster: LocalCluster, specs: Sequence[ProcessSpec]) -> float:
 def _wait_for_all(
     cluster: LocalCluster, specs: Sequence[ProcessSpec], timeout: float = 120.0
 ) -> None:
-    """Look at one process after the other, last first: a listing of all is no part of the work."""
+    """Poll one process after the other, last first: listing all would distort the measurement."""
     deadline = time.monotonic() + timeout
     waiting = [spec.name for spec in specs]
     while waiting:
@@ -54,7 +54,7 @@ def _wait_for_all(
 
 
 def measure(hosts: Sequence[HostConfig], specs: Sequence[ProcessSpec]) -> float:
-    """The makespan on a fresh cluster that has warmed up with one job a host."""
+    """Return the makespan on a fresh cluster, after a warm-up of thirty jobs."""
     with (
         tempfile.TemporaryDirectory(prefix="rosrm-throughput-") as folder,
         LocalCluster(Path(folder), hosts=hosts) as cluster,

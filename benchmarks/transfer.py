@@ -23,7 +23,7 @@ from benchmarks.stopping import run
 from rosrm_criu.transfer import Fetcher, Sender
 
 SIZES_MB = (10, 100, 500)
-#: Bytes of random, then as many of nothing.
+#: Number of random bytes, followed by as many zeros.
 GRAIN = 2048
 #: Seconds in which a process has loaded its libraries, on a busy machine too.
 LOADING = 3.0
@@ -41,7 +41,7 @@ def fill(directory: Path, megabytes: int) -> None:
 
 
 def moved(source: Path, target: Path, *, ahead: bool) -> dict[str, float]:
-    """The figures of one transfer."""
+    """Return the figures of one transfer."""
     begun = time.perf_counter()
     with Sender() as sender, Fetcher() as fetcher:
         to = fetcher.introduce()
@@ -66,7 +66,7 @@ def moved(source: Path, target: Path, *, ahead: bool) -> dict[str, float]:
 
 
 def measured(megabytes: int, rounds: int) -> dict[str, float]:
-    """The figures of one size."""
+    """Return the figures of one size."""
     found: dict[str, list[float]] = {}
     with tempfile.TemporaryDirectory() as directory:
         source = Path(directory, "source")

@@ -12,7 +12,7 @@ _HEAD: Final = "| kind | meaning |\n|---|---|\n"
 
 
 def with_table(page: str) -> str:
-    """Return the page with its table replaced: everything from its head to the next empty line."""
+    """Return the page with a new table: from the head to the next empty line."""
     before, _, rest = page.partition(_HEAD)
     _, _, after = rest.partition("\n\n")
     rows = "".join(f"| `{kind}` | {kind.meaning} |\n" for kind in EventKind)

@@ -28,13 +28,13 @@ RESULTS = ROOT / "build" / "test-results"
 #: The folders under tests/, in the order in which their results are shown.
 LAYERS = ("unit", "contract", "integration", "ros", "faults")
 
-#: The runs of pytest, in this order. A run with its output in a file goes on beside the next ones.
+#: The runs of pytest, in this order. A run with its output in a file runs beside the next ones.
 RUNS = (("contract",), ("unit",), ("integration",), ("ros", "faults"))
 BESIDE = "unit"
 
 #: Workers of the folders that run in parallel. Tests in real time mostly wait, so that a core
-#: serves two of them. Where there is a ROS graph, each worker has a network of its own, if it may.
-#: Tests that share a cluster run on one worker, the longest first (tests/conftest.py).
+#: serves two of them. With a ROS graph, each worker has a network of its own, if permitted. Tests
+#: that share a cluster run on one worker, the longest first (tests/conftest.py).
 _REAL_TIME_WORKERS = ["-n", "4", "--dist", "loadscope", "--no-loadscope-reorder"]
 WORKERS = {
     "unit": ["-n", "2"],
@@ -66,7 +66,7 @@ class Test:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one run."""
+    """The result of one run."""
 
     folders: tuple[str, ...]
     status: int
@@ -78,13 +78,13 @@ class Outcome:
 
 
 def main() -> int:
-    """Run the folders asked for; answer with the exit status of the first pytest that failed."""
+    """Run the chosen folders; return the exit status of the first pytest that failed."""
     began = time.monotonic()
     RESULTS.mkdir(parents=True, exist_ok=True)
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--layers", nargs="+", choices=LAYERS, default=LAYERS)
     options, for_pytest = parser.parse_known_args()
-    # Ctrl-C goes to pytest too, which ends its tests in order: wait for it, then close.
+    # Ctrl-C reaches pytest too, which then ends its tests: wait for it, then report.
     signal.signal(signal.SIGINT, lambda *_: None)
     folders = {layer for layer in options.layers if (ROOT / "tests" / layer).is_dir()}
     if {"--lf", "--last-failed"} & set(for_pytest):
@@ -118,12 +118,12 @@ def failed_last(folders: set[str]) -> set[str]:
 def run_folders(
     folders: tuple[str, ...], for_pytest: list[str], output: Path | None = None
 ) -> Outcome:
-    """Run some folders, and then once more, one by one, those of their tests that failed.
+    """Run some folders, and then run their failed tests once more, one by one.
 
     Args:
         folders: below tests/; they run with the same workers.
         for_pytest: further arguments.
-        output: takes the output of pytest; None: this process's own.
+        output: file for the output of pytest; None: this process's own output.
     """
     began = time.monotonic()
     name = "-".join(folders)
@@ -163,7 +163,7 @@ def run_pytest(
     result.unlink(missing_ok=True)
     command = [
         *(sys.executable, "-m", "pytest", f"--junit-xml={result}", "-o", "junit_logging=all"),
-        # What failed last is remembered for each run: two that end at once would lose one's list.
+        # Each run has its own list of failed tests: two runs that end at once would lose one.
         *("-o", f"cache_dir=.pytest_cache/{name.removesuffix('-again')}"),
         *("--durations=20", "--durations-min=5"),
     ]
@@ -178,7 +178,7 @@ def run_pytest(
         return status, None
     tests: dict[str, Test] = {}
     for case in cases:
-        # A test that fails, and again in a fixture's clean-up, has two entries and failed once.
+        # A test that fails in its body and in a fixture's clean-up has two entries; count it once.
         former = tests.get(node_id(case))
         tests[node_id(case)] = Test(
             "failed" if former and former.outcome == "failed" else outcome_of(case),
@@ -205,14 +205,14 @@ def outcome_of(case: ET.Element) -> str:
 
 
 def keep_outputs(name: str, first: Test, second: Test) -> None:
-    """Write what a flaky test printed, when it failed and when it passed, to a file."""
+    """Write both outputs of a flaky test, failed and passed, to a file."""
     path = RESULTS / "flaky" / f"{re.sub(r'[^A-Za-z0-9_.-]+', '_', name)}.txt"
     path.parent.mkdir(exist_ok=True)
     path.write_text(f"{name}\n\n--- failed ---\n{first.text}\n--- passed ---\n{second.text}\n")
 
 
 def report(outcomes: list[Outcome], seconds: float) -> int:
-    """Print the table, and as the last line the sums."""
+    """Print the table, and as the last line the sums; return the exit status."""
     print(f"\n{'':12}{'passed':>8}{'failed':>8}{'skipped':>9}{'seconds':>9}")
     for o in outcomes:
         name = "+".join(o.folders)

@@ -30,19 +30,19 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 VENV = ROOT / ".venv"
 PYTHON = VENV / "bin" / "python"
-CRIU = VENV / "criu"  # tests/conftest.py and the Makefile name it too
+CRIU = VENV / "criu"  # the same path as in tests/conftest.py and the Makefile
 LOG = VENV / "setup.log"
 STAMP = VENV / "rosrm-setup.json"
 INTERFACES = ROOT / "rosrm_msgs"
 CONSTRAINTS = ROOT / "constraints.txt"
 
-#: There are ROS 2 Jazzy wheels for these.
+#: The Python versions with ROS 2 Jazzy wheels.
 OLDEST, NEWEST = (3, 10), (3, 13)
 
-#: Run in the environment: rclpy finds the compiled interfaces.
+#: Program for the environment: rclpy finds the compiled interfaces.
 IMPORTS = "import rclpy, rosrm, rosrm_msgs.msg as m; m.ResourceInfo.__import_type_support__()"
 
-#: Lines of pip, CMake and ninja that tell how far they are.
+#: Lines of pip, CMake and ninja that show their progress.
 PROGRESS = re.compile(
     r"^\s*(?P<step>Collecting \S+|Downloading \S+|Obtaining \S+|Building wheel for \S+|"
     r"Installing \S+ dependencies|Installing collected packages|\[\d+/\d+\] .*)"
@@ -50,11 +50,11 @@ PROGRESS = re.compile(
 
 
 class SetupError(Exception):
-    """What hinders, where, and what to do about it."""
+    """An obstacle, its place, and the way out."""
 
 
 def main() -> int:
-    """Make or mend the environment; say what is done while it is done."""
+    """Make or repair the environment, and print each step."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument(
         "--chosen", action="store_true", help="this Python was asked for: remake a .venv of another"
@@ -86,7 +86,7 @@ def wait_for(lock: int) -> None:
 
 
 def set_up(*, remake_other_version: bool, tests: bool) -> None:
-    """Run the steps that are not done yet."""
+    """Run the unfinished steps."""
     packages = packages_digest()
     wanted = {"where": str(VENV), "interfaces": interfaces_digest(), "packages": packages}
     if tests:
@@ -133,7 +133,7 @@ def install_interfaces(steps: Steps, content: str) -> None:
             steps.run(
                 "the ROS interfaces: generated and compiled, about a minute",
                 *pip("wheel", "--no-deps", "--build-constraint", CONSTRAINTS),
-                *("--verbose", "--wheel-dir", built, INTERFACES),  # else it shows no progress
+                *("--verbose", "--wheel-dir", built, INTERFACES),  # for the progress
             )
             wheel = next(Path(built).glob("*.whl"))
             folder.mkdir(exist_ok=True)
@@ -158,7 +158,7 @@ def cache_folder() -> Path:
 
 
 def try_criu(steps: Steps) -> None:
-    """Bring CRIU into the environment, if one can be had; without it its tests are skipped."""
+    """Install CRIU into the environment, if available; without it its tests are skipped."""
     command = [PYTHON, "-m", "rosrm.cli", "criu", "install", "--prefix", CRIU]
     try:
         steps.run("CRIU, if there is one for this machine", *command)
@@ -168,22 +168,22 @@ def try_criu(steps: Steps) -> None:
         print(f"      To try again: .venv/bin/rosrm criu install --prefix {CRIU.relative_to(ROOT)}")
 
 
-# ----------------------------------------------------------------------------- what is there
+# ----------------------------------------------------------------------------- present state
 
 
 def interfaces_digest() -> str:
-    """Digest of all that the build of rosrm_msgs reads."""
+    """Return a digest of all files that the build of rosrm_msgs reads."""
     files = [p for p in INTERFACES.rglob("*") if p.is_file() and "__pycache__" not in p.parts]
     return digest([*files, CONSTRAINTS])
 
 
 def packages_digest() -> str:
-    """Digest of all that says which packages the environment holds."""
+    """Return a digest of all files that determine the packages of the environment."""
     return digest([CONSTRAINTS, Path(__file__), *(d / "pyproject.toml" for d in distributions())])
 
 
 def digest(files: list[Path]) -> str:
-    """SHA-256 of names and contents."""
+    """Return the SHA-256 of names and contents."""
     total = hashlib.sha256()
     for path in sorted(files):
         content = path.read_bytes()
@@ -193,19 +193,19 @@ def digest(files: list[Path]) -> str:
 
 
 def distributions() -> list[Path]:
-    """The folders of the repository's own distributions, the core first."""
+    """Return the folders of the repository's own distributions, the core first."""
     others = [*sorted(ROOT.glob("plugins/*")), *sorted(ROOT.glob("tools/*")), ROOT / "examples"]
     return [ROOT, *(d for d in others if (d / "pyproject.toml").is_file())]
 
 
 def venv_usable(*, remake_other_version: bool) -> bool:
-    """Whether `.venv` runs where it stands, with no other Python than the one asked for."""
+    """Return True if `.venv` works in this folder, and with the chosen Python version."""
     if not PYTHON.exists():
         return False
     probe = "import sys; print(*sys.version_info[:2], sys.prefix)"
     answer = subprocess.run([PYTHON, "-c", probe], capture_output=True, text=True, check=False)
     major, minor, prefix = (*answer.stdout.strip().split(" ", 2), "", "", "")[:3]
-    where = read_stamp().get("where", prefix)  # its commands name the place where it was made
+    where = read_stamp().get("where", prefix)  # its commands contain the folder where it was made
     if answer.returncode != 0 or not Path(prefix) == Path(where) == VENV:
         print("      .venv was made elsewhere or is broken: it is made anew")
         return False
@@ -216,7 +216,7 @@ def venv_usable(*, remake_other_version: bool) -> bool:
 
 
 def read_stamp() -> dict[str, str]:
-    """What went into the environment, as far as that was finished."""
+    """Return the digests of the finished parts of the environment; empty: none."""
     try:
         stamp = json.loads(STAMP.read_text())
     except (OSError, ValueError):
@@ -225,20 +225,20 @@ def read_stamp() -> dict[str, str]:
 
 
 def stamp(wanted: dict[str, str], part: str) -> None:
-    """Note that a part of the environment is finished."""
+    """Record that a part of the environment is finished."""
     write_stamp({**read_stamp(), "where": wanted["where"], part: wanted[part]})
 
 
 def write_stamp(done: dict[str, str]) -> None:
-    """Remember what went into the environment."""
+    """Write the digests of the finished parts."""
     STAMP.write_text(json.dumps(done, indent=2) + "\n")
 
 
-# ---------------------------------------------------------------------------- what is needed
+# ---------------------------------------------------------------------------- requirements
 
 
 def check_machine() -> None:
-    """Refuse, with the way out, a machine on which a later step would fail."""
+    """Raise `SetupError`, with the way out, on a machine on which a later step would fail."""
     if not OLDEST <= sys.version_info[:2] <= NEWEST:
         candidates = [f"python3.{m}" for m in range(NEWEST[1], OLDEST[1] - 1, -1)]
         found = next((name for name in candidates if shutil.which(name)), None)
@@ -269,7 +269,7 @@ def check_machine() -> None:
 
 
 def short_version() -> str:
-    """The version of this Python, as in `3.12`."""
+    """Return the version of this Python, as in `3.12`."""
     return ".".join(map(str, sys.version_info[:2]))
 
 
@@ -288,17 +288,17 @@ def make_venv() -> None:
     write_stamp({"where": str(VENV)})
 
 
-#: Installed first, so that rosrm's own distributions install without a build environment each.
+#: Installed first, so that rosrm's own distributions need no build environments.
 BACKENDS = ("pip", "hatchling", "editables", "setuptools")
 
 
 def pip(command: str, *arguments: object) -> tuple[object, ...]:
-    """A pip command of the environment, held to the exact versions."""
+    """Return a pip command of the environment, constrained to the exact versions."""
     return (PYTHON, "-m", "pip", command, "--constraint", CONSTRAINTS, *arguments)
 
 
 def editables(*, extras: str) -> list[object]:
-    """Arguments that install the repository's distributions so that edits count at once."""
+    """Return arguments that install the repository's distributions in editable mode."""
     arguments: list[object] = []
     for folder in distributions():
         arguments += ["--editable", f"{folder}[{extras}]" if folder == ROOT else folder]
@@ -306,7 +306,7 @@ def editables(*, extras: str) -> list[object]:
 
 
 class Steps:
-    """Runs commands one after another, and shows how far they are."""
+    """A runner of commands, one after another, with their progress."""
 
     def __init__(self) -> None:
         self.number = 0
@@ -350,7 +350,7 @@ class Steps:
 
 @contextlib.contextmanager
 def ended_with_us(process: subprocess.Popen[str]) -> Iterator[None]:
-    """End a command, its compilers too, where this run is interrupted."""
+    """End a command, with its compilers, where this run is interrupted."""
     try:
         yield
     except BaseException:
@@ -363,7 +363,7 @@ def ended_with_us(process: subprocess.Popen[str]) -> Iterator[None]:
 
 
 class ProgressLine:
-    """Where the running command is: rewritten in place on a terminal, now and then elsewhere."""
+    """The progress of a command: updated in place on a terminal, else printed now and then."""
 
     def __init__(self, began: float) -> None:
         self.began = began
@@ -371,7 +371,7 @@ class ProgressLine:
         self.shown = began
 
     def show(self, line: str) -> None:
-        """Take a line of output; show it if it tells how far the command is."""
+        """Show a line of output if it contains the progress."""
         match = PROGRESS.match(line)
         now = time.monotonic()
         if match is None or now - self.shown < (0.1 if self.terminal else 10.0):
@@ -385,7 +385,7 @@ class ProgressLine:
             print(text[:100], flush=True)
 
     def clear(self) -> None:
-        """Leave the line free for what comes next."""
+        """Clear the line for the next output."""
         if self.terminal:
             print("\r\033[K", end="", flush=True)
 

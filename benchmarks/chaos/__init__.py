@@ -1,6 +1,6 @@
-"""Random faults on a lab of five hosts, and an oracle that looks at reality alone.
+"""Random faults on a lab of five hosts, and an oracle that judges by observation alone.
 
-`faults` draws (seeded), `cluster` runs master and slaves as a service manager would, `harm` does
-and undoes the faults, `trial` is the loop. `oracle`, with `reality`, `outputs` and `rules`, judges:
-these four import nothing from rosrm.
+`faults` draws the faults (seeded). `cluster` runs master and slaves as a service manager would.
+`harm` is the fault injector: it does the faults and undoes them. `trial` is the loop. `oracle`
+judges, with `reality`, `outputs` and `rules`: these four import nothing from rosrm.
 """

@@ -26,13 +26,13 @@ from benchmarks.machine import percentile, print_report, say
 from benchmarks.stopping import run
 from rosrm_lab import needs
 
-#: Labs that may get stuck before a run is given up.
+#: Labs that may get stuck before the benchmark gives up.
 _MOST_STUCK: Final = 5
 _NO_CLOCKS: Final = "the package libfaketime is not installed (pip install libfaketime)"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Do faults until there were enough of them; returns the exit status."""
+    """Inject faults until the number or the time is reached; return the exit status."""
     options = _parse(arguments)
     needs.check_rights()
     needs.check_commands()
@@ -60,7 +60,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 
 def _run(options: argparse.Namespace, out: Path, tally: Tally, began: float) -> None:
-    """In one lab, or in several, where one gets stuck."""
+    """Run the rounds in one lab; start another lab where one gets stuck."""
     story = Story(options.seed)
     services = list(work.services())
     names = [service.name for service in services]
@@ -117,7 +117,7 @@ def _report(options: argparse.Namespace, tally: Tally, seconds: float) -> None:
 
 
 def _spread(seconds: Mapping[str, Sequence[float]]) -> dict[str, Any]:
-    """Middle, nearly worst and worst, by kind."""
+    """Return median, 99th percentile and maximum by kind."""
     return {
         kind: {
             "n": len(values), "p50": round(statistics.median(values), 2),

@@ -1,4 +1,4 @@
-"""Master and slaves on the hosts of a lab, started again by who plays the service manager."""
+"""Master and slaves on the hosts of a lab, restarted as by a service manager."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ DESK: Final = "desk"
 HOSTS: Final = tuple(plan.name for plan in uniform(5))
 assert LINE_HOST in HOSTS
 
-#: Seconds of silence after which a host is lost. Faults last less than that, or more.
+#: Seconds of silence after which a host is lost. Some faults last less than that, some longer.
 LEASE_S: Final = 3.0
 _ROSRM: Final = (sys.executable, "-m", "rosrm.cli")
 _MEMORY: Final = 2 * GIB
 _DISK: Final = 96 * MIB
-#: Seconds after which a service manager starts a part again that ended by itself.
+#: Seconds after which the service manager restarts a part that has ended unexpectedly.
 _AGAIN: Final = 1.0
-#: Seconds for parts to end in good order.
+#: Seconds for parts to shut down.
 _END: Final = 30.0
-#: Their command lines hold this.
+#: Part of a supervisor's command line.
 _SUPERVISOR: Final = "rosrm/supervisor/"
 
 
@@ -48,9 +48,9 @@ class Part:
     """The master or a slave.
 
     Attributes:
-        process: stands for it on this machine; None: not started yet.
-        held: it is down on purpose, and not started again.
-        ended: when it was seen to have ended by itself; 0: it has not.
+        process: the process on this machine that runs the part in its host; None: not started yet.
+        held: the part is down on purpose, and is not restarted.
+        ended: monotonic time at which an unexpected end was seen; 0: there was none.
     """
 
     name: str
@@ -63,7 +63,7 @@ class Part:
 
     @property
     def pid(self) -> int:
-        """Of the part itself on this machine; 0: it does not run."""
+        """Return the pid of the part itself on this machine; 0: it does not run."""
         with contextlib.suppress(psutil.Error):
             if self.process is not None:
                 return next((one.pid for one in psutil.Process(self.process.pid).children()), 0)
@@ -76,7 +76,7 @@ class Cluster:
     Args:
         name: of the lab.
         folder: for settings and logs.
-        tell: is told what happens by itself.
+        tell: is called with a line for each unexpected end of a part.
     """
 
     def __init__(self, name: str, folder: Path, tell: Callable[[str], None]) -> None:
@@ -122,7 +122,7 @@ class Cluster:
             )  # fmt: skip
 
     def kill(self, name: str) -> bool:
-        """SIGKILL, and keep it down until `start`; False: it did not run."""
+        """Send SIGKILL, and keep the part down until `start`; False: it did not run."""
         part = self.parts[name]
         if not part.pid or part.process is None:
             return False
@@ -132,11 +132,11 @@ class Cluster:
         return True
 
     def hold(self, name: str) -> None:
-        """Leave a part down that is about to end."""
+        """Do not restart a part that is about to end."""
         self.parts[name].held = True
 
     def tend(self) -> None:
-        """Start again what has ended by itself; to be called often."""
+        """Restart the parts that have ended unexpectedly; to be called often."""
         now = time.monotonic()
         for name, part in self.parts.items():
             if part.held or part.process is None or part.process.poll() is None:
@@ -148,7 +148,7 @@ class Cluster:
                 self.start(name)
 
     def supervisor(self, host: str) -> int:
-        """The pid of a host's supervisor on this machine; 0: there is none."""
+        """Return the pid of a host's supervisor on this machine; 0: there is none."""
         for pid in sorted(self.lab.pids(host)):
             with contextlib.suppress(OSError):
                 if _SUPERVISOR in Path(f"/proc/{pid}/cmdline").read_text():
@@ -156,7 +156,10 @@ class Cluster:
         return 0
 
     def proceed(self, name: str) -> bool:
-        """SIGCONT to a part that was stopped: what stands for it outside has stopped as well."""
+        """Send SIGCONT to a stopped part and to its process outside the host, which stopped too.
+
+        Return True if both run again.
+        """
         part = self.parts[name]
         for pid in (part.pid, part.process.pid if part.process else 0):
             if pid:
@@ -172,7 +175,7 @@ class Cluster:
                     yield psutil.Process(pid).status()
 
     def shut_down(self) -> None:
-        """End slaves, with all their processes, then the master, in good order."""
+        """Shut down the slaves, with all their processes, then the master."""
         for names in (HOSTS, (MASTER,)):
             running = [self.parts[name] for name in names if self.parts[name].process]
             for part in running:
@@ -198,7 +201,7 @@ def _master_settings() -> dict[str, object]:
         "name": "chaos",
         "state": "/run/data/master",
         "liveness": {"suspect": 1.0, "lease": LEASE_S},
-        # A move is asked for, or it is a fault: none comes by itself.
+        # A migration is requested by the benchmark or is a fault: the master starts none.
         "migration": {"strategies": {"relaunch": {}, "handoff": {}}, "automatic": False},
     }
 
@@ -208,10 +211,10 @@ def _slave_settings(host: str) -> dict[str, object]:
         "host": host,
         "state": "/run/data/slave",
         "labels": {"name": host},
-        # Without cpu: the processor is shared by all hosts, and a busy one would take no work.
+        # Without cpu: the hosts share the processor, and a busy one would make all refuse work.
         "probes": {"memory": {}, "disk": {}},
         "limits": {"memory": 0.8, "disk": 0.95},
-        # What one machine starts at a time, five hosts of a lab on one machine must not.
+        # Five hosts of a lab share one machine: together they must not start too many processes.
         "max_starting": 2,
     }
 

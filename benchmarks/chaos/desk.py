@@ -1,7 +1,8 @@
 """A client of the master, on its host, driven by lines: `{"do": ...}` in, one line out for each.
 
-`submit` takes the path of a work file, `cancel` names, `migrate` a process and a host, `look`
-tells how hosts and processes stand (for a story; nothing is judged by it). Ends with its input.
+`submit` takes the path of a work file, `cancel` names, `migrate` a process and a host. `look`
+returns the states of hosts and processes (for the story; no judgement uses them). The client ends
+when its input ends.
 """
 
 from __future__ import annotations
@@ -12,12 +13,12 @@ from typing import Any
 
 from rosrm import Client, NoMaster, RosrmError
 
-#: Seconds for finding a master; a request is given 10.
+#: Seconds for finding a master; a request has 10.
 _PATIENCE = 3.0
 
 
 def main() -> None:
-    """Answer until the input ends."""
+    """Answer requests until the input ends."""
     client: Client | None = None
     for line in sys.stdin:
         try:
@@ -26,7 +27,7 @@ def main() -> None:
         except NoMaster as error:
             answer = {"no_master": str(error)}
             if client is not None:
-                client.close()  # one that is found anew knows of no earlier master
+                client.close()  # a new client knows of no earlier master
                 client = None
         except RosrmError as error:
             answer = {"refused": str(error)}

@@ -1,4 +1,7 @@
-"""What is asked of the master, by a client on its host; in a thread: faults have their times."""
+"""Requests to the master, by a client on its host.
+
+The client runs in a thread, because the faults of a round have times to keep.
+"""
 
 from __future__ import annotations
 
@@ -23,9 +26,9 @@ if TYPE_CHECKING:
 
 #: Seconds between two attempts.
 _PAUSE: Final = 0.3
-#: In the master's answer to a submission that it had taken already.
+#: Part of the master's answer to a submission that it had accepted already.
 _KNOWN: Final = "in use already"
-#: In what a client is told whose request a master may have taken before it was killed.
+#: Parts of the answers to a request that a master may have accepted before it was killed.
 _UNKNOWN: Final = ("it is not known whether", "old by this side's clock")
 
 
@@ -34,10 +37,10 @@ class Errand:
     """One request.
 
     Attributes:
-        persistent: it is repeated until the master takes it.
+        persistent: it is repeated until the master accepts it.
         done: called by `Errands.collect` when it was answered.
         answer: the last one.
-        unsure: it was asked more than once because an answer did not come.
+        unsure: it was sent more than once because an answer was lost.
     """
 
     request: Mapping[str, Any]
@@ -48,7 +51,7 @@ class Errand:
 
 
 class Errands:
-    """A client at the desk of a lab, and its thread."""
+    """A client on the desk (the master's host) of a lab, and its thread."""
 
     def __init__(self, lab: Lab, log: Path, tell: Callable[[str], None]) -> None:
         self._tell = tell
@@ -85,13 +88,13 @@ class Errands:
         self._desk.communicate()
 
     def send(self, errand: Errand) -> Errand:
-        """To be done after those before it."""
+        """Queue a request behind those sent before."""
         self._open += 1
         self._queue.put(errand)
         return errand
 
     def collect(self) -> bool:
-        """Call `done` of what was answered; whether nothing is open any more."""
+        """Call `done` for each answered request; return True if no request is open."""
         while not self._answered.empty():
             errand = self._answered.get()
             self._open -= 1
@@ -111,7 +114,7 @@ class Errands:
                 return
             errand.unsure = errand.unsure or _may_have_been_taken(errand.answer)
             self._tell(f"{errand.request['do']} is asked again: {errand.answer}")
-            time.sleep(_PAUSE)  # who has no master, or whose master has no room, asks again
+            time.sleep(_PAUSE)  # no master, or no room at the master: the client asks again
 
     def _ask(self, request: Mapping[str, Any]) -> dict[str, Any]:
         to, source = self._desk.stdin, self._desk.stdout
@@ -130,7 +133,7 @@ class Errands:
         return answer
 
     def _ended(self) -> dict[str, Any]:
-        """The client has ended: another one takes its place, unless it was meant to end."""
+        """Start another client where this one has ended, unless this object is being closed."""
         ended = self._desk
         ended.communicate()
         if not self._leaving:
@@ -139,7 +142,10 @@ class Errands:
 
 
 def _may_have_been_taken(answer: Mapping[str, Any]) -> bool:
-    """An answer may have been lost: the client asks again by itself, and that may come too late."""
+    """Return True if the master may have accepted a request whose answer was lost.
+
+    The client retries such a request, and the retry may come too late.
+    """
     refusal = answer.get("refused", "")
     return "no_master" in answer or any(words in refusal for words in _UNKNOWN)
 

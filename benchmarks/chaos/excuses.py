@@ -1,4 +1,7 @@
-"""What is promised of a process, and which harm excuses what. Pure; knows nothing of rosrm."""
+"""Promises to a process, and allowances: the harm that explains a deviation from them.
+
+Pure; imports nothing from rosrm.
+"""
 
 from __future__ import annotations
 
@@ -9,27 +12,27 @@ from typing import Final
 
 from benchmarks.chaos.outputs import Run
 
-#: Seconds for the parts to hear each other once nothing keeps them from it: discovery, by DDS.
+#: Seconds for the parts to discover each other by DDS once no fault prevents it.
 MEETING: Final = 3.0
-#: The same where a part was started again: it has to come up before.
+#: The same where a part was restarted: it has to come up before.
 STARTING: Final = 8.0
-#: Cycles that are repeated by who follows one that was killed: the one under way, and one before.
+#: Cycles that the successor of a killed process may repeat: the last one, and one before.
 LAST_CYCLES: Final = 2
-#: The same where the machine is busy: what is kept is a second behind at most, ten cycles.
+#: The same where the machine is busy: a snapshot is at most a second old, ten cycles.
 _LAST_SECOND: Final = 12
-#: Seconds of silence after which a host may have stopped what it is to stop when it is cut off:
-#: 1.425 s by its fence (lease 3 s, suspect 1 s), less a beat (0.2 s) before and one after, and the
-#: same once more for a busy machine, which takes the words late.
+#: Seconds of silence after which a host that is cut off may have stopped isolated processes:
+#: 1.425 s by its fence (lease 3 s, suspect 1 s), less a beat (0.2 s) before and one after, and less
+#: the same once more because a busy machine processes messages late.
 _FENCED: Final = 0.8
-#: Seconds of silence after which a host may be lost: the lease, less a second to be heard again in.
+#: Seconds of silence after which a host may be lost: the lease, less a second for the next contact.
 _LOST: Final = 2.0
 #: Seconds from the last "active" of a process that is being ended until it has ended.
 _ENDING: Final = 0.5
-#: Seconds after which a state has come to another host.
+#: Seconds after which a snapshot has reached another host.
 _YOUNG: Final = 6.0
-#: What is asked for, and ends or silences nobody by force.
+#: Kinds that the benchmark requests, and that end or silence no process by force.
 MOVES: Final = ("move", "overlap")
-#: The kind of the harm that other programs on the machine do.
+#: The kind of harm that other programs on the machine do.
 OVERLOAD: Final = "overload"
 #: Cycles a second.
 _RATE: Final = 10.0
@@ -37,16 +40,16 @@ _RATE: Final = 10.0
 
 @dataclass(frozen=True)
 class Promise:
-    """What holds of a service.
+    """The guarantees for a service.
 
     Attributes:
         members: processes of one instance.
-        stateful: its numbers go on.
+        stateful: its count continues across instances.
         standby: it has a second instance, silent.
-        elsewhere: it goes to another host when its own is lost.
+        elsewhere: it is restarted on another host when its own is lost.
         isolated: its host stops it when it is cut off.
-        kept: its state is kept on its own host, on the disk.
-        copied: cycles by which a copy of its state on another host may be behind; 0: there is none.
+        kept: its snapshot is on the disk of its own host.
+        copied: cycles by which a replica on another host may be behind; 0: there is none.
     """
 
     members: int = 1
@@ -60,19 +63,19 @@ class Promise:
 
 @dataclass(frozen=True)
 class Harm:
-    """Something that was done to the lab, or asked for, and what it may explain.
+    """A fault, a request or an overload in the lab, and the deviations that it may explain.
 
     Attributes:
-        kind: of the fault; or "move", "overlap" (a move during which both may be active).
+        kind: of the fault; or "move", "overlap" (a migration during which both may be active).
         hosts: that were concerned; "*": all of them.
-        process: that was struck or moved; "": none by itself.
+        process: that was struck or moved; "": no single one.
         begun, ended: monotonic time.
-        kills: what runs on the hosts ends.
-        hides: the hosts and the master do not hear each other.
-        restarts: a part had to be started again.
-        forgets: how a job ended there meanwhile is not known.
-        fills: nothing more could be kept on the disk there.
-        deafens: who fences there did not hear that the slave is at work, or the master hears it.
+        kills: the processes on the hosts end.
+        hides: the hosts and the master have no contact.
+        restarts: a part had to be restarted.
+        forgets: the end of a job there in this time may be unknown.
+        fills: the full disk there took no more snapshots.
+        deafens: fences there had no proof that the slave works, or that the master reaches it.
     """
 
     kind: str
@@ -88,33 +91,33 @@ class Harm:
     deafens: bool = False
 
     def concerns(self, host: str) -> bool:
-        """Whether it was done to a host."""
+        """Return True if a host was concerned."""
         return host in self.hosts or "*" in self.hosts
 
 
 def may_end(name: str, promise: Promise, run: Run, harms: Sequence[Harm]) -> bool:
-    """Whether a run of a process may end by what was done, or asked for."""
+    """Return True if a fault or a request explains the end of a run of a process."""
     return any(
         harm.process == name or (harm.kills and harm.concerns(run.host)) for harm in harms
     ) or _is_parted(promise, run, harms)
 
 
 def _is_parted(promise: Promise, run: Run, harms: Sequence[Harm]) -> bool:
-    """Whether its host, or the master, may have ended it for a silence that was long enough."""
+    """Return True if the silence was long enough for its host or the master to end it."""
     if not (promise.elsewhere or promise.isolated):
         return False
     until = run.last + _ENDING
     here = [harm for harm in harms if harm.concerns(run.host)]
     hidden = _silence([harm for harm in here if harm.hides], until)
     deaf = _silence([harm for harm in here if harm.deafens], until)
-    # What goes on in a cut is stopped by its host only where that cannot know of its own slave.
+    # In a cut, a host stops a process that is not isolated only if it cannot reach its slave.
     return deaf >= _FENCED or hidden >= (_FENCED if promise.isolated else _LOST)
 
 
 def _silence(harms: Iterable[Harm], until: float) -> float:
-    """Seconds for which at least one of them went on, until a moment; those in a row add up.
+    """Return the seconds until a moment that at least one of them covered; gaps do not count.
 
-    A part that had to be started again says nothing until it is up.
+    A restarted part is silent until it is up.
     """
     silent, covered = 0.0, 0.0
     for harm in sorted(harms, key=lambda one: one.begun):
@@ -126,7 +129,7 @@ def _silence(harms: Iterable[Harm], until: float) -> float:
 
 
 def is_struck(name: str, promise: Promise, run: Run, harms: Sequence[Harm]) -> bool:
-    """Whether it ended by force, and not by a move."""
+    """Return True if a run ended by force, and not by a migration."""
     return any(
         (harm.process == name and harm.kind not in MOVES)
         or (harm.kills and harm.concerns(run.host))
@@ -135,9 +138,9 @@ def is_struck(name: str, promise: Promise, run: Run, harms: Sequence[Harm]) -> b
 
 
 def unkept(one: Run, following: Run, harms: Sequence[Harm]) -> float:
-    """Cycles since the disk was full from which the successor went on; 0: it was not.
+    """Return the cycles that a successor may repeat because a disk was full; 0: no disk was.
 
-    On its own host it goes on from what that keeps; on another one from what any host keeps.
+    A successor on the same host restores the snapshot there, one on another host any replica.
     """
     since = [
         harm.begun
@@ -150,38 +153,38 @@ def unkept(one: Run, following: Run, harms: Sequence[Harm]) -> float:
 def most_behind(
     name: str, promise: Promise, one: Run, following: Run, harms: Sequence[Harm]
 ) -> float:
-    """Cycles that may be repeated by who follows one that was struck."""
+    """Return the cycles that the successor of a struck instance may repeat."""
     if following.host == one.host and promise.kept:
         return _LAST_SECOND
-    # For a move the standby makes room; where that fails, the copy is what is left.
+    # For a migration the standby makes room. Where the migration fails, the replica is left.
     asked = any(harm.kind in MOVES and harm.process == name for harm in harms)
     second = asked or _is_struck_twice(promise, one, harms, name)
     if promise.standby and not (second and promise.copied):
         return LAST_CYCLES + _unseen(one, harms, one.host)
-    # A young one's copy may be of the one that it followed, as young or on its way then.
+    # The replica of a young instance may be its predecessor's, as young or in transit then.
     young = _RATE * 2 * _YOUNG if one.last - one.first < _YOUNG else 0.0
     return promise.copied + young + _unseen(one, harms) if promise.copied else 0.0
 
 
 def _is_struck_twice(promise: Promise, run: Run, harms: Sequence[Harm], name: str = "") -> bool:
-    """Whether one blow fell on its host, and another on one where a copy or a standby may be.
+    """Return True if one fault hit its host, and another one the host of a replica or a standby.
 
-    Which host that is nobody here knows: it may be any other one. A busy machine is no blow.
+    The host that holds it is not known here, so any other one counts. An overload does not count.
 
     Args:
-        name: of the process, where a blow to itself counts too: its standby has the same name.
+        name: of the process, where a fault to itself counts too: its standby has the same name.
     """
     blows = [harm for harm in harms if harm.kind != OVERLOAD and _is_blow(harm, name)]
     here = [one for one in blows if one.process or one.concerns(run.host)]
     there = [one for one in blows if one.process or one.hosts - {run.host}]
     if any(one is not other for one in here for other in there):
         return True
-    # What stops at once wherever the master is not heard, its standby included.
+    # Isolated processes, the standby included, stop at once wherever the master is not reachable.
     return promise.isolated and any("*" in one.hosts for one in blows)
 
 
 def _is_blow(harm: Harm, name: str) -> bool:
-    """Whether it may take a copy or a standby out of reach."""
+    """Return True if it may take a replica or a standby out of reach."""
     if harm.process:
         return harm.process == name and harm.kind not in MOVES
     silences = (harm.hides or harm.deafens) and _silence([harm], math.inf) >= _FENCED
@@ -189,20 +192,20 @@ def _is_blow(harm: Harm, name: str) -> bool:
 
 
 def _unseen(run: Run, harms: Sequence[Harm], host: str = "") -> float:
-    """Cycles of a run that nobody could see: one of them was cut off, and it went on.
+    """Return the cycles of a run that went unseen: a host was cut off, and the run continued.
 
     Args:
-        host: that was cut off; "": any, for the copies lie on any.
+        host: that was cut off; "": any, because replicas may be on any.
     """
     hiding = [harm for harm in harms if harm.hides and (not host or harm.concerns(host))]
-    # What was done explains it, or else a busy machine, since the round began.
+    # A fault explains it, or else an overload, since the round began.
     hiding = [harm for harm in hiding if harm.kind != OVERLOAD] or hiding
     since = min((harm.begun for harm in hiding), default=run.last)
     return _RATE * max(0.0, run.last - since)
 
 
 def may_be_lost(promise: Promise, one: Run, following: Run, harms: Sequence[Harm]) -> bool:
-    """Whether there may be nothing to go on from: no copy, none yet, or none within reach."""
+    """Return True if the successor may lack a snapshot: no replica, none yet, or out of reach."""
     if following.host == one.host:
         return not promise.kept
     if _is_struck_twice(promise, one, harms) or one.last - one.first < _YOUNG:

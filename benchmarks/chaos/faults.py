@@ -1,4 +1,4 @@
-"""The faults, drawn by a seed: the same seed draws the same ones. Pure."""
+"""Faults drawn from a seed: the same seed draws the same faults. Pure."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ class Kind:
     """A kind of fault.
 
     Attributes:
-        target: what it is done to.
-        weight: how often it is drawn, among all kinds.
-        lasts: it goes on until it is healed, or until what was killed is started again.
-        amounts: of it, least and most.
+        target: what is struck.
+        weight: relative frequency among all kinds.
+        lasts: the fault lasts until it is undone, e.g. until a killed part is restarted.
+        amounts: least and most of its amount.
     """
 
     target: Target
@@ -51,15 +51,15 @@ KINDS: Final = {
     "host_clock": Kind("host", 3, amounts=(1.0, 3600.0)),
 }
 
-#: How many faults overlap, and how often.
+#: Number of faults that overlap, with relative frequencies.
 _BURSTS: Final = {1: 6, 2: 3, 3: 1}
-#: Seconds within which the faults of a burst begin.
+#: Seconds within which all faults of a burst begin.
 _WITHIN: Final = 2.0
-#: Seconds that a fault lasts: it is over before anybody is lost, or it is not.
+#: Seconds that a fault lasts: too short for a host to be lost, or long enough.
 _SHORT: Final = (0.2, 2.0)
 _LONG: Final = (4.0, 7.0)
 _SHORT_SHARE: Final = 0.6
-#: Of a round: seconds that each job takes, how many jobs, how long the line, how many moves.
+#: In a round: seconds of each job, number of jobs, length of the line, number of migrations.
 _JOB: Final = (0.2, 3.0)
 _JOBS: Final = (2, 5)
 _LINE: Final = (0, 3)
@@ -77,7 +77,7 @@ class Fault:
         kind: of `KINDS`.
         target: a host, a process, or `MASTER`.
         at: seconds after the begin of its round.
-        lasts: seconds until it is healed; 0: it heals by itself.
+        lasts: seconds until it is undone; 0: nothing has to be undone.
         amount: fraction of the packets that are lost, or seconds by which the clock is set back.
     """
 
@@ -96,7 +96,7 @@ class Fault:
 
 @dataclass(frozen=True)
 class Move:
-    """A process is asked to move to a host, which may be the one it is on."""
+    """A request to migrate a process to a host, which may be its own host."""
 
     process: str
     host: str
@@ -105,11 +105,11 @@ class Move:
 
 @dataclass(frozen=True)
 class Round:
-    """What is done between two judgements.
+    """The faults and requests between two judgements.
 
     Attributes:
         faults: that overlap, in order of `at`.
-        moves: that are asked for meanwhile.
+        moves: migrations that are requested during the faults.
         jobs, line: seconds that each job takes, and each of those that wait in line.
         renews: the guest, a service, is cancelled, and another one submitted.
     """
@@ -125,15 +125,15 @@ class Round:
 def draw(
     seed: int, hosts: Sequence[str], processes: Sequence[str], movable: Sequence[str]
 ) -> Iterator[Round]:
-    """Rounds without end.
+    """Yield rounds without end.
 
     Args:
-        seed: of all that is drawn.
+        seed: of the random numbers.
         hosts: that may be struck.
-        processes: the same.
-        movable: processes that can be asked to move.
+        processes: that may be struck.
+        movable: processes that may be asked to migrate.
     """
-    chance = random.Random(seed)  # noqa: S311 - to be repeated is what it is for
+    chance = random.Random(seed)  # noqa: S311 - repeatable on purpose
     drawn, number = 0, 0
     while True:
         number += 1
@@ -151,7 +151,7 @@ def draw(
 def _burst(
     chance: random.Random, drawn: int, hosts: Sequence[str], processes: Sequence[str]
 ) -> tuple[Fault, ...]:
-    """Some faults, each on a target of its own."""
+    """Draw the faults of a burst, each on a target of its own."""
     faults: list[Fault] = []
     size = _weighted(chance, _BURSTS)
     while len(faults) < size:

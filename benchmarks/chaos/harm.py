@@ -1,4 +1,4 @@
-"""Does the faults and undoes them, and says of each what it may explain."""
+"""Fault injector: it does the faults, undoes them, and records what each may explain."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from rosrm_lab import Direction
 
 _ALL: Final = frozenset({"*"})
 _FILLER: Final = "filler"
-#: Bytes that are taken at a time, at last, where a file system is filled.
+#: Bytes of the smallest piece with which a file system is filled.
 _LEAST: Final = 4096
 
 Undo = Callable[[], bool]
 
 
 class Harmer:
-    """What can be done to a cluster; a fault that finds nothing to strike is not done."""
+    """The faults that a cluster can suffer; a fault without a target to strike is skipped."""
 
     def __init__(self, cluster: Cluster) -> None:
         self._cluster = cluster
@@ -36,7 +36,7 @@ class Harmer:
         self.done: list[Harm] = []
 
     def begin(self, fault: Fault) -> str:
-        """Do it; returns why it was not done, "" where it was."""
+        """Do a fault; return the reason why it was skipped, "" where it was done."""
         do: Callable[[Fault], tuple[Harm, Undo] | str] = getattr(self, f"_{fault.kind}")
         outcome = do(fault)
         if isinstance(outcome, str):
@@ -48,7 +48,7 @@ class Harmer:
         return ""
 
     def end(self, fault: Fault) -> bool:
-        """Undo it; False: that takes another attempt."""
+        """Undo a fault; False: another attempt is necessary."""
         if fault.number not in self._undos:
             return True
         harm, undo = self._undos[fault.number]
@@ -59,7 +59,7 @@ class Harmer:
         return True
 
     def take_done(self) -> list[Harm]:
-        """What was done and undone since the last call."""
+        """Return the harm that was done and undone since the last call."""
         done, self.done = self.done, []
         return done
 
@@ -80,7 +80,7 @@ class Harmer:
             self._cluster.start(part)
             return True
 
-        deafens = part != MASTER  # what has a fence waits for a slave at work
+        deafens = part != MASTER  # fences wait for a slave that works
         harm = Harm(fault.kind, begun, begun, hosts, hides=True, restarts=True, deafens=deafens)
         return harm, start
 
@@ -130,7 +130,7 @@ class Harmer:
         if isinstance(outcome, str):
             return outcome
         harm, undo = outcome
-        # After a kill the next one goes on from the last word that was heard, and ends nothing.
+        # A new supervisor continues from the last recorded contact, and ends nothing.
         killed = number == signal.SIGKILL
         return replace(harm, forgets=killed, deafens=not killed), undo
 
@@ -141,7 +141,7 @@ class Harmer:
         return self._signal_process(fault, signal.SIGSTOP)
 
     def _signal_process(self, fault: Fault, number: int) -> tuple[Harm, Undo] | str:
-        """The oldest of its instances, and of that the first process."""
+        """Signal the first process of the oldest instance."""
         those = [one for one in members(self._lab.name) if one.process == fault.target]
         pid = min((one.pid for one in those), default=0)
         return self._signal(fault, pid, number, frozenset(), fault.target)
@@ -216,7 +216,7 @@ class Harmer:
         return self._fill(fault, fault.target), lambda: self._free(fault.target)
 
     def _master_disk_full(self, fault: Fault) -> tuple[Harm, Undo]:
-        """The master may end of it, and is started again; states are kept elsewhere."""
+        """Fill the master's disk: the master may end and is restarted; snapshots are elsewhere."""
         harm = self._fill(fault, DESK)
         harm = replace(harm, hosts=_ALL, hides=True, restarts=True, fills=False)
         return harm, lambda: self._free(DESK)
@@ -232,7 +232,7 @@ class Harmer:
 
 
 def _fill(path: Path) -> None:
-    """Take all that a file system has left, in ever smaller pieces."""
+    """Fill a file system, in ever smaller pieces."""
     with path.open("ab") as file:
         piece = 1 << 26
         while piece >= _LEAST:

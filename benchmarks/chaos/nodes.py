@@ -1,6 +1,6 @@
-"""The ROS nodes of the workload; they tell what they do as `plain` has it.
+"""ROS nodes of the workload; they write lines in the format of `plain`.
 
-`speaker`: without state. `counter`: counts its cycles, and takes the count along when it moves.
+`speaker`: stateless. `counter`: counts its cycles, and keeps the count when it migrates.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from std_msgs.msg import Int64
 from benchmarks.chaos.plain import RATE, Lines
 from rosrm.node import Node
 
-#: A timer of rclpy follows the wall clock otherwise, and waits where that is set back.
+#: By default, a timer of rclpy follows the wall clock, and waits where that is set back.
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 
 
 class Speaker(rclpy.node.Node):  # type: ignore[misc]  # rclpy brings no types
-    """Stateless: `count` is of this run alone."""
+    """A stateless node: `count` begins at 0 in each instance."""
 
     def __init__(self, lines: Lines) -> None:
         super().__init__("speaker")
@@ -39,7 +39,7 @@ class Speaker(rclpy.node.Node):  # type: ignore[misc]  # rclpy brings no types
 
 
 class Counter(Node):
-    """Stateful: `count` goes on wherever it is, and no number is ever said twice."""
+    """A stateful node: `count` continues in each successor, and no number is written twice."""
 
     def __init__(self, lines: Lines) -> None:
         super().__init__("counter")

@@ -1,7 +1,7 @@
-"""Is all well? Judged by the processes that run and by what they write; knows nothing of rosrm.
+"""Judge of a lab by its live processes and their output; imports nothing from rosrm.
 
-`amiss` says what is not as it should be at this moment, `Oracle.history` (by `rules`) what was not
-as it should have been since the last time that all was well.
+`Oracle.amiss` returns the deviations at this moment. `Oracle.history` (by `rules`) returns those
+since the last time that there was none.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from benchmarks.chaos.outputs import Outputs
 from benchmarks.chaos.reality import Member, members
 from benchmarks.chaos.rules import Judgement
 
-#: Seconds: who has said "active" within them is active, on a busy machine.
+#: Seconds: a process with an "active" line younger than this is active, on a busy machine.
 FRESH: Final = 1.0
 
 
 @dataclass
 class Wanted:
-    """What was asked for and accepted.
+    """The accepted requests.
 
     Attributes:
-        services: by name, what each is promised.
+        services: promises by name.
         jobs: that are to be done; by name, the moment in which they were accepted.
         line: jobs that wait for one another, in the order in which they were submitted.
-        canaries: by host, the job that only it can take, submitted when all was undone.
+        canaries: by host, the job that only it can take, submitted after all faults were undone.
     """
 
     services: dict[str, Promise] = field(default_factory=dict)
@@ -42,7 +42,7 @@ class Wanted:
 
 @dataclass(frozen=True)
 class Amiss:
-    """Something that is not as it should be now."""
+    """A deviation at this moment."""
 
     kind: str
     name: str
@@ -50,15 +50,15 @@ class Amiss:
 
 
 class Oracle:
-    """Looks at a lab.
+    """Observer of the processes and outputs of a lab.
 
     Args:
         lab: its name.
         folder: of the lines.
-        wanted: changed by whoever submits.
+        wanted: the accepted requests; the caller changes them.
 
     Attributes:
-        counts: live processes, at each look.
+        counts: number of live processes, at each look.
     """
 
     def __init__(self, lab: str, folder: Path, wanted: Wanted) -> None:
@@ -69,7 +69,7 @@ class Oracle:
         self.counts: list[int] = []
 
     def look(self) -> list[Member]:
-        """Every live process of the workload; they are counted."""
+        """Return every live process of the workload, and append their number to `counts`."""
         found = members(self._lab)
         self.counts.append(len(found))
         return found
@@ -77,7 +77,7 @@ class Oracle:
     # --- at this moment -----------------------------------------------------------------------
 
     def amiss(self) -> list[Amiss]:
-        """What is not as it should be; nothing: all is well."""
+        """Return the deviations at this moment; empty: all is well."""
         now = time.monotonic()
         there: dict[str, list[Member]] = {}
         for member in self.look():
@@ -125,7 +125,7 @@ class Oracle:
             yield Amiss("orphans", name, f"the job {name} is done, and runs: {_told(there)}")
 
     def left(self) -> list[Amiss]:
-        """What runs after everything was ended."""
+        """Return the processes that still run after everything was ended."""
         found: dict[str, list[Member]] = {}
         for member in members(self._lab):
             found.setdefault(member.process, []).append(member)
@@ -137,10 +137,10 @@ class Oracle:
     # --- since the last time ------------------------------------------------------------------
 
     def history(self, harms: list[Harm]) -> Judgement:
-        """What went wrong since the last call, and what was within the promise; all is well now.
+        """Judge the time since the last call; to be called when all is well.
 
         Args:
-            harms: what was done to the lab meanwhile.
+            harms: that were done to the lab in that time.
         """
         judged = Judgement()
         reached = {
@@ -162,13 +162,13 @@ class Oracle:
         return judged
 
     def _forget_jobs(self) -> None:
-        """They were judged; a process of theirs that still comes is an orphan."""
+        """Forget the judged jobs; a process of theirs that still appears is an orphan."""
         self._wanted.jobs.clear()
         self._wanted.line.clear()
         self._wanted.canaries.clear()
 
     def told(self, names: list[str]) -> Mapping[str, list[str]]:
-        """All that is known of the newest runs of some processes, for a story."""
+        """Return the newest runs of some processes as text, for a story."""
         return {name: [str(run) for run in self._outputs.read(name)[-6:]] for name in names}
 
 

@@ -1,6 +1,6 @@
-"""What the workload said of itself: the lines of `plain.Lines`, read as they grow, as runs.
+"""Output of the workload: the lines of `plain.Lines`, read as they grow, as runs.
 
-Knows nothing of rosrm.
+Imports nothing from rosrm.
 """
 
 from __future__ import annotations
@@ -11,14 +11,14 @@ from pathlib import Path
 
 @dataclass
 class Run:
-    """One life of one operating system process, as its lines tell it.
+    """The lifetime of one operating system process, by its lines.
 
     Attributes:
-        instance, host, pid, born: who it is; the pid as its host numbers it.
+        instance, host, pid, born: the identity; the pid is the one in its host.
         first, last: monotonic time of the first and last "active"; 0: there was none.
-        first_number, last_number: said with them.
-        told: its last word, and when.
-        backwards: how often a number did not exceed the one before it.
+        first_number, last_number: the numbers in those lines.
+        told, told_at: word and time of its last line.
+        backwards: how often a number did not exceed the one before.
     """
 
     instance: str
@@ -34,7 +34,7 @@ class Run:
     backwards: int = 0
 
     def take(self, time: float, word: str, number: int) -> None:
-        """One more line."""
+        """Add a line."""
         self.told, self.told_at = word, time
         if word != "active":
             return
@@ -61,7 +61,7 @@ class Outputs:
     """All runs of all processes, from the files in a folder.
 
     Args:
-        folder: of the lines; a file is called as its process.
+        folder: of the lines; a file has the name of its process.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -69,7 +69,7 @@ class Outputs:
         self._files: dict[str, _File] = {}
 
     def read(self, process: str) -> list[Run]:
-        """The runs of a process, in order of birth, with all that was said by now."""
+        """Return the runs of a process, in order of birth, with all lines written so far."""
         known = self._files.setdefault(process, _File())
         try:
             with (self._folder / process).open("rb") as file:
@@ -89,7 +89,7 @@ class Outputs:
         return sorted(known.runs.values(), key=lambda run: run.born)
 
     def forget(self, process: str, before: float) -> None:
-        """Drop the runs of which nothing was heard since a time; they were judged."""
+        """Drop the judged runs, whose last line is older than a time."""
         known = self._files.get(process)
         if known is not None:
             known.runs = {key: run for key, run in known.runs.items() if run.told_at >= before}

@@ -1,8 +1,8 @@
-"""The plain programs of the workload, and the lines by which all of it tells what it does.
+"""Plain programs of the workload, and the lines in which the whole workload reports.
 
-Run by its path, with the standard library alone. `service`: says "active" ten times a second until
-it is stopped. `family`: the same, with a child that only waits. `job SECONDS`: "active" for so
-long, then "done".
+Run by its path, with the standard library alone. `service`: writes "active" ten times a second
+until it is stopped. `family`: the same, with a child that only waits. `job SECONDS`: writes
+"active" for so long, then "done".
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ RATE = 10.0
 
 
 class Lines:
-    """Appends to the file of this process; what was said survives the death of who said it.
+    """The file of this process; its lines survive the end of the process.
 
     A line: monotonic time, instance, host, pid, time of birth, word, number. The monotonic clock is
     the same on all hosts of a lab.
@@ -32,7 +32,7 @@ class Lines:
         self.say("born")
 
     def say(self, word: str, number: int = 0) -> None:
-        """One line, in one write."""
+        """Write one line, in one system call."""
         os.write(self._file, f"{time.monotonic():.4f} {self._head} {word} {number}\n".encode())
 
 
@@ -45,7 +45,7 @@ def stop(number: int, _: object) -> None:
 
 
 def serve(lines: Lines, seconds: float) -> None:
-    """Be active for so long."""
+    """Write "active" at `RATE` for so many seconds."""
     begun, count = time.monotonic(), 0
     while time.monotonic() < begun + seconds:
         count += 1
@@ -54,7 +54,7 @@ def serve(lines: Lines, seconds: float) -> None:
 
 
 def have_child() -> None:
-    """A child that waits for a signal, and knows nothing of its parent's end."""
+    """Fork a child that waits for a signal, and does not notice its parent's end."""
     if os.fork() == 0:
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, signal.SIG_DFL)

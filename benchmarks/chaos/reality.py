@@ -1,4 +1,4 @@
-"""Which processes of the workload run on a lab's hosts, by /proc. Knows nothing of rosrm."""
+"""Live processes of the workload on a lab's hosts, by /proc. Imports nothing from rosrm."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Member:
     Attributes:
         pid: on this machine.
         process: the name under which it was submitted.
-        instance: which run of it.
+        instance: which instance of the process.
         host: of the lab.
         state: a letter of /proc: "T" is stopped.
     """
@@ -30,7 +30,7 @@ class Member:
 
 
 def members(lab: str) -> list[Member]:
-    """Every live process of the workload on the hosts of a lab."""
+    """Return every live process of the workload on the hosts of a lab."""
     return [one for pid in _pids() if (one := _member(pid, lab)) is not None]
 
 
@@ -39,7 +39,7 @@ def _pids() -> Iterator[int]:
 
 
 def _member(pid: int, lab: str) -> Member | None:
-    """None: it has ended, is on no host of the lab, or is no part of the workload."""
+    """Return None where the process has ended, is not in the lab, or not of the workload."""
     folder = _PROC / str(pid)
     try:
         host = _host(folder, lab)
@@ -53,13 +53,13 @@ def _member(pid: int, lab: str) -> Member | None:
         state = (folder / "stat").read_text().rpartition(")")[2].split()[0]
     except OSError:
         return None
-    # A supervisor or slave may have been started by a process of the workload: never here.
+    # The variables suffice: no process of the workload starts a supervisor or a slave.
     if "CHAOS_LINES" not in variables or "ROSRM_INSTANCE" not in variables or state in "ZX":
         return None
     return Member(pid, variables["ROSRM_PROCESS"], variables["ROSRM_INSTANCE"], host, state)
 
 
 def _host(folder: Path, lab: str) -> str:
-    """By its control group; "" for what is not of the lab."""
+    """Return the host by the process's control group; "": it is not of the lab."""
     found = re.search(rf"/rosrm-lab/{re.escape(lab)}/([^/\n]+)/", (folder / "cgroup").read_text())
     return found[1] if found else ""

@@ -1,4 +1,4 @@
-"""What the runs of a process must be like, by what excuses what. Pure; knows nothing of rosrm."""
+"""Rules for the runs of a process, with allowances by harm. Pure; imports nothing from rosrm."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ class Violation:
 
 @dataclass
 class Judgement:
-    """What came of looking back.
+    """The result of judging the past.
 
     Attributes:
-        violations: what was not as promised.
-        allowed: how often something happened that is, by title.
-        parted: seconds for which a former owner went on, after what had parted it from the master.
+        violations: broken promises.
+        allowed: how often each allowance applied, by title.
+        parted: seconds for which a former owner was active after the partition was healed.
     """
 
     violations: list[Violation] = field(default_factory=list)
@@ -54,14 +54,14 @@ class Judgement:
     parted: list[float] = field(default_factory=list)
 
     def add(self, other: Judgement) -> None:
-        """Take in another one."""
+        """Add another judgement to this one."""
         self.violations += other.violations
         self.allowed += other.allowed
         self.parted += other.parted
 
 
 def chain(runs: Iterable[Run]) -> list[Run]:
-    """The runs of one process that were active, in the order in which they ended to be."""
+    """Return the runs of one process that were active, in the order of their last "active"."""
     return sorted((run for run in runs if run.first), key=lambda run: run.last)
 
 
@@ -69,14 +69,14 @@ def judge_service(
     name: str, promise: Promise, chained: Sequence[Run], harms: Sequence[Harm],
     reached: Mapping[str, float] = MappingProxyType({}),
 ) -> Judgement:  # fmt: skip
-    """Look back at the runs of a service.
+    """Judge the runs of a service.
 
     Args:
         name: of the service.
         promise: that was given.
-        chained: its runs, as `chain` has them.
-        harms: that were done meanwhile.
-        reached: when a host is known to have taken an order from the master again.
+        chained: its runs, as returned by `chain`.
+        harms: that were done in that time.
+        reached: by host, the time at which it had received an order from the master again.
     """
     judged = Judgement(
         [
@@ -98,7 +98,7 @@ def judge_service(
 
 
 def _overlap(one: Run, other: Run) -> float:
-    """Seconds for which both were active; `one` ended first."""
+    """Return the seconds for which both were active; `one` ended first."""
     return one.last - max(one.first, other.first)
 
 
@@ -106,7 +106,7 @@ def _judge_overlap(
     name: str, promise: Promise, one: Run, other: Run, harms: Sequence[Harm],
     reached: Mapping[str, float],
 ) -> Judgement:  # fmt: skip
-    """Two that were active at once: by a move that allows it, or while they were parted."""
+    """Judge two runs active at once: allowed in a relaunch migration, and in a partition."""
     if any(harm.kind == "overlap" and harm.process == name for harm in harms):
         return Judgement(allowed=Counter(overlaps=1))
     parting = [
@@ -114,10 +114,10 @@ def _judge_overlap(
         for harm in harms
         if harm.hides and (harm.concerns(one.host) or harm.concerns(other.host))
     ]
-    # What was done explains it, or else the machine itself, which may be busy to the end.
+    # A fault explains it, or else an overload, which may last to the end.
     parting = [harm for harm in parting if harm.kind != OVERLOAD] or parting
     until = [harm.ended + _OVERLAP + (STARTING if harm.restarts else MEETING) for harm in parting]
-    # On a busy machine a part that was started again comes up late: what it took shows that it has.
+    # On a busy machine a restarted part comes up late; the first order that it received tells when.
     until += [reached[host] + _OVERLAP for host in (one.host, other.host) if host in reached]
     parted = promise.elsewhere and not promise.isolated
     if parted and parting and one.last <= max(until):
@@ -130,7 +130,7 @@ def _judge_overlap(
 def _judge_state(
     name: str, promise: Promise, one: Run, following: Run, harms: Sequence[Harm]
 ) -> Judgement:
-    """Whether the numbers went on; where they did not, a title for what is allowed."""
+    """Judge the continuity of the numbers; a deviation gets the title of its allowance."""
     behind = one.last_number + 1 - following.first_number
     if behind == 0:
         return Judgement()
@@ -148,7 +148,7 @@ def _judge_state(
 
 
 def judge_job(name: str, accepted: float, runs: Sequence[Run], harms: Sequence[Harm]) -> Judgement:
-    """Done at least once; begun more than once only where something was done to its host."""
+    """Judge a job: it runs at least once, and more than once only where its host was struck."""
     if len(runs) <= 1:
         return Judgement()
     hosts = {run.host for run in runs}
@@ -167,7 +167,7 @@ def judge_job(name: str, accepted: float, runs: Sequence[Run], harms: Sequence[H
 
 
 def judge_line(line: Mapping[str, Sequence[Run]]) -> list[Violation]:
-    """Those who wait in line are begun in the order in which they came."""
+    """Return a violation for each job of the line that began before an earlier one."""
     begun = [(name, runs[0].born) for name, runs in line.items() if runs]
     return [
         Violation("order", later, f"{later} began at {then:.2f}, before {earlier} at {when:.2f}")

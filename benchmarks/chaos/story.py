@@ -1,4 +1,4 @@
-"""What is told of a run: on standard error, and with what went wrong as files."""
+"""Story of a run: on standard error, and as files beside each violation."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from typing import Any, Final
 from benchmarks.chaos.cluster import DESK, HOSTS, Cluster
 from benchmarks.machine import say
 
-#: Lines that a story goes back.
+#: Number of lines that a story keeps.
 _LENGTH: Final = 400
-#: Of each host, what helps to find the cause.
+#: Files of each host that help to find the cause.
 _KEPT: Final = {
     DESK: ("master/journal.sqlite", "master/journal.sqlite-wal"),
     **dict.fromkeys(HOSTS, ("slave/supervisor/instances.jsonl", "slave/supervisor/supervisor.log")),
@@ -30,7 +30,7 @@ class Story:
         self._lines: list[str] = []
 
     def tell(self, text: str, *, aloud: bool = False) -> None:
-        """One line."""
+        """Add a line."""
         self._lines.append(f"{time.monotonic():.2f} {time.strftime('%H:%M:%S')} {text}")
         del self._lines[:-_LENGTH]
         if aloud:
@@ -40,7 +40,7 @@ class Story:
         self, folder: Path, cluster: Cluster, violations: Sequence[Mapping[str, Any]],
         seen: Mapping[str, Any],
     ) -> None:  # fmt: skip
-        """Write a violation with all that may explain it."""
+        """Write a violation with everything that may explain it."""
         folder.mkdir(parents=True, exist_ok=True)
         told = {"seed": self._seed, "violations": violations, "story": self._lines, "seen": seen}
         (folder / "violation.json").write_text(json.dumps(told, indent=1))

@@ -1,4 +1,4 @@
-"""The loop: a round of faults, undone; wait until all is well; judge what happened meanwhile."""
+"""The loop: do a round of faults, undo them, wait until all is well, judge the round."""
 
 from __future__ import annotations
 
@@ -31,34 +31,34 @@ _LOOK: Final = 0.1
 _LOOK_AT_ALL: Final = 0.3
 #: Looks in a row at which all must be well.
 _STEADY: Final = 2
-#: Seconds within which a move that was asked for has ended.
+#: Seconds within which a requested migration has ended.
 _MOVE: Final = 30.0
-#: Load average for each core from which on the machine does not keep to its times.
+#: Load average for each core from which on the machine keeps no deadlines.
 _OVERLOAD: Final = 3.0
-#: Seconds that a job takes which only shows that its host takes work.
+#: Seconds of a canary: a job that only shows that its host accepts work.
 _CANARY: Final = 0.1
 
 
 class Stuck(Exception):
-    """All is not well, and does not become so: this lab is of no more use."""
+    """The deviations have lasted too long: this lab is of no more use."""
 
 
 @dataclass
 class Tally:
-    """What a run came to.
+    """The totals of a benchmark.
 
     Attributes:
         by_kind: faults that were done.
-        missed: faults that found nothing to strike, by kind and reason.
+        missed: skipped faults (no target to strike), by kind and reason.
         violations: by kind.
-        allowed: what happened within the promises, by title.
-        parted: seconds for which a former owner went on after what had parted it was undone.
+        allowed: deviations within the promises, by title.
+        parted: seconds for which a former owner was active after the partition was healed.
         recovery: seconds from the undoing of the last fault of a round until all was well, by kind
             of the fault, or "burst" for rounds of several kinds.
         whole: the same, from the first fault on.
         loads: load average of the machine at the end of each round.
         counts: live processes at each look, from the first round on.
-        overloaded: rounds in which so much else ran that hosts may have been lost by it.
+        overloaded: rounds with so much load by other programs that hosts may have been lost.
     """
 
     by_kind: Counter[str] = field(default_factory=Counter)
@@ -75,17 +75,17 @@ class Tally:
 
     @property
     def faults(self) -> int:
-        """That were done."""
+        """Return the number of faults that were done."""
         return self.by_kind.total()
 
 
 class Trial:
-    """A cluster, its workload, and who judges it.
+    """A cluster, its workload, and its judge.
 
     Args:
         cluster: that was just started.
         lines: folder for the lines of the workload, empty.
-        out: folder for what went wrong.
+        out: folder for violations.
         tally: counted in.
     """
 
@@ -118,7 +118,7 @@ class Trial:
         self._oracle.counts = self._tally.counts
 
     def end(self) -> None:
-        """Cancel everything, stop the slaves, and look for what is left."""
+        """Cancel everything, stop the slaves, and look for orphans."""
         names = list(self._wanted.services)
         self._wanted.services.clear()
         self._oracle.counts = []
@@ -131,10 +131,10 @@ class Trial:
     # --- a round ------------------------------------------------------------------------------
 
     def round(self, drawn: Round) -> None:
-        """Do the faults of a round and undo them; judge.
+        """Do the faults of a round, undo them, and judge.
 
         Raises:
-            Stuck: something did not become well; it was told.
+            Stuck: a deviation has lasted too long; it was reported.
         """
         self._tally.rounds += 1
         self._submit_jobs(drawn)
@@ -148,7 +148,7 @@ class Trial:
         self._harms += self._harmer.take_done()
         self._note_load(begun)
         judged = self._oracle.history(self._harms)
-        # A move goes on after its round.
+        # A migration may outlast its round.
         recent = time.monotonic() - _MOVE
         self._harms = [harm for harm in self._harms if harm.kind in MOVES and harm.begun > recent]
         self._tally.allowed += judged.allowed
@@ -163,7 +163,7 @@ class Trial:
             say(f"{self._tally.faults} faults; {', '.join(kinds)}: {told}")
 
     def _note_load(self, begun: float) -> None:
-        """A machine that is overloaded by others does what a cut does; it is counted."""
+        """Record the load; an overload by other programs counts as harm, like a cut."""
         load = os.getloadavg()[0]
         self._tally.loads.append(load)
         if load > _OVERLOAD * len(os.sched_getaffinity(0)):
@@ -172,7 +172,7 @@ class Trial:
             self._harms.append(Harm(OVERLOAD, *times, everywhere, hides=True, deafens=True))
 
     def _do(self, drawn: Round, begun: float) -> list[Fault]:
-        """Everything of a round in its time; returns the faults that were done."""
+        """Do everything of a round at its time; return the faults that were done."""
         done: list[Fault] = []
 
         def begin(fault: Fault) -> None:
@@ -211,7 +211,7 @@ class Trial:
         return self._errands.collect()
 
     def _await_well(self, number: int, what: str, timeout: float) -> float:
-        """Wait until all is well; returns since when."""
+        """Wait until all is well; return the time since which it has been."""
         deadline, since, steady = time.monotonic() + timeout, 0.0, 0
         while steady < _STEADY:
             answered = self._tend()
@@ -248,7 +248,7 @@ class Trial:
         self._submit(jobs + line, self._accept([*jobs, *line], line))
 
     def _submit_canaries(self, number: int) -> None:
-        """One job for each host: it takes work again."""
+        """Submit one job for each host, which shows that the host accepts work again."""
         entries = [
             work.job(f"canary{number}_{host}", self._lines, _CANARY, host=host) for host in HOSTS
         ]
@@ -280,7 +280,7 @@ class Trial:
         def accept(errand: Errand) -> None:
             for job in jobs:
                 self._wanted.jobs[job["name"]] = sent
-                if errand.unsure:  # a master that answered nobody may have had them done by now
+                if errand.unsure:  # a master that did not answer may have accepted them earlier
                     self._harms.append(Harm("unsure", sent, time.monotonic(), process=job["name"]))
             self._wanted.line += [job["name"] for job in line]
 
@@ -327,7 +327,7 @@ class Trial:
         say(f"the story is in {folder}")
 
     def _ask_master(self) -> dict[str, Any]:
-        """What the master says of itself, for the story alone."""
+        """Return the master's view, for the story alone."""
         answers: list[Errand] = []
         self._errands.send(Errand({"do": "look"}, persistent=False, done=answers.append))
         deadline = time.monotonic() + 20.0
@@ -338,7 +338,7 @@ class Trial:
 
 
 def promise_of(service: work.Service) -> Promise:
-    """What the oracle holds a service to."""
+    """Return the promises by which the oracle judges a service."""
     sort = service.sort
     return Promise(
         sort.members, sort.stateful, sort.standby, service.elsewhere, service.isolated,

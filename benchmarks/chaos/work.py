@@ -1,6 +1,6 @@
-"""What runs on the hosts: services, ROS nodes with and without state, jobs; as entries of a file.
+"""Workload as entries of a work file: services, ROS nodes with and without state, jobs.
 
-The constants switch on what a process asks for when something fails.
+The constants set the options for failures (host loss, isolation, standby, health).
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from typing import Any, Final
 ROOT: Final = Path(__file__).resolve().parents[2]
 _PLAIN: Final = str(Path(__file__).with_name("plain.py"))
 
-#: So many that thirty processes live: services, a child of each family, standbys, and a guest.
-#: Jobs come on top.
+#: Numbers of services, chosen such that thirty processes live: these, a child of each family,
+#: standbys, and a guest. Jobs come on top.
 PLAIN: Final = 12
 FAMILIES: Final = 2
 SPEAKERS: Final = 4
@@ -26,16 +26,16 @@ STANDBYS: Final = 2
 ELSEWHERE: Final = 2
 #: Of each sort, the last so many are stopped by their host when it is cut off. They go elsewhere.
 ISOLATED: Final = 1
-#: Of the speakers and of the counters, the first so many are watched: they must publish.
+#: Of the speakers and of the counters, the first so many have a health check: they must publish.
 WATCHED: Final = 1
 
-#: Cycles by which the copy of a state on another host may be behind: it goes there once a second.
+#: Cycles by which a replica on another host may be behind: snapshots are sent once a second.
 COPIED: Final = 30
 
 #: The host that takes the jobs of the line, one at a time: of its 2 GiB 80 % may be in use.
 LINE_HOST: Final = "host5"
 _LINE_NEED: Final = "900MiB"
-#: Services go first: what waits for room holds up who is behind.
+#: Services go first: a process that waits for room blocks those behind it.
 _FIRST: Final = 10
 
 
@@ -47,8 +47,8 @@ class Sort:
         kind: of the program.
         ros: it is a ROS node.
         members: processes of one instance.
-        strategy: by which it moves; "": it stays.
-        stateful: its number goes on, whoever is active.
+        strategy: of its migrations; "": it stays.
+        stateful: its count continues in each successor.
         standby: it has a second instance, silent, on another host.
     """
 
@@ -71,7 +71,7 @@ class Service:
     watched: bool = False
 
     def entry(self, lines: Path) -> dict[str, Any]:
-        """Of a work file."""
+        """Return its entry of a work file."""
         entry = {
             **_common(self.name, lines),
             "priority": _FIRST,
@@ -108,7 +108,7 @@ _SORTS: Final = {
 
 
 def services() -> Iterator[Service]:
-    """All that run from the beginning to the end."""
+    """Yield the services that run from the beginning to the end."""
     for word, (sort, count) in _SORTS.items():
         for number in range(1, count + 1):
             isolated = number > count - ISOLATED
@@ -118,13 +118,13 @@ def services() -> Iterator[Service]:
 
 
 def guest(number: int) -> Service:
-    """One of those of which there is one at a time: it is cancelled for the next one."""
+    """Return a guest: a service that is cancelled when the next guest is submitted."""
     sort = (_SORTS["plain"], _SORTS["counter"], _SORTS["family"])[number % 3][0]
     return Service(f"guest{number}", sort, elsewhere=bool(number % 2))
 
 
 def job(name: str, lines: Path, seconds: float, *, host: str = "") -> dict[str, Any]:
-    """The entry of a job; with a host, it runs there alone."""
+    """Return the entry of a job; with a host, it runs there alone."""
     entry = {
         **_common(name, lines),
         "kind": "job",
@@ -137,7 +137,7 @@ def job(name: str, lines: Path, seconds: float, *, host: str = "") -> dict[str, 
 
 
 def line_job(name: str, lines: Path, seconds: float) -> dict[str, Any]:
-    """The entry of a job that waits in line with its like: there is room for one at a time."""
+    """Return the entry of a job that waits in line: there is room for one at a time."""
     entry = job(name, lines, seconds, host=LINE_HOST)
     return {**entry, "needs": {"memory": _LINE_NEED}}
 

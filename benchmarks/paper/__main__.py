@@ -1,8 +1,8 @@
-"""Measures the figures and the table of the section IV of the paper: python -m benchmarks.paper -h.
+"""Measurement of the paper's figures and table (section IV): `python -m benchmarks.paper -h`.
 
 Exit status: 0 when every claim holds; 1 when one does not; 2 when something is missing or failed;
-128 + signal number when a signal stopped it. Nothing of a lab is left behind. A figure that failed
-leaves its folder with settings, logs and records, and does not keep the others from being measured.
+128 + signal number when a signal stopped it. The labs are removed. A figure that failed leaves its
+folder with settings, logs and records, and the other figures are measured nevertheless.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _FAILED = 2
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure what is asked for; returns the exit status."""
+    """Measure the figures that the arguments name; return the exit status."""
     options = _parse(arguments)
     names = FIGURES if options.figure == "all" else (options.figure,)
     raise_signals()
@@ -93,9 +93,9 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 
 def _measured(name: str, options: argparse.Namespace) -> int:
-    """Measure one figure, write it, and say how it went; returns its exit status."""
+    """Measure one figure, write it, and report the outcome; return its exit status."""
     results = [options.out / f"{name}{suffix}" for suffix in (".json", ".png")]
-    for old in results:  # what fails now must not show what was measured before
+    for old in results:  # a failed measurement must not leave the results of an earlier one
         old.unlink(missing_ok=True)
     load = os.getloadavg()[0]
     say(f"{name}: begins (load average {load:.2f})")
@@ -106,7 +106,7 @@ def _measured(name: str, options: argparse.Namespace) -> int:
         say(f"{name}: failed: {error}")
         say(f"{name}: settings, logs and records are kept in {folder}")
         return _FAILED
-    except BaseException:  # a Ctrl-C, or a fault of ours: nobody looks at what was kept
+    except BaseException:  # Ctrl-C or a bug: the folder is of no use
         shutil.rmtree(folder, ignore_errors=True)
         raise
     shutil.rmtree(folder, ignore_errors=True)
@@ -119,7 +119,7 @@ def _measured(name: str, options: argparse.Namespace) -> int:
 
 
 def _report(name: str, options: argparse.Namespace, folder: Path, load: float) -> dict[str, Any]:
-    """Measure one figure, and write its numbers and its picture; returns the numbers."""
+    """Measure one figure, and write its numbers and its picture; return the numbers."""
     module, began = importlib.import_module(f"benchmarks.paper.{name}"), time.monotonic()
     wanted = Options(folder, options.runs, tuple(options.drive), options.small, options.lab)
     result = module.measure(wanted)

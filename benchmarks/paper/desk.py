@@ -3,8 +3,8 @@
     python -m benchmarks.paper.desk
 
 Each line of standard input is a JSON object, and each is answered by a line: `{"do": "submit",
-"work": FILE}` queues the processes of a work file; `{"do": "look", "after": N}` tells how hosts and
-processes are, and the events after number N. Ends with its input.
+"work": FILE}` queues the processes of a work file; `{"do": "look", "after": N}` returns the states
+of hosts and processes, and the events after number N. The client ends when its input ends.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from typing import Any
 
 from rosrm import Client, HostRow, RosrmError
 
-#: Seconds for a master that is coming up on a busy machine.
+#: Seconds for a master that is starting on a busy machine.
 _PATIENCE = 60.0
 
 
 def main() -> None:
-    """Answer until the input ends."""
+    """Answer requests until the input ends."""
     with Client(timeout=_PATIENCE) as client:
         print(json.dumps({"connected": True}), flush=True)
         for line in sys.stdin:

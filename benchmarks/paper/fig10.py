@@ -1,4 +1,4 @@
-"""Fig. 10: processes grow to the limit of their slave, and move to that with the most room."""
+"""Fig. 10: processes grow to the limit of their slave, and migrate to the one with most room."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ CLAIM: Final = (
     "A process whose slave has reached the limit of 80 % migrates to the slave that has the "
     "largest margin of those with room for it"
 )
-#: Bytes of each host, and MB that something else than rosrm's processes holds there.
+#: Bytes of each host, and MB that another program than rosrm's processes holds there.
 _HOSTS: Final = {
     "host1": (512 * MIB, 0.0),
     "host2": (512 * MIB, 30.0),
@@ -28,14 +28,14 @@ _HOSTS: Final = {
 #: Seconds at which the processes are submitted, and at which the run ends.
 _COME: Final = (0.0, 33.0, 75.0)
 _END: Final = 135.0
-#: MB of each at its beginning, and more in every second.
+#: MB of each at its beginning, and MB that it grows by in every second.
 _MB, _GROWTH = 20.0, 5.5
 _LEAST_MOVES: Final = 2
-#: As in `cluster.yaml` by default; told here because it is part of the judgement.
+#: The default of `cluster.yaml`; set here because the judgement depends on it.
 _HEADROOM: Final = 0.05
-#: So many times as fast as the paper's run is this one.
+#: How many times as fast as the paper's run this one is.
 _THAN_PAPER: Final = 2.7
-#: A small run is so many times as fast.
+#: How many times as fast as usual a small run is.
 _FASTER: Final = 3.0
 
 
@@ -73,7 +73,7 @@ def _growing(number: int, growth: float) -> dict[str, Any]:
 
 
 def judge(trace: Trace) -> tuple[list[str], dict[str, Any]]:
-    """What speaks against the claim, and the numbers."""
+    """Return the objections to the claim, and the numbers."""
     moves = trace.moves()
     wrong = []
     if len(moves) < _LEAST_MOVES:
@@ -109,7 +109,7 @@ def _draw(trace: Trace, moves: list[Move], path: Path) -> None:
 
 
 def scaled(faster: float = 1.0) -> dict[str, str]:
-    """What differs from the paper, for a run that is so many times as fast as usual."""
+    """Return the differences from the paper, for a run that is `faster` times as fast as usual."""
     coming = ", ".join(f"{at / faster:g}" for at in _COME)
     sizes = ", ".join(f"{memory // MIB}" for memory, _ in _HOSTS.values())
     held = ", ".join(f"{mb:g}" for _, mb in _HOSTS.values())

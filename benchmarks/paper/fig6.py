@@ -24,7 +24,7 @@ CLAIM: Final = (
 )
 _LEAST_MB, _MOST_MB = 8, 80
 _SEED: Final = 6
-#: More is submitted than the hosts can hold, by this factor, so that the queue comes to wait.
+#: The processes need more than the hosts have, by this factor, so that the queue has to wait.
 _TOO_MUCH: Final = 1.2
 #: Seconds between two submissions, and after the last one.
 _EVERY: Final = 0.8
@@ -32,12 +32,12 @@ _AFTER: Final = 6.0
 
 
 def hosts(*, small: bool) -> list[HostPlan]:
-    """Three alike."""
+    """Return three equal hosts."""
     return uniform(3, memory=256 * MIB if small else GIB, cpu=0.5, disk=64 * MIB)
 
 
 def sizes(memory: float, seed: int = _SEED) -> list[int]:
-    """MB that each process holds: as many as overfill three hosts of so many bytes each."""
+    """Return the MB of each process, in sum more than three hosts of so many bytes can hold."""
     chance = random.Random(seed)  # noqa: S311 - sizes, no secrets
     room_mb = _TOO_MUCH * 3 * MEMORY_LIMIT * memory / 1e6
     chosen: list[int] = []
@@ -71,7 +71,7 @@ def measure(options: Options) -> Result:
 
 
 def replayed_otherwise(simulation: Mapping[str, Any]) -> list[str]:
-    """What the replay of the run's record says against it, in words."""
+    """Return an objection where a replay of the run's record decides otherwise."""
     differently, decisions = simulation["replayed_differently"], simulation["replayed_decisions"]
     if not differently and decisions:
         return []
@@ -79,12 +79,12 @@ def replayed_otherwise(simulation: Mapping[str, Any]) -> list[str]:
 
 
 def named(chosen: list[int]) -> dict[str, int]:
-    """The processes' MB by name, in the order in which they come."""
+    """Return the processes' MB by name, in the order of submission."""
     return {f"process_{number:03d}": mb for number, mb in enumerate(chosen)}
 
 
 def judge(trace: Trace, needs: dict[str, float]) -> tuple[list[str], dict[str, Any]]:
-    """What speaks against the claim, and the numbers.
+    """Return the objections to the claim, and the numbers.
 
     Args:
         trace: of the run.

@@ -1,4 +1,4 @@
-"""Fig. 7: slaves join at 25 s and 75 s, and get what comes until they are as full as the rest."""
+"""Fig. 7: slaves join at 25 s and 75 s, and get all work until they are as full as the rest."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ CLAIM: Final = (
 _MB: Final = 32
 #: Seconds at which slaves 2 and 3 are started.
 JOINS: Final = (25.0, 75.0)
-#: Within which a slave that was started must have got a process: it has to come up, too.
+#: Seconds within which a slave that was started must have got a process: it has to start, too.
 _TAKEN_UP: Final = 15.0
 _NEED: Final = (_MB + HOLDER_MB) * 1e6
 #: Seconds between two submissions, and after the last one.
@@ -32,7 +32,7 @@ _AFTER: Final = 6.0
 
 
 def measure(options: Options) -> Result:
-    """Fill hosts that come one after the other."""
+    """Fill hosts that join one after the other."""
     faster = 4.0 if options.small else 1.0
     plans = uniform(3, memory=256 * MIB if options.small else GIB, cpu=0.5, disk=64 * MIB)
     count = int(1.1 * 3 * MEMORY_LIMIT * (plans[0].memory or GIB) / _NEED)
@@ -59,7 +59,7 @@ def measure(options: Options) -> Result:
 
 
 def judge(trace: Trace, joins: Sequence[float]) -> tuple[list[str], dict[str, Any]]:
-    """What speaks against the claim, and the numbers.
+    """Return the objections to the claim, and the numbers.
 
     Args:
         trace: of the run.

@@ -1,4 +1,4 @@
-"""Fig. 8: the number of processes that can be held grows in proportion to the slaves, 1 to 10."""
+"""Fig. 8: the number of processes that fit grows in proportion to the slaves, 1 to 10."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _NEED: Final = (_MB + HOLDER_MB) * 1e6
 _LEAST_R2: Final = 0.999
 _SLAVES, _FEW = 10, 3
 _MEMORY, _LITTLE = 528 * MIB, 192 * MIB
-#: Seconds without an assignment after which no more fits: the readings show all that was started.
+#: Seconds without an assignment after which no more fits: the readings include all processes.
 _QUIET: Final = 4.0
 _LONGEST: Final = 90.0
 
@@ -54,7 +54,7 @@ def measure(options: Options) -> Result:
 
 
 def _settled(trace: Trace, newest: str, look: Look) -> bool:
-    """Whether the newest host holds something, and nothing has been assigned for a while."""
+    """Return True if the newest host holds a process, and no assignment was made for a while."""
     assigned = list(trace.of_kind("assigned"))
     if not any(event.host == newest for event in assigned):
         return False
@@ -63,7 +63,7 @@ def _settled(trace: Trace, newest: str, look: Look) -> bool:
 
 
 def judge(trace: Trace, held: list[int], fit: Line) -> tuple[list[str], dict[str, Any]]:
-    """What speaks against the claim, and the numbers.
+    """Return the objections to the claim, and the numbers.
 
     Args:
         trace: of the run.

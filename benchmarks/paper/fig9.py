@@ -2,9 +2,9 @@
 
 One cycle is one reading received and decoded for each slave, and one decision. Through real rclpy,
 up to 1,000 slaves: the CPU time of all threads of a real master, per cycle of the slaves, and the
-core's time for one decision among so many hosts (`benchmarks.scale`, in a process of its own, as it
-changes its network). In the core alone, up to 10,000: taking in one reading of each, and one
-decision.
+core's time for one decision among so many hosts (`benchmarks.scale`, in a process of its own,
+because it changes its network). In the core alone, up to 10,000 slaves: one reading of each, and
+one decision.
 """
 
 from __future__ import annotations
@@ -35,20 +35,20 @@ _CORE: Final = (1, 10, 100, 1000, 3000, 10_000)
 _FEW: Final = (1, 100, 300)
 #: Processes, and so DDS participants, that the simulated slaves share.
 _SHARED_BY: Final = 2
-#: So far a usage goes in a cycle that each reading is sent at once.
+#: Change of a usage in a cycle; so large that each reading is sent at once.
 _STEP: Final = 0.1
-#: Seconds at the full rate before the count, and of the count: slaves ask for work again and again
-#: in the first half minute. Shorter for a run that shows only that it works.
+#: Seconds at the full rate before the count (because slaves ask for work repeatedly in the first
+#: half minute), the same for a small run, and seconds of the count.
 _SETTLE, _SHORTLY, _SECONDS = 30.0, 3.0, 6.0
-#: Seconds after which one number of slaves is given up, and for its end then.
+#: Seconds after which the measurement of one number of slaves is given up, and for its end then.
 _LONGEST, _END = 400.0, 60.0
-#: Parts of the readings that the master may miss, and of the rate that may be wanting.
+#: Fractions of the readings that the master may miss, and of the rate that may be lacking.
 _MOST_MISSED, _MOST_WANTING = 0.01, 0.1
-#: Part of the variance that the line must explain to describe the points at all. With few slaves
-#: each reading wakes the master, with many it takes several at a time: so they bend downwards.
+#: Part of the variance that the line must explain to describe the points at all. The points bend
+#: downwards: with few slaves each reading wakes the master, with many it receives several at once.
 _LEAST_R2: Final = 0.9
 _CYCLE_MS: Final = 100.0
-#: Decisions, of which the median counts.
+#: Number of decisions; the median counts.
 _DECISIONS: Final = 60
 
 
@@ -64,12 +64,12 @@ def measure(options: Options) -> Result:
 
 
 def through_rclpy(slaves: int, settle: float, folder: Path) -> dict[str, Any]:
-    """One cycle of a real master with so many simulated slaves.
+    """Measure one cycle of a real master with so many simulated slaves.
 
     Args:
         slaves: how many.
         settle: seconds at the full rate before the count.
-        folder: for what the measurement says meanwhile.
+        folder: for the log of the measurement.
     """
     processes = min(slaves, _SHARED_BY)
     options = {
@@ -78,7 +78,7 @@ def through_rclpy(slaves: int, settle: float, folder: Path) -> dict[str, Any]:
     }  # fmt: skip
     seen = _scale([f"--{name}={value:g}" for name, value in options.items()], folder)
     decided, _ = decision(slaves, _DECISIONS)
-    # What is left out is a reading that stayed the same: one message a slave costs so much more.
+    # An unchanged reading is not sent. If it were, one message a slave would cost so much more.
     received = seen["us_per_message"] * slaves / 1e3 / seen["messages_per_cycle"]
     ms = received + decided * slaves / 1e3
     say(f"fig9: {slaves} slaves: {ms:.3f} ms a cycle, {seen['missed']} readings missed")
@@ -105,17 +105,17 @@ def through_rclpy(slaves: int, settle: float, folder: Path) -> dict[str, Any]:
 
 
 def _scale(options: list[str], folder: Path) -> dict[str, Any]:
-    """What `benchmarks.scale` measures."""
+    """Run `benchmarks.scale`; return its figures."""
     log = folder / "scale.log"
     with log.open("w") as sink:
         process = subprocess.Popen(
             [sys.executable, "-m", "benchmarks.scale", *options],
             stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=sink, text=True, cwd=ROOT,
-            start_new_session=True,  # a Ctrl-C is for who ends it
+            start_new_session=True,  # a Ctrl-C is for the parent, which ends it
         )  # fmt: skip
         try:
             said, _ = process.communicate(timeout=_LONGEST)
-        except BaseException:  # also a Ctrl-C: it hears none, being in a session of its own
+        except BaseException:  # also a Ctrl-C, which does not reach a session of its own
             _end(process)
             raise
     if process.returncode:
@@ -129,7 +129,7 @@ def _scale(options: list[str], folder: Path) -> dict[str, Any]:
 
 
 def _end(process: subprocess.Popen[str]) -> None:
-    """Let it end its master and slaves."""
+    """Let the measurement end its master and slaves."""
     process.send_signal(signal.SIGTERM)
     try:
         process.communicate(timeout=_END)
@@ -148,7 +148,7 @@ def _in_core(slaves: int) -> dict[str, Any]:
 def judge(
     real: list[dict[str, Any]], core: list[dict[str, Any]], fit: Line
 ) -> tuple[list[str], dict[str, Any]]:
-    """What speaks against the claim, and the numbers."""
+    """Return the objections to the claim, and the numbers."""
     wrong = []
     if fit.r2 < _LEAST_R2:
         wrong.append(
@@ -176,7 +176,7 @@ def judge(
 
 
 def not_kept_up(one: dict[str, Any]) -> list[str]:
-    """Why a number of slaves was not what was to be measured, in words."""
+    """Return the deviations from the intended rates, as sentences."""
     slaves, wanted = one["slaves"], one["slaves"] * RATE_HZ
     wrong = []
     if one["missed"] > _MOST_MISSED * one["cycles"]:

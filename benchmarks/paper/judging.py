@@ -1,4 +1,4 @@
-"""Whether what was seen bears out what the paper claims. Pure."""
+"""Comparison of the observations with the paper's claims. Pure."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Line:
 
 
 def line(x: Sequence[float], y: Sequence[float]) -> Line:
-    """The line through points; raises `ValueError` for fewer than two different x."""
+    """Return the line through points; raises `ValueError` for fewer than two different x."""
     xs, ys = np.asarray(x, float), np.asarray(y, float)
     if len(set(x)) < 2 or len(xs) != len(ys):
         raise ValueError(f"a line needs two points at least: x {list(x)}, y {list(y)}")
@@ -38,7 +38,7 @@ def line(x: Sequence[float], y: Sequence[float]) -> Line:
 
 
 def proportion(x: Sequence[float], y: Sequence[float]) -> Line:
-    """The line through points and the origin; raises `ValueError` where no x is beside 0."""
+    """Return the line through points and the origin; raises `ValueError` where all x are 0."""
     xs, ys = np.asarray(x, float), np.asarray(y, float)
     if not xs.any() or len(xs) != len(ys):
         raise ValueError(f"a proportion needs a point beside 0: x {list(x)}, y {list(y)}")
@@ -52,14 +52,14 @@ def _explained(xs: FloatArray, ys: FloatArray, slope: float, intercept: float) -
 
 
 def gap(look: Look, hosts: Sequence[str]) -> float | None:
-    """Fullest minus emptiest of some hosts, fraction; None: one is not there or not known."""
+    """Return fullest minus emptiest of some hosts, fraction; None: one is absent or not known."""
     seen = [look.hosts[name].usage for name in hosts if name in look.hosts]
     usages = [usage for usage in seen if usage is not None]
     return max(usages) - min(usages) if len(usages) == len(hosts) else None
 
 
 def widest_gap(trace: Trace, hosts: Sequence[str], begin: float = 0.0) -> float:
-    """The largest gap from a moment (s of the master's clock) on; 0: there was none."""
+    """Return the largest gap from a moment (s of the master's clock) on; 0: there was none."""
     gaps = (gap(look, hosts) for look in trace.looks if look.elapsed >= begin)
     return max((one for one in gaps if one is not None), default=0.0)
 
@@ -67,11 +67,11 @@ def widest_gap(trace: Trace, hosts: Sequence[str], begin: float = 0.0) -> float:
 def not_to_emptiest(
     trace: Trace, needs: Mapping[str, float], tolerance: float = 2 * NOISE
 ) -> list[str]:
-    """Assignments that did not go to the host with the largest margin, in words.
+    """Return the assignments that did not go to the host with the largest margin, as sentences.
 
-    How full a host was is reckoned independently of rosrm: what it had when it was first seen, and
-    the needs of all that was assigned to it since. For processes that stay, and hold what they
-    need.
+    The usage of a host is computed independently of rosrm: the usage at its first reading, and the
+    needs of all processes assigned to it since. Valid for processes that stay, and whose usage
+    equals their needs.
 
     Args:
         trace: of the run; hosts of equal limits.
@@ -82,7 +82,7 @@ def not_to_emptiest(
     held: dict[str, dict[str, float]] = {}
     first = first_looks(trace)
     for event in trace.of_kind("assigned"):
-        for others in held.values():  # an assignment that was not taken up is given again
+        for others in held.values():  # an assignment that the slave did not take is repeated
             others.pop(event.process, None)
         loads = {
             name: (host.usage or 0.0) + sum(held.get(name, {}).values()) / host.capacity
@@ -100,7 +100,7 @@ def not_to_emptiest(
 
 
 def first_looks(trace: Trace) -> dict[str, tuple[float, HostLook]]:
-    """When each host was first seen asking for work (s of the master's clock), and how it was."""
+    """Return the first look (s of the master's clock) at which each host asked for work."""
     first: dict[str, tuple[float, HostLook]] = {}
     for look in trace.looks:
         for name, host in look.hosts.items():
@@ -110,7 +110,7 @@ def first_looks(trace: Trace) -> dict[str, tuple[float, HostLook]]:
 
 
 def room_left(look: Look, need: float, limit: float) -> list[str]:
-    """Hosts that could have taken one more process of `need` bytes, and stayed under the limit."""
+    """Return the hosts with room for one more process of `need` bytes under the limit."""
     return [
         name
         for name, host in look.hosts.items()
@@ -119,7 +119,7 @@ def room_left(look: Look, need: float, limit: float) -> list[str]:
 
 
 def over(trace: Trace, limit: float) -> dict[str, float]:
-    """The highest usage of each host that was over a limit by more than the noise."""
+    """Return the highest usage of each host that exceeded a limit by more than the noise."""
     peaks: dict[str, float] = {}
     for look in trace.looks:
         for name, host in look.hosts.items():
@@ -129,10 +129,10 @@ def over(trace: Trace, limit: float) -> dict[str, float]:
 
 
 def wrong_move(look: Look, move: Move, limit: float, headroom: float) -> str:
-    """What is wrong with a migration, by the last look before it; "": nothing.
+    """Return the error of a migration, by the last look before it; "": none.
 
-    Its source must have reached the limit, and of the hosts that have room for what the process
-    uses it must have gone to that with the largest margin.
+    The source must have reached the limit. Of the hosts with room for the usage of the process,
+    the destination must have the largest margin.
 
     Args:
         look: at the cluster, right before.

@@ -28,13 +28,13 @@ DESK: Final = "desk"
 _ROSRM: Final = str(Path(sys.executable).with_name("rosrm"))
 #: Seconds between two looks at the cluster.
 LOOK_S: Final = 0.2
-#: Seconds for a part to come up, on a busy machine and within a small quota.
+#: Seconds for a part to start, on a busy machine and within a small quota.
 _START: Final = 90.0
 _ANSWER: Final = 30.0
 #: A run that takes so many times as long as on a quiet machine is given up.
 _SLOWEST: Final = 4.0
 _END: Final = 15.0
-#: Lines of the master's record that are shown when something is wrong.
+#: Lines of the master's record that are shown with an error.
 _TOLD: Final = 15
 _WRONG: Final = frozenset({"failed", "cancelled", "set_aside", "stuck", "unreachable"})
 
@@ -48,7 +48,7 @@ class Part:
     """A program on a host.
 
     Attributes:
-        log: what it writes.
+        log: the file of its output.
     """
 
     name: str
@@ -56,12 +56,12 @@ class Part:
     log: Path
 
     def check(self) -> None:
-        """Raise `Failed` with its last words where it has ended."""
+        """Raise `Failed` with the last lines of its output where it has ended."""
         if self.process.poll() is not None:
             raise self.last_words()
 
     def last_words(self) -> Failed:
-        """What is to be said of its end."""
+        """Return an error with its exit code and the last lines of its output."""
         words = self.log.read_text(errors="replace").strip().splitlines()[-5:]
         said = "\n  ".join(words) or "it said nothing"
         return Failed(f"{self.name} ended with exit code {self.process.returncode}:\n  {said}")
@@ -72,7 +72,7 @@ class LabCluster:
 
     Args:
         name: of the lab.
-        hosts: beside the desk.
+        hosts: in addition to the desk.
         folder: for settings and logs.
         cluster: the master's `cluster.yaml`; None: with the paper's settings.
     """
@@ -119,7 +119,7 @@ class LabCluster:
         self._start(f"the slave of {host}", host, [_ROSRM, "slave", "--config", settings])
 
     def start_slave_beside(self, host: str) -> None:
-        """Start a host's slave beside its limits; what it starts is within."""
+        """Start a host's slave outside the host's limits; its processes are within them."""
         state = str(DATA / "slave")
         self.lab.supervise(host, state, timeout=_START)
         measured = {name: {"group": self.lab.group(host)} for name in ("cpu", "memory")}
@@ -129,7 +129,7 @@ class LabCluster:
         self._start(f"the slave of {host}", host, command, limited=False)
 
     def check_supervisors(self, hosts: Sequence[str]) -> None:
-        """Raise `Failed` where a slave has started a supervisor of its own, beside the limits."""
+        """Raise `Failed` where a slave has started a second supervisor, outside the limits."""
         for host in hosts:
             commands = [_command(pid) for pid in self.lab.pids(host)]
             count = sum(b"rosrm/supervisor/" in command for command in commands)
@@ -137,7 +137,7 @@ class LabCluster:
                 raise Failed(f"{host} has {count} supervisors: its jobs may be beside its limits")
 
     def start_holder(self, host: str, mb: float) -> None:
-        """Start something on a host that rosrm knows nothing of: it holds memory."""
+        """Start a program on a host that holds memory, and is not known to rosrm."""
         command = [sys.executable, "-m", "rosrm_examples.holder", "--mb", f"{mb:g}"]
         self._start(f"the holder on {host}", host, command)
 
@@ -150,7 +150,7 @@ class LabCluster:
         self.wait_until(f"slaves of {', '.join(hosts)} asking for work", asking, _START)
 
     def stop_master(self) -> None:
-        """Let the master end in good order."""
+        """Shut down the master."""
         master = next(part for part in self._parts if part.name == "master")
         self._parts.remove(master)
         master.process.send_signal(signal.SIGINT)
@@ -196,10 +196,10 @@ class LabCluster:
         self._ask({"do": "submit", "work": work})
 
     def look(self) -> Look:
-        """Look at the cluster, and keep what is seen in the trace.
+        """Look at the cluster, and add the look to the trace.
 
         Raises:
-            Failed: a part has ended, or a process has not become what it should.
+            Failed: a part has ended, or a process is in a wrong state.
         """
         self._check()
         plain = self._ask({"do": "look", "after": self.trace.last_sequence})
@@ -218,14 +218,14 @@ class LabCluster:
         return look
 
     def begin(self) -> None:
-        """The run's own time is 0 now."""
+        """Set the run's own time to 0."""
         self.trace.looks.clear()
         self.trace.start = self.look().elapsed
 
     def wait_until(
         self, what: str, condition: Callable[[Look], bool], timeout: float, every: float = LOOK_S
     ) -> Look:
-        """Look until a condition holds; raises `Failed` with what was waited for."""
+        """Look until a condition holds; at the timeout raise `Failed` with its name."""
         deadline = time.monotonic() + timeout
         while not condition(look := self.look()):
             if time.monotonic() >= deadline:
@@ -233,11 +233,11 @@ class LabCluster:
                 raise Failed(
                     f"{what}: not within {timeout:g} s (hosts {sorted(look.hosts)}, {seen})"
                 )
-            time.sleep(every)  # the next look is due then
+            time.sleep(every)  # time of the next look
         return look
 
     def play(self, due: Sequence[tuple[float, Callable[[], None]]], seconds: float) -> Look:
-        """Do things at their times (s from `begin`), and look on until the run is over."""
+        """Carry out actions at their times (s from `begin`), and look until the run is over."""
         coming = sorted(due, key=lambda one: one[0])
         while True:
             look = self.look()
@@ -246,22 +246,22 @@ class LabCluster:
                 coming.pop(0)[1]()
             if elapsed >= seconds:
                 return look
-            time.sleep(LOOK_S)  # the next look is due then
+            time.sleep(LOOK_S)  # time of the next look
 
     def feed(
         self, entries: Sequence[Mapping[str, Any]], *, every: float, after: float,
         also: Sequence[tuple[float, Callable[[], None]]] = (),
     ) -> Look:  # fmt: skip
-        """Submit processes one by one, and look on until the run is over.
+        """Submit processes one by one, and look until the run is over.
 
-        Each comes `every` seconds after the one before, and later where that is not yet in the
-        readings: so a busy machine stretches the run, and does not change it.
+        Each is submitted `every` seconds after the one before, but not before the readings contain
+        that one: so a busy machine only stretches the run.
 
         Args:
             entries: of a work file.
             every: seconds.
             after: seconds from the last submission to the end.
-            also: what else is done, at its time from `begin`.
+            also: other actions, at their times from `begin`.
         """
         coming, other = list(entries), sorted(also, key=lambda one: one[0])
         longest = _SLOWEST * (len(coming) * every + after)
@@ -278,7 +278,7 @@ class LabCluster:
                 return look
             if elapsed > longest:
                 raise Failed(f"{len(coming)} processes were not submitted within {longest:.0f} s")
-            time.sleep(min(LOOK_S, every / 2))  # the next look is due then
+            time.sleep(min(LOOK_S, every / 2))  # time of the next look
 
     def _ask(self, request: dict[str, Any]) -> dict[str, Any]:
         assert self._desk is not None, "the cluster is used outside of its `with` block"
@@ -288,23 +288,23 @@ class LabCluster:
 def _command(pid: int) -> bytes:
     try:
         return Path(f"/proc/{pid}/cmdline").read_bytes()
-    except OSError:  # it has ended
+    except OSError:  # the process has ended
         return b""
 
 
 def _shown(look: Look) -> bool:
-    """Whether all that was assigned is in the readings."""
+    """Return True if all assignments are in the readings."""
     return look.count("assigned") + look.count("starting") == 0 and all(
         host.in_flight == 0.0 for host in look.hosts.values()
     )
 
 
 class Desk:
-    """The program on the desk that speaks to the master.
+    """The program on the desk that is a client of the master.
 
     Args:
         start: starts it, with pipes to and from it.
-        check: raises `Failed` where something else that it needs has ended.
+        check: raises `Failed` where another part that it needs has ended.
     """
 
     def __init__(self, start: Callable[[], Part], check: Callable[[], None]) -> None:
@@ -315,7 +315,7 @@ class Desk:
     def __enter__(self) -> Self:
         try:
             self._line(_START)
-        except BaseException:  # also a Ctrl-C: `with` ends nothing that it has not entered
+        except BaseException:  # also a Ctrl-C: `__exit__` is not called where `__enter__` fails
             self.__exit__(None, None, None)
             raise
         return self
@@ -330,7 +330,7 @@ class Desk:
         self._part.process.communicate()
 
     def ask(self, request: dict[str, Any]) -> dict[str, Any]:
-        """One question, one answer; raises `Failed`."""
+        """Send a request, and return the answer; raises `Failed`."""
         to = self._part.process.stdin
         assert to is not None
         try:
@@ -361,7 +361,7 @@ class Desk:
         return answer
 
     def _ended(self) -> Failed:
-        """Its last words; it has closed its pipes."""
+        """Return the error for a desk that has closed its pipes."""
         try:
             self._part.process.wait(_END)
         except subprocess.TimeoutExpired:

@@ -1,4 +1,4 @@
-"""Writes what was measured into `docs/evaluation.md`: the text between each figure's two marks.
+"""Writer of the results into `docs/evaluation.md`: the text between each figure's two marks.
 
 <!-- fig6 -->
 (what this module writes)
@@ -40,7 +40,7 @@ def update_page(page: Path, results: Path, names: Iterable[str]) -> None:
 
 
 def checked_page(page: Path) -> str:
-    """The text of a page that has the marks of every figure; raises `RosrmError`."""
+    """Return the text of a page that has the marks of every figure; raises `RosrmError`."""
     text = page.read_text(encoding="utf-8")
     for name in FIGURES:
         if not _marked(name).search(text):
@@ -60,7 +60,7 @@ def _replaced(text: str, name: str, content: str) -> str:
 
 
 def section(name: str, report: _Report, picture: str) -> str:
-    """What is written about one figure.
+    """Return the text about one figure.
 
     Args:
         name: of the figure.

@@ -1,4 +1,4 @@
-"""Draws the figures as the paper has them: the same axes and units."""
+"""Pictures of the figures with the axes and units of the paper."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _INK: Final = "#22303c"
 _FAINT: Final = "#dddad2"
 _COLOURS: Final = ("#00798c", "#d1495b", "#c98a1b", "#5b6c9d")
 
-#: Words on a line of the picture.
+#: Text on a line of the picture.
 _WORDS: Final[dict[str, Any]] = {
     "ha": "center", "va": "center", "fontsize": 8, "color": _INK,
     "bbox": {"fc": "white", "ec": "none", "pad": 1},
@@ -32,7 +32,7 @@ def usage(
     path: Path, trace: Trace, limit: float, *, joins: Sequence[float] = (),
     moves: Sequence[Move] = (), mark_assignments: bool = True,
 ) -> None:  # fmt: skip
-    """Figs. 6, 7 and 10: memory utilisation rate of each slave over the elapsed time.
+    """Draw figs. 6, 7 and 10: memory utilisation rate of each slave over the elapsed time.
 
     Args:
         path: of the .png.
@@ -40,7 +40,7 @@ def usage(
         limit: fraction.
         joins: seconds at which slaves were started.
         moves: migrations to be marked.
-        mark_assignments: a tick below the curves for each.
+        mark_assignments: draw a tick below the curves for each.
     """
     figure, axes = _axes("Elapsed time [s]", "Memory utilization rate [%]")
     colours = dict(zip(trace.hosts, _COLOURS, strict=False))
@@ -72,7 +72,7 @@ def _mark_moves(axes: Axes, trace: Trace, moves: Sequence[Move]) -> None:
 
 
 def processes(path: Path, slaves: Sequence[int], held: Sequence[int], fit: Line) -> None:
-    """Fig. 8: processes that can be allocated against the number of slaves."""
+    """Draw fig. 8: processes that can be allocated against the number of slaves."""
     figure, axes = _axes("Number of slaves", "Number of processes")
     axes.plot(slaves, held, ls="", marker="o", color=_COLOURS[0], label="measured")
     words = f"y = {fit.slope:.2f}x {fit.intercept:+.2f}, R² = {fit.r2:.4f}"
@@ -87,7 +87,7 @@ def cycle_times(
     path: Path, real: tuple[Sequence[int], Sequence[float]],
     core: tuple[Sequence[int], Sequence[float]], fit: Line, paper: Line,
 ) -> None:  # fmt: skip
-    """Fig. 9: processing time of the master's cycle against the number of slaves.
+    """Draw fig. 9: processing time of the master's cycle against the number of slaves.
 
     Args:
         path: of the .png.
@@ -118,7 +118,7 @@ def cycle_times(
 
 
 def execution_times(path: Path, seconds: dict[str, float]) -> None:
-    """Table III as bars.
+    """Draw Table III as bars.
 
     Args:
         path: of the .png.

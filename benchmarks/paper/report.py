@@ -1,4 +1,4 @@
-"""What every figure leaves: its numbers, and what they were measured on."""
+"""Results of a figure as a file: its numbers, and the conditions of the measurement."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ class Result:
     """A figure that was measured.
 
     Attributes:
-        wrong: in words, what speaks against the claim; empty: it holds.
+        wrong: objections to the claim, as sentences; empty: it holds.
         figures: numbers, plain, by the keys of the JSON file.
-        scaled: what differs from the paper's setting, and why.
+        scaled: the differences from the paper's setting, with reasons.
         runs: how often it was measured.
         draw: writes the picture to a path.
     """
@@ -35,14 +35,14 @@ class Result:
 
 @dataclass(frozen=True)
 class Options:
-    """How a figure is measured.
+    """The options of a measurement.
 
     Attributes:
         folder: for settings, logs and records, removed afterwards.
         runs: of each case of Table III.
-        drives: to be mapped for Table III; none: what is there.
-        small: so small that it only shows that it works.
-        lab: what the names of labs begin with.
+        drives: to be mapped for Table III; empty: those available.
+        small: measure so little that it only shows that the measurement works.
+        lab: prefix of the names of labs.
     """
 
     folder: Path
@@ -55,13 +55,13 @@ class Options:
 def plain_report(
     name: str, claim: str, result: Result, *, small: bool, seconds: float, load_before: float
 ) -> dict[str, Any]:
-    """All that the JSON file of a figure holds.
+    """Return the content of a figure's JSON file.
 
     Args:
         name: of the figure.
         claim: in words.
         result: what was measured.
-        small: whether only to show that it works.
+        small: the run only shows that the measurement works.
         seconds: that it took.
         load_before: average of the machine's load over the minute before.
     """

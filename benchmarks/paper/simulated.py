@@ -1,4 +1,4 @@
-"""How closely `rosrm simulate` agrees with a recorded run."""
+"""Agreement of `rosrm simulate` with a recorded run."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _LONGEST = 120.0
 
 
 def agreement(records: Path) -> dict[str, Any]:
-    """Replay and simulate the only record in a folder; what `rosrm simulate --json` says of it."""
+    """Replay and simulate the only record in a folder; return the result of `rosrm simulate`."""
     found = sorted(records.glob("*.rosrec"))
     if len(found) != 1:
         raise Failed(f"one record was expected in {records}, and {len(found)} are there")

@@ -12,9 +12,9 @@ from rosrm_examples.drives import load_drive
 from rosrm_examples.errors import DriveError
 from rosrm_examples.pieces import load_pieces
 
-#: Where they are at hand; together they have 373 scans and 536 m.
+#: The KITTI drives available; together they have 373 scans and 536 m.
 KITTI: Final = ("kitti0001", "kitti0002", "kitti0027")
-#: A metre each; `--drive street:1000` is the kilometre, and takes hours within small quotas.
+#: A metre a scan; `--drive street:1000` is the kilometre, and takes hours within small quotas.
 STREET: Final = "street:200"
 PIECES: Final = 10
 _MODULE: Final = "rosrm_examples.map_piece"
@@ -28,7 +28,7 @@ class Piece:
     Attributes:
         drive: name or path, as `load_drive` takes it.
         number: of the piece, from 1.
-        of: pieces of its drive.
+        of: number of pieces of its drive.
     """
 
     drive: str
@@ -37,27 +37,27 @@ class Piece:
 
     @property
     def name(self) -> str:
-        """Of its process."""
+        """Return the name of its process."""
         stem = "".join(one if one.isalnum() else "_" for one in Path(self.drive).stem)
         return f"{stem}_{self.number:02d}"
 
     def arguments(self, out: Path) -> list[str]:
-        """Of the mapping program; each drive has a folder of its own below `out`."""
+        """Return the arguments of the mapping program; each drive has a folder below `out`."""
         return [
             "--drive", self.drive, "--piece", str(self.number), "--of", str(self.of),
             "--out", str(self.folder(out)),
         ]  # fmt: skip
 
     def folder(self, out: Path) -> Path:
-        """Where its result is."""
+        """Return the folder of its result."""
         return out / self.name.rpartition("_")[0]
 
     def command(self, out: Path) -> list[str]:
-        """To map it without rosrm."""
+        """Return the command that maps it without rosrm."""
         return [sys.executable, "-m", _MODULE, *self.arguments(out)]
 
     def entry(self, out: Path, directory: Path) -> dict[str, Any]:
-        """Of a work file."""
+        """Return its entry of a work file."""
         return {
             "name": self.name,
             "module": _MODULE,
@@ -65,33 +65,33 @@ class Piece:
             "working_directory": str(directory),
             "ros": True,
             "kind": "job",
-            "readiness": "running",  # nobody waits for a job to be seen in the graph
+            "readiness": "running",  # it is a job: its node in the graph is not waited for
             "needs": {"memory": _MEMORY, "cpu": 0},
         }
 
 
 def shared_out(scans: Sequence[int], pieces: int) -> list[int]:
-    """How many of `pieces` each drive is cut into: in proportion, by the largest remainder.
+    """Return the number of pieces of each drive: in proportion, by the largest remainder.
 
     Args:
         scans: of each drive.
-        pieces: together; at least as many as drives.
+        pieces: in all; at least as many as drives.
     """
     counts = [1] * len(scans)
-    while sum(counts) < pieces:  # whoever has the longest pieces is cut once more
+    while sum(counts) < pieces:  # the drive with the longest pieces is cut once more
         longest = max(range(len(scans)), key=lambda one: (scans[one] / counts[one], -one))
         counts[longest] += 1
     return counts
 
 
 def pieces_of(drives: Sequence[str], pieces: int = PIECES) -> list[Piece]:
-    """The job; raises `DriveError` for a drive that is not there or cannot be cut so."""
+    """Return the pieces; raises `DriveError` for a drive that is missing or too short for them."""
     if len(drives) > pieces:
         raise DriveError(f"{len(drives)} drives are too many for {pieces} pieces: at most {pieces}")
     loaded = [load_drive(name) for name in drives]
     counts = shared_out([len(drive) for drive in loaded], pieces)
     for drive, of in zip(loaded, counts, strict=True):
-        drive.piece(1, of)  # raises where it cannot be cut so
+        drive.piece(1, of)  # raises where the drive is too short
     return [
         Piece(name, number, of)
         for name, of in zip(drives, counts, strict=True)
@@ -100,7 +100,7 @@ def pieces_of(drives: Sequence[str], pieces: int = PIECES) -> list[Piece]:
 
 
 def drives_at_hand() -> tuple[str, ...]:
-    """The KITTI drives where all are, else a simulated street of 200 m."""
+    """Return the KITTI drives where all are available, else a simulated street of 200 m."""
     try:
         for name in KITTI:
             load_drive(name)
@@ -110,6 +110,6 @@ def drives_at_hand() -> tuple[str, ...]:
 
 
 def scans_mapped(pieces: Sequence[Piece], out: Path) -> int:
-    """How many scans the results of a run hold, overlaps twice; raises where one is missing."""
+    """Return the number of scans in the results, overlaps twice; raises where one is missing."""
     folders = {piece.folder(out) for piece in pieces}
     return sum(len(one.poses) for folder in folders for one in load_pieces(folder))

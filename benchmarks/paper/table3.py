@@ -1,8 +1,7 @@
 """Table III: SLAM in ten pieces on one host, on ten hosts placed by hand, on ten hosts by rosrm.
 
-Every host has the same CPU quota. In all cases a master and the slaves of all hosts run, and
-beside the quota; they do nothing where rosrm is not asked. Each case is measured several times, by
-turns.
+Every host has the same CPU quota. In all cases a master and the slaves of all hosts run, outside
+the quotas; they are idle in the cases without rosrm. Each case is measured several times, by turns.
 """
 
 from __future__ import annotations
@@ -29,9 +28,9 @@ CLAIM: Final = (
     "piece, and is several times as fast as one host (by a third of the number of hosts at least)"
 )
 _MOST_RATIO: Final = 1.05
-#: Of the number of hosts, by which they are faster than one: else they were not at work together.
+#: Least speed-up over one host, as a fraction of the number of hosts: they must work in parallel.
 _LEAST_SPEED_UP: Final = 1 / 3
-#: Cores of each host: ten of them, with the slaves and the master beside, fit on two.
+#: Cores of each host: ten of them, with the slaves and the master, fit on two.
 _CPU: Final = 0.17
 _MEMORY: Final = 512 * MIB
 #: Seconds after which a case is given up.
@@ -59,7 +58,7 @@ class Cases:
         self._out = out
 
     def one_host(self, run: int) -> float:
-        """One piece after the other on the first host; seconds."""
+        """Map one piece after the other on the first host; return the seconds."""
         out = self._out / f"one{run}"
         began = time.monotonic()
         for piece in self._pieces:
@@ -67,7 +66,7 @@ class Cases:
         return self._checked(time.monotonic() - began, out)
 
     def ideal(self, run: int) -> float:
-        """Each piece on a host of its own, started at once without rosrm; seconds."""
+        """Map each piece on a host of its own, all at once, without rosrm; return the seconds."""
         out = self._out / f"ideal{run}"
         began = time.monotonic()
         self._map(list(zip(self._hosts, self._pieces, strict=True)), out)
@@ -93,7 +92,7 @@ class Cases:
             raise Failed(f"mapping by hand ended with exit codes {codes}")
 
     def by_rosrm(self, run: int) -> tuple[float, dict[str, Any]]:
-        """All submitted at once; seconds from then to the last end, and what they went for."""
+        """Submit all pieces at once; return the seconds to the last end, and their parts."""
         out = self._out / f"rosrm{run}"
         entries = [piece.entry(out, ROOT) for piece in self._pieces]
         for entry in entries:
@@ -105,7 +104,7 @@ class Cases:
         def over(look: Look) -> bool:
             return all(look.states.get(name) == "finished" for name in names)
 
-        # Seldom looked at: in the other cases nobody looks.
+        # Polled seldom, because the other cases run without polling.
         self._cluster.wait_until("all pieces mapped", over, _LONGEST, every=_PAUSE)
         times = _times(self._cluster.trace, names, began)
         seconds = self._checked(max(times["finished"].values()), out)
@@ -113,12 +112,12 @@ class Cases:
 
     def _checked(self, seconds: float, out: Path) -> float:
         scans_mapped(self._pieces, out)  # raises where a result is missing
-        time.sleep(_PAUSE)  # the kernel gives out quotas by the period: begin with fresh ones
+        time.sleep(_PAUSE)  # the kernel grants quotas by the period: begin with fresh ones
         return seconds
 
 
 def _times(trace: Trace, names: set[str], began: float) -> dict[str, dict[str, float]]:
-    """Seconds from `began` (unix time) to the last event of each kind, by kind and process."""
+    """Return the seconds from `began` (unix time) to the last event, by kind and process."""
     found: dict[str, dict[str, float]] = {kind: {} for kind in ("assigned", "starting", "finished")}
     for event in trace.of_kind(*found):
         if event.process in names:
@@ -127,7 +126,7 @@ def _times(trace: Trace, names: set[str], began: float) -> dict[str, dict[str, f
 
 
 def _spent(trace: Trace, names: set[str], times: dict[str, dict[str, float]]) -> dict[str, Any]:
-    """Where the time went, and how many pieces each host got."""
+    """Return the parts of the time, and the number of pieces of each host."""
     assigned = [event for event in trace.placed() if event.process in names]
     ends, starts = times["finished"], times["starting"]
     return {
@@ -176,11 +175,11 @@ def measure(options: Options) -> Result:
 def judge(
     seconds: dict[str, list[float]], spent: Sequence[dict[str, Any]], hosts: int
 ) -> tuple[list[str], dict[str, Any]]:
-    """What speaks against the claim, and the numbers.
+    """Return the objections to the claim, and the numbers.
 
     Args:
         seconds: of each run, by case.
-        spent: what the runs by rosrm say of themselves.
+        spent: parts of the time of the runs by rosrm.
         hosts: how many.
     """
     middle = {case: statistics.median(runs) for case, runs in seconds.items()}

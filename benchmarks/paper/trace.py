@@ -1,4 +1,4 @@
-"""What was seen of a run: how full each host was, and what the master did."""
+"""Observations of a run: usage of each host, and events of the master."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ class HostLook:
 
     Attributes:
         usage: of its memory, fraction; None: not known.
-        in_flight: fraction that was assigned and is not in the reading yet.
+        in_flight: reservations: fraction that was assigned and is not in the reading yet.
         capacity: bytes.
         accepting: it is under its limits and has asked for work.
     """
@@ -25,7 +25,7 @@ class HostLook:
 
     @property
     def load(self) -> float:
-        """What the master counts as used, fraction; infinite where it is not known."""
+        """Return the usage with reservations, fraction; infinite where it is not known."""
         return float("inf") if self.usage is None else self.usage + self.in_flight
 
 
@@ -46,12 +46,12 @@ class Look:
     memory: Mapping[str, float] = field(default_factory=dict)
 
     def count(self, state: str) -> int:
-        """How many processes are in a state."""
+        """Return the number of processes in a state."""
         return sum(one == state for one in self.states.values())
 
     @classmethod
     def of(cls, plain: Mapping[str, Any]) -> Look:
-        """From an answer of the desk."""
+        """Build a look from an answer of the desk."""
         hosts = {name: HostLook(**host) for name, host in plain["hosts"].items()}
         return cls(plain["elapsed"], hosts, plain["states"], plain["memory"])
 
@@ -89,7 +89,7 @@ class Move:
 
 @dataclass
 class Trace:
-    """All that was seen of a run.
+    """All observations of a run.
 
     Attributes:
         start: seconds of the master's clock at which the run's own time is 0.
@@ -102,7 +102,7 @@ class Trace:
     events: list[Happening] = field(default_factory=list)
 
     def add(self, plain: Mapping[str, Any]) -> Look:
-        """Take in an answer of the desk."""
+        """Add an answer of the desk."""
         look = Look.of(plain)
         self.looks.append(look)
         self.events += [Happening(**event) for event in plain["events"]]
@@ -110,25 +110,25 @@ class Trace:
 
     @property
     def last_sequence(self) -> int:
-        """Of the newest event."""
+        """Return the sequence number of the newest event; 0: none."""
         return self.events[-1].sequence if self.events else 0
 
     @property
     def hosts(self) -> list[str]:
-        """Names of all hosts that were seen, sorted as people count."""
+        """Return the names of all hosts ever seen, in natural order (host2 before host10)."""
         names = {name for look in self.looks for name in look.hosts}
         return sorted(names, key=lambda name: (len(name), name))
 
     def of_kind(self, *kinds: str) -> Iterator[Happening]:
-        """The events of some kinds."""
+        """Return the events of some kinds."""
         return (event for event in self.events if event.kind in kinds)
 
     def placed(self) -> list[Happening]:
-        """The last assignment of each process: one that was not taken up is given again."""
+        """Return the last assignment of each process: one that no slave took is repeated."""
         return list({event.process: event for event in self.of_kind("assigned")}.values())
 
     def before(self, elapsed: float) -> Look | None:
-        """The last look before a moment of the master's clock."""
+        """Return the last look before a moment of the master's clock."""
         found = None
         for look in self.looks:
             if look.elapsed >= elapsed:
@@ -137,7 +137,7 @@ class Trace:
         return found
 
     def moves(self) -> list[Move]:
-        """Every migration that reached its destination, in order."""
+        """Return every migration that reached its destination, in order."""
         begun: dict[str, Happening] = {}
         moves = []
         for event in self.of_kind("migration_begun", "migrated"):
@@ -156,18 +156,18 @@ class Trace:
     # --- for files and pictures -----------------------------------------------------------
 
     def times(self) -> list[float]:
-        """Seconds of the run at each look."""
+        """Return the seconds of the run at each look."""
         return [round(look.elapsed - self.start, 2) for look in self.looks]
 
     def percent(self, host: str) -> list[float | None]:
-        """Memory utilisation of a host at each look, percent; None: not known, or not there."""
+        """Return a host's memory utilisation at each look, percent; None: not known, or absent."""
         seen = [look.hosts.get(host) for look in self.looks]
         return [
             None if one is None or one.usage is None else round(100 * one.usage, 2) for one in seen
         ]
 
     def curves(self) -> dict[str, Any]:
-        """Times, utilisations and assignments, plain."""
+        """Return times, utilisations and assignments, plain."""
         return {
             "elapsed_s": self.times(),
             "memory_percent": {host: self.percent(host) for host in self.hosts},
@@ -176,7 +176,7 @@ class Trace:
         }
 
     def assignments(self) -> list[dict[str, Any]]:
-        """When which process went where, plain."""
+        """Return time, process and host of each assignment, plain."""
         return [
             {"s": round(event.elapsed - self.start, 2), "process": event.process,
              "host": event.host}
@@ -185,7 +185,7 @@ class Trace:
 
 
 def per_host(assignments: Sequence[Happening]) -> dict[str, int]:
-    """How many processes each host got."""
+    """Return the number of processes of each host."""
     counts: dict[str, int] = {}
     for event in assignments:
         counts[event.host] = counts.get(event.host, 0) + 1

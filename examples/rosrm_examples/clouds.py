@@ -13,7 +13,7 @@ from sensor_msgs.msg import PointCloud2, PointField
 from rosrm_examples.arrays import Points
 from rosrm_examples.stamps import stamp_of
 
-#: How scans travel: none is lost while a reader moves or its host is busy, up to so many.
+#: QoS of scans: while a reader migrates or its host is busy, up to `depth` scans wait for it.
 SCANS_QOS: Final = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 
 _AXES: Final = ("x", "y", "z")
@@ -22,7 +22,7 @@ _POINT_BYTES: Final = _FLOAT_BYTES * len(_AXES)
 
 
 def cloud_message(points: Points, t: float, frame: str) -> PointCloud2:
-    """Packs (N, 3) points, metres, as float32 x, y, z.
+    """Pack (N, 3) points, metres, as float32 x, y, z.
 
     Args:
         points: In the axes of `frame`.
@@ -38,16 +38,16 @@ def cloud_message(points: Points, t: float, frame: str) -> PointCloud2:
     ]
     message.point_step = _POINT_BYTES
     message.row_step = _POINT_BYTES * len(points)
-    # rclpy takes this array as it is; of bytes it would look at each one.
+    # rclpy takes this array as it is; with bytes it would check each one.
     message.data = array("B", np.ascontiguousarray(points, "<f4").tobytes())
     return message
 
 
 def points_of(message: PointCloud2) -> NDArray[np.float32]:
-    """Unpacks the (N, 3) points, metres, of a cloud that may have further fields.
+    """Unpack the (N, 3) points, metres, of a cloud that may have further fields.
 
     Raises:
-        ValueError: it has no x, y and z of float32, or less data than it says.
+        ValueError: it has no x, y and z of float32, or less data than its header declares.
     """
     layout = np.dtype(
         {
@@ -69,7 +69,7 @@ def points_of(message: PointCloud2) -> NDArray[np.float32]:
 
 
 def _offsets(message: PointCloud2) -> list[int]:
-    """Where x, y and z lie within a point, bytes."""
+    """Return the offsets of x, y and z within a point, bytes."""
     found = {field.name: field for field in message.fields}
     for axis in _AXES:
         if axis not in found or found[axis].datatype != PointField.FLOAT32:

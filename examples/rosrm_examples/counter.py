@@ -1,4 +1,4 @@
-"""A counter that can be moved from host to host and never loses count."""
+"""A counter that migrates from host to host and never loses count."""
 
 import rclpy
 from rclpy.executors import ExternalShutdownException
@@ -8,10 +8,10 @@ from rosrm.node import Node
 
 
 class Counter(Node):
-    """Publishes 1, 2, 3, ... on `count`, ten times a second."""
+    """A node that publishes 1, 2, 3, ... on `count`, ten times a second."""
 
     def __init__(self) -> None:
-        """Begins at 0; a successor is given the state of the node before it."""
+        """Begin at 0; a successor restores the state of the node before it."""
         super().__init__("counter")
         self.count = 0
         self.output = self.create_publisher(Int64, "count", 10)
@@ -19,16 +19,16 @@ class Counter(Node):
         self.keep_state("~/state", Int64, self.save, self.restore)
 
     def tick(self) -> None:
-        """Counts on."""
+        """Increment the count, and publish it."""
         self.count += 1
         self.output.publish(Int64(data=self.count))
 
     def save(self) -> Int64:
-        """Returns all that a successor needs."""
+        """Return the state that a successor needs."""
         return Int64(data=self.count)
 
     def restore(self, state: Int64) -> None:
-        """Takes it over."""
+        """Restore the state of the predecessor."""
         self.count = state.data
 
 

@@ -2,11 +2,11 @@
 
     python -m rosrm_examples.demo --out out/demo
 
-A master and three slaves come up as three hosts, each with a budget of memory. NDT SLAM processes
-(ROS 2 nodes) map the pieces of a drive, placed by rosrm. Meanwhile processes that hold 8 to 80 MB
-arrive one after another, until every host is at its limit and the queue waits (the paper's Fig. 6).
-As they end, a recorder that cannot leave its host grows until that host is over its limit, and the
-master moves others off it (the paper's Fig. 10).
+A master and three slaves start as three hosts, each with a budget of memory. NDT SLAM processes
+(ROS 2 nodes) map the pieces of a drive, placed by rosrm. At the same time, processes that hold 8 to
+80 MB arrive one after another, until every host is at its limit and the queue waits (the paper's
+Fig. 6). As they end, a recorder that cannot leave its host grows until that host is over its limit,
+and the master migrates others off it (the paper's Fig. 10).
 
 Exit status: 0 when everything was done; 1 when something failed; 2 when the arguments cannot be
 used; 128 + signal number (130 for Ctrl-C) when a signal stopped it.
@@ -17,7 +17,7 @@ from __future__ import annotations
 import os
 import signal
 
-if __name__ == "__main__":  # ends the imports below without a traceback
+if __name__ == "__main__":  # exits without a traceback while the imports below run
     signal.signal(signal.SIGINT, lambda *_: os._exit(130))
 
 import argparse
@@ -58,14 +58,14 @@ from rosrm_examples.merge import join, write_map
 from rosrm_examples.pieces import load_pieces
 
 SUMMARY_FILE: Final = "summary.json"
-#: What the demo leaves, in the order in which one looks at it.
+#: Files that the demo writes, in the order in which a user looks at them.
 LEFT: Final = (SUMMARY_FILE, USAGE_FILE, "map.png", "map.ply", EVENTS_FILE, SAMPLES_FILE)
-#: Below the folder of results.
+#: A folder below the folder of results.
 _PIECES: Final = "pieces"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the demo; returns the exit status."""
+    """Run the demo; return the exit status."""
     options = _parse(arguments)
     return run_demo("demo", options.out, lambda stage: _demonstrate(options, stage))
 
@@ -75,7 +75,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         "demo", "Three hosts on this machine map a LiDAR drive while memory runs short."
     )
     parser.add_argument("--pieces", type=int, default=9, help="number of pieces (default: 9)")
-    parser.add_argument(  # with this default every host comes close to its limit
+    parser.add_argument(  # this default brings every host close to its limit
         "--seed", type=int, default=328, help="of the holders' sizes (default: 328)"
     )
     parser.add_argument(
@@ -93,7 +93,7 @@ def _pace(text: str) -> float:
 
 def _demonstrate(options: argparse.Namespace, stage: Stage) -> None:
     drive = drive_of(options.drive)
-    drive.piece(1, options.pieces)  # raises where it cannot be cut so
+    drive.piece(1, options.pieces)  # raises where the drive is too short
     scenario = Scenario(
         drive.name, len(drive), options.pieces, options.seed, options.pace, _budget()
     )
@@ -117,7 +117,7 @@ def _cluster(scenario: Scenario, out: Path) -> LocalCluster:
 def _write_results(
     out: Path, drive: Drive, record: Record, processes: Sequence[ProcessRow]
 ) -> dict[str, Any]:
-    """Writes everything that the demo leaves; returns the summary."""
+    """Write all results of the demo; return the summary."""
     record.write(out)
     figures = write_map(join(load_pieces(out / _PIECES)), drive, out)
     draw_usage(out / USAGE_FILE, record, title_of(record))
@@ -130,7 +130,7 @@ def _write_results(
 
 
 def _budget() -> int:
-    """The memory of each host, bytes; less than usual where this machine has little.
+    """Return the memory of each host, bytes; less than usual where this machine has little.
 
     Raises:
         Unfit: too little for the demo.

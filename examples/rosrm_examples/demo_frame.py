@@ -1,4 +1,4 @@
-"""What every demo is around its work: arguments, exit status, the folder of results, memory."""
+"""Common frame of the demos: arguments, exit status, folder of results, memory check."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from rosrm_examples.demo_run import DemoFailed, Stopped, StopSignals
 from rosrm_examples.errors import ExampleError
 from rosrm_resources.memory import CgroupMemory
 
-#: Below the folder of results: states and logs of master and slaves.
+#: A folder below the folder of results: states and logs of master and slaves.
 CLUSTER: Final = "cluster"
-#: A folder with this file in it is a demo's own to empty.
+#: Mark of a folder that belongs to a demo, which may empty it.
 _MARK: Final = ".rosrm-demo"
 
 
@@ -31,11 +31,11 @@ class Unfit(Exception):
 
 @dataclass(frozen=True)
 class Stage:
-    """What a demo works with.
+    """The console and the signals of a demo.
 
     Attributes:
-        console: for what it says.
-        signals: to be looked at now and then.
+        console: for its output.
+        signals: to be checked regularly.
     """
 
     console: Console
@@ -43,7 +43,7 @@ class Stage:
 
 
 def run_demo(name: str, out: Path, demonstrate: Callable[[Stage], None]) -> int:
-    """Carries a demo out and says what stopped it; returns the exit status."""
+    """Run a demo and report the reason where it stops; return the exit status."""
     stage = Stage(Console(), StopSignals())
     try:
         demonstrate(stage)
@@ -63,7 +63,7 @@ def run_demo(name: str, out: Path, demonstrate: Callable[[Stage], None]) -> int:
 
 
 def demo_parser(name: str, description: str) -> argparse.ArgumentParser:
-    """The arguments that every demo takes."""
+    """Return a parser with the arguments that every demo takes."""
     parser = argparse.ArgumentParser(
         prog=f"python -m rosrm_examples.{name}", description=description
     )
@@ -75,14 +75,14 @@ def demo_parser(name: str, description: str) -> argparse.ArgumentParser:
 
 
 def own_folder(out: Path, left: Iterable[str], folders: Iterable[str] = ()) -> TextIO:
-    """Empties the folder of an earlier demo; the file that is returned keeps a second demo out.
+    """Empty the folder of an earlier demo; return a file that locks out a second demo.
 
     Args:
-        left: files that a demo leaves.
-        folders: that it makes, beside that of the cluster.
+        left: files that a demo writes.
+        folders: that it makes, in addition to that of the cluster.
 
     Raises:
-        Unfit: the folder is not of a demo, or another demo writes to it.
+        Unfit: the folder belongs to no demo, or another demo writes to it.
     """
     out.mkdir(parents=True, exist_ok=True)
     mark = out / _MARK
@@ -102,7 +102,7 @@ def own_folder(out: Path, left: Iterable[str], folders: Iterable[str] = ()) -> T
 
 
 def free_memory() -> float:
-    """Bytes that this machine, or the group that this process is in, has left."""
+    """Return the free bytes of this machine, or of this process's control group if less."""
     free = float(psutil.virtual_memory().available)
     group = CgroupMemory.find()
     if group is not None:

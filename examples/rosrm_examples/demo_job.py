@@ -1,6 +1,6 @@
-"""What the demo runs, and when: the mapping job, the processes that hold memory, and a recorder.
+"""Plan of the demo: the mapping job, the processes that hold memory, a recorder, and their times.
 
-Nothing here happens: these are plans, made of a seed.
+Pure: everything is computed from a seed.
 """
 
 from __future__ import annotations
@@ -22,46 +22,46 @@ from rosrm.config.settings import (
 
 HOSTS: Final = ("host1", "host2", "host3")
 MEMORY_LIMIT: Final = 0.8
-#: Bytes of memory that each host counts as its own, where the machine has as much.
+#: Bytes of memory in the budget of each host, where the machine has as much.
 BUDGET: Final = 768 * 2**20
-#: With less than this a host has no room for what the demo shows.
+#: Bytes; with less than this a host has no room for the demo.
 LEAST_BUDGET: Final = 448 * 2**20
 
 #: Part of the free memory that one host may take.
 _SHARE: Final = 0.25
-#: MB that a holder holds, from the paper's Fig. 6.
+#: MB of a holder, from the paper's Fig. 6.
 _LEAST_MB, _MOST_MB = 8, 80
-#: MB that a holder takes beside, for it is a Python process.
+#: MB of a holder's own footprint, because it is a Python process.
 _FOOTPRINT_MB = 13
 _PIECE_MB = 95
-#: The holders want this much more than the hosts have to give: so the queue comes to wait.
+#: Memory of all holders over that of all hosts, so that the queue has to wait.
 _TOO_MUCH: Final = 1.25
 
 #: Seconds at the pace 1.
 _PIECE_S: Final = 4.5
 _ARRIVAL_S: Final = 0.42
 _HOLD_S: Final = 24.0
-#: The recorder comes when the first holders have ended, and those that waited have come in.
+#: Time at which the first holders have ended and those in the queue have been placed.
 _RECORDER_AT_S: Final = 34.0
 _RECORD_S: Final = 15.0
 _RECORDER_MB: Final = 20
 #: Part of its host's memory that the recorder takes in each second.
 _RECORDER_GROWTH: Final = 0.055
 
-#: The host that has what the recorder needs, and so cannot give it away.
+#: Label of the host with the disk that the recorder needs, so that it cannot be migrated.
 _DISK_LABEL: Final = {"disk": "fast"}
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """What one demo is made of.
+    """The settings of one demo.
 
     Attributes:
         drive: name or path of the drive to map.
-        scans: of the drive.
-        pieces: that it is cut into.
+        scans: number of scans of the drive.
+        pieces: number of pieces of the drive.
         seed: of the holders' sizes.
-        pace: how many times faster than usual everything comes and goes.
+        pace: how many times as fast as usual all processes arrive and end.
         budget: bytes of each host.
     """
 
@@ -82,12 +82,12 @@ class Arrival:
 
 
 def budget_for(available: float) -> int:
-    """The memory of each host, bytes, where so much is free on this machine."""
+    """Return the memory of each host, bytes, for so much free memory on this machine."""
     return int(min(BUDGET, available * _SHARE))
 
 
 def cluster_config(pace: float) -> ClusterConfig:
-    """The master's settings: Eq. 1 over memory, and calm but prompt moves."""
+    """Return the master's settings: Eq. 1 over memory, and prompt but few migrations."""
     return ClusterConfig(
         name="demo",
         scoring=ScoringChoice(options={"weights": {"memory": 1.0, "cpu": 0.1}}),
@@ -98,9 +98,9 @@ def cluster_config(pace: float) -> ClusterConfig:
 
 
 def host_configs(budget: int, cores: int) -> list[HostConfig]:
-    """Three hosts out of one machine: each counts its own processes against a budget.
+    """Return three hosts on one machine: each measures its own processes against a budget.
 
-    The memory is what the demo is about: each host may use all cores, and its disk is large.
+    Only memory is limited: each host may use all cores, and its disk is large.
     """
     return [
         HostConfig(
@@ -115,7 +115,7 @@ def host_configs(budget: int, cores: int) -> list[HostConfig]:
 
 
 def arrivals(scenario: Scenario, out: Path, working_directory: Path) -> list[Arrival]:
-    """Everything that is submitted, in order of time.
+    """Return all submissions, in order of time.
 
     Args:
         out: folder for the mapped pieces, absolute.
@@ -133,7 +133,7 @@ def arrivals(scenario: Scenario, out: Path, working_directory: Path) -> list[Arr
 
 
 def holder_sizes(scenario: Scenario) -> list[int]:
-    """MB that each holder holds: as many as overfill the hosts."""
+    """Return the MB of each holder, in sum more than the hosts can hold."""
     room_mb = len(HOSTS) * MEMORY_LIMIT * scenario.budget / 1e6
     chance = random.Random(scenario.seed)  # noqa: S311 - sizes, no secrets
     sizes: list[int] = []
@@ -143,18 +143,18 @@ def holder_sizes(scenario: Scenario) -> list[int]:
 
 
 def kind_of(name: str) -> str:
-    """What a process of the demo is, by its name: "piece", "holder" or "recorder"."""
+    """Return the kind of a process of the demo: "piece", "holder" or "recorder"."""
     return name.partition("_")[0]
 
 
 def count_by_kind(names: Sequence[str]) -> dict[str, int]:
-    """How many there are of each kind."""
+    """Return the number of processes of each kind."""
     kinds = [kind_of(name) for name in names]
     return {kind: kinds.count(kind) for kind in ("piece", "holder", "recorder")}
 
 
 def _piece(scenario: Scenario, number: int, out: Path, working_directory: Path) -> ProcessSpec:
-    """Slowed down to some seconds, so that there is something to see."""
+    """Return the process that maps a piece, slowed down to some seconds, to be visible."""
     rate = math.ceil(scenario.scans / scenario.pieces) / _PIECE_S * scenario.pace
     return ProcessSpec(
         name=f"piece_{number:02d}",
@@ -183,9 +183,9 @@ def _holder(scenario: Scenario, number: int, mb: int) -> ProcessSpec:
 
 
 def _recorder(scenario: Scenario) -> ProcessSpec:
-    """Takes more and more memory, and is bound to the host with the fast disk.
+    """Return the process that grows, and is bound to the host with the fast disk.
 
-    It says nothing of its growth: that is what brings its host to the limit.
+    It does not declare its growth, which brings its host to the limit.
     """
     growth_mb = _RECORDER_GROWTH * scenario.budget / 1e6 * scenario.pace
     return ProcessSpec(

@@ -1,16 +1,16 @@
-"""The migration demo: a drive is mapped live, and in mid-drive the SLAM moves to another host.
+"""The migration demo: a drive is mapped live, and in mid-drive the SLAM migrates to another host.
 
     python -m rosrm_examples.demo_migration --out out/migration
 
-A master and three slaves come up as three hosts, each with a budget of memory. On one of them a
+A master and three slaves start as three hosts, each with a budget of memory. On one of them a
 player publishes the scans of a LiDAR drive as a scanner would; on another a SLAM node maps them. In
 mid-drive that host reaches its limit of memory: rosrm hands the SLAM off to the third host, with
-its state, while the drive goes on. An observer hears every pose; in the end they are compared with
-those of the same drive mapped in one go.
+its state, while the drive continues. An observer receives every pose; in the end they are compared
+with those of the same drive mapped in one go.
 
-Exit status: 0 when no scan was lost or mapped twice and the SLAM moved once; 1 when something was
-otherwise; 2 when the arguments cannot be used; 128 + signal number (130 for Ctrl-C) when a signal
-stopped it.
+Exit status: 0 when no scan was lost or mapped twice and the SLAM migrated once; 1 when something
+was otherwise; 2 when the arguments cannot be used; 128 + signal number (130 for Ctrl-C) when a
+signal stopped it.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from __future__ import annotations
 import os
 import signal
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy: as the SLAM that moves
-if __name__ == "__main__":  # ends the imports below without a traceback
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy, and as for the SLAM process
+if __name__ == "__main__":  # exits without a traceback while the imports below run
     signal.signal(signal.SIGINT, lambda *_: os._exit(130))
 
 import argparse
@@ -71,9 +71,9 @@ from rosrm_examples.slam_state import STATES
 
 SUMMARY_FILE: Final = "summary.json"
 MAP_FILE, TRAJECTORY_FILE, CLOUD_FILE = "map.png", "trajectory.png", "map.ply"
-#: What the demo leaves, in the order in which one looks at it.
+#: Files that the demo writes, in the order in which a user looks at them.
 LEFT: Final = (SUMMARY_FILE, MAP_FILE, TRAJECTORY_FILE, CLOUD_FILE, EVENTS_FILE, SAMPLES_FILE)
-#: Below the folder of results: what each instance of the SLAM mapped.
+#: A folder below the folder of results: the map of each instance of the SLAM.
 _PARTS: Final = "parts"
 _REPORT: Final = "player.json"
 
@@ -82,7 +82,7 @@ _COLOURS: Final = ("#2563c9", "#2f9e44", "#c98a1b", "#9c36b5")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the demo; returns the exit status."""
+    """Run the demo; return the exit status."""
     options = _parse(arguments)
     return run_demo("demo_migration", options.out, lambda stage: _demonstrate(options, stage))
 
@@ -143,7 +143,7 @@ def _check_memory() -> None:
 
 
 def _carry_out(live: LiveDrive, record: Record, directory: Path, stage: Stage) -> LiveRun:
-    """Plays and maps the drive on a cluster; returns what was seen."""
+    """Play and map the drive on a cluster; return the observations."""
     cluster = LocalCluster(directory, cluster_config(), host_configs(os.cpu_count() or 1))
     with closing(Observer(cluster.ros)) as observer:
         script = MigrationScript(live, observer)
@@ -166,7 +166,7 @@ def _carry_out(live: LiveDrive, record: Record, directory: Path, stage: Stage) -
 
 
 def _write_results(out: Path, run: LiveRun, record: Record) -> dict[str, Any]:
-    """Writes everything that the demo leaves; returns the summary."""
+    """Write all results of the demo; return the summary."""
     record.write(out)
     moves = [move for move in record.moves() if move.process == SLAM]
     summary = summarise(run, unmigrated_poses(run.drive), len(moves))

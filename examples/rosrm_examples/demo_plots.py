@@ -1,6 +1,6 @@
-"""Draws what was seen of a demo: memory over time, where each process went, what waited.
+"""Plots of a demo: memory over time, assignments and migrations of each process, the queue.
 
-python -m rosrm_examples.demo_plots out/demo      draws usage.png anew
+python -m rosrm_examples.demo_plots out/demo      redraws usage.png
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ USAGE_FILE: Final = "usage.png"
 _PAPER, _INK, _QUIET, _FAINT = "#fbfaf7", "#22303c", "#8b949c", "#e4e2db"
 _COLOURS: Final = ("#00798c", "#d1495b", "#c98a1b")
 _WAITING: Final = "#b9c3cc"
-#: Marker, size, width of its lines and words for an assignment of each kind of process.
+#: Marker, size, line width and label for an assignment of each kind of process.
 _MARKS: Final = {
     "piece": ("s", 22, 0.0, "SLAM piece"),
     "holder": ("|", 48, 1.5, "holder"),
     "recorder": ("D", 30, 0.0, "recorder"),
 }
-#: Marks of one lane that are nearer to each other, seconds, stand in rows.
+#: Seconds; marks of one lane that are nearer to each other are drawn in rows.
 _TOGETHER_S: Final = 0.4
 _ROWS: Final = (0.0, 0.32, -0.32)
 
 
 def draw_usage(path: Path, record: Record, title: str) -> None:
-    """Draw the record as a .png: utilisation of memory, assignments and moves, and the queue."""
+    """Draw the record as a .png: utilisation of memory, assignments, migrations, and the queue."""
     figure, (usage, lanes, queue) = plt.subplots(
         3, 1, figsize=(11, 8.2), sharex=True, layout="constrained", facecolor=_PAPER,
         height_ratios=(5, 2.2, 1.1),
@@ -59,18 +59,18 @@ def draw_usage(path: Path, record: Record, title: str) -> None:
 
 
 def colour_of(record: Record, host: str) -> str:
-    """The colour that a host has in every part of the picture."""
+    """Return the colour of a host in every part of the picture."""
     return _COLOURS[record.hosts.index(host) % len(_COLOURS)]
 
 
 def memory_of(record: Record, host: str) -> Floats:
-    """(S,) utilisation of a host's memory, percent; NaN where it is not known."""
+    """Return the (S,) utilisation of a host's memory, percent; NaN where it is not known."""
     seen = (sample.usage.get("memory", {}).get(host) for sample in record.samples)
     return 100 * np.array([np.nan if value is None else value for value in seen])
 
 
 def _times(record: Record) -> Floats:
-    """(S,) seconds since the first process was submitted."""
+    """Return the (S,) seconds since the first process was submitted."""
     return np.array([sample.elapsed for sample in record.samples]) - record.start
 
 
@@ -102,7 +102,7 @@ def _mark_limit_reached(axes: Axes, record: Record, limit: float) -> None:
 
 
 def _draw_lanes(axes: Axes, record: Record) -> None:
-    """A lane for each host: every assignment in it, every migration from lane to lane."""
+    """Draw a lane for each host, with its assignments, and the migrations between lanes."""
     lane = {host: -1.25 * number for number, host in enumerate(record.hosts)}
     for host, y in lane.items():
         _draw_lane(axes, record, host, y)
@@ -141,7 +141,7 @@ def _draw_lane(axes: Axes, record: Record, host: str, y: float) -> None:
 
 
 def stacked(times: Sequence[float]) -> list[int]:
-    """The row of each mark, so that those that come together do not cover each other."""
+    """Return the row of each mark, so that marks close in time do not cover each other."""
     rows: list[int] = []
     for number, at in enumerate(times):
         together = number > 0 and at - times[number - 1] < _TOGETHER_S
@@ -158,7 +158,7 @@ def _draw_queue(axes: Axes, record: Record) -> None:
 
 
 def _legend(axes: Axes, **options: Any) -> None:
-    """Above the axes, to the left."""
+    """Draw the legend above the axes, to the left."""
     legend = axes.legend(
         frameon=False, labelcolor=_INK, ncols=7, loc="lower left", bbox_to_anchor=(-0.01, 0.985),
         columnspacing=1.6, alignment="left", **{"handlelength": 1.8, **options},
@@ -176,7 +176,7 @@ def _dress(axes: Axes) -> None:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Draws usage.png from samples.json and events.jsonl in a folder."""
+    """Draw usage.png from samples.json and events.jsonl in a folder; return the exit status."""
     if len(arguments) != 1:
         print("usage: python -m rosrm_examples.demo_plots FOLDER", file=sys.stderr)
         return 2
@@ -192,7 +192,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def title_of(record: Record) -> str:
-    """One line above the picture."""
+    """Return one line above the picture."""
     processes = sum(1 for _ in record.of_kind("submitted"))
     return (
         f"{processes} processes on {len(record.hosts)} hosts of {record.budget / 2**20:.0f} MiB, "

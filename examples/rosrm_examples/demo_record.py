@@ -1,4 +1,4 @@
-"""What was seen of a demo: samples of the hosts and the master's event record, and their sum."""
+"""Record of a demo: samples of the hosts, the master's events, and their summary."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Move:
 
 @dataclass
 class Record:
-    """All that was seen.
+    """All observations of a demo.
 
     Attributes:
         hosts: their names, in order.
@@ -65,33 +65,33 @@ class Record:
     events: list[EventRow] = field(default_factory=list)
 
     def add(self, view: Snapshot) -> None:
-        """Take in a snapshot with hosts, processes and the events since the one before."""
+        """Add a view with hosts, processes and the events since the last one."""
         self.samples.append(sample_of(view))
         self.events.extend(view.events)
 
     @property
     def last_sequence(self) -> int:
-        """Of the newest event."""
+        """Return the sequence number of the newest event; 0: none."""
         return self.events[-1].sequence if self.events else 0
 
     @property
     def start(self) -> float:
-        """When the first process was submitted, by the master's clock."""
+        """Return the time of the first submission, by the master's clock; 0: none."""
         return next((e.elapsed for e in self.events if e.kind == "submitted"), 0.0)
 
     def of_kind(self, *kinds: str) -> Iterator[EventRow]:
-        """The events of some kinds."""
+        """Return the events of some kinds."""
         return (event for event in self.events if event.kind in kinds)
 
     def moves(self) -> list[Move]:
-        """Every migration that reached its destination."""
+        """Return every migration that reached its destination."""
         return [
             Move(event.elapsed, event.process, event.facts["from"], event.facts["to"])
             for event in self.of_kind("migrated")
         ]
 
     def last_instance(self, process: str) -> tuple[str, int] | None:
-        """Host and number of the instance that owned a process last."""
+        """Return host and number of the last owner of a process."""
         owner: tuple[str, int] | None = None
         moving = owner
         for event in self.events:
@@ -122,7 +122,7 @@ class Record:
 
     @classmethod
     def read(cls, folder: Path) -> Record:
-        """The inverse of `write`."""
+        """Read a record from the files of `write`."""
         plain = json.loads((folder / SAMPLES_FILE).read_text())
         lines = (folder / EVENTS_FILE).read_text().splitlines()
         return cls(
@@ -135,7 +135,7 @@ class Record:
 
 
 def sample_of(view: Snapshot) -> Sample:
-    """What is kept of a snapshot."""
+    """Return the usages and the counts of a view."""
     usage: dict[str, dict[str, float | None]] = {}
     for host in view.hosts:
         for resource in host.resources:
@@ -150,10 +150,10 @@ def sample_of(view: Snapshot) -> Sample:
 def summarise(
     record: Record, processes: Sequence[ProcessRow], figures: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """The figures of `summary.json`.
+    """Return the figures of `summary.json`.
 
     Args:
-        processes: all, as they were at the end.
+        processes: all, with their states at the end.
         figures: of the map.
     """
     states = Counter(row.state for row in processes)

@@ -1,4 +1,4 @@
-"""Carries a demo out: starts the cluster, does what its script says, watches until it is over."""
+"""Run of a demo: start the cluster, carry out its script, watch until it is over."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from rosrm_examples.demo_record import Record
 from rosrm_examples.demo_screen import Screen
 
 _START_S: Final = 30.0
-#: A demo is over by then, or something is wrong.
+#: Seconds; a demo that takes longer has failed.
 _LONGEST_S: Final = 150.0
 _SAMPLE_S: Final = 0.2
 _SPIN_S: Final = 0.05
@@ -28,11 +28,11 @@ _WRONG: Final = frozenset({"failed", "cancelled", "set_aside", "stuck"})
 
 
 class DemoFailed(Exception):
-    """The demo did not come to its end; the text says why, and where to look."""
+    """The demo did not reach its end; the text gives the reason, and the log to read."""
 
 
 class Stopped(Exception):
-    """Somebody stopped the demo.
+    """A signal stopped the demo.
 
     Attributes:
         number: of the signal.
@@ -44,7 +44,7 @@ class Stopped(Exception):
 
 
 class StopSignals:
-    """Notes SIGINT, SIGTERM and SIGHUP; the demo looks for them, and so stops nowhere halfway."""
+    """Recorder of SIGINT, SIGTERM and SIGHUP; the demo polls it, and so never stops halfway."""
 
     def __init__(self) -> None:
         self._came: int | None = None
@@ -55,34 +55,34 @@ class StopSignals:
         self._came = number
 
     def check(self) -> None:
-        """Raises `Stopped` when a signal has come."""
+        """Raise `Stopped` when a signal has come."""
         if self._came is not None:
             raise Stopped(self._came)
 
 
 class Script(Protocol):
-    """What a demo does, and when it is over."""
+    """The actions of a demo, and its end."""
 
     def act(self, client: Client, elapsed: float) -> None:
-        """Do what is due, `elapsed` seconds after the beginning; called again and again."""
+        """Do the actions that are due, `elapsed` seconds after the beginning; called repeatedly."""
 
     def is_over(self, view: Snapshot) -> bool:
-        """Look at hosts and processes: whether nothing is left to do or to wait for."""
+        """Return True if nothing is left to do or to wait for, by hosts and processes."""
 
 
 class Arrivals:
-    """Submits processes at their times, until all have ended."""
+    """A script that submits processes at their times, and ends when all of them have ended."""
 
     def __init__(self, coming: Sequence[Arrival]) -> None:
         self._left = list(coming)
 
     def act(self, client: Client, elapsed: float) -> None:
-        """Submit what is due."""
+        """Submit the processes that are due."""
         while self._left and self._left[0].at <= elapsed:
             client.submit(self._left.pop(0).specs)
 
     def is_over(self, view: Snapshot) -> bool:
-        """Whether all have ended."""
+        """Return True if all processes have been submitted and have ended."""
         return not self._left and all(row.state in OVER for row in view.processes)
 
 
@@ -92,11 +92,11 @@ class Demo:
     def __init__(
         self, cluster: LocalCluster, record: Record, screen: Screen, signals: StopSignals
     ) -> None:
-        """Prepares the run; nothing is started.
+        """Prepare the run; nothing is started.
 
         Args:
             cluster: to be started, and ended.
-            record: takes in all that is seen.
+            record: for all observations.
         """
         self.record = record
         self._screen = screen
@@ -104,7 +104,7 @@ class Demo:
         self._cluster = cluster
 
     def carry_out(self, script: Script) -> Sequence[ProcessRow]:
-        """Do what the script says; returns the processes as they were at the end.
+        """Carry out a script; return the processes with their states at the end.
 
         Raises:
             DemoFailed: a process failed, a part of rosrm died, or it took too long.
@@ -115,7 +115,7 @@ class Demo:
             with closing(self._screen):
                 return self._run(script)
         except RosrmError:
-            self._check_parts()  # a part that has died says it better than who waited for it
+            self._check_parts()  # the error of a part that has died is more precise than a timeout
             raise
         finally:
             self._cluster.close()
@@ -192,7 +192,7 @@ class Demo:
 
 
 def _last_words(log: Path) -> str:
-    """The last line that a process wrote, as a line of its own."""
+    """Return the last line that a process wrote, as a line of its own."""
     try:
         lines = log.read_text(errors="replace").split("\n")
     except OSError:

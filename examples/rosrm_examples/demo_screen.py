@@ -1,4 +1,4 @@
-"""What the demo shows while it runs: a live table in a terminal, else a line now and then."""
+"""Output of a running demo: a live table in a terminal, else a line every few seconds."""
 
 from __future__ import annotations
 
@@ -23,25 +23,25 @@ _LINE_EVERY_S: Final = 3.0
 
 
 class Screen(Protocol):
-    """Shows how the demo is getting on."""
+    """A display of the progress of a demo."""
 
     def show(self, view: Snapshot, elapsed: float) -> None:
-        """Show a snapshot, `elapsed` seconds after the beginning."""
+        """Show a view, `elapsed` seconds after the beginning."""
 
     def close(self) -> None:
         """Leave the terminal as it was."""
 
 
-#: What there is to say of a snapshot, in one line.
+#: Text for a view, in one line.
 Words: TypeAlias = Callable[[Snapshot], str]
 
 
 def screen_for(console: Console, note: Words | None = None, line: Words | None = None) -> Screen:
-    """The live table where there is a terminal that can show it, else lines.
+    """Return the live table where the terminal can show it, else lines.
 
     Args:
-        note: said beside the table; the default is that of the demo of pieces and holders.
-        line: said instead of it.
+        note: text beside the table; the default is that of the demo of pieces and holders.
+        line: text in place of the table.
     """
     if console.is_terminal:
         return LiveScreen(console, note or note_of)
@@ -58,7 +58,7 @@ class LiveScreen:
         self._events: deque[EventRow] = deque(maxlen=_EVENTS)
 
     def show(self, view: Snapshot, elapsed: float) -> None:  # noqa: ARG002 - the table has a clock
-        """Renew the table."""
+        """Update the table."""
         self._events.extend(view.events)
         rows = max(_FEWEST_ROWS, self._console.height - _OTHER_LINES)
         shown = replace(view, events=list(self._events))
@@ -67,7 +67,7 @@ class LiveScreen:
         self._live.update(table, refresh=True)
 
     def close(self) -> None:
-        """Take the table away."""
+        """Remove the table."""
         self._live.stop()
 
 
@@ -80,7 +80,7 @@ class LineScreen:
         self._next = 0.0
 
     def show(self, view: Snapshot, elapsed: float) -> None:
-        """Print what there is to say now."""
+        """Print new migrations, and the line when it is due."""
         for event in view.events:
             if event.kind in ("migration_begun", "over_limit"):
                 self._print(f"        {event.message}")
@@ -92,11 +92,11 @@ class LineScreen:
         self._console.print(text, highlight=False, markup=False, soft_wrap=True)
 
     def close(self) -> None:
-        """What was printed stays."""
+        """Do nothing: printed lines stay."""
 
 
 def note_of(view: Snapshot) -> str:
-    """What is going on, in a few words."""
+    """Return the phase of the demo, in a few words."""
     runs = count_by_kind([row.name for row in view.processes if row.state in RUNNING])
     if runs["piece"]:
         return "the pieces are mapped"
@@ -108,14 +108,14 @@ def note_of(view: Snapshot) -> str:
 
 
 def line_of(view: Snapshot) -> str:
-    """`memory 41 40 42 %   9 pieces and 8 holders run, 3 wait, 12 finished`."""
+    """Return the line `memory 41 40 42 %   9 pieces and 8 holders run, 3 wait, 12 finished`."""
     waiting = sum(row.state == "queued" for row in view.processes)
     finished = sum(row.state == "finished" for row in view.processes)
     return f"{memory_line(view)}   {_run(view.processes)}, {waiting} wait, {finished} finished"
 
 
 def memory_line(view: Snapshot) -> str:
-    """`memory 41 40 42 %`, in the order of the hosts."""
+    """Return `memory 41 40 42 %`, in the order of the hosts."""
     memory = sample_of(view).usage.get("memory", {})
     used = " ".join("  ?" if value is None else f"{100 * value:3.0f}" for value in memory.values())
     return f"memory {used} %"

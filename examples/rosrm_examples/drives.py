@@ -30,14 +30,14 @@ _NPZ_ARRAYS = ("xyz_cm", "count", "t", "T_world_velo")
 
 @dataclass(frozen=True)
 class Drive:
-    """A drive: scans in order, each made or read only when it is asked for.
+    """A drive: scans in order, each made or read on demand.
 
     Attributes:
-        name: What it was loaded by.
+        name: As given to `load_drive`.
         indices: (S,) number of each scan in the whole drive.
         times: (S,) time of each scan, seconds.
         truth: (S, 4, 4) true poses of the sensor, or None where none are known.
-        read: Gives the scan of a number: (N, 3) float32 metres, sensor frame.
+        read: Returns the scan of a number: (N, 3) float32 metres, sensor frame.
     """
 
     name: str
@@ -47,23 +47,23 @@ class Drive:
     read: Callable[[int], NDArray[np.float32]]
 
     def __len__(self) -> int:
-        """Returns the number of scans."""
+        """Return the number of scans."""
         return len(self.indices)
 
     def scans(self) -> Iterator[NDArray[np.float32]]:
-        """Yields each scan: (N, 3) float32 metres, sensor frame."""
+        """Yield each scan: (N, 3) float32 metres, sensor frame."""
         return (self.read(int(index)) for index in self.indices)
 
     def part(self, first: int, end: int) -> Drive:
-        """Returns the scans from position `first` up to, not including, `end`."""
+        """Return the scans from position `first` up to, not including, `end`."""
         cut = slice(first, end)
         truth = None if self.truth is None else self.truth[cut]
         return replace(self, indices=self.indices[cut], times=self.times[cut], truth=truth)
 
     def piece(self, k: int, of: int, overlap: int = DEFAULT_OVERLAP) -> Drive:
-        """Returns piece k (1 to `of`) of the drive cut into equal, contiguous pieces.
+        """Return piece k (1 to `of`) of the drive cut into equal, contiguous pieces.
 
-        Each piece but the last goes on for the first `overlap` scans of the next one.
+        Each piece but the last includes the first `overlap` scans of the next one.
         """
         if not 1 <= k <= of:
             raise DriveError(f"piece {k} of {of}: pieces are numbered from 1 to {of}")
@@ -79,14 +79,14 @@ class Drive:
 
 
 def load_drive(name: str | Path) -> Drive:
-    """Loads a drive by name or path.
+    """Load a drive by name or path.
 
     Args:
         name: "street", "street:SCANS", "kittiNNNN", or the path of a thinned .npz or of a KITTI
             raw folder.
 
     Raises:
-        DriveError: There is no such drive, or it is damaged; says what was expected.
+        DriveError: There is no such drive, or it is damaged; the text names the expected form.
     """
     drive = _load(str(name))
     late = np.flatnonzero(np.diff(drive.times) <= 0)
@@ -99,12 +99,12 @@ def load_drive(name: str | Path) -> Drive:
 
 
 def drive_of(name: str | Path | None) -> Drive:
-    """Loads a drive by name or path; without one, the default drive."""
+    """Load a drive by name or path; without one, the default drive."""
     return load_drive(name) if name else default_drive()
 
 
 def default_drive() -> Drive:
-    """Loads KITTI 0001 where it can be found, else the simulated street."""
+    """Load KITTI 0001 where it can be found, else the simulated street."""
     return load_drive("kitti0001" if _find_kitti("kitti0001") else "street")
 
 
@@ -124,7 +124,7 @@ def _load(text: str) -> Drive:
 
 
 def _kitti_folders() -> list[Path]:
-    """Returns where KITTI may lie: the variable's folder, else beside the repository."""
+    """Return the folders to search for KITTI: the variable's, else those beside the repository."""
     named = os.environ.get(KITTI_VARIABLE)
     if named:
         return [Path(named)]
@@ -132,7 +132,7 @@ def _kitti_folders() -> list[Path]:
 
 
 def _find_kitti(name: str) -> Path | None:
-    """Looks for kittiNNNN as a thinned archive, then as a raw folder (of the earliest date)."""
+    """Return the path of kittiNNNN: a thinned archive, else a raw folder (of the earliest date)."""
     number = name.removeprefix("kitti")
     for folder in _kitti_folders():
         for pattern in (f"{name}.npz", f"*_drive_{number}_sync", f"*/*_drive_{number}_sync"):
@@ -191,10 +191,10 @@ def _load_npz(path: Path, name: str) -> Drive:
 
 
 def _read_npz(path: Path) -> Arrays:
-    """Reads the arrays of a thinned drive and checks their shapes against each other."""
+    """Read the arrays of a thinned drive, and check their shapes against each other."""
     try:
         with np.load(path, allow_pickle=False) as archive:
-            # A lone number becomes an array of one, so that everything has a length to compare.
+            # A scalar becomes an array of one, so that each has a length to compare.
             arrays: Arrays = {name: np.atleast_1d(archive[name]) for name in _NPZ_ARRAYS}
     except KeyError as error:
         raise DriveError(f"{path}: {error}; needed are {_listed(_NPZ_ARRAYS)}") from error

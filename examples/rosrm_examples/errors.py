@@ -1,4 +1,4 @@
-"""The errors that a user of the examples can meet.
+"""Errors of the examples that a user can meet.
 
 ExampleError          one line that says what, where, and what is allowed
 ├── DriveError        a drive cannot be found, read or cut
@@ -7,7 +7,7 @@ ExampleError          one line that says what, where, and what is allowed
 
 
 class ExampleError(ValueError):
-    """What a user gave cannot be used."""
+    """An argument or a file of the user cannot be used."""
 
 
 class DriveError(ExampleError):

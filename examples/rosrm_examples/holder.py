@@ -1,10 +1,10 @@
-"""A process that holds memory, and nothing else.
+"""A process that holds memory, and does nothing else.
 
     python -m rosrm_examples.holder --mb 40 --seconds 30
 
-It holds N MB (1 MB = 10^6 bytes) beyond its own footprint, every page touched, until SIGINT or
-SIGTERM comes or its time is over, and exits with status 0. With --ros it is a ROS 2 node of its
-own; without, it imports next to nothing.
+It holds N MB (1 MB = 10^6 bytes) in addition to its own footprint, every page touched, until SIGINT
+or SIGTERM comes or its time is over, and exits with status 0. With --ros it is a ROS 2 node;
+without, it imports very little.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ GROWTH_PERIOD_S = 0.1
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Holds memory until told to stop; returns the exit status."""
-    # A blocked signal waits until it is asked for: no handler, and no moment at which it is lost.
+    """Hold memory until a stop signal; return the exit status."""
+    # A blocked signal stays pending until the program waits for it: no handler, none is lost.
     signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
     raw = list(sys.argv if arguments is None else ["holder", *arguments])
     options, ros_arguments = _parse(raw[1:])
@@ -38,7 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parse(arguments: list[str]) -> tuple[argparse.Namespace, list[str]]:
-    """Splits what `--ros-args` begins from the options of its own."""
+    """Split the own options from those that `--ros-args` begins."""
     at = arguments.index("--ros-args") if "--ros-args" in arguments else len(arguments)
     parser = argparse.ArgumentParser(prog="python -m rosrm_examples.holder")
     parser.add_argument("--mb", required=True, type=_amount, help="MB to hold")
@@ -60,7 +60,7 @@ def _amount(text: str) -> float:
 
 
 def _hold(mb: float, grow: float, most: float, seconds: float | None) -> None:
-    """Holds `mb` MB, and `grow` MB more a second, until a stop signal or the time is over."""
+    """Hold `mb` MB, and `grow` MB more a second, until a stop signal or the time is over."""
     blocks = [_touched(int(mb * 1e6))]
     held = mb
     started = time.monotonic()
@@ -77,7 +77,7 @@ def _hold(mb: float, grow: float, most: float, seconds: float | None) -> None:
 
 
 def _touched(size: int) -> mmap.mmap | None:
-    """Maps `size` bytes and writes to each page, so that all of it is really there."""
+    """Map `size` bytes and write to each page, so that all of it is resident."""
     if size <= 0:
         return None
     block = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
@@ -91,7 +91,7 @@ def _stopped_within(seconds: float) -> bool:
 
 
 def _ros_node(arguments: list[str]) -> AbstractContextManager[object]:
-    """Is a ROS 2 node for as long as the context lasts."""
+    """Run a ROS 2 node for the lifetime of the context."""
     from rosrm_examples.lean_node import lean_node  # noqa: PLC0415 (rclpy with --ros alone)
 
     return lean_node("holder", arguments)

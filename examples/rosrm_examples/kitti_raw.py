@@ -1,4 +1,4 @@
-"""Reads a drive in the layout of KITTI's raw data (A. Geiger et al., IJRR 2013).
+"""Reader of drives in the layout of KITTI's raw data (A. Geiger et al., IJRR 2013).
 
     2011_09_26/
       calib_imu_to_velo.txt                       optional, else the nominal mounting is taken
@@ -7,8 +7,8 @@
         velodyne_points/data/0000000000.bin ...   float32 x, y, z, reflectance
         oxts/data/0000000000.txt ...              optional GNSS/INS: lat lon alt roll pitch yaw ...
 
-Scans are thinned as they are read. A drive may lack single scans: a file's own number says which
-line and which GNSS/INS packet belong to it.
+Scans are thinned as they are read. A drive may lack single scans: the number in a file's name
+selects its line and its GNSS/INS packet.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ NEAREST_M, FARTHEST_M = 3.0, 60.0  # nearer is the car itself, farther is too sp
 VOXEL_M = 0.5
 
 _EARTH_RADIUS_M = 6378137.0
-# KITTI's drawing of the car: the scanner is 0.81 m ahead of the IMU, 0.32 m to its right and
+# From KITTI's drawing of the car: the scanner is 0.81 m ahead of the IMU, 0.32 m to its right and
 # 0.80 m above it, with parallel axes (x ahead, y to the left, z up).
 _NOMINAL_IMU_IN_VELO = make_pose(np.eye(3), np.array([-0.81, 0.32, -0.80]))
 
@@ -37,13 +37,13 @@ class RawDrive:
     """A drive folder ..._drive_NNNN_sync.
 
     Attributes:
-        numbers: (S,) numbers of the scans that are there.
+        numbers: (S,) numbers of the scans that exist.
         times: (S,) unix seconds.
         truth: (S, 4, 4) poses of the scanner in the frame of its first scan, or None.
     """
 
     def __init__(self, folder: Path) -> None:
-        """Reads everything but the scans."""
+        """Read everything but the scans."""
         self._scans = folder / "velodyne_points" / "data"
         files = sorted(self._scans.glob("*.bin"))
         if not files:
@@ -56,7 +56,7 @@ class RawDrive:
         self.truth = self._read_truth(folder)
 
     def scan(self, number: int) -> NDArray[np.float32]:
-        """Reads and thins one scan: (N, 3) float32 metres, sensor frame."""
+        """Read and thin one scan: (N, 3) float32 metres, sensor frame."""
         values = np.fromfile(self._files[number], dtype="<f4")
         if len(values) % 4:
             raise DriveError(
@@ -98,7 +98,7 @@ def _number(file: Path) -> int:
 
 
 def _unix_time(line: str, path: Path) -> float:
-    """Turns '2011-09-26 13:02:25.951199337' (UTC, nanoseconds) into unix seconds."""
+    """Turn '2011-09-26 13:02:25.951199337' (UTC, nanoseconds) into unix seconds."""
     whole, _, fraction = line.strip().partition(".")
     try:
         moment = datetime.strptime(whole, "%Y-%m-%d %H:%M:%S").replace(tzinfo=timezone.utc)
@@ -108,7 +108,7 @@ def _unix_time(line: str, path: Path) -> float:
 
 
 def _read_packet(path: Path) -> Floats:
-    """Reads latitude, longitude (degrees), altitude (m), roll, pitch, yaw (rad)."""
+    """Read latitude, longitude (degrees), altitude (m), roll, pitch, yaw (rad)."""
     try:
         values = np.array(path.read_text().split()[:6], dtype=np.float64)
     except (OSError, ValueError) as error:
@@ -119,7 +119,7 @@ def _read_packet(path: Path) -> Floats:
 
 
 def _read_calibration(path: Path) -> Pose:
-    """Reads the IMU's pose in the scanner's frame, or takes the nominal one."""
+    """Read the IMU's pose in the scanner's frame; without a file, use the nominal one."""
     if not path.exists():
         return _NOMINAL_IMU_IN_VELO
     try:
@@ -131,7 +131,7 @@ def _read_calibration(path: Path) -> Pose:
 
 
 def _imu_pose(packet: Floats, scale: float) -> Pose:
-    """Places a GNSS/INS packet on the Mercator plane, in metres at the drive's latitude."""
+    """Return the pose of a GNSS/INS packet on the Mercator plane, metres at that latitude."""
     latitude, longitude, altitude, roll, pitch, yaw = packet
     x = scale * _EARTH_RADIUS_M * np.radians(longitude)
     y = scale * _EARTH_RADIUS_M * np.log(np.tan(np.radians(90 + latitude) / 2))
@@ -140,7 +140,7 @@ def _imu_pose(packet: Floats, scale: float) -> Pose:
 
 
 def _turn(axis: int, angle: float) -> Floats:
-    """Returns the (3, 3) rotation about one axis by `angle` rad."""
+    """Return the (3, 3) rotation about one axis by `angle` rad."""
     i, j = [(1, 2), (2, 0), (0, 1)][axis]
     rotation = np.eye(3)
     rotation[i, i] = rotation[j, j] = np.cos(angle)

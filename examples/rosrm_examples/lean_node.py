@@ -1,4 +1,4 @@
-"""A ROS 2 node without the topics and services that these examples have no use for."""
+"""A ROS 2 node without the topics and services that these examples do not use."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _WITHOUT_TYPE_SERVICE = ["--ros-args", "-p", "start_type_description_service:=fa
 
 @contextmanager
 def lean_node(name: str, arguments: list[str]) -> Iterator[Node]:
-    """Is in the ROS graph for as long as the context lasts; signals stay the caller's.
+    """Create a node for the lifetime of the context; signals stay the caller's.
 
     Args:
         name: The node's name, unless the arguments remap it.
@@ -22,12 +22,12 @@ def lean_node(name: str, arguments: list[str]) -> Iterator[Node]:
     """
     with ros_context([*arguments, *_WITHOUT_TYPE_SERVICE]):
         node = Node(name, enable_rosout=False, start_parameter_services=False)
-        yield node  # held here too: a caller need not name it to keep it in the graph
+        yield node  # the frame keeps a reference, so that the caller need not
 
 
 @contextmanager
 def ros_context(arguments: list[str]) -> Iterator[None]:
-    """Has ROS ready for as long as the context lasts; signals stay the caller's.
+    """Initialise ROS for the lifetime of the context; signals stay the caller's.
 
     Args:
         arguments: The command line; only what follows `--ros-args` is used.

@@ -1,4 +1,4 @@
-"""SLAM on a drive that is still going on, in one of several instances that follow each other."""
+"""SLAM on a live drive, in one of several instances that succeed each other."""
 
 from __future__ import annotations
 
@@ -15,39 +15,39 @@ from rosrm_examples.slam import Slam
 #: Scans from which a map can be begun in mid-drive. With the last one alone the next pose may be
 #: 0.12 m off those of the whole map on KITTI 0001; with five 0.03 m, and none later 0.09 m.
 _RECENT_SCANS: Final = 5
-#: Most points of them; who moves again and again would have more and more.
+#: Most points of them; otherwise they would grow with each migration.
 _RECENT_POINTS: Final = 100_000
 
 
 class LiveSlam:
-    """Maps scan by scan, and tells what it mapped itself from what it took over.
+    """A mapping, scan by scan, that separates its own part from the restored one.
 
     Attributes:
         slam: The mapping.
-        refused: Scans that were not later than the one before.
+        refused: Number of scans that were not later than the one before.
     """
 
     def __init__(self) -> None:
-        """Begins a new map."""
+        """Begin a new map."""
         self.slam = Slam()
         self.refused = 0
-        self._first_own = 0  # position of the first pose that was not taken over
+        self._first_own = 0  # position of the first pose that was not restored
         self._map_before: Arrays = {}
         self._recent: deque[tuple[Pose, Points]] = deque(maxlen=_RECENT_SCANS)
         self._seen_before: Points = np.zeros((0, 3), np.float32)
 
     @property
     def pose(self) -> Pose:
-        """Where the sensor is."""
+        """Return the pose of the sensor."""
         return self.slam.poses[-1]
 
     @property
     def time(self) -> float | None:
-        """Of the newest scan, seconds; None: there was none."""
+        """Return the time of the newest scan, seconds; None: there was none."""
         return self.slam.times[-1] if self.slam.times else None
 
     def add_scan(self, points: Points, t: float) -> None:
-        """Takes the next scan.
+        """Add the next scan.
 
         Args:
             points: (N, 3) metres, sensor frame.
@@ -64,34 +64,34 @@ class LiveSlam:
         self._recent.append((self.pose, points))
 
     def _begin_map(self) -> None:
-        """Without a map, but with a pose: what was seen around there is the first of it."""
+        """Insert the restored surroundings as the first keyframe, if there is a pose but no map."""
         if self.slam.poses and not self.slam.has_map:
             self._recent.append((self.pose, self._seen_before))
             self.slam.add_to_map(self._seen_before)
-            self._map_before = self.slam.map_state()  # that was mapped by somebody else
+            self._map_before = self.slam.map_state()  # mapped by a predecessor
 
     def surroundings(self) -> Points:
-        """Returns the newest scans as if seen at once: (N, 3) float32 metres, sensor frame."""
+        """Return the newest scans in one frame: (N, 3) float32 metres, sensor frame."""
         if not self._recent:
             return self._seen_before
         here = inverse(self.pose)
         clouds = [transform(here @ pose, points) for pose, points in reversed(self._recent)]
         return np.concatenate(clouds)[:_RECENT_POINTS].astype(np.float32)
 
-    # --- taking over -----------------------------------------------------------------------
+    # --- restoring -------------------------------------------------------------------------
 
     def take_over_motion(self, state: Arrays) -> None:
-        """Goes on from a trajectory and a velocity, see `Slam.motion_state`."""
+        """Restore trajectory and velocity, see `Slam.motion_state`."""
         self.slam.restore_motion(state)
         self._first_own = len(self.slam.poses)
 
     def take_over_map(self, state: Arrays) -> None:
-        """Goes on with a map, see `Slam.map_state`."""
+        """Restore a map, see `Slam.map_state`."""
         self.slam.restore_map(state)
         self._map_before = state
 
     def take_over_surroundings(self, points: Points) -> None:
-        """Goes on without a map, see `surroundings`; the pose is taken over beside it."""
+        """Restore `surroundings` instead of a map; the pose is restored separately."""
         self.take_over_map({})
         self._recent.clear()
         self._seen_before = points
@@ -99,7 +99,7 @@ class LiveSlam:
     # --- the end ---------------------------------------------------------------------------
 
     def part(self, host: str) -> MapPart:
-        """Returns what this instance mapped."""
+        """Return the part that this instance mapped."""
         poses = self.slam.poses[self._first_own :]
         return MapPart(
             host=host,

@@ -1,4 +1,4 @@
-"""What one instance of the live SLAM mapped, as it leaves it on disk at its end."""
+"""Part of a map by one instance of the live SLAM, written to disk at the end of the instance."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ class MapPart:
     """A part of a trajectory and of a map, in the frame of the drive's first scan.
 
     Attributes:
-        host: On which it was made.
+        host: The host that made it.
         times: (S,) seconds.
         poses: (S, 4, 4).
-        points: (P, 3) float32 metres, without those that it took over.
-        refused: Scans that came a second time, or too late.
+        points: (P, 3) float32 metres, without the restored ones.
+        refused: Number of scans that came twice, or too late.
     """
 
     host: str
@@ -30,13 +30,13 @@ class MapPart:
 
 
 def save_part(path: Path, part: MapPart) -> None:
-    """Writes a part so that a reader finds either nothing or all of it."""
+    """Write a part atomically: a reader finds either nothing or all of it."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_arrays(path, asdict(part))
 
 
 def load_part(path: Path) -> MapPart:
-    """Reads a part; raises PieceError where there is none or it is damaged."""
+    """Read a part; raises PieceError where there is none or it is damaged."""
     arrays = read_arrays(path, [field.name for field in fields(MapPart)])
     return MapPart(
         host=str(arrays["host"]),
@@ -48,7 +48,7 @@ def load_part(path: Path) -> MapPart:
 
 
 def load_parts(folder: Path) -> list[MapPart]:
-    """Reads all parts in a folder, in the order in which they were driven.
+    """Read all parts in a folder, in the order of the drive.
 
     Raises:
         PieceError: there is none, or one is damaged.

@@ -4,7 +4,7 @@
 
 It publishes the pose of every scan on `odometry` (nav_msgs/Odometry) and writes piece_02.npz at its
 end. Exit status: 0 when the piece is written, 2 when the arguments cannot be used, and 128 + signal
-number when SIGINT or SIGTERM stopped it first; then nothing is written.
+number when SIGINT or SIGTERM stopped it before that; then nothing is written.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from __future__ import annotations
 import os
 import signal
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy: one process is one core's work
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy: a process should use one core
 if __name__ == "__main__":
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # ends the imports below without a traceback
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # no traceback while the imports below run
 
 import argparse
 import sys
@@ -39,13 +39,13 @@ PROGRESS_SCANS = 10
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Maps a piece; returns the exit status."""
+    """Map a piece; return the exit status."""
     raw = list(sys.argv if arguments is None else ["map_piece", *arguments])
     options = _parse(remove_ros_args(raw)[1:])
     stop = StopSignals()
     try:
         piece = load_drive(options.drive).piece(options.piece, options.of, options.overlap)
-        options.out.mkdir(parents=True, exist_ok=True)  # if that fails, then before the work
+        options.out.mkdir(parents=True, exist_ok=True)  # a failure is reported before the work
         with lean_node("map_piece", raw) as node:
             slam = _map(piece, node, options.rate, stop)
         if stop.came is not None:
@@ -75,7 +75,7 @@ def _parse(arguments: Sequence[str]) -> argparse.Namespace:
 
 
 def _map(piece: Drive, node: Node, rate: float, stop: StopSignals) -> Slam:
-    """Runs SLAM over a piece and publishes each pose, up to the end or a signal."""
+    """Run SLAM over a piece and publish each pose, up to the end or a signal."""
     publisher = node.create_publisher(Odometry, "odometry", 10)
     slam = Slam()
     started, cpu_before = time.monotonic(), time.process_time()

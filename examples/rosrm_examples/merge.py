@@ -48,9 +48,9 @@ class JoinedMap:
 
 
 def join(pieces: Sequence[MapPiece]) -> JoinedMap:
-    """Chains pieces, in order, through the scans that neighbours share.
+    """Chain pieces, in order, through the scans that neighbours share.
 
-    A scan that two pieces have is taken from the earlier one, whose map was fuller by then.
+    A scan in two pieces is taken from the earlier one, because its map was fuller by then.
     """
     first = pieces[0]
     indices, times, poses = first.indices, first.times, first.poses
@@ -67,7 +67,7 @@ def join(pieces: Sequence[MapPiece]) -> JoinedMap:
 
 
 def end_error_percent(poses: Floats, truth: Floats) -> float:
-    """Returns how far the end is from the true end, in percent of the true path's length.
+    """Return the distance of the end from the true end, in percent of the true path's length.
 
     Args:
         poses: (S, 4, 4); compared relative to the first, as the truth is.
@@ -80,7 +80,7 @@ def end_error_percent(poses: Floats, truth: Floats) -> float:
 
 
 def write_map(joined: JoinedMap, drive: Drive, out: Path) -> dict[str, float | int | None]:
-    """Writes map.ply, map.png and trajectory.npz; returns the figures of the summary."""
+    """Write map.ply, map.png and trajectory.npz; return the figures of the summary."""
     truth = None if drive.truth is None else _truth_of(joined, drive)
     error = None if truth is None else end_error_percent(joined.poses, truth)
     out.mkdir(parents=True, exist_ok=True)
@@ -101,7 +101,7 @@ def write_map(joined: JoinedMap, drive: Drive, out: Path) -> dict[str, float | i
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Joins the pieces in a folder; returns the exit status."""
+    """Join the pieces in a folder; return the exit status."""
     parser = argparse.ArgumentParser(prog="python -m rosrm_examples.merge", description=__doc__)
     parser.add_argument("--drive", required=True, help="the drive that the pieces are of")
     parser.add_argument("--pieces", required=True, type=Path, help="folder of piece_KK.npz")
@@ -118,7 +118,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _place(piece: MapPiece, indices: Keys, poses: Floats) -> Pose:
-    """Returns the piece's frame in the frame of the given trajectory."""
+    """Return the piece's frame in the frame of the given trajectory."""
     shared, before, within = np.intersect1d(indices, piece.indices, return_indices=True)
     if len(shared) == 0:
         raise PieceError(
@@ -130,7 +130,7 @@ def _place(piece: MapPiece, indices: Keys, poses: Floats) -> Pose:
 
 
 def _truth_of(joined: JoinedMap, drive: Drive) -> Floats:
-    """Returns the true poses of the joined scans, relative to the first."""
+    """Return the true poses of the joined scans, relative to the first."""
     assert drive.truth is not None
     if not np.isin(joined.indices, drive.indices).all():
         raise PieceError(f"the pieces have scans that drive {drive.name!r} lacks: another drive's?")

@@ -1,4 +1,4 @@
-"""What the migration demo runs, and when: a player, the live SLAM, and a recorder that grows.
+"""Plan of the migration demo: a player, the live SLAM, a recorder that grows, and their times.
 
 The player stays on the robot, with its scanner. The SLAM begins on the host with the fast disk, and
 has to leave it when the recorder, which needs that disk, takes the memory.
@@ -22,23 +22,23 @@ from rosrm_examples.observer import Observer
 #: The SLAM begins on the first; the player stays on the last.
 HOSTS: Final = ("host1", "host2", "robot")
 SLAM, PLAYER, RECORDER = "slam", "player", "recorder"
-#: Bytes of memory that host1 and host2, and the robot, count as their own.
+#: Bytes of memory in the budgets of host1 and host2, and of the robot.
 BUDGET: Final = 448 * 2**20
 _ROBOT_BUDGET: Final = 160 * 2**20
-#: Bytes that must be free on this machine: what runs on the hosts, and rosrm.
+#: Bytes that must be free on this machine: for the processes on the hosts, and rosrm.
 LEAST_FREE: Final = 2 * BUDGET
 
 #: MB, declared.
 _SLAM_MB, _PLAYER_MB, _RECORDER_MB = 130, 90, 33
-#: MB that the recorder takes in the end, and in each second until then: it has not said so.
+#: MB that the recorder takes in the end, and in each second until then; not declared.
 _RECORDER_MOST_MB, _RECORDER_GROWTH_MB = 310, 200
 
 _FAST_DISK: Final = {"disk": "fast"}
 _SCANNER: Final = {"scanner": "yes"}
 
-#: A drive that is shorter is played slower, for a process needs its time to start: seconds.
+#: Seconds; a shorter drive is played slower, because processes need time to start.
 _SHORTEST_S: Final = 20.0
-#: The recorder comes when this part of the drive is over, and the SLAM moves soon after.
+#: Part of the drive after which the recorder is submitted; the SLAM migrates soon after.
 _RECORDER_AT: Final = 0.15
 #: Seconds without a pose after which nothing more is expected.
 _QUIET_S: Final = 10.0
@@ -47,14 +47,14 @@ _OVER: Final = ("finished", "failed", "cancelled")
 
 @dataclass(frozen=True)
 class LiveDrive:
-    """How a drive is played and mapped.
+    """A drive with the settings for playing and mapping it.
 
     Attributes:
-        drive: what is played.
+        drive: to be played.
         rate: times as fast as it was driven.
-        state: of the SLAM that moves: "full" or "pose".
-        out: folder for what the instances of the SLAM leave, absolute.
-        report: file for what the player says at its end, absolute.
+        state: of the SLAM that migrates: "full" or "pose".
+        out: folder for the maps of the SLAM's instances, absolute.
+        report: file for the player's report at its end, absolute.
         working_directory: in which the drive is found.
     """
 
@@ -67,17 +67,17 @@ class LiveDrive:
 
     @property
     def period(self) -> float:
-        """Seconds between two scans, as they are played."""
+        """Return the seconds between two scans, as played."""
         return float(np.median(np.diff(self.drive.times))) / self.rate
 
 
 def usual_rate(drive: Drive) -> float:
-    """Real time, or slower where the drive is so short that nothing could move in it."""
+    """Return the rate of playing: 1, or less where the drive is too short for a migration."""
     return min(1.0, float(drive.times[-1] - drive.times[0]) / _SHORTEST_S)
 
 
 def cluster_config() -> ClusterConfig:
-    """The master's settings: what is stateful is handed off."""
+    """Return the master's settings: stateful processes migrate by handoff."""
     return ClusterConfig(
         name="migration-demo",
         scoring=ScoringChoice(options={"weights": {"memory": 1.0}}),
@@ -89,7 +89,7 @@ def cluster_config() -> ClusterConfig:
 
 
 def host_configs(cores: int) -> list[HostConfig]:
-    """Three hosts out of one machine: each counts its own processes against a budget."""
+    """Return three hosts on one machine: each measures its own processes against a budget."""
     labels = dict(zip(HOSTS, (_FAST_DISK, {}, _SCANNER), strict=True))
     return [
         HostConfig(
@@ -98,7 +98,7 @@ def host_configs(cores: int) -> list[HostConfig]:
             scope="slice",
             budget={
                 "memory": _ROBOT_BUDGET if labels[name] == _SCANNER else BUDGET,
-                "cpu": 2 * cores,  # whoever maps may use them all; memory is what runs short
+                "cpu": 2 * cores,  # enough for a SLAM on all cores; memory is the scarce resource
                 "disk": 2**30,
             },
             limits={"memory": MEMORY_LIMIT, "cpu": 1.0},
@@ -108,7 +108,7 @@ def host_configs(cores: int) -> list[HostConfig]:
 
 
 def slam_spec(live: LiveDrive) -> ProcessSpec:
-    """The process that moves."""
+    """Return the process that migrates."""
     return ProcessSpec(
         name=SLAM,
         module="rosrm_examples.slam_node",
@@ -122,7 +122,7 @@ def slam_spec(live: LiveDrive) -> ProcessSpec:
 
 
 def player_spec(live: LiveDrive) -> ProcessSpec:
-    """Plays the drive once, when the SLAM listens."""
+    """Return the player, which plays the drive once, when the SLAM has subscribed."""
     return ProcessSpec(
         name=PLAYER,
         module="rosrm_examples.player",
@@ -139,7 +139,7 @@ def player_spec(live: LiveDrive) -> ProcessSpec:
 
 
 def recorder_spec() -> ProcessSpec:
-    """Takes more memory than it has said, on the host with the fast disk."""
+    """Return the recorder: it takes more memory than declared, on the host with the fast disk."""
     return ProcessSpec(
         name=RECORDER,
         module="rosrm_examples.holder",
@@ -152,7 +152,7 @@ def recorder_spec() -> ProcessSpec:
 
 
 class MigrationScript:
-    """SLAM, player, recorder, each in its turn; it is over when all scans that were sent are heard.
+    """A script for SLAM, player and recorder that ends when all scans are mapped.
 
     The cluster's end then ends the SLAM and the recorder.
     """
@@ -167,7 +167,7 @@ class MigrationScript:
         self._elapsed = 0.0
 
     def act(self, client: Client, elapsed: float) -> None:
-        """Submit what is due."""
+        """Submit the processes that are due."""
         self._elapsed = elapsed
         heard = len(self._observer.heard)
         if heard > self._heard:
@@ -191,7 +191,7 @@ class MigrationScript:
         return slam is not None and slam.state == "running" and self._observer.publishers() > 0
 
     def is_over(self, view: Snapshot) -> bool:
-        """Whether the player has ended, and every scan was heard, or nothing more comes."""
+        """Return True if the player has ended, and all poses were received or no more come."""
         self._rows = {row.name: row for row in view.processes}
         player = self._rows.get(PLAYER)
         if player is None or player.state not in _OVER or self._rows[SLAM].state == "migrating":
@@ -200,7 +200,7 @@ class MigrationScript:
         return self._heard >= len(self._live.drive) or quiet >= _QUIET_S
 
     def progress(self, view: Snapshot) -> str:
-        """How far the drive is, and where it is mapped."""
+        """Return the progress of the drive, and the host that maps it."""
         slam = next((row for row in view.processes if row.name == SLAM), None)
         if slam is None:
             return "the SLAM is to start"

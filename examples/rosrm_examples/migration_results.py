@@ -1,4 +1,4 @@
-"""What became of a drive that was mapped live while the SLAM moved: figures, and what is wrong."""
+"""Results of a live drive with migrations: figures, and deviations from a correct run."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from rosrm_examples.observer import Heard
 from rosrm_examples.slam import Slam
 from rosrm_examples.stamps import nanoseconds_of, seconds_of, stamp_of
 
-#: Most that the poses may differ from those of the unmigrated run, metres, by what moved.
+#: Metres; largest allowed difference from the poses without migration, by the migrated state.
 LARGEST_DEVIATION_M: Final = {"full": 1e-9, "pose": 0.1}
 
 
 @dataclass(frozen=True)
 class LiveRun:
-    """What was seen of one live run.
+    """The observations of one live run.
 
     Attributes:
         drive: that was played.
         sent: scans that the player sent.
-        heard: every pose that the observer heard, as they came.
-        parts: what each instance of the SLAM mapped, in the order in which they were active.
-        period: seconds between two scans, as they were played.
+        heard: every received pose, in order of arrival.
+        parts: the part of each instance of the SLAM, in the order in which they were active.
+        period: seconds between two scans, as played.
     """
 
     drive: Drive
@@ -40,26 +40,26 @@ class LiveRun:
     period: float
 
     def stamps(self) -> list[int]:
-        """Of all scans of the drive, nanoseconds."""
+        """Return the stamps of all scans of the drive, nanoseconds."""
         return [nanoseconds_of(stamp_of(float(t))) for t in self.drive.times]
 
     def numbers(self, part: MapPart) -> Keys:
-        """(S,) which scans of the drive a part has, from 0."""
+        """Return the (S,) positions of a part's scans in the drive, from 0."""
         played = np.array([seconds_of(stamp_of(float(t))) for t in self.drive.times])
         return np.searchsorted(played, part.times).astype(np.int64)
 
     def by_stamp(self) -> dict[int, Heard]:
-        """The first pose that was heard of each scan."""
+        """Return the first received pose of each scan."""
         first: dict[int, Heard] = {}
         for one in self.heard:
             first.setdefault(one.stamp, one)
         return first
 
     def gaps(self) -> list[float]:
-        """Of each move: from the source's last output to the destination's first, less a period.
+        """Return, for each migration, the time between the outputs of source and destination.
 
-        Seconds; negative where the next output came early. Moves of which one of the two was not
-        heard are left out.
+        Seconds, less a period; negative where the next output came early. Migrations without the
+        last output of the source or the first one of the destination are left out.
         """
         first = self.by_stamp()
         gaps = []
@@ -73,7 +73,7 @@ class LiveRun:
 
 
 def unmigrated_poses(drive: Drive) -> Floats:
-    """Maps a drive in one go, scans and times as a player sends them: (S, 4, 4) poses."""
+    """Map a drive in one go, scans and times as a player sends them: (S, 4, 4) poses."""
     slam = Slam()
     for points, t in zip(drive.scans(), drive.times, strict=True):
         slam.add_scan(points, seconds_of(stamp_of(float(t))))
@@ -81,11 +81,11 @@ def unmigrated_poses(drive: Drive) -> Floats:
 
 
 def summarise(run: LiveRun, unmigrated: Floats, migrations: int) -> dict[str, Any]:
-    """The figures of `summary.json`.
+    """Return the figures of `summary.json`.
 
     Args:
-        unmigrated: (S, 4, 4) poses of the same drive without a move.
-        migrations: that the master counts.
+        unmigrated: (S, 4, 4) poses of the same drive without a migration.
+        migrations: counted by the master.
     """
     first, gaps = run.by_stamp(), run.gaps()
     refused = sum(part.refused for part in run.parts)
@@ -109,8 +109,8 @@ def summarise(run: LiveRun, unmigrated: Floats, migrations: int) -> dict[str, An
 
 
 def differences(summary: dict[str, Any], state: str, migrations: int) -> list[str]:
-    """What is not as it has to be, a line each; nothing, where all is well."""
-    # Not the order in which two writers are heard: what DDS has to send again comes late.
+    """Return the deviations from a correct run, a line each; empty: there are none."""
+    # The order of two writers' messages does not count: DDS may resend some of them late.
     wanted = {"scans_lost": 0, "scans_repeated": 0, "migrations": migrations}
     wrong = [
         f"{name} is {summary[name]}, not {value}"
@@ -129,7 +129,7 @@ def differences(summary: dict[str, Any], state: str, migrations: int) -> list[st
 
 
 def _max_deviation(run: LiveRun, unmigrated: Floats) -> float | None:
-    """Metres; None: nothing was heard."""
+    """Return the largest distance, metres; None: no pose was received."""
     first = run.by_stamp()
     apart = [
         float(np.linalg.norm(first[stamp].pose[:3, 3] - pose[:3, 3]))
@@ -140,7 +140,7 @@ def _max_deviation(run: LiveRun, unmigrated: Floats) -> float | None:
 
 
 def _end_error(run: LiveRun) -> float | None:
-    """Percent of the path; None: the truth is not known, or not all poses were heard."""
+    """Return the end error, percent of the path; None: no truth, or some poses are missing."""
     first, stamps = run.by_stamp(), run.stamps()
     if run.drive.truth is None or not all(stamp in first for stamp in stamps):
         return None

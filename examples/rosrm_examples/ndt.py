@@ -21,7 +21,7 @@ from rosrm_examples.arrays import Arrays, Flags, Floats, Keys, Points
 from rosrm_examples.poses import Pose, make_pose, rotation_from_vector
 from rosrm_examples.voxels import VoxelTable, sum_by_key, voxel_centres, voxel_keys
 
-MIN_POINTS = 5  # fewer say nothing of a cell's shape (Magnusson 2009, section 6.2)
+MIN_POINTS = 5  # fewer do not define a cell's shape (Magnusson 2009, section 6.2)
 OUTLIER_RATIO = 0.55  # part of the points expected off the map (as in Magnusson's code)
 THICKEN = 0.03  # of a Gaussian's trace, added to its variance in every direction
 NOISE_VARIANCE = 1e-4  # m^2; a range is known to about 1 cm at best
@@ -31,7 +31,7 @@ MAX_HALVINGS = 4
 SMALL_SHIFT = 5e-3  # m; a shorter step ends the search, well below the noise of a cell
 SMALL_TURN = 5e-4  # rad
 
-# Columns of a map's table: what is summed, then the Gaussian that follows from it.
+# Columns of a map's table: the sums, then the Gaussian computed from them.
 _SUMS = slice(0, 10)  # count, x, y, z, xx, xy, xz, yy, yz, zz about the cell's centre
 _MEAN = slice(10, 13)
 _WHITEN = slice(13, 22)  # (3, 3) W by rows, W^T W = inverse covariance
@@ -42,7 +42,7 @@ class NdtMap:
     """Gaussians in cubic cells, updated in place with each scan that is inserted."""
 
     def __init__(self, cell: float) -> None:
-        """Starts an empty map with cells of `cell` metres."""
+        """Start an empty map with cells of `cell` metres."""
         self.cell = cell
         self._table = VoxelTable(22)
         # Magnusson 2009, eqs. 6.7 and 6.8: a Gaussian fitted to the log of a Gaussian plus a
@@ -53,7 +53,7 @@ class NdtMap:
         self.d2 = float(-2 * np.log(middle / self.d1))
 
     def insert(self, points: Points) -> None:
-        """Adds (N, 3) points, metres, in the map's frame."""
+        """Add (N, 3) points, metres, in the map's frame."""
         keys = voxel_keys(points, self.cell)
         cells, sums = sum_by_key(keys, _moments(points - voxel_centres(keys, self.cell)))
         rows = self._table.ensure(cells)
@@ -61,10 +61,10 @@ class NdtMap:
         self._fit(rows)
 
     def look_up(self, points: Points) -> tuple[Flags, Floats, Floats]:
-        """Finds the Gaussians of the cells that points fall into.
+        """Find the Gaussians of the cells that points fall into.
 
         Returns:
-            (N,) which points have one; for those M: (M, 3) means; (M, 3, 3) whitening W.
+            (N,) True for points with one; for those M: (M, 3) means; (M, 3, 3) whitening W.
         """
         rows = self._table.find(voxel_keys(points, self.cell))
         hit = rows >= 0
@@ -75,7 +75,7 @@ class NdtMap:
         return hit, found[:, _MEAN], found[:, _WHITEN].reshape(-1, 3, 3)
 
     def to_arrays(self) -> Arrays:
-        """Returns all that the map is made of, to be given to `from_arrays`."""
+        """Return all data of the map, to be given to `from_arrays`."""
         return {
             "cell": np.array(self.cell),
             "keys": self._table.keys,
@@ -84,7 +84,7 @@ class NdtMap:
 
     @classmethod
     def from_arrays(cls, arrays: Arrays) -> NdtMap:
-        """Restores a map that matches exactly as the one that `to_arrays` was called on."""
+        """Restore a map that matches exactly like the one that `to_arrays` was called on."""
         ndt = cls(float(arrays["cell"]))
         rows = ndt._table.ensure(arrays["keys"])
         ndt._table.rows[:, _SUMS] = arrays["sums"]
@@ -92,7 +92,7 @@ class NdtMap:
         return ndt
 
     def _fit(self, rows: Keys) -> None:
-        """Computes the Gaussians of the given cells from their sums (Magnusson eqs. 6.2, 6.3)."""
+        """Compute the Gaussians of the given cells from their sums (Magnusson eqs. 6.2, 6.3)."""
         table = self._table
         rows = rows[table.rows[rows, 0] >= MIN_POINTS]
         sums = table.rows[rows, _SUMS]
@@ -115,7 +115,7 @@ class Derivatives(NamedTuple):
 
 
 def derivatives(ndt: NdtMap, pose: Pose, points: Points) -> Derivatives:
-    """Scores (N, 3) sensor points at a pose, with the gradient and Hessian at zero motion.
+    """Score (N, 3) sensor points at a pose, with the gradient and Hessian at zero motion.
 
     Magnusson 2009, eqs. 6.9 to 6.13, with the Jacobian and second derivatives of a small motion
     (see `move`) in place of those of Euler angles.
@@ -145,14 +145,14 @@ def derivatives(ndt: NdtMap, pose: Pose, points: Points) -> Derivatives:
 
 
 def move(pose: Pose, motion: Floats) -> Pose:
-    """Shifts the sensor by motion[:3], metres, and turns it about itself by motion[3:], rad."""
+    """Shift the sensor by motion[:3], metres, and turn it about itself by motion[3:], rad."""
     return make_pose(rotation_from_vector(motion[3:]) @ pose[:3, :3], pose[:3, 3] + motion[:3])
 
 
 def match(ndt: NdtMap, guess: Pose, points: Points) -> Pose:
-    """Finds the pose near `guess` at which (N, 3) sensor points fit the map best.
+    """Find the pose near `guess` at which (N, 3) sensor points fit the map best.
 
-    Without any point on the map, or without a better pose, the guess comes back.
+    Returns the guess where no point is on the map, or no pose is better.
     """
     pose, here = guess, derivatives(ndt, guess, points)
     for _ in range(MAX_STEPS):
@@ -172,7 +172,7 @@ def match(ndt: NdtMap, guess: Pose, points: Points) -> Pose:
 
 
 def _newton_step(at: Derivatives, longest: float) -> Floats:
-    """Returns the (6,) Newton step, downhill even where the Hessian is not positive definite."""
+    """Return the (6,) Newton step, downhill even where the Hessian is not positive definite."""
     curvature, axes = np.linalg.eigh(at.hessian)
     steepest = np.abs(curvature).max()
     if steepest == 0:
@@ -184,6 +184,6 @@ def _newton_step(at: Derivatives, longest: float) -> Floats:
 
 
 def _moments(points: Floats) -> Floats:
-    """Returns (N, 10): one, the coordinates and their products, as summed per cell."""
+    """Return (N, 10): one, the coordinates and their products, as summed per cell."""
     x, y, z = points.T
     return np.column_stack([np.ones(len(x)), x, y, z, x * x, x * y, x * z, y * y, y * z, z * z])

@@ -1,4 +1,4 @@
-"""Hears what a SLAM publishes, from outside: every pose, and when it came."""
+"""Observer of a SLAM from outside: every pose, with its time of arrival."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Heard:
 
     Attributes:
         arrived: When DDS received it, unix seconds.
-        stamp: Of the scan that it is the pose of, nanoseconds.
+        stamp: Of its scan, nanoseconds.
         pose: (4, 4).
     """
 
@@ -38,17 +38,16 @@ class Heard:
 
 
 class Observer:
-    """Keeps every message on `odometry`, until it is closed.
+    """A recorder of every message on `odometry`, until it is closed.
 
-    DDS notes the time at which a message comes, in a thread of its own: it does not matter what
-    this process is doing at that moment.
+    DDS notes the time of arrival in a thread of its own, so a busy process does not distort it.
 
     Attributes:
-        heard: In the order in which they came.
+        heard: In order of arrival.
     """
 
     def __init__(self, ros: RosSettings) -> None:
-        """Begins to listen."""
+        """Subscribe."""
         os.environ.update(ros.environment())
         self.heard: list[Heard] = []
         self._context = rclpy.Context()
@@ -69,7 +68,7 @@ class Observer:
         self._thread.start()
 
     def publishers(self) -> int:
-        """How many publishers of `odometry` are matched."""
+        """Return the number of matched publishers of `odometry`."""
         return int(self._input.get_publisher_count())
 
     def _listen(self) -> None:
@@ -82,7 +81,7 @@ class Observer:
         self.heard.append(Heard(arrived, stamp, pose_of(message)))
 
     def close(self) -> None:
-        """Listen no more."""
+        """Unsubscribe, and end the thread."""
         self._stopping.set()
         self._thread.join()
         self._executor.shutdown()

@@ -14,7 +14,7 @@ MAP_FRAME, LIDAR_FRAME = "map", "lidar"
 
 
 def odometry_message(pose: Pose, velocity: Floats, t: float) -> Odometry:
-    """Packs a pose and a velocity.
+    """Pack a pose and a velocity.
 
     Args:
         pose: Of the sensor in the map's frame.
@@ -36,7 +36,7 @@ def odometry_message(pose: Pose, velocity: Floats, t: float) -> Odometry:
 
 
 def pose_of(message: Odometry) -> Pose:
-    """Unpacks the (4, 4) pose."""
+    """Unpack the (4, 4) pose."""
     position, turn = message.pose.pose.position, message.pose.pose.orientation
     return make_pose(
         rotation_from_quaternion(turn.x, turn.y, turn.z, turn.w),
@@ -45,6 +45,6 @@ def pose_of(message: Odometry) -> Pose:
 
 
 def velocity_of(message: Odometry) -> Floats:
-    """Unpacks the (6,) velocity."""
+    """Unpack the (6,) velocity."""
     linear, angular = message.twist.twist.linear, message.twist.twist.angular
     return np.array([linear.x, linear.y, linear.z, angular.x, angular.y, angular.z])

@@ -1,4 +1,4 @@
-"""Draws maps from above, with the trajectory and the true one."""
+"""Pictures of maps from above, with the trajectory and the true one."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 
 _PAPER, _INK, _QUIET = "#fbfaf7", "#22303c", "#8b949c"
 _DRIVEN, _TRUE = "#d1495b", "#00798c"
-_SIDE_M = 35.0  # how far beside the trajectory the map is shown
+_SIDE_M = 35.0  # margin of the map beside the trajectory
 
 
 @dataclass(frozen=True)
@@ -27,10 +27,10 @@ class Stretch:
 
     Attributes:
         label: For the legend.
-        colour: As matplotlib knows it.
+        colour: A colour of matplotlib.
         points: (P, 3) metres.
         trajectory: (S, 3) positions, metres.
-        numbers: (S,) of the scans that were seen from there.
+        numbers: (S,) of the scans that were mapped there.
     """
 
     label: str
@@ -43,7 +43,7 @@ class Stretch:
 def draw_map(
     path: Path, points: Points, trajectory: Floats, truth: Floats | None, title: str
 ) -> None:
-    """Draws the map as a .png.
+    """Draw the map as a .png.
 
     Args:
         path: Where to write it.
@@ -76,7 +76,7 @@ def draw_map(
 def draw_stretches(
     path: Path, stretches: Sequence[Stretch], truth: Floats | None, title: str
 ) -> None:
-    """Draws maps over each other, each in its colour, as a .png.
+    """Draw maps over each other, each in its colour, as a .png.
 
     Args:
         path: Where to write it.
@@ -97,7 +97,7 @@ def draw_stretches(
 
 
 def draw_errors(path: Path, stretches: Sequence[Stretch], truth: Floats | None, title: str) -> None:
-    """Draws the trajectory against the true one, and how far apart they are, as a .png."""
+    """Draw the trajectory and the true one, and the distance between them, as a .png."""
     driven = np.concatenate([one.trajectory for one in stretches])
     width, height = np.ptp(driven[:, :2], axis=0)
     tall = float(np.clip(10 * height / max(width, 1.0), 2.0, 10.0))  # inches
@@ -120,7 +120,7 @@ def draw_errors(path: Path, stretches: Sequence[Stretch], truth: Floats | None, 
 
 
 def _from_above(trajectory: Floats) -> tuple[Figure, Axes]:
-    """Opens a picture that shows the surroundings of (S, 3) positions, metres."""
+    """Open a picture that shows the surroundings of (S, 3) positions, metres."""
     low = trajectory[:, :2].min(axis=0) - _SIDE_M
     high = trajectory[:, :2].max(axis=0) + _SIDE_M
     width, height = high - low

@@ -1,4 +1,4 @@
-"""A mapped piece of a drive, as `map_piece` leaves it on disk and `merge` joins it."""
+"""A mapped piece of a drive, as `map_piece` writes it to disk and `merge` joins it."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from rosrm_examples.errors import PieceError
 
 @dataclass(frozen=True)
 class MapPiece:
-    """What mapping one piece gave, in the frame of the piece's first scan.
+    """The map and the trajectory of one piece, in the frame of the piece's first scan.
 
     Attributes:
-        number: Which piece this is, from 1.
-        of: How many pieces the drive was cut into.
+        number: Of the piece, from 1.
+        of: Number of pieces of the drive.
         indices: (S,) numbers of its scans in the whole drive.
         times: (S,) seconds.
         poses: (S, 4, 4).
@@ -38,19 +38,19 @@ class MapPiece:
 
 
 def piece_path(folder: Path, number: int) -> Path:
-    """Returns where a piece lies in the folder of pieces."""
+    """Return the path of a piece in the folder of pieces."""
     return folder / f"piece_{number:02d}.npz"
 
 
 def save_piece(folder: Path, piece: MapPiece) -> Path:
-    """Writes a piece into a folder so that a reader finds either nothing or all of it."""
+    """Write a piece into a folder atomically: a reader finds either nothing or all of it."""
     path = piece_path(folder, piece.number)
     write_arrays(path, {field.name: getattr(piece, field.name) for field in fields(piece)})
     return path
 
 
 def write_arrays(path: Path, arrays: Mapping[str, ArrayLike]) -> None:
-    """Writes an .npz so that a reader finds either nothing or all of it."""
+    """Write an .npz atomically: a reader finds either nothing or all of it."""
     unfinished = path.with_suffix(f".{os.getpid()}.tmp")
     named: dict[str, Any] = {name: np.asarray(value) for name, value in arrays.items()}
     try:
@@ -62,7 +62,7 @@ def write_arrays(path: Path, arrays: Mapping[str, ArrayLike]) -> None:
 
 
 def read_arrays(path: Path, names: Iterable[str]) -> Arrays:
-    """Reads arrays by name; raises PieceError where one is missing or damaged."""
+    """Read arrays by name; raises PieceError where one is missing or damaged."""
     try:
         with np.load(path, allow_pickle=False) as archive:
             return {name: archive[name] for name in names}
@@ -71,7 +71,7 @@ def read_arrays(path: Path, names: Iterable[str]) -> Arrays:
 
 
 def load_piece(path: Path) -> MapPiece:
-    """Reads a piece; raises PieceError where there is none or it is damaged."""
+    """Read a piece; raises PieceError where there is none or it is damaged."""
     arrays = read_arrays(path, [field.name for field in fields(MapPiece)])
     return MapPiece(
         number=int(arrays["number"]),
@@ -84,7 +84,7 @@ def load_piece(path: Path) -> MapPiece:
 
 
 def load_pieces(folder: Path) -> list[MapPiece]:
-    """Reads all pieces of a drive from a folder; raises PieceError where one is missing."""
+    """Read all pieces of a drive from a folder; raises PieceError where one is missing."""
     paths = sorted(folder.glob("piece_*.npz"))
     if not paths:
         raise PieceError(f"{folder}: no pieces (piece_01.npz, ...) are here")

@@ -3,10 +3,10 @@
     python -m rosrm_examples.player --drive kitti0001 --rate 0.5
     python -m rosrm_examples.player --drive street:200 --hz 20 --subscribers 2
 
-It waits until somebody subscribes to `points` (sensor_msgs/PointCloud2), publishes scan by scan in
-the drive's own time, that time scaled, or so many a second, and ends when all has arrived. Exit
-status: 0 when every scan was sent, 1 when nobody came to hear them, 2 when the arguments cannot be
-used, and 128 + signal number when SIGINT or SIGTERM stopped it.
+It waits until a node subscribes to `points` (sensor_msgs/PointCloud2), publishes scan by scan in
+the drive's own time, that time scaled, or so many a second, and ends when all have arrived. Exit
+status: 0 when every scan was sent, 1 when no node subscribed, 2 when the arguments cannot be used,
+and 128 + signal number when SIGINT or SIGTERM stopped it.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from __future__ import annotations
 import signal
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # ends the imports below without a traceback
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # no traceback while the imports below run
 
 import argparse
 import json
@@ -41,12 +41,12 @@ from rosrm_examples.stopping import StopSignals
 
 _PROGRESS_SCANS: Final = 10
 _LOOK_S: Final = 0.05
-#: Longest that the end waits for slow readers.
+#: Seconds that the end waits for slow readers, at most.
 _ARRIVE_S: Final = 10.0
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Plays a drive; returns the exit status."""
+    """Play a drive; return the exit status."""
     raw = list(sys.argv if arguments is None else ["player", *arguments])
     options = _parse(remove_ros_args(raw)[1:])
     stop = StopSignals()
@@ -87,7 +87,7 @@ def _positive(text: str) -> float:
 
 
 def schedule(times: Floats, rate: float, hz: float | None) -> Floats:
-    """Returns when each scan is due, seconds after the first.
+    """Return the time at which each scan is due, seconds after the first.
 
     Args:
         times: (S,) of the scans, seconds.
@@ -99,7 +99,7 @@ def schedule(times: Floats, rate: float, hz: float | None) -> Floats:
 
 
 def _play(drive: Drive, node: Node, options: argparse.Namespace, stop: StopSignals) -> int:
-    """Publishes the scans; returns how many."""
+    """Publish the scans; return their number."""
     publisher = node.create_publisher(PointCloud2, "points", SCANS_QOS)
     if not _heard(publisher, options.subscribers, options.wait, stop):
         return 0
@@ -120,7 +120,7 @@ def _play(drive: Drive, node: Node, options: argparse.Namespace, stop: StopSigna
 
 
 def _heard(publisher: Any, subscribers: int, longest: float, stop: StopSignals) -> bool:
-    """Waits until so many subscribe; says so when they do not come."""
+    """Wait for so many subscribers; report where they do not come."""
     deadline = time.monotonic() + longest
     while publisher.get_subscription_count() < subscribers:
         if stop.came is not None:

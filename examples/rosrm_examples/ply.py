@@ -1,4 +1,4 @@
-"""Writes point clouds as PLY, binary little endian, which every viewer of point clouds opens."""
+"""Writer of point clouds as PLY, binary little endian, which every point cloud viewer opens."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rosrm_examples.arrays import Points
 
 
 def write_ply(path: Path, points: Points, colours: NDArray[np.uint8] | None = None) -> None:
-    """Writes (N, 3) points, metres, with (N, 3) red, green, blue where given."""
+    """Write (N, 3) points, metres, with (N, 3) red, green, blue where given."""
     layout: list[tuple[str, str]] = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
     if colours is not None:
         layout += [("red", "u1"), ("green", "u1"), ("blue", "u1")]

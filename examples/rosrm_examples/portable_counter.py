@@ -1,9 +1,9 @@
-"""A counter whose whole memory moves with it, by CRIU: nothing of it is on a topic.
+"""A counter that migrates with its whole memory, by CRIU: it publishes no state.
 
     python -m rosrm_examples.portable_counter --mb 100 --period 0.02
 
 It holds MB of memory and publishes on `count` (std_msgs/Int64MultiArray) the count, 1, 2, 3, ...;
-how often it has read all its memory; and the CRC-32 of what it found there the last time.
+the number of complete reads of its memory; and the CRC-32 of its content at the last one.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ SLICE = 4_000_000
 
 
 class PortableCounter(PortableNode):
-    """Counts, and reads its memory over and over.
+    """A counter that reads its memory over and over.
 
     Args:
         mb: of memory, 1 MB = 10^6 bytes; the content is the same in each run.
@@ -39,18 +39,18 @@ class PortableCounter(PortableNode):
         self.at = self.checksum_so_far = 0
 
     def join(self) -> None:
-        """Makes its part in the ROS graph, anew after each move."""
+        """Create the publisher and the timer, also after each migration."""
         self.output = self.create_publisher(Int64MultiArray, "count", 100)
         self.create_timer(self.period, self.tick)
 
     def tick(self) -> None:
-        """Counts on."""
+        """Count, and publish."""
         self.read_on()
         self.count += 1
         self.output.publish(Int64MultiArray(data=[self.count, self.passes, self.checksum]))
 
     def read_on(self) -> None:
-        """Reads the next slice of the memory."""
+        """Read the next slice of the memory."""
         part = memoryview(self.memory)[self.at : self.at + SLICE]
         self.checksum_so_far = zlib.crc32(part, self.checksum_so_far)
         self.at += SLICE
@@ -60,7 +60,7 @@ class PortableCounter(PortableNode):
 
 
 def filled(size: int) -> bytearray:
-    """So many bytes by chance, the same each time."""
+    """Return so many random bytes, the same in each call."""
     memory = bytearray(size)
     chance = random.Random(0)  # noqa: S311 - no secret
     for at in range(0, size, SLICE):
@@ -69,7 +69,7 @@ def filled(size: int) -> bytearray:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Counts until told to stop."""
+    """Count until a stop signal."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     at = given.index("--ros-args") if "--ros-args" in given else len(given)
     parser = argparse.ArgumentParser(prog="python -m rosrm_examples.portable_counter")

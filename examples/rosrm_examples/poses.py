@@ -15,7 +15,7 @@ _TINY_ANGLE = 1e-9  # rad; below it sin(a)/a is 1 to the last bit
 
 
 def make_pose(rotation: Floats, translation: Floats) -> Pose:
-    """Joins a (3, 3) rotation and a (3,) translation, metres."""
+    """Join a (3, 3) rotation and a (3,) translation, metres."""
     pose = np.eye(4)
     pose[:3, :3] = rotation
     pose[:3, 3] = translation
@@ -23,19 +23,19 @@ def make_pose(rotation: Floats, translation: Floats) -> Pose:
 
 
 def transform(pose: Pose, points: Points) -> Floats:
-    """Moves (N, 3) points from the pose's own frame into the frame that it is given in."""
+    """Transform (N, 3) points from the pose's own frame into the frame that it is given in."""
     moved: Floats = points @ pose[:3, :3].T + pose[:3, 3]
     return moved
 
 
 def inverse(pose: Pose) -> Pose:
-    """Inverts a pose; exact in form, unlike a general matrix inverse."""
+    """Invert a pose; exact in form, unlike a general matrix inverse."""
     rotation = pose[:3, :3].T
     return make_pose(rotation, -rotation @ pose[:3, 3])
 
 
 def rotation_from_vector(vector: Floats) -> Floats:
-    """Turns a (3,) rotation vector, rad, into a (3, 3) rotation (Rodrigues' formula)."""
+    """Turn a (3,) rotation vector, rad, into a (3, 3) rotation (Rodrigues' formula)."""
     angle = float(np.linalg.norm(vector))
     x, y, z = vector
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
@@ -47,7 +47,7 @@ def rotation_from_vector(vector: Floats) -> Floats:
 
 
 def vector_from_rotation(rotation: Floats) -> Floats:
-    """Turns a (3, 3) rotation by less than half a turn into its (3,) rotation vector, rad."""
+    """Turn a (3, 3) rotation by less than half a turn into its (3,) rotation vector, rad."""
     twice_axis = np.array(
         [
             rotation[2, 1] - rotation[1, 2],
@@ -63,7 +63,7 @@ def vector_from_rotation(rotation: Floats) -> Floats:
 
 
 def quaternion(rotation: Floats) -> tuple[float, float, float, float]:
-    """Returns the unit quaternion x, y, z, w (w >= 0) of a (3, 3) rotation."""
+    """Return the unit quaternion x, y, z, w (w >= 0) of a (3, 3) rotation."""
     vector = vector_from_rotation(rotation)
     angle = float(np.linalg.norm(vector))
     scale = 0.5 if angle < _TINY_ANGLE else np.sin(angle / 2) / angle
@@ -72,7 +72,7 @@ def quaternion(rotation: Floats) -> tuple[float, float, float, float]:
 
 
 def rotation_from_quaternion(x: float, y: float, z: float, w: float) -> Floats:
-    """Turns a quaternion, of unit length but for rounding, into a (3, 3) rotation."""
+    """Turn a quaternion, of unit length but for rounding, into a (3, 3) rotation."""
     x, y, z, w = np.array([x, y, z, w]) / np.sqrt(x * x + y * y + z * z + w * w)
     return np.array(
         [
@@ -84,7 +84,7 @@ def rotation_from_quaternion(x: float, y: float, z: float, w: float) -> Floats:
 
 
 def mean_pose(poses: Floats) -> Pose:
-    """Averages (S, 4, 4) poses that lie close together (chordal mean of the rotations)."""
+    """Average (S, 4, 4) poses that lie close together (chordal mean of the rotations)."""
     left, _, right = np.linalg.svd(poses[:, :3, :3].mean(axis=0))
     left[:, 2] *= np.linalg.det(left @ right)  # a rotation, never a reflection
     return make_pose(left @ right, poses[:, :3, 3].mean(axis=0))

@@ -23,11 +23,11 @@ STATE_FORMAT = 1
 
 @dataclass(frozen=True)
 class SlamSettings:
-    """What can be tuned; the defaults are those that measured best on KITTI.
+    """The parameters; the defaults are those that measured best on KITTI.
 
     Attributes:
-        cells: Edge of the map cells, metres, from coarse to fine. The coarsest finds a motion that
-            is not known yet (2 m between scans), the finest decides how true the map is.
+        cells: Edge of the map cells, metres, from coarse to fine. The coarsest finds an unknown
+            motion (2 m between scans), the finest determines the accuracy of the map.
         strides: Every how many points are matched at each level.
         keyframe_m: A scan enters the map when the sensor has moved this far, metres.
         cloud_voxel_m: Voxel of the point cloud that is kept for output, metres.
@@ -40,7 +40,7 @@ class SlamSettings:
 
 
 class Slam:
-    """Maps a drive scan by scan, in the frame of its first scan.
+    """A map of a drive, built scan by scan, in the frame of its first scan.
 
     Each scan is predicted with constant velocity, matched against the map from coarse to fine,
     and added to the map when it is a keyframe.
@@ -49,11 +49,11 @@ class Slam:
         poses: The pose of each scan so far.
         times: The time of each scan, seconds.
         velocity: (6,) of the sensor in its own frame: m/s along and rad/s about x, y, z.
-        keyframes: How many scans have entered the map since this object was made.
+        keyframes: Number of scans that have entered the map since this object was made.
     """
 
     def __init__(self, settings: SlamSettings | None = None) -> None:
-        """Starts at the identity with an empty map."""
+        """Start at the identity with an empty map."""
         self.settings = settings or SlamSettings()
         self.poses: list[Pose] = []
         self.times: list[float] = []
@@ -65,7 +65,7 @@ class Slam:
         self._clear_map()
 
     def add_scan(self, points: Points, t: float) -> Pose:
-        """Takes the next scan and returns the sensor's pose.
+        """Map the next scan and return the sensor's pose.
 
         Args:
             points: (N, 3) metres, sensor frame; points that are not finite are left out.
@@ -86,7 +86,7 @@ class Slam:
         return pose
 
     def add_to_map(self, points: Points) -> None:
-        """Adds (N, 3) sensor points to the map at the present pose."""
+        """Add (N, 3) sensor points to the map at the present pose."""
         pose = self.poses[-1]
         world = transform(pose, points)
         for ndt in self._levels:
@@ -97,22 +97,22 @@ class Slam:
 
     @property
     def has_map(self) -> bool:
-        """Whether there is anything to match a scan against."""
+        """Return True if there is a map to match a scan against."""
         return self._keyframe is not None
 
     def map_points_since(self, earlier: Arrays) -> Points:
-        """Returns what came into the map since an earlier `map_state`: (M, 3) float32 metres."""
+        """Return the points added since an earlier `map_state`: (M, 3) float32 metres."""
         if "cloud_keys" not in earlier:
             return self.map_points()
         points = self._cloud.points_since(earlier["cloud_keys"], earlier["cloud_rows"])
         return points.astype(np.float32)
 
     def map_points(self) -> Points:
-        """Returns the map so far, thinned: (M, 3) float32 metres, frame of the first scan."""
+        """Return the map so far, thinned: (M, 3) float32 metres, frame of the first scan."""
         return self._cloud.points().astype(np.float32)
 
     def state(self, with_map: bool = True) -> Arrays:
-        """Returns the whole state by name; without the map it is small, but not exact."""
+        """Return the whole state by name; without the map it is small, but not exact."""
         state: Arrays = {"format": np.array(STATE_FORMAT), **self.motion_state()}
         for field in fields(self.settings):
             state[f"settings_{field.name}"] = np.array(getattr(self.settings, field.name))
@@ -121,10 +121,10 @@ class Slam:
         return state
 
     def motion_state(self, newest: int | None = None) -> Arrays:
-        """Returns the trajectory and the velocity by name.
+        """Return the trajectory and the velocity by name.
 
         Args:
-            newest: How many poses, the last ones; the last alone is enough to go on. None: all.
+            newest: Number of poses, the last ones; one is enough to continue from. None: all.
         """
         first = 0 if newest is None else max(0, len(self.poses) - newest)
         return {
@@ -134,7 +134,7 @@ class Slam:
         }
 
     def map_state(self) -> Arrays:
-        """Returns the map by name; nothing before the first keyframe."""
+        """Return the map by name; empty before the first keyframe."""
         if self._keyframe is None:
             return {}
         state: Arrays = {
@@ -149,7 +149,7 @@ class Slam:
 
     @classmethod
     def from_state(cls, state: Arrays) -> Slam:
-        """Restores what `state` returned: it goes on exactly as the original would."""
+        """Restore the result of `state`: the copy continues exactly as the original would."""
         if int(state["format"]) != STATE_FORMAT:
             raise ValueError(f"SLAM state of format {state['format']}: only {STATE_FORMAT} is read")
         slam = cls(_settings_from(state))
@@ -158,13 +158,13 @@ class Slam:
         return slam
 
     def restore_motion(self, state: Arrays) -> None:
-        """Overwrites trajectory and velocity with what `motion_state` returned."""
+        """Overwrite trajectory and velocity with the result of `motion_state`."""
         self.poses = list(state["poses"].copy())
         self.times = state["times"].tolist()
         self.velocity = state["velocity"].copy()
 
     def restore_map(self, state: Arrays) -> None:
-        """Overwrites the map with what `map_state` returned."""
+        """Overwrite the map with the result of `map_state`."""
         if "keyframe" not in state:
             self._clear_map()
             return
@@ -179,10 +179,10 @@ class Slam:
     def _clear_map(self) -> None:
         self._levels = [NdtMap(cell) for cell in self.settings.cells]
         self._cloud = VoxelCloud(self.settings.cloud_voxel_m)
-        self._keyframe = None  # where the sensor was at the last keyframe
+        self._keyframe = None  # position of the sensor at the last keyframe
 
     def _predict(self, t: float) -> Pose:
-        """Moves the last pose on with constant velocity."""
+        """Extrapolate the last pose with constant velocity."""
         if not self.poses:
             return np.eye(4)
         step = self.velocity * (t - self.times[-1])
@@ -190,7 +190,7 @@ class Slam:
         return predicted
 
     def _follow(self, pose: Pose, t: float) -> None:
-        """Takes the pose over and measures the velocity from it."""
+        """Append the pose, and derive the velocity from it."""
         if self.poses:
             step = inverse(self.poses[-1]) @ pose
             elapsed = t - self.times[-1]

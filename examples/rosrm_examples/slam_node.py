@@ -1,4 +1,4 @@
-"""A ROS 2 node that maps a drive while it goes on, and that rosrm can move to another host.
+"""A ROS 2 node that maps a drive live, and that rosrm can migrate to another host.
 
     python -m rosrm_examples.slam_node --ros-args -p state:=pose -p out:=/tmp/parts
 
@@ -8,9 +8,9 @@
 | `odometry` | nav_msgs/Odometry       | out: pose and velocity, once for each scan         |
 | `map`      | sensor_msgs/PointCloud2 | out, latched: the map, every `map_every` keyframes |
 
-Parameters: `state`, "full" or "pose", is what a successor is given, see slam_state.py; `map_every`,
-keyframes; `out`, a folder in which the node writes what it mapped itself when SIGINT or SIGTERM
-ends it.
+Parameters: `state`, "full" or "pose": the state that a successor restores, see slam_state.py;
+`map_every`, keyframes; `out`, a folder in which the node writes its own part of the map when SIGINT
+or SIGTERM ends it.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from __future__ import annotations
 import os
 import signal
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy: one process is one core's work
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy: a process should use one core
 if __name__ == "__main__":
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # ends the imports below without a traceback
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # no traceback while the imports below run
 
 import sys
 from collections.abc import Sequence
@@ -50,7 +50,7 @@ _LOOK_S: Final = 0.1
 
 
 class SlamNode(Node):
-    """Maps what comes on `points`.
+    """A node that maps the scans on `points`.
 
     Attributes:
         live: the mapping.
@@ -66,7 +66,7 @@ class SlamNode(Node):
         self.create_subscription(PointCloud2, "points", self.take_scan, SCANS_QOS)
         for topic in self._state():
             self.keep_state(topic.name, topic.type, topic.save, topic.restore)
-        self.when_active(self.publish_map)  # who comes late finds it also after a move
+        self.when_active(self.publish_map)  # late subscribers receive it also after a migration
 
     def _state(self) -> list[StateTopic]:
         state = str(self.declare_parameter("state", "full").value)
@@ -75,7 +75,7 @@ class SlamNode(Node):
         return STATES[state](self.live)
 
     def take_scan(self, message: PointCloud2) -> None:
-        """Map a scan, and say where it was seen from."""
+        """Map a scan, and publish its pose."""
         slam = self.live.slam
         keyframes, t = slam.keyframes, seconds_of(message.header.stamp)
         try:
@@ -94,7 +94,7 @@ class SlamNode(Node):
             self._map.publish(cloud_message(points, self.live.time, MAP_FRAME))
 
     def write_part(self) -> Path | None:
-        """Write what this instance mapped; None: nothing, or nowhere to write it."""
+        """Write the part that this instance mapped; None: there is none, or no folder for it."""
         part = self.live.part(os.environ.get("ROSRM_HOST", ""))
         if not self._out or not len(part.times):
             return None
@@ -105,7 +105,7 @@ class SlamNode(Node):
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Maps until SIGINT or SIGTERM; returns the exit status."""
+    """Map until SIGINT or SIGTERM; return the exit status."""
     raw = list(sys.argv if arguments is None else ["slam_node", *arguments])
     stop = StopSignals()
     try:

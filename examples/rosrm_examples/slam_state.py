@@ -1,11 +1,11 @@
-"""The state of the live SLAM on the wire: all of it, or the pose and the newest scans alone.
+"""The state of the live SLAM as messages: all of it, or the pose and the newest scans alone.
 
-`full`: `~/state` and `~/state/map` (rosrm_msgs/Arrays); a successor goes on exactly as the
+`full`: `~/state` and `~/state/map` (rosrm_msgs/Arrays); a successor continues exactly as the
 original would. `pose`: `~/state` (Odometry) and `~/state/surroundings` (PointCloud2), messages that
-others can read as well; a successor begins a new map with the newest scans.
+other programs can read as well; a successor begins a new map with the newest scans.
 
-The trajectory behind the last pose is in neither: nothing that comes depends on it, it would grow
-for ever, and each instance writes its own part of it at its end.
+Neither includes the trajectory behind the last pose: later results do not depend on it, it would
+grow for ever, and each instance writes its own part of it at its end.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class StateTopic(NamedTuple):
         name: Of the topic.
         type: Of the message.
         save: Makes the message; None: unchanged since the last one.
-        restore: Overwrites what was there with what a message says.
+        restore: Overwrites the state with the content of a message.
     """
 
     name: str
@@ -43,7 +43,7 @@ class StateTopic(NamedTuple):
 
 
 def full_state(live: LiveSlam) -> list[StateTopic]:
-    """Motion with every scan, and the map, megabytes of it, when it has changed."""
+    """Return the motion, sent with every scan, and the map (megabytes), sent on change."""
     saved_at: int | None = None  # keyframes in the map that was saved last
 
     def save_motion() -> ArraysMessage:
@@ -71,11 +71,11 @@ def full_state(live: LiveSlam) -> list[StateTopic]:
 
 
 def pose_state(live: LiveSlam) -> list[StateTopic]:
-    """Pose, velocity, and what was seen around there, as messages that others know."""
+    """Return pose, velocity and surroundings, as standard messages."""
 
     def save_pose() -> Odometry:
         if live.time is None:
-            return Odometry()  # without a frame: no scan has come
+            return Odometry()  # without a frame: there was no scan yet
         return odometry_message(live.pose, live.slam.velocity, live.time)
 
     def restore_pose(message: Odometry) -> None:

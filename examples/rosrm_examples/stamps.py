@@ -8,21 +8,21 @@ _NS = 1_000_000_000
 
 
 def stamp_of(t: float) -> Time:
-    """Turns seconds into a time stamp, to the nearest nanosecond."""
+    """Turn seconds into a time stamp, to the nearest nanosecond."""
     whole = int(t)
     return from_nanoseconds(whole * _NS + round((t - whole) * _NS))
 
 
 def from_nanoseconds(nanoseconds: int) -> Time:
-    """Turns nanoseconds into a time stamp."""
+    """Turn nanoseconds into a time stamp."""
     return Time(sec=nanoseconds // _NS, nanosec=nanoseconds % _NS)
 
 
 def nanoseconds_of(stamp: Time) -> int:
-    """Turns a time stamp into nanoseconds: what tells two scans apart."""
+    """Turn a time stamp into nanoseconds, which distinguish scans."""
     return int(stamp.sec) * _NS + int(stamp.nanosec)
 
 
 def seconds_of(stamp: Time) -> float:
-    """Turns a time stamp into seconds."""
+    """Turn a time stamp into seconds."""
     return float(stamp.sec) + float(stamp.nanosec) / _NS

@@ -7,14 +7,14 @@ from types import FrameType
 
 
 class StopSignals:
-    """Notes SIGINT and SIGTERM, so that a node stops between two scans and never within one.
+    """A recorder of SIGINT and SIGTERM, so that a node stops between two scans, never within one.
 
     Attributes:
-        came: The number of the signal that came last, or None.
+        came: The number of the last signal, or None.
     """
 
     def __init__(self) -> None:
-        """Takes both signals over."""
+        """Install handlers for both signals."""
         self.came: int | None = None
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._note)

@@ -1,7 +1,7 @@
 """A simulated drive: a laser scanner is ray-cast through a street with houses and parked cars.
 
 Everything but the ground is an upright box. The ground is uneven on purpose: on a flat one every
-scan shows the same rings, which holds scan matching to no motion at all. The same seed always
+scan shows the same rings, so that scan matching would find no motion at all. The same seed always
 gives the same street, and each scan has its own noise, so that any part of a drive can be made
 without the scans before it.
 """
@@ -25,7 +25,7 @@ _COLUMNS = 720  # directions around, evenly spaced
 _GROUND_M = np.geomspace(3.2, 45.0, 24)  # distances at which the downward beams meet the ground
 _UPWARD = np.tan(np.radians(np.linspace(0.5, 22.0, 18)))  # slopes of the other beams
 _KERB_IN_SIGHT_M = 25.0
-_DEPTH_M = 0.5  # how deep a box is sunk into the ground, which is not level below it
+_DEPTH_M = 0.5  # depth of a box below the ground, which is uneven
 
 _BEND_RAD = np.radians(60)
 _SHARPEST_M = 40.0  # mean radius of the bend; a short street bends less instead
@@ -51,7 +51,7 @@ class Street:
     """
 
     def __init__(self, scans: int, seed: int = 1) -> None:
-        """Builds the street; scans are cast when asked for."""
+        """Build the street; scans are cast on demand."""
         self._seed = seed
         self.times: Floats = SCAN_PERIOD_S * np.arange(scans, dtype=np.float64)
         driven = np.cumsum(1.0 + 0.2 * np.sin(np.arange(scans) / 12))
@@ -61,7 +61,7 @@ class Street:
         self.truth: Floats = inverse(self._poses[0]) @ self._poses
 
     def scan(self, index: int) -> NDArray[np.float32]:
-        """Casts one scan and thins it: (N, 3) float32 metres, sensor frame."""
+        """Cast one scan and thin it: (N, 3) float32 metres, sensor frame."""
         pose = self._poses[index]
         rays, reach = _rays(pose[:3, 3])
         for box in self._boxes_near(pose[:3, 3]):
@@ -73,7 +73,7 @@ class Street:
         return thin(transform(inverse(pose), world), VOXEL_M).astype(np.float32)
 
     def _sensor_pose(self, driven: float) -> Floats:
-        """Stands the sensor upright on the ground's slope, looking along the road."""
+        """Return the pose of the sensor upright on the ground's slope, looking along the road."""
         x, y, heading = self._road.at(driven)
         ahead = np.array([np.cos(heading), np.sin(heading)])
         left = np.array([-ahead[1], ahead[0]])
@@ -108,7 +108,7 @@ class _Road:
         self._y = self._step * np.cumsum(np.sin(self._heading))
 
     def at(self, along: float, left: float = 0.0) -> tuple[float, float, float]:
-        """Returns x, y (m) and heading (rad) at a distance driven, `left` of the middle."""
+        """Return x, y (m) and heading (rad) at a distance driven, `left` of the middle."""
         x, y, heading = (
             float(np.interp(along, self._along, line)) for line in (self._x, self._y, self._heading)
         )
@@ -116,11 +116,11 @@ class _Road:
 
 
 def _furnish(road: _Road, rng: np.random.Generator) -> Floats:
-    """Places all boxes: rows of x, y, heading, half length, half width, bottom, top."""
+    """Place all boxes: rows of x, y, heading, half length, half width, bottom, top."""
     boxes: list[list[float]] = []
 
     def place(along: float, left: float, size: tuple[float, float, float]) -> None:
-        """Puts a box of length, width and height on the ground, lengthways to the road."""
+        """Put a box of length, width and height on the ground, lengthways to the road."""
         x, y, heading = road.at(along, left)
         ground = float(_height(np.array([x, y])))
         length, width, height = size
@@ -145,7 +145,7 @@ def _furnish(road: _Road, rng: np.random.Generator) -> Floats:
 
 
 def _height(xy: Floats) -> Floats:
-    """Returns the ground's height, metres, at (..., 2) places."""
+    """Return the ground's height, metres, at (..., 2) places."""
     height, kx, ky, phase = _WAVES.T
     waves = np.sin(xy[..., :1] * kx + xy[..., 1:] * ky + phase)
     ground: Floats = waves @ height
@@ -153,15 +153,15 @@ def _height(xy: Floats) -> Floats:
 
 
 def _on_ground(xy: Floats) -> Floats:
-    """Lifts (2,) or (..., 2) places to the (..., 3) points of the ground there."""
+    """Lift (2,) or (..., 2) places to the (..., 3) points of the ground there."""
     return np.concatenate([xy, _height(xy)[..., None]], axis=-1)
 
 
 def _rays(eye: Floats) -> tuple[Floats, Floats]:
-    """Aims the beams of one turn of the scanner.
+    """Aim the beams of one turn of the scanner.
 
-    A downward beam is aimed at the very point of the ground that it hits, so nothing has to be
-    searched for. That the ground could hide a part of itself is left out.
+    A downward beam is aimed directly at the point of the ground that it hits, so no search is
+    necessary. The ground occludes no other part of the ground (a simplification).
 
     Returns:
         (columns, beams, 3) unit directions; (columns, beams) distances to the ground, metres,
@@ -185,7 +185,7 @@ def _rays(eye: Floats) -> tuple[Floats, Floats]:
 
 
 def _shorten(reach: Floats, rays: Floats, eye: Floats, box: Floats) -> None:
-    """Cuts the beams that a box is in the way of (slab test), in place."""
+    """Shorten the beams that a box blocks (slab test), in place."""
     x, y, heading, half_length, half_width, bottom, top = box
     turn = np.array([[np.cos(heading), np.sin(heading)], [-np.sin(heading), np.cos(heading)]])
     start = turn @ (eye[:2] - [x, y])
@@ -204,7 +204,7 @@ def _shorten(reach: Floats, rays: Floats, eye: Floats, box: Floats) -> None:
 
 
 def _columns_towards(turn: Floats, start: Floats, half: Floats) -> NDArray[np.intp]:
-    """Returns the columns of beams in whose directions a box lies, seen from outside it."""
+    """Return the columns of beams in whose directions a box lies, seen from outside it."""
     corners = (np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]]) * half - start) @ turn
     angles = np.arctan2(corners[:, 1], corners[:, 0])
     first = angles[0]

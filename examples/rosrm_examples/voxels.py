@@ -1,4 +1,4 @@
-"""Cubic voxels: packed integer keys, and tables that hold a row of numbers per voxel."""
+"""Cubic voxels: packed integer keys, and tables with a row of numbers per voxel."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ _MASK = (1 << _BITS) - 1
 
 
 def voxel_keys(points: Points, size: float) -> Keys:
-    """Packs the voxel of each point into one integer.
+    """Pack the voxel of each point into one integer.
 
     Args:
         points: (N, 3) metres, finite, within 2^20 voxels of the origin on each axis.
         size: Edge of a voxel, metres.
 
     Returns:
-        (N,) keys, equal exactly where the voxel is.
+        (N,) keys, equal exactly where the voxels are equal.
     """
     cell = np.floor(points / size).astype(np.int64) + _OFFSET
     keys: Keys = (cell[:, 0] << (2 * _BITS)) | (cell[:, 1] << _BITS) | cell[:, 2]
@@ -27,14 +27,14 @@ def voxel_keys(points: Points, size: float) -> Keys:
 
 
 def voxel_centres(keys: Keys, size: float) -> Floats:
-    """Returns the (N, 3) centres, metres, of voxels with an edge of `size` metres."""
+    """Return the (N, 3) centres, metres, of voxels with an edge of `size` metres."""
     cell = np.column_stack([keys >> (2 * _BITS), (keys >> _BITS) & _MASK, keys & _MASK])
     centres: Floats = (cell - _OFFSET + 0.5) * size
     return centres
 
 
 def sum_by_key(keys: Keys, features: Floats) -> tuple[Keys, Floats]:
-    """Adds up the (N, C) features of equal keys: (V,) sorted keys, (V, C) sums."""
+    """Add up the (N, C) features of equal keys: (V,) sorted keys, (V, C) sums."""
     if len(keys) == 0:
         return keys, features
     order = np.argsort(keys, kind="stable")
@@ -44,7 +44,7 @@ def sum_by_key(keys: Keys, features: Floats) -> tuple[Keys, Floats]:
 
 
 def thin(points: Points, size: float) -> Floats:
-    """Replaces the (N, 3) points of each voxel of `size` metres by their mean: (V, 3)."""
+    """Replace the (N, 3) points of each voxel of `size` metres by their mean: (V, 3)."""
     _, sums = sum_by_key(voxel_keys(points, size), _with_ones(points))
     return _means(sums)
 
@@ -58,19 +58,19 @@ class VoxelTable:
     """
 
     def __init__(self, width: int) -> None:
-        """Starts without a voxel."""
+        """Start with an empty table."""
         self.keys: Keys = np.empty(0, np.int64)
         self.rows: Floats = np.empty((0, width))
 
     def find(self, keys: Keys) -> Keys:
-        """Returns the (N,) row number of each key, -1 where the voxel is not there."""
+        """Return the (N,) row number of each key, -1 where there is no such voxel."""
         if len(self.keys) == 0:
             return np.full(len(keys), -1)
         at = np.minimum(np.searchsorted(self.keys, keys), len(self.keys) - 1)
         return np.where(self.keys[at] == keys, at, -1)
 
     def ensure(self, keys: Keys) -> Keys:
-        """Adds the voxels that are missing; returns the row number of each (sorted) key."""
+        """Add the missing voxels; return the row number of each (sorted) key."""
         missing = keys[self.find(keys) < 0]
         at = np.searchsorted(self.keys, missing)
         self.keys = np.insert(self.keys, at, missing)
@@ -82,22 +82,22 @@ class VoxelCloud:
     """A point cloud that grows scan by scan and keeps one point, the mean, per voxel."""
 
     def __init__(self, size: float) -> None:
-        """Starts empty, with voxels of `size` metres."""
+        """Start empty, with voxels of `size` metres."""
         self.size = size
         self.table = VoxelTable(4)  # count, sum of x, y, z
 
     def insert(self, points: Points) -> None:
-        """Adds (N, 3) points, metres."""
+        """Add (N, 3) points, metres."""
         keys, sums = sum_by_key(voxel_keys(points, self.size), _with_ones(points))
         at = self.table.ensure(keys)
         self.table.rows[at] += sums
 
     def points(self) -> Floats:
-        """Returns the (V, 3) means, metres."""
+        """Return the (V, 3) means, metres."""
         return _means(self.table.rows)
 
     def points_since(self, keys: Keys, rows: Floats) -> Floats:
-        """Returns the (W, 3) means, metres, of the points added since the table was this one.
+        """Return the (W, 3) means, metres, of the points added since an earlier state of the table.
 
         Args:
             keys: (V,) of the table then.
@@ -109,7 +109,7 @@ class VoxelCloud:
 
 
 def _means(rows: Floats) -> Floats:
-    """Divides rows of count, sum of x, y, z by their counts."""
+    """Divide rows of count, sum of x, y, z by their counts."""
     means: Floats = rows[:, 1:] / rows[:, :1]
     return means
 

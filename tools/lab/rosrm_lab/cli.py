@@ -101,9 +101,10 @@ def up(  # noqa: PLR0917 - typer calls it, by name
 
 @contextlib.contextmanager
 def _interrupts_noted() -> Iterator[Callable[[], None]]:
-    """Within, a Ctrl-C takes effect where that is asked for; afterwards it is too late for one.
+    """Defer Ctrl-C: it takes effect where the caller asks for it, and not at all after the block.
 
-    Else it could come where Python ignores it, and says a traceback: at a fork, in a finaliser.
+    Otherwise it could come at a fork or in a finaliser. Python ignores it there, and prints a
+    traceback.
     """
     asked: list[int] = []
 
@@ -117,7 +118,7 @@ def _interrupts_noted() -> Iterator[Callable[[], None]]:
     except BaseException as error:
         signal.signal(signal.SIGINT, before)
         if isinstance(error, LabError):
-            stop_if_asked()  # it has ended a command of ours
+            stop_if_asked()  # the signal has ended a child of this process
         raise
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
@@ -258,11 +259,11 @@ def down(
         typer.echo("no lab" if everything else f"no lab {name!r}: nothing to remove")
 
 
-# --- inner parts ------------------------------------------------------------------------------
+# --- helpers ----------------------------------------------------------------------------------
 
 
 def opened(name: str) -> Lab:
-    """A lab that a command works on."""
+    """Return the lab that a command works on."""
     from rosrm_lab import Lab
 
     _check_rights()
@@ -270,12 +271,12 @@ def opened(name: str) -> Lab:
 
 
 def planned(number: int, limits: dict[str, str], more: Sequence[str]) -> list[HostPlan]:
-    """The hosts that the options of `up` ask for; raises `ConfigError`.
+    """Return the hosts that the options of `up` define; raises `ConfigError`.
 
     Args:
-        number: of hosts alike.
+        number: of equal hosts.
         limits: theirs, as text, by resource.
-        more: further hosts, or other limits, as `--host` takes them.
+        more: further hosts, or other limits, in the format of `--host`.
     """
     from rosrm_lab.plan import MOST_HOSTS
 
@@ -289,7 +290,7 @@ def planned(number: int, limits: dict[str, str], more: Sequence[str]) -> list[Ho
 
 
 def fraction(text: str) -> float:
-    """`1%` or `0.01`; raises `ConfigError`."""
+    """Return the fraction for `1%` or `0.01`; raises `ConfigError`."""
     from rosrm_lab.wires import check_loss
 
     percent = text.endswith("%")
@@ -297,7 +298,7 @@ def fraction(text: str) -> float:
         value = float(text[:-1]) / 100.0 if percent else float(text)
     except ValueError:
         raise ConfigError(f"SHARE {text!r}: give percent (1%) or a fraction (0.01)") from None
-    if value >= 1.0 and not percent:  # who writes 1 may mean either
+    if value >= 1.0 and not percent:  # a plain 1 may mean 1% or all
         raise ConfigError(f"SHARE {text!r}: say {text}% or a fraction below 1; 100% is all")
     check_loss(value)
     return value
@@ -326,9 +327,9 @@ def _host(name: str, limits: dict[str, str]) -> HostPlan:
     return HostPlan(name, None if memory is None else int(memory), cpu, int(disk))
 
 
-#: A limit that is a whole number of these was given in powers of 1024, and is shown so.
+#: A limit that is a multiple of this was given in powers of 1024, and is shown so.
 _MIB = 2**20
-#: As `rosrm.extensions.units` calls what is measured.
+#: The kinds of quantities, by their names in `rosrm.extensions.units`.
 _MEASURES = {"memory": "size", "cpu": "cores", "disk": "size"}
 
 
@@ -339,7 +340,7 @@ def _limit(host: str, what: str, text: str) -> float | None:
 
 
 def _quantity(measures: str, text: str, where: str) -> float:
-    """A number with or without a unit; what a shell hands over is always text."""
+    """Return a number with or without a unit; a shell passes text in any case."""
     from rosrm.extensions.units import Quantity
 
     try:
@@ -373,7 +374,7 @@ def _say_link(name: str, host: str) -> None:
 
 
 def _network(name: str, host: str) -> str:
-    """Return the faults of a host's network in words; "": none."""
+    """Return the faults of a host's network as text; "": none."""
     (row,) = [row for row in opened(name).status() if row.name == host]
     return row.network
 

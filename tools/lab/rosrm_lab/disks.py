@@ -16,7 +16,7 @@ _FORMAT: Final = 60.0
 
 
 def make(image: Path, host: HostPlan) -> None:
-    """A sparse file with an ext4 file system: no journal, no reserve, ready at once.
+    """Make a sparse file with an ext4 file system: no journal, no reserve, ready at once.
 
     Raises:
         LabError: it could not be made.
@@ -35,9 +35,9 @@ def make(image: Path, host: HostPlan) -> None:
 
 
 def used(mount: Path) -> int | None:
-    """Bytes in use on a file system; None: it is gone."""
+    """Return the bytes in use on a file system; None: it is gone."""
     try:
         status = os.statvfs(mount)
-    except OSError:  # switched off this moment
+    except OSError:  # the host was switched off at this moment
         return None
     return (status.f_blocks - status.f_bfree) * status.f_frsize

@@ -1,8 +1,8 @@
 """The control groups of a lab, version 1 or 2.
 
 Each host has one group with three in it: `limited`, where its processes run within memory and CPU
-quota; `free`, for what shall be on the host without counting against them; and `own` for what the
-lab itself needs: the first process, and the relays. (Version 2 wants processes in leaves only.)
+quota; `free`, for processes on the host outside its limits; and `own` for the lab's own processes:
+the first process, and the relays. (Version 2 requires processes in leaves only.)
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ LEAVES: Final[tuple[Leaf, ...]] = ("limited", "free", "own")
 
 #: cpuacct: version 1 keeps the CPU time of a group there.
 _NEEDED: Final = ("memory", "cpu", "cpuacct")
-#: Seconds. Shorter than the kernel's 100 ms: a host that has used up its share stands still for
-#: a moment that ROS does not notice.
+#: Seconds. Shorter than the kernel's 100 ms: a host that has used up its share is paused so shortly
+#: that ROS does not notice.
 _PERIOD: Final = 0.02
 _LONG_PERIOD: Final = 0.1
-#: Below this the share of a short period is less than the least millisecond.
+#: Cores; below this the share of a short period is less than the least possible, a millisecond.
 _SHORT_ENOUGH: Final = 0.05
-#: A kernel without swap, or that does not count it, has none of these.
+#: Files that a kernel without swap, or without swap accounting, lacks.
 _ABOUT_SWAP: Final = ("memory.memsw.limit_in_bytes", "memory.swap.max")
-#: Seconds for killed processes to leave their group, and for the kernel to give up the group.
+#: Seconds for killed processes to leave their group, and for the kernel to release the group.
 _GONE: Final = 10.0
 _LOOK: Final = 0.01
-#: Of a path below a deleted group, and of one of its files that was still open.
+#: Errors for a path below a deleted group, and for one of its files that was still open.
 _GROUP_IS_GONE: Final = (errno.ENOENT, errno.ENODEV)
 _ATTEMPTS: Final = 5
 
@@ -49,7 +49,7 @@ class Hierarchy:
     Attributes:
         version: 1 or 2.
         mount: its top.
-        controllers: those of ours that it has.
+        controllers: those that a lab needs and it has.
     """
 
     version: int
@@ -58,21 +58,22 @@ class Hierarchy:
 
     @property
     def top(self) -> Path:
-        """The group of all labs."""
+        """Return the group of all labs."""
         return self.mount / PREFIX
 
     def group(self, lab: str, host: str, leaf: Leaf) -> Path:
-        """One of a host's two groups."""
+        """Return one of a host's groups."""
         return self.top / lab / host / leaf
 
 
 def find_hierarchies(root: Path = Path("/")) -> list[Hierarchy]:
-    """Where the controllers are that a lab needs.
+    """Return the hierarchies with the controllers that a lab needs.
 
     Args:
         root: of the file system, for recorded trees.
 
     Raises:
+        LabError: a controller is missing; the message names it.
         LabError: one is not there; the message says which.
     """
     found: dict[Path, Hierarchy] = {}
@@ -108,7 +109,7 @@ def make(hierarchies: Iterable[Hierarchy], lab: str, host: HostPlan) -> None:
 
 
 def limits(hierarchy: Hierarchy, host: HostPlan) -> Iterator[tuple[str, str]]:
-    """The control files that make a host's limits, in this order, and what to write there."""
+    """Yield the control files of a host's limits, in this order, with their content."""
     if "memory" in hierarchy.controllers and host.memory is not None:
         if hierarchy.version == 1:
             yield "memory.limit_in_bytes", str(host.memory)
@@ -127,23 +128,23 @@ def limits(hierarchy: Hierarchy, host: HostPlan) -> Iterator[tuple[str, str]]:
 
 
 def doors(hierarchies: Iterable[Hierarchy], lab: str, host: str, leaf: Leaf) -> list[Path]:
-    """The files through which a process enters one of a host's groups."""
+    """Return the files through which a process enters one of a host's groups."""
     return [h.group(lab, host, leaf) / "cgroup.procs" for h in hierarchies]
 
 
 def members(hierarchies: Iterable[Hierarchy], lab: str, host: str = "") -> set[int]:
-    """The processes in the groups of a host, or of all the lab's hosts."""
+    """Return the processes in the groups of a host, or of all the lab's hosts."""
     found: set[int] = set()
     for hierarchy in hierarchies:
         for door in (hierarchy.top / lab / host).rglob("cgroup.procs"):
             with contextlib.suppress(FileNotFoundError, OSError):
                 found.update(int(line) for line in door.read_text().split())
-    found.discard(0)  # from outside our own namespace of processes
+    found.discard(0)  # a process outside this PID namespace
     return found
 
 
 def processes(hierarchies: Iterable[Hierarchy], lab: str, host: str) -> set[int]:
-    """What was started on a host, without what the lab itself needs there."""
+    """Return the processes that were started on a host, without the lab's own ones."""
     known = list(hierarchies)
     return members(known, lab, f"{host}/limited") | members(known, lab, f"{host}/free")
 
@@ -152,7 +153,7 @@ def kill(hierarchies: Sequence[Hierarchy], lab: str, host: str = "") -> None:
     """End every process in the groups of a host or lab, and wait until they have gone.
 
     Raises:
-        LabError: some would not go.
+        LabError: some did not end.
     """
     deadline = time.monotonic() + _GONE
     while pids := members(hierarchies, lab, host):
@@ -171,7 +172,7 @@ def remove(hierarchies: Sequence[Hierarchy], lab: str) -> None:
     """End the processes of a lab and remove its groups.
 
     Raises:
-        LabError: a process or group would not go.
+        LabError: a process did not end, or a group could not be removed.
     """
     deadline = time.monotonic() + _GONE
     while True:
@@ -179,18 +180,18 @@ def remove(hierarchies: Sequence[Hierarchy], lab: str) -> None:
         left = [failure for h in hierarchies if (failure := _remove_tree(h.top / lab))]
         if not left:
             break
-        # The kernel gives a group up a moment after its last process has gone; and a process that
+        # The kernel releases a group a moment after its last process has gone; and a process that
         # was about to enter may have done so.
         if time.monotonic() > deadline:
             raise LabError(f"control groups cannot be removed: {'; '.join(left)}")
         time.sleep(_LOOK)
     for hierarchy in hierarchies:
-        with contextlib.suppress(OSError):  # other labs have theirs in it
+        with contextlib.suppress(OSError):  # other labs have groups in it
             hierarchy.top.rmdir()
 
 
 def labs(hierarchies: Iterable[Hierarchy]) -> set[str]:
-    """The labs that have groups."""
+    """Return the labs that have groups."""
     return {
         entry.name
         for hierarchy in hierarchies
@@ -201,7 +202,7 @@ def labs(hierarchies: Iterable[Hierarchy]) -> set[str]:
 
 
 def memory_used(hierarchies: Iterable[Hierarchy], lab: str, host: str) -> int | None:
-    """Bytes that a host's limited processes use, without cache that can be dropped at once."""
+    """Return the bytes that a host's limited processes use, without cache that can be dropped."""
     for hierarchy in hierarchies:
         if "memory" not in hierarchy.controllers:
             continue
@@ -213,10 +214,10 @@ def memory_used(hierarchies: Iterable[Hierarchy], lab: str, host: str) -> int | 
 
 
 def memory_left(hierarchies: Iterable[Hierarchy]) -> int | None:
-    """Bytes that all labs together may still use, where we are a container with a limit of its own.
+    """Return the bytes that all labs together may still use in a container with an own limit.
 
-    None: nothing but the machine's memory limits them. The group that the labs' groups are made in
-    is the container's; what is above it cannot be seen from here.
+    None: only the machine's memory limits them. The parent of the labs' groups is the container's
+    group; the groups above it are not visible here.
     """
     for hierarchy in hierarchies:
         if "memory" not in hierarchy.controllers:
@@ -231,11 +232,11 @@ def memory_left(hierarchies: Iterable[Hierarchy]) -> int | None:
     return None
 
 
-# --- inner parts ------------------------------------------------------------------------------
+# --- helpers ----------------------------------------------------------------------------------
 
 
 def _memory_used(hierarchy: Hierarchy, group: Path) -> int:
-    """Bytes that a group uses, without cache that can be dropped at once."""
+    """Return the bytes that a group uses, without cache that can be dropped at once."""
     name, key = (
         ("memory.usage_in_bytes", "total_inactive_file")
         if hierarchy.version == 1
@@ -247,7 +248,7 @@ def _memory_used(hierarchy: Hierarchy, group: Path) -> int:
 
 
 def _mounted(root: Path) -> Iterator[tuple[int, Path, frozenset[str]]]:
-    """Version, mount point and controllers of each hierarchy; version 1 first."""
+    """Yield version, mount point and controllers of each hierarchy; version 1 first."""
     found = []
     for line in (root / "proc/self/mountinfo").read_text().splitlines():
         before, _, after = line.partition(" - ")
@@ -266,7 +267,7 @@ def _mounted(root: Path) -> Iterator[tuple[int, Path, frozenset[str]]]:
 
 
 def _make_group(hierarchy: Hierarchy, group: Path) -> None:
-    """Make a group and those above it; in version 2 each hands our controllers on to the next."""
+    """Make a group and those above it; in version 2 each delegates the controllers to the next."""
     parts = group.relative_to(hierarchy.mount).parts
     for attempts_left in reversed(range(_ATTEMPTS)):
         above = hierarchy.mount
@@ -292,7 +293,7 @@ def _hand_on(group: Path, controllers: Sequence[str]) -> None:
 
 
 def _remove_tree(tree: Path) -> str:
-    """Remove groups, the deepest first; returns what hinders, or ""."""
+    """Remove groups, the deepest first; return the obstacle, or ""."""
     for folder, _, _ in os.walk(tree, topdown=False):
         try:
             Path(folder).rmdir()

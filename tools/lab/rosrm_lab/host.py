@@ -1,4 +1,4 @@
-"""A virtual host as processes: its first one, how others get in, and how all of them end."""
+"""A virtual host as processes: the first one, the entrance for others, and the end of all."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from rosrm_lab.needs import find_command
 from rosrm_lab.plan import HostPlan
 from rosrm_lab.store import Birth
 
-#: Where a host has its disk, as its processes see it.
+#: Mount point of a host's disk, as seen by its processes.
 DATA: Final = Path("/run/data")
 
 _INSIDE: Final = Path(__file__).parent / "inside"
@@ -32,12 +32,12 @@ _INSIDE: Final = Path(__file__).parent / "inside"
 _BOOT: Final = 30.0
 #: Seconds for a kernel to end the processes of a host.
 _END: Final = 10.0
-#: Enters control groups, then executes the rest: N FILE... COMMAND...
+#: Shell script that enters control groups, then executes the rest: N FILE... COMMAND...
 _ENTER: Final = (
     'n=$1; shift; while [ "$n" -gt 0 ]; do { echo 0 > "$1"; } 2>/dev/null || '
     '{ echo "rosrm: the host has gone" >&2; exit 125; }; shift; n=$((n - 1)); done; exec "$@"'
 )
-#: Would lead discovery to where the lab cannot reach, or make it deaf.
+#: Variables that would point discovery outside the lab, or disable it.
 _NOT_INHERITED: Final = (
     "ROS_LOCALHOST_ONLY",
     "ROS_STATIC_PEERS",
@@ -54,12 +54,12 @@ _NOT_INHERITED: Final = (
 
 @dataclass(frozen=True, slots=True)
 class Entrance:
-    """How to execute a command on a host.
+    """A command line that executes a command on a host.
 
     Attributes:
         command: the whole command line.
         environment: all variables.
-        descriptors: that it must inherit; whoever made this closes them.
+        descriptors: that it must inherit; the caller of `entrance` closes them.
     """
 
     command: list[str]
@@ -68,7 +68,7 @@ class Entrance:
 
 
 def boot(hierarchies: Sequence[Hierarchy], lab: str, host: HostPlan, hosts_file: str) -> Birth:
-    """Start the first process of a host, whose network and groups are there.
+    """Start the first process of a host, whose network and groups exist already.
 
     Raises:
         LabError: a namespace or mount could not be made.
@@ -90,7 +90,8 @@ def boot(hierarchies: Sequence[Hierarchy], lab: str, host: HostPlan, hosts_file:
         *(sys.executable, "-I", "-S", str(_INSIDE / "init.py"), json.dumps(settings)),
     ]
     with os.fdopen(reader, "rb", buffering=0) as ready:
-        # A session of its own: Ctrl-C while it boots is for us, who then remove everything.
+        # A session of its own, because a Ctrl-C during the boot is for this process, which then
+        # removes everything.
         launcher = subprocess.Popen(
             command,
             pass_fds=[writer],
@@ -123,13 +124,13 @@ def entrance(
     environment: Mapping[str, str] | None = None,
     directory: str | None = None,
 ) -> Entrance:
-    """How to execute a command on a host.
+    """Return the command line that executes a command on a host.
 
     Args:
         leaf: of the host's groups.
-        user: name of the user to be; "": stay who we are.
-        environment: variables on top of our own and those of the host.
-        directory: to start in; None: ours. Where the host has none such, its disk.
+        user: name of the user to run as; "": the user of this process.
+        environment: variables on top of this process's and those of the host.
+        directory: to start in; None: this process's. If the host lacks it, the host's disk.
 
     Raises:
         LabError: the host is off.
@@ -169,10 +170,10 @@ def entrance(
 
 
 def host_environment(base: Mapping[str, str], host: str) -> dict[str, str]:
-    """The variables of a process on a host.
+    """Return the variables of a process on a host.
 
     Args:
-        base: of whoever starts it; what it says of ROS discovery does not hold in a lab.
+        base: the caller's variables; those about ROS discovery are dropped, as invalid in a lab.
         host: its name.
     """
     environment = without_bootstrapper(base)
@@ -186,7 +187,7 @@ def host_environment(base: Mapping[str, str], host: str) -> dict[str, str]:
         TMPDIR=str(DATA / "tmp"),
         ROS_HOME=str(DATA / "ros"),
     )
-    environment.pop("ROS_LOG_DIR", None)  # below ROS_HOME
+    environment.pop("ROS_LOG_DIR", None)  # the default is below ROS_HOME
     return environment
 
 
@@ -194,22 +195,22 @@ def power_off(hierarchies: Sequence[Hierarchy], lab: str, host: str, birth: Birt
     """End all processes of a host at once; raises `LabError` where they do not end.
 
     Args:
-        birth: of its first process; None: not known.
+        birth: identity of its first process; None: not known.
     """
     if birth is not None and birth.alive:
         with contextlib.suppress(ProcessLookupError), _pid_descriptor(birth.pid) as descriptor:
-            if birth.alive:  # the descriptor is its, not a later process's
+            if birth.alive:  # now the descriptor cannot be a later process's
                 signal.pidfd_send_signal(descriptor, signal.SIGKILL)
-                # PID 1 of a namespace ends last: when it has, all of them have.
+                # PID 1 of a namespace ends last: all other processes have ended before.
                 if not _readable(descriptor, _END):
                     raise LabError(f"host {host} of lab {lab!r} did not end within {_END:g} s")
     groups.kill(hierarchies, lab, host)
 
 
 def _entering(hierarchies: Sequence[Hierarchy], lab: str, host: str) -> list[str]:
-    """Words before a command, by which it is one of the lab's own processes from the first on.
+    """Return a command prefix that puts the command into the lab's own control group first.
 
-    Whatever happens then, who removes the lab finds it; and it cannot begin after the removal.
+    So the removal of the lab finds the process in any case, and it cannot begin after the removal.
     """
     doors = [str(door) for door in groups.doors(hierarchies, lab, host, "own")]
     return ["/bin/sh", "-c", _ENTER, "rosrm-lab", str(len(doors)), *doors]
@@ -231,7 +232,7 @@ def _readable(descriptor: int, timeout: float) -> bool:
 
 
 def _until_ready(reader: int, deadline: float) -> list[str]:
-    """The lines that the first process says, until it is ready, has failed or takes too long."""
+    """Return the lines of the first process, until it is ready, has failed or takes too long."""
     said = b""
     while not (said.endswith(b"\n") and said.split(b"\n")[-2].startswith((b"ready", b"failed"))):
         if not _readable(reader, max(0.0, deadline - time.monotonic())):
@@ -244,7 +245,7 @@ def _until_ready(reader: int, deadline: float) -> list[str]:
 
 
 def _last_words(launcher: subprocess.Popen[bytes]) -> str:
-    """What the launcher printed; its first child lets go of its output when it is ready."""
+    """Return the launcher's output; its first child closes the output when it is ready."""
     try:
         output, _ = launcher.communicate(timeout=5.0)
     except subprocess.TimeoutExpired:
@@ -255,7 +256,7 @@ def _last_words(launcher: subprocess.Popen[bytes]) -> str:
 
 
 def _identity(user: str) -> tuple[list[str], dict[str, str]]:
-    """Options of setpriv, and variables, that make a process one of a user."""
+    """Return options of setpriv, and variables, that run a process as a user."""
     if not user:
         return [], {}
     import pwd  # noqa: PLC0415 - seldom needed
@@ -271,7 +272,7 @@ def _identity(user: str) -> tuple[list[str], dict[str, str]]:
 def _working_directory() -> str:
     try:
         return str(Path.cwd())
-    except FileNotFoundError:  # it was removed under us
+    except FileNotFoundError:  # the directory was removed
         return "/"
 
 

@@ -1,6 +1,6 @@
-"""`Lab`: several virtual hosts on this machine, made, used, disturbed and removed."""
+"""`Lab`: several virtual hosts on this machine: creation, use, faults and removal."""
 
-# pyroute2 takes longer to import than `exec` takes in all: only what changes the network has it.
+# pyroute2 takes longer to import than `exec` takes in all: only network changes import it.
 # ruff: noqa: PLC0415
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ class Lab:
             lab.exec("host1", ["hostname"])
             lab.cut("host2", "in")
 
-    A lab whose `with` block's process was killed counts as left behind: the next of its name
-    removes it first. One that is made by `up` stays until `down`.
+    A lab counts as abandoned when the process of its `with` block was killed: the next lab of its
+    name removes it first. A lab made by `up` stays until `down`.
 
     Args:
         name: of the lab.
-        hosts: to be made; for a lab that is up, none.
+        hosts: to be made; none for a lab that is up.
         subnet: IPv4 range of their addresses; None: a free one.
 
     Attributes:
@@ -69,16 +69,16 @@ class Lab:
     # --- begin and end ------------------------------------------------------------------------
 
     def up(self, *, owner: Birth | None = None, between: Callable[[], None] = lambda: None) -> None:
-        """Make the lab; what a killed attempt left is removed first.
+        """Make the lab; the remains of a killed attempt are removed first.
 
         Args:
-            owner: the process whose end makes it one that was left behind.
-            between: called before each host and after the last; what it raises takes back what was
-                made.
+            owner: the process whose end makes the lab an abandoned one.
+            between: called before each host and after the last; its exception undoes everything
+                made so far.
 
         Raises:
             LabError: it is up already, or something is missing on this machine; nothing is left.
-            ConfigError: the hosts or the subnet cannot be.
+            ConfigError: the hosts or the subnet are impossible.
         """
         from rosrm_lab import making
 
@@ -86,7 +86,7 @@ class Lab:
         with making.explained(self.name), store.lock(self.name):
             making.refuse_if_up(self.name)
             making.remove(self._hierarchies, self.name)
-            # Not before: what a killed attempt left takes memory and room on the disk.
+            # Not before, because the remains of a killed attempt take memory and disk space.
             needs.check_machine(self._hosts, store.IMAGES, self._hierarchies)
             try:
                 with store.lock(""):  # two labs at once must not choose the same addresses
@@ -100,10 +100,10 @@ class Lab:
                 raise
 
     def down(self) -> bool:
-        """Remove the lab: end its processes, delete its disks. False: there was nothing of it.
+        """Remove the lab: end its processes, delete its disks. False: there was nothing to remove.
 
         Raises:
-            LabError: something could not be removed; repeating it goes on.
+            LabError: something could not be removed; a second call continues.
         """
         from rosrm_lab import making
 
@@ -112,7 +112,7 @@ class Lab:
             return making.remove(self._hierarchies, self.name)
 
     def __enter__(self) -> Self:
-        """Make the lab; it ends with this process at the latest when the next one is made."""
+        """Make the lab; it counts as abandoned when this process has ended."""
         self.up(owner=Birth.of(os.getpid()))
         return self
 
@@ -124,32 +124,32 @@ class Lab:
     ) -> None:
         _to_the_end(self.down)
 
-    # --- looking ------------------------------------------------------------------------------
+    # --- queries ------------------------------------------------------------------------------
 
     @property
     def plan(self) -> LabPlan:
-        """What the lab consists of; raises `LabError` where it is not up."""
+        """Return the plan of the lab; raises `LabError` where it is not up."""
         return self._record().plan
 
     def address(self, host: str) -> str:
-        """A host's IPv4 address in the lab."""
+        """Return a host's IPv4 address in the lab."""
         return str(self.plan.address(host))
 
     def is_up(self, host: str) -> bool:
-        """Whether a host is switched on."""
+        """Return True if a host is switched on."""
         record = self._record()
         return record.is_up(record.plan.host(host).name)
 
     def status(self) -> list[HostStatus]:
-        """How each host is."""
+        """Return the status of each host."""
         record = self._record()
         return [host_status(self._hierarchies, record, host) for host in record.plan.hosts]
 
     def outside(self, host: str, path: str | Path) -> Path:
-        """A file of a host, as this machine reaches it while the host is up.
+        """Return the path on this machine of a host's file, valid while the host is up.
 
         Args:
-            path: as the host has it; a relative one is on its disk.
+            path: as seen by the host; a relative one is on its disk.
         """
         record = self._record()
         if not record.is_up(record.plan.host(host).name):
@@ -157,14 +157,14 @@ class Lab:
         return record.outside(host, DATA / path)
 
     def group(self, host: str) -> str:
-        """The control group with a host's limits, as the option `group` of a probe wants it."""
+        """Return the control group with a host's limits, for the option `group` of a probe."""
         self.plan.host(host)
         hierarchy = self._hierarchies[0]
         limited = hierarchy.group(self.name, host, "limited")
         return f"/{limited.relative_to(hierarchy.mount)}"
 
     def pids(self, host: str) -> set[int]:
-        """What was started on a host, by its numbers on this machine."""
+        """Return the pids on this machine of the processes that were started on a host."""
         self.plan.host(host)
         return groups.processes(self._hierarchies, self.name, host)
 
@@ -186,12 +186,12 @@ class Lab:
     ) -> subprocess.Popen[bytes]:
         """Start a command on a host; the other arguments are those of `subprocess.Popen`.
 
-        What is returned stands for it: signals reach the command, its exit status is the
-        command's, and killing the one kills the other.
+        The returned process is a relay: signals reach the command, its exit status is the
+        command's, and killing it kills the command.
 
         Args:
             limited: it counts against the host's memory and CPU; False: it is on the host, but
-                beside its limits.
+                outside its limits.
             user: to run as; "": as this process.
             env: variables on top of this process's and the host's.
             cwd: directory to start in; None: this process's.
@@ -231,10 +231,10 @@ class Lab:
         timeout: float = 60.0,
         check: bool = True,
     ) -> subprocess.CompletedProcess[str]:
-        """Run a command on a host to its end, and return what it said.
+        """Run a command on a host to its end, and return its output.
 
         Args:
-            input: what it reads.
+            input: for its standard input.
             timeout: seconds, after which it is killed and `subprocess.TimeoutExpired` raised.
             check: raise `LabError` where it fails.
         """
@@ -263,14 +263,14 @@ class Lab:
         return subprocess.CompletedProcess(list(command), process.returncode, said, troubles)
 
     def supervise(self, host: str, state: str, timeout: float = 60.0) -> None:
-        """Start a supervisor within a host's limits, for a slave that will be beside them.
+        """Start a supervisor within a host's limits, for a slave outside of them.
 
-        Processes are children of the supervisor, so they are within the limits too; a slave that
-        is started with this state directory finds the supervisor there.
+        Processes are children of the supervisor, so they are within the limits too; a slave that is
+        started with this state directory finds the supervisor there.
 
         Args:
-            state: directory of the slave, as the host has it.
-            timeout: seconds for it to start, as `exec` has it.
+            state: directory of the slave, as seen by the host.
+            timeout: seconds for it to start, as for `exec`.
         """
         command = [sys.executable, "-m", "rosrm.supervisor", "--state", f"{state}/supervisor"]
         self.exec(host, command, timeout=timeout)
@@ -278,16 +278,16 @@ class Lab:
     def become(
         self, host: str, command: Sequence[str], *, user: str = "", env: Mapping[str, str]
     ) -> None:
-        """Put a command on a host in this process's place; returns only by raising."""
+        """Replace this process by a command on a host; returns only by raising."""
         way = entrance(self._hierarchies, self._record(), host, command, user=user, environment=env)
         for descriptor in way.descriptors:
             os.set_inheritable(descriptor, True)
         os.execve(way.command[0], way.command, way.environment)  # noqa: S606 - no shell is wanted
 
-    # --- disturbing ---------------------------------------------------------------------------
+    # --- faults -------------------------------------------------------------------------------
 
     def cut(self, host: str, direction: Direction = "both") -> None:
-        """Let nothing pass to the host ("in"), from it ("out"), or both."""
+        """Drop all packets to the host ("in"), from it ("out"), or both."""
         self._change_link(host, direction, cut=True)
 
     def loss(self, host: str, fraction: float, direction: Direction = "both") -> None:
@@ -296,10 +296,10 @@ class Lab:
         self._change_link(host, direction, loss=fraction)
 
     def delay(self, host: str, seconds: float, direction: Direction = "both") -> None:
-        """Let each packet to and from a host be late; 0 ends it.
+        """Delay each packet to and from a host, seconds; 0 ends it.
 
         Raises:
-            LabError: this kernel cannot delay; nothing was changed.
+            LabError: this kernel has no netem; nothing was changed.
         """
         check_delay(seconds)
         self._change_link(host, direction, delay=seconds)
@@ -309,7 +309,7 @@ class Lab:
         self._change_link(host, "both", cut=False, loss=0.0, delay=0.0)
 
     def kill(self, host: str) -> None:
-        """Cut a host's power: all its processes end at once, and the network hears no farewell.
+        """Cut a host's power: all its processes end at once, and send nothing more.
 
         Its disk keeps what was written; memory, /run and /dev/shm are lost. `boot` ends it.
         """
@@ -321,7 +321,7 @@ class Lab:
             store.write(record)
 
     def boot(self, host: str) -> None:
-        """Switch a host on again after `kill`; nothing runs there yet. Raises `LabError`."""
+        """Switch a host on again after `kill`; no process runs there yet. Raises `LabError`."""
         from rosrm_lab import making
 
         with making.explained(self.name), store.lock(self.name):
@@ -331,7 +331,7 @@ class Lab:
             making.switch_on(self._hierarchies, record, host)
             store.write(record)
 
-    # --- inner parts --------------------------------------------------------------------------
+    # --- helpers ------------------------------------------------------------------------------
 
     @property
     def _hierarchies(self) -> list[groups.Hierarchy]:
@@ -370,7 +370,7 @@ class Lab:
 
 
 def _to_the_end(remove: Callable[[], object]) -> None:
-    """Remove a lab; a signal that raises in the midst of it is passed on when nothing is left."""
+    """Remove a lab completely; a signal's exception is raised again when nothing is left."""
     try:
         remove()
     except BaseException:
@@ -379,7 +379,7 @@ def _to_the_end(remove: Callable[[], object]) -> None:
 
 
 def all_labs() -> Iterator[Lab]:
-    """Every lab of which there is something on this machine, killed attempts too."""
+    """Yield every lab with remains on this machine, killed attempts too."""
     from rosrm_lab import network
 
     found = store.labs() | groups.labs(groups.find_hierarchies())
@@ -392,5 +392,5 @@ def all_labs() -> Iterator[Lab]:
     for name in sorted(found):
         try:
             yield Lab(name)
-        except ConfigError:  # a folder that somebody else put there
+        except ConfigError:  # a folder that is not of a lab
             continue

@@ -1,4 +1,4 @@
-"""Makes a lab, switches its hosts on and off, changes their network, and removes all of it."""
+"""Creation of a lab, power and network of its hosts, and removal of everything."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from rosrm_lab.wires import Link
 
 @contextlib.contextmanager
 def explained(lab: str) -> Iterator[None]:
-    """Turn what this machine refuses, a file, a program or a process, into a `LabError`.
+    """Turn an error of this machine (a file, a program or a process) into a `LabError`.
 
     Args:
-        lab: on which somebody is at work.
+        lab: that is being changed.
     """
     try:
         yield
@@ -33,7 +33,7 @@ def explained(lab: str) -> Iterator[None]:
 
 
 def refuse_if_up(lab: str) -> None:
-    """Raise `LabError` where a lab of this name is up, and nobody has left it behind."""
+    """Raise `LabError` where a lab of this name is up, and not abandoned."""
     record = store.read(lab)
     if record is None or not record.complete or record.boot != store.boot_id():
         return
@@ -46,13 +46,13 @@ def refuse_if_up(lab: str) -> None:
 
 
 def choose_subnet(wanted: IPv4Network | None) -> IPv4Network:
-    """The addresses of a new lab.
+    """Return the address range of a new lab.
 
     Args:
-        wanted: None: any that are free.
+        wanted: None: any free range.
 
     Raises:
-        ConfigError: they are in use.
+        ConfigError: the range is in use.
     """
     labs = [(one, store.read(one)) for one in store.labs()]
     taken = [
@@ -66,7 +66,7 @@ def choose_subnet(wanted: IPv4Network | None) -> IPv4Network:
 
 
 def make(hierarchies: Sequence[Hierarchy], record: Record, between: Callable[[], None]) -> None:
-    """Make all that a lab's record says, and mark it as complete; raises `LabError`.
+    """Make everything in a lab's record, and mark it as complete; raises `LabError`.
 
     Args:
         between: called before each host and after the last, and may raise.
@@ -86,14 +86,14 @@ def make(hierarchies: Sequence[Hierarchy], record: Record, between: Callable[[],
 
 def switch_on(hierarchies: Sequence[Hierarchy], record: Record, host: str) -> None:
     """Connect a host and start its first process; raises `LabError`."""
-    switch_off(hierarchies, record, host)  # what an earlier life left, if it was killed in part
+    switch_off(hierarchies, record, host)  # remains of an earlier, partly killed run of the host
     plan = record.plan
     network.plug_in(plan, host, record.links[host])
     record.inits[host] = boot(hierarchies, plan.name, plan.host(host), plan.hosts_file())
 
 
 def switch_off(hierarchies: Sequence[Hierarchy], record: Record, host: str) -> None:
-    """Cut a host's power: first nobody hears it any more, then its processes end."""
+    """Cut a host's power: first remove its network, then end its processes."""
     plan = record.plan
     network.unplug(plan, host)
     power_off(hierarchies, plan.name, host, record.inits.pop(host, None))
@@ -102,7 +102,7 @@ def switch_off(hierarchies: Sequence[Hierarchy], record: Record, host: str) -> N
 
 
 def change_link(record: Record, host: str, before: Link, after: Link) -> None:
-    """Make a host's network as bad as it is to be: all of it, or nothing; raises `LabError`."""
+    """Apply the faults of a host's network: all of them, or none; raises `LabError`."""
     if record.is_up(host):
         network.set_delays(record.plan, host, before, after)
     elif after.delays and after != before:
@@ -117,15 +117,15 @@ def change_link(record: Record, host: str, before: Link, after: Link) -> None:
 
 
 def remove(hierarchies: Sequence[Hierarchy], lab: str) -> bool:
-    """Remove all there is of a lab, whatever is known of it; False: there was nothing.
+    """Remove all parts of a lab, with or without a record; False: there were none.
 
     Raises:
-        LabError: something does not go; repeating it goes on.
+        LabError: a part could not be removed; a second call continues.
     """
     namespaces = list(namespaces_of(lab, network.existing()))
     if not namespaces and lab not in store.labs() | groups.labs(hierarchies):
         return False
-    # The groups hold every process of the lab: first ones, and all that were started there.
+    # The groups hold every process of the lab: first processes, and all that were started there.
     groups.remove(hierarchies, lab)
     network.remove(namespaces)
     store.forget(lab)

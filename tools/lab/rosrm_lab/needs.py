@@ -1,4 +1,4 @@
-"""What a lab needs of this machine, and what to say where it is missing."""
+"""Requirements of a lab on this machine, and the advice where one is missing."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rosrm.errors import LabError
 from rosrm_lab import groups
 from rosrm_lab.plan import MIB, HostPlan, total
 
-#: Bits of the capabilities (linux/capability.h), and what they are needed for.
+#: Bits of the capabilities (linux/capability.h), and the purpose of each.
 CAPABILITIES: Final = {
     "CAP_DAC_OVERRIDE": (1, "to keep the lab's files"),
     "CAP_KILL": (5, "to end the processes of a host"),
@@ -24,7 +24,7 @@ CAPABILITIES: Final = {
     "CAP_SYS_CHROOT": (18, "to enter a host"),
     "CAP_SYS_ADMIN": (21, "for namespaces, mounts and control groups"),
 }
-#: Programs, and the Debian package that brings each.
+#: Programs, and the Debian package of each.
 COMMANDS: Final = {
     "mkfs.ext4": "e2fsprogs",
     "mount": "mount",
@@ -33,11 +33,11 @@ COMMANDS: Final = {
     "setpriv": "util-linux",
     "unshare": "util-linux",
 }
-#: `nft` is asked for when a network is changed.
+#: `nft` is only required when a network is changed.
 FROM_THE_START: Final = ("mkfs.ext4", "mount", "nsenter", "setpriv", "unshare")
-#: Makes loop devices, which disks are mounted with.
+#: Makes loop devices, with which disks are mounted.
 _DEVICE: Final = Path("/dev/loop-control")
-#: Where they are although an ordinary user's PATH, or sudo's, may not say so.
+#: Their folders, because the PATH of an ordinary user, or of sudo, may lack some.
 _PLACES: Final = "/usr/local/sbin:/usr/sbin:/sbin:/usr/local/bin:/usr/bin:/bin"
 
 WITHOUT_ROOT: Final = (
@@ -51,7 +51,7 @@ WITHOUT_ROOT: Final = (
 
 
 def find_command(name: str) -> str:
-    """The path of a program; raises `LabError` with the package that brings it."""
+    """Return the path of a program; raises `LabError` with the package that contains it."""
     found = shutil.which(name, path=f"{os.environ.get('PATH', '')}:{_PLACES}")
     if found is None:
         raise LabError(
@@ -62,16 +62,16 @@ def find_command(name: str) -> str:
 
 
 def check_commands(names: Iterable[str] = tuple(COMMANDS)) -> None:
-    """Raise `LabError` where a program is missing, by default one of all that a lab may need."""
+    """Raise `LabError` where a program is missing; default: any that a lab may need."""
     for name in names:
         find_command(name)
 
 
 def check_rights(hosts: Sequence[HostPlan] = (), status: str | None = None) -> None:
-    """Raise `LabError` where a capability is missing; it says which, and what goes without.
+    """Raise `LabError` where a capability is missing; the text also shows a way without it.
 
     Args:
-        hosts: that were asked for: the way without root is shown for the first.
+        hosts: of the lab: the way without root is shown for the first.
         status: content of /proc/self/status.
     """
     text = status if status is not None else Path("/proc/self/status").read_text()
@@ -93,9 +93,9 @@ def check_machine(
     """Raise `LabError` where a program, a device, memory or disk space is missing.
 
     Args:
-        hosts: that are asked for.
-        images: the directory that will hold their disks.
-        hierarchies: where their groups will be: a container may have a limit of its own there.
+        hosts: of the lab.
+        images: the directory for their disks.
+        hierarchies: of their groups: a container may have a limit of its own there.
     """
     check_commands(FROM_THE_START)
     if not _DEVICE.exists():
@@ -108,7 +108,7 @@ def check_machine(
 
 
 def overbooked(hosts: Sequence[HostPlan]) -> str:
-    """A warning where the hosts may use more cores together than there are; else ""."""
+    """Return a warning where the hosts may use more cores together than there are; else ""."""
     cores, wanted = psutil.cpu_count() or 1, total(host.cpu for host in hosts)
     if wanted <= cores:
         return ""

@@ -1,6 +1,6 @@
 """The network of a lab: a bridge in a namespace of its own, and a cable from it to each host.
 
-The bridge has no address, and nothing else hangs on it: nothing a host sends gets out of the lab.
+The bridge has no address and no other link, so that no packet of a host leaves the lab.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
 _BRIDGE: Final = "bridge"
-#: How a host calls its one interface.
+#: Name of a host's one interface, in the host.
 INTERFACE: Final = "eth0"
 _MAIN_TABLE: Final = 254
-#: TC_H_ROOT: pyroute2's own `root=True` asks for a handle too, which a deletion must not have.
+#: TC_H_ROOT: pyroute2's own `root=True` also requires a handle, which a deletion must not have.
 _ROOT: Final = 0xFFFFFFFF
 _IPV4: Final = 2
 
 
 @contextlib.contextmanager
 def _explained(what: str) -> Iterator[None]:
-    """Turn what the kernel refuses, or a container's rules do, into a `LabError`.
+    """Turn an error of the kernel, or of a container's rules, into a `LabError`.
 
     Args:
-        what: cannot be done then.
+        what: the failed action, for the message.
     """
     try:
         yield
@@ -51,19 +51,19 @@ def _explained(what: str) -> Iterator[None]:
 
 @_explained("the network namespaces of this machine cannot be listed")
 def existing() -> list[str]:
-    """All named network namespaces of this machine."""
+    """Return all named network namespaces of this machine."""
     return list(netns.listnetns())
 
 
 @_explained("the address ranges of this machine cannot be read")
 def ranges_in_use() -> list[tuple[IPv4Network, str]]:
-    """The address ranges that this machine reaches directly or by a route, and how."""
+    """Return the address ranges that this machine reaches directly or by a route, with the link."""
     found = []
     with IPRoute() as machine:
         interfaces = {link["index"]: link.get("ifname") for link in machine.get_links()}
         for route in machine.get_routes(family=_IPV4, table=_MAIN_TABLE):
             target = route.get("dst")
-            if target:  # the default route is nobody's range
+            if target:  # the default route has no range
                 owner = interfaces.get(route.get("oif"), "a route of this machine")
                 found.append((IPv4Network(f"{target}/{route['dst_len']}"), f"{owner}"))
     return found
@@ -75,7 +75,7 @@ def make_switch(lab: LabPlan) -> None:
     name = names.switch_namespace(lab.name)
     netns.create(name)
     with _inside(name) as switch:
-        # Without a querier in the lab, snooping would forget who listens to multicast.
+        # The lab has no querier, so that snooping would forget the receivers of multicast.
         switch.link("add", ifname=_BRIDGE, kind="bridge", br_mcast_snooping=0, br_stp_state=0)
         switch.link("set", index=_index(switch, _BRIDGE), state="up")
 
@@ -85,7 +85,7 @@ def plug_in(lab: LabPlan, host: str, link: Link) -> None:
     """Make a host's namespace, and the cable to the switch.
 
     Args:
-        link: what is wrong with the cable from the beginning.
+        link: faults of the cable from the beginning.
     """
     name, port = names.host_namespace(lab.name, host), lab.port(host)
     netns.create(name)
@@ -109,7 +109,7 @@ def plug_in(lab: LabPlan, host: str, link: Link) -> None:
 
 @_explained("a host cannot be taken off the bridge")
 def unplug(lab: LabPlan, host: str) -> None:
-    """Take a host's cable away; nothing that its dying processes send is heard any more."""
+    """Remove a host's cable, so that packets of its dying processes reach no other host."""
     if names.switch_namespace(lab.name) not in existing():
         return
     with _inside(names.switch_namespace(lab.name)) as switch:
@@ -119,14 +119,14 @@ def unplug(lab: LabPlan, host: str) -> None:
 
 @_explained("a network namespace cannot be removed")
 def remove(namespaces: Iterable[str]) -> None:
-    """Remove namespaces with all that is in them."""
+    """Remove namespaces with their content."""
     for name in namespaces:
         with contextlib.suppress(FileNotFoundError):
             netns.remove(name)
 
 
 def set_rules(lab: LabPlan, links: Mapping[str, Link]) -> None:
-    """Put cuts and losses in force, all at once.
+    """Apply cuts and losses, all at once.
 
     Args:
         links: by host.
@@ -148,7 +148,7 @@ def set_rules(lab: LabPlan, links: Mapping[str, Link]) -> None:
 
 @_explained("the packets of a host cannot be delayed")
 def set_delays(lab: LabPlan, host: str, before: Link, after: Link) -> None:
-    """Delay what goes to and from a host.
+    """Delay the packets to and from a host.
 
     Raises:
         LabError: the kernel has no netem; nothing was changed.
@@ -170,7 +170,7 @@ def _set_delay(name: str, interface: str, wire: Wire) -> None:
         index = _index(namespace, interface)
         try:
             if wire.delay:
-                # limit: packets on their way; netem drops what is more than that.
+                # limit: packets in transit; netem drops more than that.
                 namespace.tc(
                     "replace", "netem", index=index, delay=round(wire.delay * 1e6), limit=100_000
                 )
@@ -187,7 +187,7 @@ def _set_delay(name: str, interface: str, wire: Wire) -> None:
 
 
 def _reason(error: Exception) -> str:
-    """In words: both kinds of errors carry a number and a text."""
+    """Return the text of an error; both kinds of errors carry a number and a text."""
     number = error.args[0] if error.args else None
     if len(error.args) < 2 or not isinstance(number, int):
         return str(error)
@@ -196,7 +196,7 @@ def _reason(error: Exception) -> str:
 
 @contextlib.contextmanager
 def _inside(name: str) -> Iterator[Any]:
-    """A netlink connection within a namespace."""
+    """Open a netlink connection within a namespace."""
     with IPRoute(netns=name) as connection:
         yield connection
 

@@ -1,4 +1,4 @@
-"""What a lab consists of: its hosts, their sizes, addresses and names. Pure: makes nothing."""
+"""Plan of a lab: its hosts, their sizes, addresses and names. Pure: makes nothing."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from rosrm.errors import ConfigError
 MIB: Final = 2**20
 GIB: Final = 2**30
 
-#: A Python program with ROS needs several times as much; below this not even a shell is sure.
+#: Bytes; with less, not even a shell is sure to run. A ROS program in Python needs a multiple.
 LEAST_MEMORY: Final = 16 * MIB
-#: The kernel gives out CPU time by the millisecond, in periods of 100 ms at most.
+#: Cores; the kernel grants CPU time by the millisecond, in periods of 100 ms at most.
 LEAST_CPU: Final = 0.01
-#: Below this ext4 leaves hardly any room for files.
+#: Bytes; with less, ext4 leaves hardly any room for files.
 LEAST_DISK: Final = 16 * MIB
 MOST_HOSTS: Final = 250
 DEFAULT_DISK: Final = GIB
 
-#: Labs take their addresses from here, one /24 each.
+#: Range of the labs' addresses, one /24 each.
 POOL: Final = IPv4Network("10.213.0.0/16")
 _POOL_PREFIX: Final = 24
 
-#: No host can have an address of these.
+#: Ranges that no host can have an address of.
 _UNUSABLE: Final = {
     IPv4Network("0.0.0.0/8"): "this network itself",
     IPv4Network("127.0.0.0/8"): "loopback, which never leaves a host",
@@ -35,7 +35,7 @@ _UNUSABLE: Final = {
     IPv4Network("240.0.0.0/4"): "reserved, and broadcast",
 }
 
-#: What a host name may be; interface names, namespaces and control groups are made of them.
+#: Pattern of host names; interface names, namespaces and control groups contain them.
 _NAME: Final = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9-]{0,30}[A-Za-z0-9])?")
 
 
@@ -56,7 +56,7 @@ class HostPlan:
     disk: int = DEFAULT_DISK
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be made; raises `ConfigError`."""
+        """Refuse an impossible host; raises `ConfigError`."""
         check_name(self.name, "host")
         _check_least(self, "memory", self.memory, LEAST_MEMORY, "16MiB")
         _check_least(self, "cpu", self.cpu, LEAST_CPU, "0.01 cores")
@@ -68,7 +68,7 @@ class LabPlan:
     """A lab: hosts in one network of their own.
 
     Attributes:
-        name: several labs with different names live side by side.
+        name: several labs with different names can exist side by side.
         hosts: in the order of their addresses.
         subnet: of their addresses.
     """
@@ -78,7 +78,7 @@ class LabPlan:
     subnet: IPv4Network
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be made; raises `ConfigError`."""
+        """Refuse an impossible lab; raises `ConfigError`."""
         check_name(self.name, "lab")
         if not 1 <= len(self.hosts) <= MOST_HOSTS:
             raise ConfigError(
@@ -96,11 +96,11 @@ class LabPlan:
 
     @property
     def names(self) -> list[str]:
-        """The hosts' names."""
+        """Return the hosts' names."""
         return [host.name for host in self.hosts]
 
     def host(self, name: str) -> HostPlan:
-        """One host by its name; raises `ConfigError` where there is none."""
+        """Return a host by its name; raises `ConfigError` where there is none."""
         for host in self.hosts:
             if host.name == name:
                 return host
@@ -109,30 +109,30 @@ class LabPlan:
         )
 
     def number(self, name: str) -> int:
-        """Of a host, from 1 on."""
+        """Return the number of a host, from 1 on."""
         return self.names.index(self.host(name).name) + 1
 
     def address(self, name: str) -> IPv4Address:
-        """Of a host on the lab's network."""
+        """Return the address of a host on the lab's network."""
         return self.subnet.network_address + self.number(name)
 
     def mac(self, name: str) -> str:
-        """A host's hardware address; it stays when the host is booted again."""
+        """Return a host's hardware address; it stays when the host is booted again."""
         low = int(self.address(name)).to_bytes(4, "big")
         return "02:00:" + ":".join(f"{byte:02x}" for byte in low)
 
     def port(self, name: str) -> str:
-        """The interface of the switch that a host hangs on."""
+        """Return the interface of the switch to which a host is connected."""
         return f"port{self.number(name)}"
 
     def hosts_file(self) -> str:
-        """What each host's /etc/hosts says."""
+        """Return the content of each host's /etc/hosts."""
         lines = ["127.0.0.1 localhost", "::1 localhost"]
         lines += [f"{self.address(name)} {name}" for name in self.names]
         return "\n".join(lines) + "\n"
 
     def to_plain(self) -> dict[str, Any]:
-        """For the lab's state file."""
+        """Return the content of the lab's state file."""
         return {
             "name": self.name,
             "subnet": str(self.subnet),
@@ -141,7 +141,7 @@ class LabPlan:
 
     @classmethod
     def from_plain(cls, plain: Mapping[str, Any]) -> LabPlan:
-        """What `to_plain` made."""
+        """Build a plan from the result of `to_plain`."""
         hosts = tuple(HostPlan(*fields) for fields in plain["hosts"])
         return cls(plain["name"], hosts, IPv4Network(plain["subnet"]))
 
@@ -149,7 +149,7 @@ class LabPlan:
 def uniform(
     number: int, *, memory: int | None = None, cpu: float | None = None, disk: int = DEFAULT_DISK
 ) -> list[HostPlan]:
-    """Hosts alike: host1, host2, ..., in the units of `HostPlan`."""
+    """Return equal hosts: host1, host2, ..., in the units of `HostPlan`."""
     if not 1 <= number <= MOST_HOSTS:
         raise ConfigError(f"{number} hosts; allowed are 1 to {MOST_HOSTS}")
     return [HostPlan(f"host{i}", memory, cpu, disk) for i in range(1, number + 1)]
@@ -165,7 +165,7 @@ def check_name(name: str, what: str) -> None:
 
 
 def parse_subnet(text: str) -> IPv4Network:
-    """A subnet such as 10.9.0.0/24; raises `ConfigError`."""
+    """Return a subnet such as 10.9.0.0/24; raises `ConfigError`."""
     try:
         return IPv4Network(text)
     except ValueError as error:
@@ -185,10 +185,10 @@ def check_usable(subnet: IPv4Network) -> None:
 
 
 def free_subnet(taken: Sequence[IPv4Network]) -> IPv4Network:
-    """The first of the pool that overlaps with nothing; raises `ConfigError` when all are taken.
+    """Return the first subnet of the pool that is free; raises `ConfigError` when all are taken.
 
     Args:
-        taken: what this machine and other labs use.
+        taken: ranges in use by this machine and other labs.
     """
     for subnet in POOL.subnets(new_prefix=_POOL_PREFIX):
         if not any(subnet.overlaps(other) for other in taken):
@@ -200,8 +200,8 @@ def check_free(subnet: IPv4Network, taken: Iterable[tuple[IPv4Network, str]]) ->
     """Raise `ConfigError` for a subnet that is in use.
 
     Args:
-        subnet: that was asked for.
-        taken: ranges, and who has them.
+        subnet: to be used.
+        taken: ranges, each with its owner.
     """
     for other, owner in taken:
         if subnet.overlaps(other):
@@ -212,7 +212,7 @@ def check_free(subnet: IPv4Network, taken: Iterable[tuple[IPv4Network, str]]) ->
 
 
 def total(amounts: Iterable[float | None]) -> float:
-    """The sum of what is limited."""
+    """Return the sum of the limits that are set."""
     return sum(amount for amount in amounts if amount is not None)
 
 
@@ -223,29 +223,29 @@ def _check_least(host: HostPlan, what: str, amount: float | None, least: float, 
 
 # --- names on the machine ---------------------------------------------------------------------
 
-#: Namespaces and control groups of all labs begin with this.
+#: Prefix of the namespaces and control groups of all labs.
 PREFIX: Final = "rosrm-lab"
-#: Where ip and pyroute2 keep network namespaces that have names.
+#: Folder in which ip and pyroute2 keep named network namespaces.
 _NAMESPACES: Final = Path("/run/netns")
 
 
 def switch_namespace(lab: str) -> str:
-    """The network namespace with the bridge between a lab's hosts."""
+    """Return the name of the network namespace with the bridge between a lab's hosts."""
     return f"{PREFIX}:{lab}"
 
 
 def host_namespace(lab: str, host: str) -> str:
-    """The network namespace of a host."""
+    """Return the name of the network namespace of a host."""
     return f"{PREFIX}:{lab}:{host}"
 
 
 def namespace_path(name: str) -> Path:
-    """The file that stands for a network namespace."""
+    """Return the file of a network namespace."""
     return _NAMESPACES / name
 
 
 def namespaces_of(lab: str, existing: Iterable[str]) -> Iterator[str]:
-    """The namespaces that belong to a lab, those of its hosts first."""
+    """Yield the namespaces that belong to a lab, those of its hosts first."""
     mine = [name for name in existing if name.startswith(host_namespace(lab, ""))]
     yield from mine
     if switch_namespace(lab) in existing:

@@ -1,4 +1,4 @@
-"""How the hosts of a lab are."""
+"""Status of the hosts of a lab."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rosrm_lab.store import Record
 
 @dataclass(frozen=True, slots=True)
 class HostStatus:
-    """How a host is.
+    """The status of a host.
 
     Attributes:
         lab: the name of its lab.
@@ -25,9 +25,9 @@ class HostStatus:
         memory_used: bytes; None: not known.
         cpu: cores its limited processes may use; None: no limit.
         disk: bytes of its disk.
-        disk_used: bytes; None: not known, for the host is off.
+        disk_used: bytes; None: not known, because the host is off.
         processes: how many run there.
-        network: what is wrong with its link, in words; "": nothing.
+        network: the faults of its link, as text; "": none.
     """
 
     lab: str
@@ -44,7 +44,7 @@ class HostStatus:
 
 
 def host_status(hierarchies: Sequence[Hierarchy], record: Record, host: HostPlan) -> HostStatus:
-    """How one host is now."""
+    """Return the present status of a host."""
     lab, alive = record.plan.name, record.is_up(host.name)
     return HostStatus(
         lab=lab,

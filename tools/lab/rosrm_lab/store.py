@@ -1,7 +1,7 @@
-"""What is known of a lab between two commands: one file each, under /run/rosrm-lab.
+"""State of a lab between two commands: one file each, under /run/rosrm-lab.
 
-What a command makes on the machine can be found and removed without the file; it tells the plan,
-the first process of each host, and what is wrong with the network.
+The file has the plan, the first process of each host, and the faults of the network. All that a
+command makes on the machine can be found and removed without the file.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from rosrm_lab.plan import PREFIX, LabPlan
 from rosrm_lab.wires import Link
 
 RUN: Final = Path("/run") / PREFIX
-#: Disks go where there is room, not into the memory that /run is made of.
+#: Folder of the disks: on a real file system, because /run is in memory.
 IMAGES: Final = Path("/var/lib") / PREFIX
 
 _VERSION: Final = 1
@@ -33,7 +33,7 @@ _LOOK: Final = 0.05
 
 @dataclass(frozen=True, slots=True)
 class Birth:
-    """A process that can be told from a later one of the same number.
+    """The identity of a process, different from that of a later process with the same pid.
 
     Attributes:
         pid: its number.
@@ -45,27 +45,27 @@ class Birth:
 
     @classmethod
     def of(cls, pid: int) -> Birth | None:
-        """Of a process that lives; None: there is none."""
+        """Return the identity of a live process; None: there is none."""
         stat = read_stat(pid)
         return cls(pid, stat.start) if stat is not None and stat.alive else None
 
     @property
     def alive(self) -> bool:
-        """It lives on."""
+        """Return True if the process is alive."""
         return Birth.of(self.pid) == self
 
 
 @dataclass(slots=True)
 class Record:
-    """A lab as its file has it.
+    """The state of a lab in its file.
 
     Attributes:
-        plan: what it consists of.
-        complete: it was made to the end; else it is being made, or that was interrupted.
+        plan: hosts and network.
+        complete: it was made completely; else it is being made, or that was interrupted.
         boot: the boot of the machine in which it was made.
-        owner: the process whose end makes the lab one that was left behind; None: it stays.
+        owner: the process whose end makes the lab an abandoned one; None: it stays.
         inits: the first process of each host that was booted.
-        links: what is wrong with the hosts' network.
+        links: faults of the hosts' network.
     """
 
     plan: LabPlan
@@ -76,16 +76,16 @@ class Record:
     links: dict[str, Link] = field(default_factory=dict)
 
     def is_up(self, host: str) -> bool:
-        """Whether a host is switched on."""
+        """Return True if a host is switched on."""
         birth = self.inits.get(host)
         return birth is not None and birth.alive
 
     def outside(self, host: str, path: Path) -> Path:
-        """A file of a host that is up, as this machine reaches it."""
+        """Return the path on this machine of a file of a host that is up."""
         return Path(f"/proc/{self.inits[host].pid}/root") / str(path).lstrip("/")
 
     def to_plain(self) -> dict[str, Any]:
-        """For the file."""
+        """Return the content of the file."""
         return {
             "version": _VERSION,
             "plan": self.plan.to_plain(),
@@ -98,7 +98,7 @@ class Record:
 
     @classmethod
     def from_plain(cls, plain: Mapping[str, Any]) -> Record:
-        """What `to_plain` made."""
+        """Build a record from the result of `to_plain`."""
         if plain["version"] != _VERSION:
             raise ValueError(f"version {plain['version']}")
         owner = plain["owner"]
@@ -113,12 +113,12 @@ class Record:
 
 
 def boot_id() -> str:
-    """Names this boot of the machine."""
+    """Return the id of this boot of the machine."""
     return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
 
 
 def read(lab: str) -> Record | None:
-    """What is known of a lab; None: nothing, or nothing that can be understood."""
+    """Return the state of a lab; None: there is none, or it is unreadable."""
     try:
         return Record.from_plain(json.loads((RUN / lab / _FILE).read_text()))
     except (OSError, ValueError, KeyError, TypeError):
@@ -126,7 +126,7 @@ def read(lab: str) -> Record | None:
 
 
 def write(record: Record) -> None:
-    """Keep what is known of a lab; a reader sees the old or the new, never a part."""
+    """Write the state of a lab; a reader sees the old or the new file, never a part."""
     folder = RUN / record.plan.name
     folder.mkdir(parents=True, exist_ok=True)
     part = folder / f"{_FILE}.part"
@@ -135,21 +135,21 @@ def write(record: Record) -> None:
 
 
 def image(lab: str, host: str) -> Path:
-    """The file that is a host's disk."""
+    """Return the file of a host's disk."""
     return IMAGES / lab / f"{host}.ext4"
 
 
 def forget(lab: str) -> None:
-    """Remove all files of a lab; that of its state goes last."""
+    """Remove all files of a lab; that of its state last."""
     for folder in (IMAGES / lab, RUN / lab):
         if folder.exists():
             shutil.rmtree(folder)
-        with contextlib.suppress(OSError):  # other labs have theirs in it
+        with contextlib.suppress(OSError):  # other labs have files in it
             folder.parent.rmdir()
 
 
 def labs() -> set[str]:
-    """The labs that have files."""
+    """Return the labs that have files."""
     return {
         entry.name
         for folder in (RUN, IMAGES)
@@ -161,10 +161,10 @@ def labs() -> set[str]:
 
 @contextlib.contextmanager
 def lock(name: str, timeout: float = 30.0) -> Iterator[None]:
-    """Let one command at a time change a lab; the end of a process frees what it held.
+    """Let one command at a time change a lab; the lock is released at the end of its process.
 
     Args:
-        name: of the lab; "" for what concerns all of them.
+        name: of the lab; "" for changes that concern all labs.
         timeout: seconds to wait for another command.
     """
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as claim:
@@ -179,7 +179,7 @@ def lock(name: str, timeout: float = 30.0) -> Iterator[None]:
                         f"another command is at work on lab {name!r}, for more than {timeout:g} s: "
                         "wait for its end, or end it"
                     ) from None
-                time.sleep(_LOOK)  # nothing tells that a name has become free
+                time.sleep(_LOOK)  # there is no event when a name becomes free
         yield
 
 

@@ -1,4 +1,4 @@
-"""What is wrong with the network of each host, and the firewall rules that make it so. Pure."""
+"""Network faults of each host, and the firewall rules that cause them. Pure."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, Final, Literal
 
 from rosrm.errors import ConfigError
 
-#: "in": what the host hears; "out": what others hear of it.
+#: "in": packets to the host; "out": packets from the host.
 Direction = Literal["in", "out", "both"]
 DIRECTIONS: Final = ("in", "out", "both")
 
@@ -47,7 +47,7 @@ class Link:
     outgoing: Wire = field(default_factory=Wire)
 
     def changed(self, direction: Direction, **values: Any) -> Link:
-        """With other values of `Wire` in one direction or both; raises `ConfigError`."""
+        """Return a link with other values in one direction or both; raises `ConfigError`."""
         check_direction(direction)
         incoming, outgoing = self.incoming, self.outgoing
         if direction != "out":
@@ -58,11 +58,11 @@ class Link:
 
     @property
     def delays(self) -> bool:
-        """Whether it delays packets in any direction."""
+        """Return True if it delays packets in any direction."""
         return bool(self.incoming.delay or self.outgoing.delay)
 
     def describe(self) -> str:
-        """In words; "" for a link without faults."""
+        """Return the faults as text; "" for a link without faults."""
         if self.incoming == self.outgoing:
             return _words(self.incoming)
         parts = [("in", self.incoming), ("out", self.outgoing)]
@@ -70,38 +70,38 @@ class Link:
 
 
 def check_direction(direction: str) -> None:
-    """Raise `ConfigError` for a word that is no direction."""
+    """Raise `ConfigError` for an unknown direction."""
     if direction not in DIRECTIONS:
         raise ConfigError(f"direction {direction!r}; allowed: {', '.join(DIRECTIONS)}")
 
 
 def check_loss(fraction: float) -> None:
-    """Raise `ConfigError` for what is no fraction."""
+    """Raise `ConfigError` for a number that is not a fraction."""
     if not 0.0 <= fraction <= 1.0:
         raise ConfigError(f"loss {fraction:g} is not within 0..1 (0 % to 100 %)")
 
 
 def check_delay(seconds: float) -> None:
-    """Raise `ConfigError` for a delay that cannot be."""
+    """Raise `ConfigError` for an impossible delay."""
     if not 0.0 <= seconds <= _MOST_DELAY:
         raise ConfigError(f"delay {seconds:g} s is not within 0..{_MOST_DELAY:g} s")
 
 
 def ruleset(links: Mapping[str, Link]) -> str:
-    """The whole firewall of the switch, for `nft -f`, which puts it in force at one stroke.
+    """Return the whole firewall of the switch, for `nft -f`, which applies it atomically.
 
     Args:
         links: by the port of the switch.
     """
     rules = [rule for port, link in links.items() for rule in _rules(port, link)]
-    # Naming the table before deleting it makes the deletion right when there is none yet.
+    # Naming the table before the deletion makes it succeed when there is none yet.
     lines = [
         f"table bridge {_TABLE}",
         f"delete table bridge {_TABLE}",
         f"table bridge {_TABLE} {{",
         "  chain between_hosts {",
         "    type filter hook forward priority 0; policy accept;",
-        # Who cannot be asked for its address cannot be spoken to: a cut would be two-way.
+        # Without ARP, a host's address could not be resolved: a one-way cut would be two-way.
         "    ether type arp accept",
         *(f"    {rule}" for rule in rules),
         "  }",
@@ -129,7 +129,7 @@ def _words(wire: Wire) -> str:
 
 
 def to_plain(links: Mapping[str, Link]) -> dict[str, Any]:
-    """For the lab's state file."""
+    """Return the content of the lab's state file."""
     return {
         name: [[wire.cut, wire.loss, wire.delay] for wire in (link.incoming, link.outgoing)]
         for name, link in links.items()
@@ -137,5 +137,5 @@ def to_plain(links: Mapping[str, Link]) -> dict[str, Any]:
 
 
 def from_plain(plain: Mapping[str, Any]) -> dict[str, Link]:
-    """What `to_plain` made."""
+    """Build the links from the result of `to_plain`."""
     return {name: Link(Wire(*into), Wire(*out)) for name, (into, out) in plain.items()}

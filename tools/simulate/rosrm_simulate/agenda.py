@@ -1,4 +1,4 @@
-"""Virtual time: what is to happen, in order; at equal times as it was planned."""
+"""Agenda on virtual time: actions in order of time; at equal times in order of planning."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ Action = Callable[[], None]
 
 @dataclass(order=True, slots=True)
 class Entry:
-    """One thing to happen.
+    """One planned action.
 
     Attributes:
-        action: None: it was called off.
+        action: None: it was cancelled.
     """
 
     time: float
@@ -24,11 +24,11 @@ class Entry:
 
 
 class Agenda:
-    """What is to happen.
+    """The planned actions.
 
     Attributes:
         now: virtual seconds; never goes back.
-        pending: how many things are still to happen.
+        pending: number of actions to come.
     """
 
     def __init__(self) -> None:
@@ -38,7 +38,7 @@ class Agenda:
         self._number = 0
 
     def at(self, time: float, action: Action) -> Entry:
-        """Plan something, not before now."""
+        """Plan an action, not before now."""
         self._number += 1
         entry = Entry(max(time, self.now), self._number, action)
         heapq.heappush(self._entries, entry)
@@ -46,24 +46,24 @@ class Agenda:
         return entry
 
     def after(self, seconds: float, action: Action) -> Entry:
-        """Plan something so much later."""
+        """Plan an action in so many seconds."""
         return self.at(self.now + seconds, action)
 
     def call_off(self, entry: Entry | None) -> None:
-        """It does not happen."""
+        """Cancel an action, unless it was done; None is ignored."""
         if entry is not None and entry.action is not None:
             entry.action = None
             self.pending -= 1
 
     @property
     def next_time(self) -> float:
-        """When the next thing happens; inf: nothing will."""
+        """Return the time of the next action; inf: there is none."""
         while self._entries and self._entries[0].action is None:
             heapq.heappop(self._entries)
         return self._entries[0].time if self._entries else inf
 
     def do_next(self) -> None:
-        """Let time pass until the next thing, and do it."""
+        """Advance the time to the next action, and do it."""
         entry = heapq.heappop(self._entries)
         action, entry.action = entry.action, None
         if action is not None:

@@ -1,4 +1,4 @@
-"""How closely a simulation agrees with the run that it simulates."""
+"""Agreement of a simulation with the run that it simulates."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ class Agreement:
 
     Attributes:
         processes: that got a host in either run.
-        same_host: of those, part whose first host is the same; one that got none in one of the runs
-            is not among it.
-        same_counts: part of the processes that would have to change their first host for each host,
-            and for none at all, to get as many in both runs: 1 minus that.
+        same_host: of those, part whose first host is the same; a process without a host in one of
+            the runs does not count as the same.
+        same_counts: part of the processes whose first host may stay, if the number of processes of
+            each host (and of no host at all) is to become the same in both runs.
         usage: by resource, mean distance of the usage of the same host at the same time, fraction.
-        ranked: the same of the k-th fullest host, whichever it is.
+        ranked: the same for the k-th fullest hosts of both runs.
         balance: by resource, mean distance of fullest minus emptiest host at the same time.
-        makespan: the second's, as a part of the first's; None: one of them has none.
+        makespan: of the second run, as a part of the first's; None: one of them has none.
         migrations: of the first and of the second.
     """
 
@@ -67,7 +67,7 @@ def _first_host(run: Outcome, process: str) -> str | None:
 
 
 class _Apart(NamedTuple):
-    """Mean distances of two runs in one resource; 0: they have nothing in common."""
+    """The mean distances of two runs in one resource; 0: they have nothing in common."""
 
     usage: float = 0.0
     ranked: float = 0.0
@@ -85,7 +85,7 @@ def _distances(first: Curves, second: Curves, resource: str) -> _Apart:
     some = there.any(axis=1)
     if not some.any():
         return _Apart()
-    # Sorted by fullness; NaN, not there in one of them, goes last in both.
+    # Sorted by fullness; NaN (the host is absent in one of them) goes last in both.
     one, other = (np.where(there, values, np.nan)[some] for values in (one, other))
     one_ranked, other_ranked = np.sort(one, axis=1), np.sort(other, axis=1)
     return _Apart(
@@ -96,7 +96,7 @@ def _distances(first: Curves, second: Curves, resource: str) -> _Apart:
 
 
 def _at(curves: Curves, resource: str, hosts: list[str], moments: FloatArray) -> FloatArray:
-    """(M, H) usage of hosts at moments: the newest sample holds."""
+    """Return the (M, H) usage of hosts at moments: the newest sample holds."""
     columns = [curves.hosts.index(name) for name in hosts]
     rows = np.clip(np.searchsorted(curves.times, moments, side="right") - 1, 0, None)
     found: FloatArray = curves.usage[resource][rows][:, columns]

@@ -1,4 +1,4 @@
-"""`rosrm simulate`: what would have been, with other policies, weights and hosts."""
+"""`rosrm simulate`: a workload under other policies, weights and hosts."""
 
 # Each command imports what it needs when it runs, so that `rosrm --help` is quick.
 # ruff: noqa: PLC0415

@@ -1,7 +1,7 @@
-"""Runs a workload: the master's core and the slaves' cores on virtual time.
+"""Engine of a simulation: the master's core and the slaves' cores on virtual time.
 
-The master is told the same events as in reality, with what its policies, strategies and settings
-are; what it commands reaches the hosts after the time that a message takes.
+The master's core gets the same events as in reality, with real policies, strategies and settings.
+Its commands reach the hosts after the time that a message takes.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _TELL_EVERY: Final = 2000
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """How far a run is.
+    """The progress of a run.
 
     Attributes:
         now: virtual seconds.
@@ -62,11 +62,11 @@ class Simulation:
     """One run of a workload.
 
     Args:
-        workload: that is run; its first arrival must not lie behind its end.
+        workload: to be run; its first arrival must not be after its end.
         settings: of the master's core.
         policy: that orders the hosts, with its name.
         strategies: by name.
-        declared: what their offers declare. A simulated host has all executors.
+        declared: declarations of their offers. A simulated host has all executors.
     """
 
     def __init__(
@@ -94,14 +94,14 @@ class Simulation:
         self._taken_in: Reply | None = None
         self._active = 0.0
         self._usage_told = -1
-        # After this long without any event nothing falls due any more with time alone.
+        # After this long without any event, the passing of time alone has no further effect.
         self._patience = 2.0 + max(
             settings.settle, settings.hysteresis, settings.cooldown, settings.delivery_timeout,
             settings.lease, settings.order_retry,
         )  # fmt: skip
 
     def run(self, progress: Callable[[Progress], None] | None = None) -> Outcome:
-        """Let time pass until nothing can change any more, or `until` of the workload."""
+        """Run until nothing can change any more, or until the workload's `until`."""
         self._plan()
         next_tick, told = 0.0, 0
         until = self.workload.until
@@ -123,7 +123,7 @@ class Simulation:
         return self.meter.outcome(self.state, self.agenda.now)
 
     def _after_tick(self, now: float) -> float:
-        """When readings come next: as long as nothing changes they are left out."""
+        """Return the time of the next readings; they are left out while nothing changes."""
         if now - self._active <= self._patience:
             return now + self.workload.model.period
         return self.agenda.next_time if self.agenda.pending else inf
@@ -150,7 +150,7 @@ class Simulation:
             self.agenda.at(time, partial(self._ask, event))
 
     def _ask(self, request: Any) -> None:
-        """Somebody asks the master for something: an event with the number of a request."""
+        """Send a user's request to the master: an event with a request number."""
         self._requests += 1
         self._tell(replace(request, request=self._requests))
 
@@ -195,7 +195,7 @@ class Simulation:
         self._tell(happened.TimePassed())
 
     def _read(self, machines: list[Machine]) -> None:
-        """Readings of these hosts reach the master; who is under its limits asks for work."""
+        """Deliver readings of hosts to the master; hosts under their limits ask for work."""
         readings = [machine.reading(self.agenda.now) for machine in machines]
         for machine in machines:
             machine.sequence += 1
@@ -220,7 +220,7 @@ class Simulation:
                 self._ask(happened.ProcessRequested(0, machine.host_id, machine.incarnation))
 
     def _tell_usages(self, machine: Machine) -> None:
-        """What each instance uses, if it is not what was said before."""
+        """Deliver the usage of each instance, if it has changed since the last time."""
         usages = machine.usages(self.agenda.now)
         if usages == machine.told_usage:
             return
@@ -236,7 +236,7 @@ class Simulation:
     # --- the master ----------------------------------------------------------------------
 
     def _tell(self, event: happened.Event) -> None:
-        """The master's core takes an event in, and what it commands is carried out."""
+        """Process an event in the master's core, and carry out its commands."""
         now = self.agenda.now
         self.state.wall = now
         commands = step(self.state, event, now)

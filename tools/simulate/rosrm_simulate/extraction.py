@@ -1,8 +1,8 @@
-"""Makes a workload of a record: what arrived when, what it used, and which hosts were there.
+"""Extraction of a workload from a record: arrivals, usages, and hosts with their times.
 
-What a process used is known only as far as it ran: its memory by its age, once a second; its CPU as
-the mean of what it got, which on a crowded host is less than it wanted. What it did not do in the
-record (one that ran to the end) it does not do in the simulation either.
+The usage of a process is known only as far as it ran: its memory by its age, once a second; its CPU
+as the mean of the cores that it got, which on a crowded host is less than it needed. Behaviour
+that is not in the record (the end of a process that was still running) is not simulated either.
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ from rosrm_simulate.workload import Curve, HostPlan, Model, ProcessPlan, Workloa
 
 #: Points of a memory curve that are kept.
 _POINTS: Final = 64
-#: Requests of people that are made again in a simulation. Checkpoints and restores are not: nothing
-#: takes images there, and a process uses nothing meanwhile, which its curve shows.
+#: Users' requests that are repeated in a simulation. Checkpoints and restores are not: there are no
+#: checkpoint images in it. The process's curve shows the time without usage.
 _REQUESTS: Final = (
     happened.CancelRequested, happened.RestartRequested, happened.MigrationRequested,
     happened.HostStateRequested,
 )  # fmt: skip
-#: The scope of a resource that counts nothing but what the slave started.
+#: Scope of a resource whose readings count only the slave's own processes.
 _OURS_ALONE: Final = "slice"
 _RUNS: Final = frozenset({InstanceState.RUNNING, InstanceState.READY})
 
 
 @dataclass(slots=True)
 class _Host:
-    """What a record shows of one host."""
+    """The data of one host in a record."""
 
     description: HostDescription
     joins: float
@@ -55,7 +55,7 @@ class _Host:
 
 @dataclass(slots=True)
 class _Process:
-    """What a record shows of one process."""
+    """The data of one process in a record."""
 
     spec: ProcessSpec
     arrives: float
@@ -66,7 +66,7 @@ class _Process:
 
 
 class Extraction:
-    """Follows a replay, and makes a workload of it; its `watch` is what a replay asks for."""
+    """A builder of a workload from a replay; pass its `watch` to the replay as the watcher."""
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
@@ -82,17 +82,17 @@ class Extraction:
         self._stops: list[float] = []
         self._stops_since: dict[int, float] = {}
         for name, item in recording.header.intents.get("process", {}).items():
-            if not ProcessPhase(item["phase"]).over:  # the master took it up again at its start
+            if not ProcessPhase(item["phase"]).over:  # the master restored it at its start
                 self._processes[name] = _Process(spec_from_dict(item["spec"]), 0.0)
 
     def watch(self, state: MasterState, one: Happened, commands: Sequence[Command]) -> None:
-        """One event of the record, and what came of it."""
+        """Process one event of the record, and the commands that followed from it."""
         at = one.now - self._started
         self._take(state, one.event, commands, at)
         for command in commands:
             if isinstance(command, Assign):
                 self._assigned[command.assignment.instance.number] = at
-            elif isinstance(command, PublishStateConfig):  # the destination goes on at its age
+            elif isinstance(command, PublishStateConfig):  # it continues at the source's age
                 since = self._runs_since.get(command.source, at)
                 self._runs_since[command.destination] = since
             elif isinstance(command, Record) and command.kind in (
@@ -162,7 +162,7 @@ class Extraction:
                 row = state.hosts.resources.index(one.name)
                 seen.limits[one.name] = float(state.hosts.limit[row, column])
                 if one.scope == _OURS_ALONE or not all(instance.seen for instance in held):
-                    continue  # nothing of others is in it, or not yet to be told from ours
+                    continue  # nothing of others is in it, or it cannot be separated yet
                 ours = sum(instance.seen.get(one.name, 0.0) for instance in held) / one.capacity
                 others = float(state.hosts.usage[row, column]) - ours
                 seen.others.setdefault(one.name, []).append(max(0.0, others))
@@ -198,7 +198,7 @@ class Extraction:
     # --- the workload --------------------------------------------------------------------
 
     def workload(self) -> Workload:
-        """What the record shows, up to its end."""
+        """Return the workload of the record, up to its end."""
         model = Model(
             period=min((one.description.period for one in self._hosts.values()), default=0.1),
             start=_middle(self._starts, Model().start),

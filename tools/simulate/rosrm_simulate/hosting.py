@@ -1,4 +1,4 @@
-"""What the slaves do: their cores decide, and this carries it out on the machines."""
+"""Slaves of a simulation: their cores decide, and the machines carry out the commands."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from rosrm_simulate.agenda import Agenda, Entry
 from rosrm_simulate.machine import Machine, Program
 from rosrm_simulate.workload import Model, ProcessPlan
 
-#: The signal of an instance that was stopped: SIGINT.
+#: The signal that ends a stopped instance: SIGINT.
 _INTERRUPTED = 2
 
 
 class Hosting:
-    """Carries out what the slaves' cores ask for.
+    """An executor of the commands of all slaves' cores.
 
     Args:
         agenda: time.
         model: of the hosts.
         plans: by process name.
-        tell: takes an event to the master.
+        tell: sends an event to the master.
 
     Attributes:
         where: number of an instance to the machine that has it.
@@ -42,10 +42,10 @@ class Hosting:
         self._ends: dict[str, Entry] = {}
         self._settling: dict[tuple[InstanceId, RestartPolicy], Order] = {}
 
-    # --- the slave hears -----------------------------------------------------------------
+    # --- events of a slave -----------------------------------------------------------------
 
     def hear(self, machine: Machine, event: reducer.Event) -> None:
-        """Something happens to a slave."""
+        """Process an event in a slave's core, and carry out its commands."""
         for command in reducer.step(machine.slave, event, self._agenda.now):
             self._carry_out(machine, command)
 
@@ -71,7 +71,7 @@ class Hosting:
             self._settle(machine, command)
 
     def _say(self, machine: Machine, event: happened.Event) -> None:
-        """An event reaches the master, if the host still is there when it leaves."""
+        """Send an event to the master, unless the host is gone at the time of its arrival."""
 
         def arrive() -> None:
             if machine.up or machine.stopping:
@@ -82,7 +82,7 @@ class Hosting:
     def _supervisor_says(self, machine: Machine, status: InstanceStatus) -> None:
         self.hear(machine, reducer.SupervisorReported((status,)))
 
-    # --- what runs -----------------------------------------------------------------------
+    # --- programs --------------------------------------------------------------------------
 
     def _launch(self, machine: Machine, assignment: Assignment) -> None:
         instance = assignment.instance
@@ -133,7 +133,7 @@ class Hosting:
         self._agenda.after(seconds, partial(self._started, machine, instance, program.run))
 
     def _plan_end(self, machine: Machine) -> None:
-        """The next process of a host that will have done its work."""
+        """Plan the next end of work on a host."""
         name = machine.plan.name
         self._agenda.call_off(self._ends.pop(name, None))
         time = machine.next_end()
@@ -141,7 +141,7 @@ class Hosting:
             self._ends[name] = self._agenda.at(time, partial(self._work_done, machine))
 
     def take_over(self, machine: Machine) -> None:
-        """An instance goes on with the work of another."""
+        """Plan the end of work again after an instance has taken over the work of another."""
         machine.changed(self._agenda.now)
         self._plan_end(machine)
 
@@ -158,10 +158,10 @@ class Hosting:
         self._supervisor_says(machine, machine.end_status(instance, program, now, signal=signal))
         self._close(machine)
 
-    # --- a host goes ---------------------------------------------------------------------
+    # --- departure of a host ---------------------------------------------------------------
 
     def stop_all(self, machine: Machine) -> None:
-        """A slave stops in good order, with all its processes."""
+        """Shut down a slave, with all its processes."""
         machine.stopping = True
         for instance in list(machine.slave.held):
             if not machine.slave.held[instance].status.state.ended:
@@ -173,7 +173,7 @@ class Hosting:
             machine.up = False
 
     def lose(self, machine: Machine) -> None:
-        """A host is gone without a word, and everything on it."""
+        """Drop a host at once, with everything on it; it sends no message."""
         machine.up = False
         for instance in machine.programs:
             del self.where[instance.number]
@@ -183,7 +183,7 @@ class Hosting:
     # --- orders --------------------------------------------------------------------------
 
     def obey(self, machine: Machine, order: Order) -> None:
-        """A slave takes an order, and answers it."""
+        """Carry out an order at a slave, and answer it."""
         if order.action == "execute":
             message = f"the simulation cannot carry out {order.executor!r}"
             answer = happened.OrderAnswered(order.order, False, "failed", message)

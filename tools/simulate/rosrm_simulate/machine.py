@@ -1,8 +1,8 @@
-"""The model of one host: the slave's core, and what really runs there.
+"""The model of one host: the slave's core, and the programs on the host.
 
-A host has CPU time to give out: while its processes want more cores than there are, each gets the
-same part of what it wants, and one that has work to do takes so much longer. Memory is what the
-processes hold; nobody is killed for it, so that the limits alone say what went wrong.
+A host has CPU time to share: while its processes want more cores than there are, each gets the same
+part of its demand, and one with work to do takes so much longer. Memory is the sum over the
+processes; there is no out-of-memory kill, so that overload shows in the limits alone.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from rosrm.model.values import (
 )
 from rosrm_simulate.workload import HostPlan, ProcessPlan
 
-#: Work left, seconds, that counts as none: sums of fractions are not exact.
+#: Seconds of work left that count as none, because sums of fractions are not exact.
 _NONE_LEFT = 1e-9
 
 
@@ -36,10 +36,10 @@ class Program:
     """One instance on a host.
 
     Attributes:
-        begun: when it began to run; None: it is starting.
+        begun: time at which it began to run; None: it is starting.
         work: seconds of its duration that it has done.
-        stopping: it was told to end.
-        run: counts its starts: what was planned for an earlier one is void.
+        stopping: it was ordered to end.
+        run: counts its starts: plans for an earlier one are void.
     """
 
     plan: ProcessPlan
@@ -53,7 +53,7 @@ class Program:
 
 
 class Reading(NamedTuple):
-    """What a slave reads; `usage` (RESOURCE_SLOTS,), fractions; `accepts`: under all limits."""
+    """A slave's reading; `usage` (RESOURCE_SLOTS,), fractions; `accepts`: under all limits."""
 
     at: float
     usage: FloatArray
@@ -62,13 +62,13 @@ class Reading(NamedTuple):
 
 @dataclass(slots=True)
 class Machine:
-    """One host that is there.
+    """One host of a simulation.
 
     Attributes:
         incarnation: of its slave.
-        host_id: that the master gave it; 0: it is not registered.
-        up: it runs; one that is down neither hears nor says anything.
-        stopping: its slave stops in good order, and the host goes with its last process.
+        host_id: assigned by the master; 0: it is not registered.
+        up: it runs; a host that is down neither receives nor sends anything.
+        stopping: its slave is shutting down, and the host goes with its last process.
         asked: it has asked for work.
         limit: (RESOURCE_SLOTS,) as in its readings.
     """
@@ -98,31 +98,31 @@ class Machine:
         self.limit[: len(names)] = [self.plan.limits.get(name, 1.0) for name in names]
 
     def description(self) -> HostDescription:
-        """What its slave says when it registers."""
+        """Return the description with which its slave registers."""
         plan = self.plan
         return HostDescription(
             plan.name, self.incarnation, labels=plan.labels, resources=plan.resources,
             max_processes=plan.max_processes, period=self.period,
         )  # fmt: skip
 
-    # --- what runs -----------------------------------------------------------------------
+    # --- programs --------------------------------------------------------------------------
 
     def begin(self, instance: InstanceId, now: float) -> None:
-        """An instance that was starting runs from now on."""
+        """Let a starting instance run from now on."""
         program = self.programs[instance]
         if program.begun is None:
             program.begun = now
         self.changed(now)
 
     def remove(self, instance: InstanceId, now: float) -> Program:
-        """An instance has ended."""
+        """Remove an instance that has ended; return its program."""
         self.changed(now)
         program = self.programs.pop(instance)
         self.changed(now)
         return program
 
     def changed(self, now: float) -> None:
-        """What runs has changed: work done so far counts at the old rate, more at the new one."""
+        """Apply a change of the programs: past work at the old CPU rate, further at the new."""
         self._work_until(now)
         wanted = sum(one.plan.cpu for one in self.programs.values() if one.begun is not None)
         cores = self.plan.capacity("cpu") * (1.0 - self.plan.busy.get("cpu", 0.0))
@@ -143,7 +143,7 @@ class Machine:
         return self._rate if program.plan.cpu > 0.0 else 1.0
 
     def next_end(self) -> float:
-        """When the next process has done its work, as things stand; inf: none will."""
+        """Return the time of the next end of work at the present rate; inf: there is none."""
         return min(
             (self._end_of(one) for one in self.programs.values() if one.begun is not None),
             default=inf,
@@ -156,7 +156,7 @@ class Machine:
         return self._worked_until + max(0.0, program.plan.duration - program.work) / rate
 
     def done(self, now: float) -> list[InstanceId]:
-        """Instances whose work is done."""
+        """Return the instances whose work is done."""
         self._work_until(now)
         return [
             instance
@@ -165,22 +165,22 @@ class Machine:
             and one.work >= one.plan.duration - _NONE_LEFT
         ]  # fmt: skip
 
-    # --- what shows ----------------------------------------------------------------------
+    # --- readings and usages ---------------------------------------------------------------
 
     def memory_of(self, program: Program, now: float) -> float:
-        """Bytes that an instance holds."""
+        """Return the bytes that an instance holds."""
         return 0.0 if program.begun is None else program.plan.memory.at(now - program.begun)
 
     def cpu_of(self, program: Program) -> float:
-        """Cores that an instance gets."""
+        """Return the cores that an instance gets."""
         return 0.0 if program.begun is None else program.plan.cpu * self._rate
 
     def grows(self, now: float) -> bool:
-        """The memory of a process is still changing."""
+        """Return True if the memory of a process is still changing."""
         return now < self._level_from
 
     def reading(self, now: float) -> Reading:
-        """What its slave says in `resource_info`."""
+        """Return the slave's reading for `resource_info`."""
         if self._reading is None or self.grows(self._reading.at):
             used = self.usage(now)
             usage = np.zeros(RESOURCE_SLOTS)
@@ -193,7 +193,7 @@ class Machine:
         return self._reading
 
     def usage(self, now: float) -> Mapping[str, float]:
-        """Fraction of each resource that is used."""
+        """Return the fraction of each resource that is used."""
         held = sum(self.memory_of(one, now) for one in self.programs.values())
         used = {"memory": held}
         running = [one for one in self.programs.values() if one.begun is not None]
@@ -205,7 +205,7 @@ class Machine:
         }
 
     def usages(self, now: float) -> tuple[tuple[int, float, float], ...]:
-        """Number, cores and bytes of each instance."""
+        """Return number, cores and bytes of each instance."""
         return tuple(
             (instance.number, self.cpu_of(one), self.memory_of(one, now))
             for instance, one in self.programs.items()
@@ -214,7 +214,7 @@ class Machine:
     def end_status(
         self, instance: InstanceId, program: Program, now: float, *, signal: int = 0
     ) -> InstanceStatus:
-        """What the supervisor says of an instance that has ended."""
+        """Return the supervisor's status for an instance that has ended."""
         run_time = 0.0 if program.begun is None else now - program.begun
         cpu_time = program.plan.cpu * program.work
         return InstanceStatus(
@@ -224,6 +224,6 @@ class Machine:
 
 
 def _level_from(program: Program) -> float:
-    """When the memory of an instance changes no more."""
+    """Return the time from which the memory of an instance stays constant."""
     assert program.begun is not None
     return program.begun + program.plan.memory.level_from

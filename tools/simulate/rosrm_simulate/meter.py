@@ -1,4 +1,4 @@
-"""Measures a run, real or simulated, by what the master's core is told and decides."""
+"""Meter of a run, real or simulated, by the events and commands of the master's core."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from rosrm.model.event_kinds import EventKind
 from rosrm.model.values import Kind
 from rosrm.wording import standing
 
-#: Resources of which the balance is measured and drawn.
+#: Resources with a balance that is measured and drawn.
 MEASURED: Final = ("memory", "cpu")
-#: Most samples of the curves; then every other one is dropped.
+#: Most samples of the curves; beyond it every other one is dropped.
 _SAMPLES: Final = 4000
 _ENDS: Final = frozenset({EventKind.FINISHED, EventKind.FAILED, EventKind.CANCELLED})
 _CHANGES: Final = _ENDS | {
@@ -33,7 +33,7 @@ _CHANGES: Final = _ENDS | {
 
 @dataclass(frozen=True, slots=True)
 class Curves:
-    """Usage over time, as the master saw it.
+    """The usage over time, in the master's view.
 
     Attributes:
         times: (T,) seconds from the first arrival; a value holds until the next time.
@@ -53,20 +53,20 @@ class Outcome:
     """A run in numbers.
 
     Attributes:
-        processes: submitted and taken.
-        finished, running, waiting, ended_otherwise: where they stand at the end; they add up to
-            `processes`. Waiting: in the queue, or set aside as no host may take it.
+        processes: submitted and accepted.
+        finished, running, waiting, ended_otherwise: numbers by state at the end; they add up to
+            `processes`. Waiting: in the queue, or set aside because no host may take it.
         never_placed: process name to the reason, of those that never got a host.
         makespan: seconds from the first arrival to the end of the last job; None: a job has not
             finished, or there is none.
         wait_mean, wait_max: seconds from arrival to the first host, of those that got one.
-        migrations, failed_migrations: moves that were done, and that were not.
+        migrations, failed_migrations: migrations that succeeded, and that did not.
         imbalance: by resource, fullest minus emptiest host, fraction, mean over time.
         over_limit: seconds that a host was at or over a limit, summed over the hosts.
         span: seconds over which the last two were measured.
         placements: process name to its hosts, in order.
         arrivals, ends: process name to seconds from the first arrival.
-        events: that the core took in.
+        events: number of events that the core processed.
     """
 
     processes: int
@@ -92,7 +92,7 @@ class Outcome:
 
 @dataclass(slots=True)
 class _Totals:
-    """Sums over time since the first arrival."""
+    """The sums over time since the first arrival."""
 
     seconds: float = 0.0
     gap: dict[str, float] = field(default_factory=lambda: dict.fromkeys(MEASURED, 0.0))
@@ -103,10 +103,10 @@ class _Totals:
 
 
 class Meter:
-    """Follows a run.
+    """A measurement that follows a run.
 
     Args:
-        until: the run is measured up to here; inf: up to the last time that anything changed.
+        until: the run is measured up to here; inf: up to the last change.
     """
 
     def __init__(self, until: float = inf) -> None:
@@ -129,11 +129,11 @@ class Meter:
 
     @property
     def ended(self) -> int:
-        """How many processes have ended so far."""
+        """Return the number of processes that have ended so far."""
         return len(self._ends)
 
     def begin(self, state: MasterState, now: float) -> None:
-        """The core starts with this: what is not over arrives now, and what runs has its host."""
+        """Begin with a core's state: unfinished processes arrive now, running ones have hosts."""
         for process in state.processes.values():
             if process.phase.over:
                 continue
@@ -146,7 +146,7 @@ class Meter:
     def take(
         self, state: MasterState, event: happened.Event, commands: Sequence[Command], now: float
     ) -> None:
-        """The core has taken an event in, and this came of it."""
+        """Process an event of the core, with the commands that followed from it."""
         self.events += 1
         for command in commands:
             if isinstance(command, Record) and command.kind in _CHANGES:
@@ -155,7 +155,7 @@ class Meter:
             self._sample(state, now)
 
     def changed(self, now: float) -> None:
-        """Something changed that the core was not told of in so many words."""
+        """Note the time of a change that is not an event of the core."""
         self._integrate(now)
         self._at_change = self._totals.copy()
 
@@ -180,7 +180,7 @@ class Meter:
     # --- usage over time -----------------------------------------------------------------
 
     def _integrate(self, now: float) -> None:
-        """Until now everything was as it was sampled last."""
+        """Add the time since the last sample, whose values hold until now."""
         seconds = min(now, self._until) - max(self._at, self._first)
         self._at = now
         if seconds <= 0.0 or seconds == inf:
@@ -223,10 +223,10 @@ class Meter:
     # --- the end -------------------------------------------------------------------------
 
     def outcome(self, state: MasterState, now: float) -> Outcome:
-        """All that was measured; `now` is the end of the run."""
+        """Return all figures; `now` is the end of the run."""
         self._integrate(now)
         if self._samples and now > self._samples[-1][0]:
-            self._samples.append((now, self._samples[-1][1]))  # what was sampled last holds
+            self._samples.append((now, self._samples[-1][1]))  # the last sample still holds
         totals = self._totals if self._until < inf else self._at_change
         first = 0.0 if self._first == inf else self._first
         waits = [at - self._arrivals.get(name, at) for name, at in self._placed_at.items()]
@@ -279,7 +279,7 @@ class Meter:
 
 
 def _why_not_placed(state: MasterState, process: Process) -> str:
-    """Return why a process got no host; one that was cancelled before may have no reason."""
+    """Return the reason why a process got no host; one cancelled before may have none."""
     if process.phase.over:
         return process.reason or f"it {standing(process.phase.value)}"
     return process.reason or f"it waits behind {state.queue.head()}"

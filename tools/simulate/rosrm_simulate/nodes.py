@@ -1,7 +1,7 @@
-"""What nodes that keep to the handoff protocol answer to the master, as if nothing went wrong.
+"""Answers of nodes in the handoff protocol, without faults.
 
-Of the channel between source and destination only the end is modelled: who is active, and that the
-destination then goes on with the source's work where it stood.
+The channel between source and destination is not modelled, only its effect: which node is active,
+and that the destination then continues the source's work.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class Nodes:
         self._tell = tell
 
     def hear(self, config: PublishStateConfig) -> None:
-        """The master says where a handoff stands; who is named answers."""
+        """Process a phase of a handoff; the named node answers."""
         if config.phase is HandoffPhase.SHADOW:
             seconds = self._model.ready + self._model.handoff
             self._later(seconds, config, config.destination, ReportPhase.READY)
@@ -52,7 +52,7 @@ class Nodes:
             self._tell(HandoffReported(config.process, config.destination, number, phase))
 
     def _switch(self, config: PublishStateConfig) -> None:
-        """The source falls silent, and the destination goes on with its work."""
+        """Let the source end its output, and the destination continue its work."""
         there = self._hosting.where.get(config.destination)
         here = self._hosting.where.get(config.source)
         if there is None:

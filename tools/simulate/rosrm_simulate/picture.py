@@ -1,4 +1,4 @@
-"""Draws the runs of `rosrm simulate`: memory and CPU of every host over time, one row a run."""
+"""Picture of the runs of `rosrm simulate`: memory and CPU of every host, one row a run."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from rosrm_simulate.meter import MEASURED
 from rosrm_simulate.runs import Report, Run
 
 _FORMATS: Final = (".png", ".svg", ".pdf")
-#: Hosts that are named beside the curves; more would hide them.
+#: Most hosts with a legend beside the curves; more would hide them.
 _NAMED: Final = 8
 _HEIGHT: Final = 2.4
 
 
 def check(path: Path) -> None:
-    """Refuse at once what could not be drawn after a long run."""
+    """Raise an error before a long run, if its picture could not be drawn."""
     if find_spec("matplotlib") is None:
         raise RosrmError(
             "--plot needs matplotlib, which is not installed: pip install 'rosrm-simulate[plot]'"

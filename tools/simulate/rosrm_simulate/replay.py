@@ -1,4 +1,4 @@
-"""Tells a core again what a record holds, and compares what it decides with what was decided."""
+"""Replay of a record in a core, and comparison of its decisions with the recorded ones."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from rosrm.recording.encoding import Happened, decisions
 from rosrm.recording.reader import Recording
 from rosrm_simulate.meter import Meter, Outcome
 
-#: Differences that are told in full.
+#: Number of differences that are shown in full.
 _TOLD: Final = 5
 
 Watcher = Callable[[MasterState, Happened, Sequence[Command]], None]
@@ -28,7 +28,7 @@ Watcher = Callable[[MasterState, Happened, Sequence[Command]], None]
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """One event after which something else was decided.
+    """One event after which the core decided otherwise than recorded.
 
     Attributes:
         elapsed: seconds since the beginning of the record.
@@ -46,13 +46,13 @@ class Difference:
 
 @dataclass(frozen=True, slots=True)
 class Replay:
-    """What came of a replay.
+    """The result of a replay.
 
     Attributes:
-        decisions: that were recorded.
-        different: events after which something else was decided than recorded.
+        decisions: number of recorded decisions.
+        different: number of events after which the decisions differ from the recorded ones.
         differences: the first few of them.
-        outcome: of the run, as recorded, up to where it is measured.
+        outcome: of the run, as recorded, up to the end of the measurement.
     """
 
     decisions: int
@@ -66,20 +66,20 @@ def replay(
     strategies: Mapping[str, MigrationStrategy], watcher: Watcher | None = None,
     until: float = inf, *, declared: Declared | None = None,
 ) -> Replay:  # fmt: skip
-    """Tell a core again everything that a record holds, at the same times.
+    """Replay all events of a record in a core, at the same times.
 
-    With the settings and plugins of the recorded master it decides the same. The events go on as
-    recorded whatever is decided, so that other settings only show where the first difference is.
+    With the settings and plugins of the recorded master it decides the same. The events follow the
+    record whatever is decided, so other settings only show where the first difference is.
 
     Args:
         recording: of a master's run.
         settings: of the master's core.
         policy: that orders the hosts, with its name.
         strategies: by name.
-        watcher: is shown each event with what came of it.
+        watcher: is called with each event and its commands.
         until: seconds from the beginning of the record: the run is measured up to here. All of it
             is replayed nonetheless.
-        declared: what the offers of policy and strategies declare.
+        declared: declarations of the offers of policy and strategies.
     """
     header = recording.header
     state = MasterState(settings, policy[0], policy[1], strategies, header.epoch, declared=declared)

@@ -1,4 +1,4 @@
-"""Carries out what `rosrm simulate` is asked for: reads the file, runs every variant, compares."""
+"""Runs of `rosrm simulate`: read the file, run every variant, compare."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _LONGEST_OPENING: Final = 64
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """What the command line asks for; the fields are its options."""
+    """The arguments of the command line; the fields are its options."""
 
     file: Path
     variants: Path | None = None
@@ -74,11 +74,11 @@ class Run:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """What came of it.
+    """The results of a command.
 
     Attributes:
         recording: None: a workload was simulated.
-        replayed: the record told to the core again, with the recorded settings.
+        replayed: the replay of the record with the recorded settings.
         agreement: of the recorded run with its simulation.
     """
 
@@ -90,7 +90,7 @@ class Report:
 
 
 def carry_out(request: Request) -> Report:
-    """Simulate; raises `ConfigError` or `RecordError` for what is wrong with the files."""
+    """Simulate; raises `ConfigError` or `RecordError` for errors in the files."""
     registry = Registry.discover()
     changes = _changes(request)
     if _holds_record(request.file):
@@ -128,7 +128,7 @@ def _holds_record(path: Path) -> bool:
 
 
 def _end(request: Request) -> float:
-    """Seconds after which each run ends; inf: when it ends by itself."""
+    """Return the seconds after which each run ends; inf: when nothing can change any more."""
     if not request.until:
         return inf
     try:
@@ -166,7 +166,7 @@ def _of_record(request: Request, changes: Sequence[Node], registry: Registry) ->
 
 
 def agreement_of(path: Path) -> Agreement:
-    """How closely the simulation of a recorded run agrees with it; raises as `carry_out`."""
+    """Return the agreement of a recorded run with its simulation; raises as `carry_out`."""
     agreement = carry_out(Request(path)).agreement
     if agreement is None:
         raise ConfigError(f"{path}: is a workload; only the record of a run can be compared")
@@ -178,7 +178,7 @@ def load_record(path: Path, *, cut: bool = False) -> Recording:
 
     Args:
         path: of its file.
-        cut: take what is there of one that is cut short.
+        cut: accept an incomplete record.
     """
     try:
         with path.open("rb") as file:
@@ -198,8 +198,8 @@ def replay_record(
         until: seconds from the beginning, up to which the recorded run is measured.
 
     Raises:
-        RecordError: its settings are not those of this version.
-        ConfigError, PluginError: a plugin that it names is not here.
+        RecordError: its settings do not fit this version.
+        ConfigError, PluginError: a plugin that it names is not installed.
     """
     try:
         config = ClusterConfig.from_json(json.dumps(dict(recording.header.config)))
@@ -242,7 +242,7 @@ def _plugins(
 
 
 class Shown:
-    """Says on a terminal how far a run is, once it takes longer than a moment."""
+    """A progress display on a terminal, for runs that take more than a moment."""
 
     def __init__(self) -> None:
         from rich.console import Console  # noqa: PLC0415 - only the command line needs rich
@@ -254,12 +254,12 @@ class Shown:
         self._name = ""
 
     def named(self, name: str) -> Shown:
-        """The run of a variant is next."""
+        """Set the variant of the next run; return the display."""
         self._name = name
         return self
 
     def __call__(self, progress: Progress) -> None:
-        """A run is so far."""
+        """Show the progress of a run."""
         if not sys.stderr.isatty() or time.monotonic() - self._began < _SHOWN_AFTER:
             return
         self._status.update(
@@ -271,7 +271,7 @@ class Shown:
             self._status.start()
 
     def close(self) -> None:
-        """All runs are done."""
+        """Remove the display after the last run."""
         if self._on:
             self._status.stop()
 

@@ -1,4 +1,4 @@
-"""What `rosrm simulate` says: a table for people, and the same as JSON."""
+"""Output of `rosrm simulate`: a table for a terminal, and the same as JSON."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rosrm_simulate.agreement import Agreement
 from rosrm_simulate.replay import Replay
 from rosrm_simulate.runs import Report, Run
 
-#: Processes that were never placed, of which the reason is told.
+#: Number of never placed processes whose reason is shown.
 _TOLD: Final = 3
 #: Columns about the processes, and about the hosts: side by side where there is room.
 _PROCESSES: Final = ("HOSTS", "PLACED", "DONE", "MAKESPAN", "WAIT", "LONGEST")
@@ -24,7 +24,7 @@ _WIDE: Final = 125
 
 
 def show(report: Report) -> None:
-    """Print what came of it."""
+    """Print the results of a command."""
     if report.recording is not None and report.replayed is not None:
         _say_of_record(report, report.replayed)
     is_wide = tables.console().width >= _WIDE
@@ -67,7 +67,7 @@ def _cells(run: Run) -> dict[str, str]:
 
 
 def _seconds(seconds: float) -> str:
-    """Rows are compared: minutes would hide what differs."""
+    """Return a time in seconds, because minutes would hide differences between rows."""
     return f"{seconds:.1f} s" if seconds < 999.95 else f"{seconds:.0f} s"
 
 
@@ -90,7 +90,7 @@ def _say_of_record(report: Report, replayed: Replay) -> None:
 
 
 def agreement_lines(agreement: Agreement) -> Iterator[str]:
-    """Say how closely a simulation agrees with its run."""
+    """Yield the lines about the agreement of a simulation with its run."""
     same = round(agreement.same_host * agreement.processes)
     processes = counted(agreement.processes, "process", "processes")
     yield "The simulation compared with the recorded run:"
@@ -112,7 +112,7 @@ def _points(of: Mapping[str, float]) -> str:
 
 
 def report_form(report: Report) -> dict[str, Any]:
-    """All numbers, as `--json` prints them."""
+    """Return all numbers, as printed by `--json`."""
     replayed, recording = report.replayed, report.recording
     return {
         "workload": report.workload.name,

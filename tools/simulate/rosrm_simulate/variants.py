@@ -1,4 +1,4 @@
-"""The variants of a simulation: the settings of a master as they are, then with each change."""
+"""Variants of a simulation: the given settings of a master, then with each change."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from rosrm.errors import ConfigError
 from rosrm.extensions.registry import Registry
 from rosrm.extensions.units import Quantity
 
-#: What of a cluster's settings a simulation can try out.
+#: Sections of a cluster's settings that a variant can change.
 SECTIONS: Final = ("scoring", "migration", "queue", "defaults", "liveness", "delivery_timeout")
 _OF_A_VARIANT: Final = ("name", "hosts", *SECTIONS)
 
@@ -37,7 +37,7 @@ class Variant:
 
 
 def check_keys(node: Node, known: Sequence[str], where: str, problems: Problems) -> None:
-    """Note every key that is not known."""
+    """Add a problem for every unknown key."""
     inside = f" in {where}" if where else ""
     for name, item in node.items.items():
         if name not in known:
@@ -46,13 +46,13 @@ def check_keys(node: Node, known: Sequence[str], where: str, problems: Problems)
 
 
 def text_of(node: Node, key: str) -> str:
-    """The text under a key; "" where there is none."""
+    """Return the text under a key; "" where there is none."""
     found = node.get(key)
     return found.value if found is not None and isinstance(found.value, str) else ""
 
 
 def read_variants(path: str | Path) -> list[Node]:
-    """The variants of a file of their own."""
+    """Return the variants of a file of their own."""
     root, problems = read(path), Problems()
     check_keys(root, ("variants",), "", problems)
     problems.raise_any()
@@ -60,7 +60,7 @@ def read_variants(path: str | Path) -> list[Node]:
 
 
 def variant_in_text(text: str) -> Node:
-    """A variant that is given on the command line as text."""
+    """Return a variant given as text on the command line."""
     return parse(text, "--variant")
 
 
@@ -74,7 +74,7 @@ def variant_of_option(option: str, path: tuple[str, ...], value: str | int) -> N
 
 
 def settings_node(config: Mapping[str, Any], name: str) -> Node:
-    """The sections of recorded settings that a simulation can try out."""
+    """Return the sections of recorded settings that a variant can change."""
     return parse(json.dumps({key: config[key] for key in SECTIONS if key in config}), name)
 
 
@@ -82,10 +82,10 @@ def load_variants(
     base: Node, changes: Sequence[Node], path: str | Path, registry: Registry,
     title: str = "as given",
 ) -> tuple[Variant, ...]:  # fmt: skip
-    """The settings as they are, then with each of the changes.
+    """Return the given settings, then those with each of the changes.
 
     Raises:
-        ConfigError: for everything that is wrong.
+        ConfigError: lists all errors.
     """
     problems = Problems()
     check_keys(base, SECTIONS, "cluster", problems)
@@ -117,7 +117,7 @@ def _variant(base: Node, change: Node, path: str | Path, registry: Registry) -> 
     own = _only(change, SECTIONS)
     under = base
     if change.get("scoring", "policy") is not None and base.get("scoring") is not None:
-        # The options of one policy are not those of another.
+        # The options of one policy do not fit another.
         members = {key: item for key, item in base.items.items() if key != "scoring"}
         under = Node(members, base.place)
     name = text_of(change, "name") or _told(change)
@@ -136,7 +136,7 @@ def _only(node: Node, keys: Sequence[str]) -> Node:
 
 
 def _told(change: Node) -> str:
-    """A variant without a name is called by what it changes."""
+    """Return a name for a variant without one: its changes."""
     return ", ".join(_leaves(change.plain())) or "as given"
 
 
@@ -150,7 +150,7 @@ def _leaves(plain: Any, before: str = "") -> Iterator[str]:
 
 
 def variants_of(root: Node) -> list[Node]:
-    """The variants that a document lists; raises `ConfigError`."""
+    """Return the variants that a document lists; raises `ConfigError`."""
     node = root.get("variants")
     if node is None:
         return []

@@ -1,4 +1,4 @@
-"""What is simulated: hosts that come and go, processes that arrive, and how a host behaves.
+"""Input of a simulation: hosts with their times, arriving processes, and the model of a host.
 
 Seconds, bytes, cores and fractions are the units; times count from the beginning of the run.
 """
@@ -16,7 +16,7 @@ from rosrm.model.values import EMPTY, ProcessSpec, ResourceDescription
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """How every host behaves; docs/reference/simulation.md says what this leaves out.
+    """The model of every host; docs/reference/simulation.md lists its simplifications.
 
     Attributes:
         period: seconds between two readings.
@@ -44,11 +44,10 @@ class HostPlan:
     Attributes:
         resources: with their capacities.
         limits: upper limits, fractions by resource.
-        busy: what others use there, fractions by resource, all the time.
-        joins: when its slave registers.
-        leaves: when it goes; inf: never.
-        lost: it goes without a word, and its processes end with it; else its slave stops in good
-            order.
+        busy: usage by other programs, fractions by resource, all the time.
+        joins: time at which its slave registers.
+        leaves: time at which it goes; inf: never.
+        lost: it goes without a message, and its processes end with it; else its slave shuts down.
     """
 
     name: str
@@ -62,17 +61,17 @@ class HostPlan:
     lost: bool = False
 
     def capacity(self, resource: str) -> float:
-        """Base units; 0 where it has no such resource."""
+        """Return the capacity in base units; 0 where it has no such resource."""
         return next((one.capacity for one in self.resources if one.name == resource), 0.0)
 
     def room(self, resource: str) -> float:
-        """Base units up to the limit, empty."""
+        """Return the base units up to the limit, for an empty host."""
         return self.capacity(resource) * self.limits.get(resource, 1.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """An amount over the age of a process: straight lines between points, level after the last.
+    """An amount over the age of a process: straight lines between points, constant after the last.
 
     Attributes:
         ages: seconds, rising from 0.
@@ -84,7 +83,7 @@ class Curve:
 
     @classmethod
     def growing(cls, first: float, rate: float, most: float) -> Curve:
-        """From `first` by `rate` a second up to `most`; a rate of 0 is level."""
+        """Return a curve from `first` by `rate` a second up to `most`; a rate of 0 is constant."""
         if rate <= 0.0:
             return cls((0.0,), (first,))
         if most == inf:
@@ -93,16 +92,16 @@ class Curve:
 
     @property
     def level_from(self) -> float:
-        """The age from which nothing changes any more."""
+        """Return the age from which the amount is constant."""
         return self.ages[-1]
 
     @property
     def most(self) -> float:
-        """The largest amount; inf: it grows without end."""
+        """Return the largest amount; inf: it grows without end."""
         return inf if self.level_from == inf else max(self.amounts)
 
     def at(self, age: float) -> float:
-        """The amount at an age."""
+        """Return the amount at an age."""
         if age >= self.ages[-1]:
             return self.amounts[-1]
         if self.ages[-1] == inf:
@@ -117,15 +116,15 @@ class Curve:
 
 @dataclass(frozen=True, slots=True)
 class ProcessPlan:
-    """One process: what the master is told of it, and what it really does.
+    """One process: its submission, and its real behaviour.
 
     Attributes:
         spec: as it is submitted.
-        arrives: when it is submitted.
-        memory: that it holds, by its age.
+        arrives: time of its submission.
+        memory: bytes, by its age.
         cpu: cores that it wants.
         disk: bytes that it holds on disk.
-        duration: seconds that it runs where it has all the CPU that it wants; inf: it never ends.
+        duration: seconds that it runs with all the CPU that it wants; inf: it never ends.
     """
 
     spec: ProcessSpec
@@ -137,16 +136,16 @@ class ProcessPlan:
 
     @property
     def name(self) -> str:
-        """Its name."""
+        """Return its name."""
         return self.spec.name
 
 
 @dataclass(frozen=True, slots=True)
 class Workload:
-    """All that is simulated.
+    """The whole input of a simulation.
 
     Attributes:
-        requests: of people: cancel, restart, migrate, drain …, with their times.
+        requests: of users: cancel, restart, migrate, drain …, with their times.
         until: the run ends here at the latest; inf: when nothing can change any more.
     """
 
@@ -158,7 +157,7 @@ class Workload:
     until: float = inf
 
     def with_hosts(self, count: int) -> Workload:
-        """The same on another number of hosts: the first ones, or copies of them all by turns."""
+        """Return a copy with so many hosts: the first ones, or copies of them all by turns."""
         hosts = [_copy(self.hosts, number) for number in range(count)]
         return replace(self, hosts=tuple(hosts))
 

@@ -34,18 +34,18 @@ _LIMITS: Final[Mapping[str, float]] = {"memory": 0.8, "cpu": 0.9, "disk": 0.9}
 
 @dataclass(frozen=True)
 class Drawn:
-    """Marks a quantity that is one value, or drawn evenly from `[lowest, highest]` by the seed."""
+    """A quantity that is one value, or drawn evenly from `[lowest, highest]` by the seed."""
 
     quantity: Quantity
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
-        """Tells pydantic to call `parse`."""
+        """Return a schema with which pydantic calls `parse`."""
         from pydantic_core import core_schema  # noqa: PLC0415 - as in `Quantity`
 
         return core_schema.no_info_plain_validator_function(self.parse)
 
     def parse(self, given: object) -> tuple[float, float]:
-        """Lowest and highest value; raises `ValueError` with what is allowed."""
+        """Return lowest and highest value; raises `ValueError` with the allowed forms."""
         if not isinstance(given, (list, tuple)):
             value = self.quantity.parse(given)
             return value, value
@@ -66,7 +66,7 @@ DrawnRate = Annotated[Span, Drawn(Quantity("amount"))]
 
 @dataclass(frozen=True, slots=True)
 class ModelInFile:
-    """How every host behaves."""
+    """The model of every host."""
 
     period: Annotated[float, Quantity("duration", low=0.01, high=10.0)] = _MODEL.period
     usage_period: PositiveSeconds = _MODEL.usage_period
@@ -96,7 +96,7 @@ class HostInFile:
 
 @dataclass(frozen=True, slots=True)
 class ProcessInFile:
-    """One process, and what it really does."""
+    """One process: its submission, and its real behaviour."""
 
     name: str
     arrives: DrawnSeconds = (0.0, 0.0)
@@ -118,7 +118,7 @@ class ProcessInFile:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """A workload and how it is to be run: as given, then with each change."""
+    """A workload with its variants: the given settings, then each change."""
 
     workload: Workload
     variants: tuple[Variant, ...]
@@ -127,7 +127,7 @@ class Comparison:
 def load_workload(
     path: str | Path, registry: Registry, changes: Sequence[Node] = (), seed: int | None = None
 ) -> Comparison:
-    """Read the workload of a simulation; raises one `ConfigError` for everything that is wrong.
+    """Read the workload of a simulation; raises one `ConfigError` that lists all errors.
 
     Args:
         path: of the file.
@@ -204,7 +204,7 @@ def _until(root: Node, problems: Problems) -> float:
 
 
 def _listed(root: Node, section: str, problems: Problems) -> Iterator[Node]:
-    """The entries of a list, each `foreach` written out."""
+    """Yield the entries of a list, with each `foreach` expanded."""
     node = root.get(section)
     if node is None or not isinstance(node.value, tuple) or not node.value:
         what = "host" if section == "hosts" else "process"
@@ -299,7 +299,7 @@ def _spec(given: ProcessInFile, needs: Mapping[str, float]) -> ProcessSpec:
 def _check_fits(
     node: Node, given: ProcessInFile, hosts: Sequence[HostPlan], problems: Problems
 ) -> None:
-    """A process that is larger than every host could only wait for ever."""
+    """Add a problem for a process that is larger than every host, and so could only wait."""
     amounts = {"memory": given.memory[1], "disk": given.disk[1]}
     declared = {name: amount for name, amount in given.needs.items() if name in _UNITS}
     for where, wanted in (((), amounts), (("needs",), declared)):
@@ -317,7 +317,7 @@ def _check_fits(
 def _refuse_endless(
     nodes: Sequence[Node], plans: Sequence[ProcessPlan | None], until: float, problems: Problems
 ) -> None:
-    """A run that never comes to rest needs an end."""
+    """Add a problem for a run without an end."""
     for node, plan in zip(nodes, plans, strict=True):
         if plan is not None and plan.memory.most == inf == plan.duration == until:
             problems.add(

@@ -1,1 +1,1 @@
-"""Programs that run within a virtual host, by their path, with the standard library alone."""
+"""Programs that run within a virtual host, by their paths, with the standard library alone."""

@@ -1,7 +1,7 @@
-"""The first process of a virtual host: makes it a host of its own, then buries what is orphaned.
+"""The first process of a virtual host: it sets up the host, then reaps orphans.
 
-Executed in new namespaces; its first child is PID 1 there. It says on a pipe "pid N" (as seen from
-outside), then "ready" or "failed WHY". Standard library only.
+Executed in new namespaces; its first child is PID 1 there. It writes to a pipe "pid N" (as seen
+from outside), then "ready" or "failed WHY". Standard library only.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ FOLDERS = ("state", "tmp", "ros")
 
 
 def main() -> None:
-    """Become PID 1 of the namespaces that this was started in."""
+    """Become PID 1 of the namespaces in which this process was started."""
     settings = json.loads(sys.argv[1])
     ready = int(settings["ready"])
     child = os.fork()
@@ -42,13 +42,13 @@ def main() -> None:
 
 
 def set_up(settings: dict[str, str]) -> None:
-    """Name and mounts of the host."""
+    """Set the name and the mounts of the host."""
     socket.sethostname(settings["hostname"])
     mount("-t", "proc", "-o", "nosuid,nodev,noexec", "proc", "/proc")
     mount("-t", "tmpfs", "-o", "mode=755,nosuid,nodev", "tmpfs", "/run")
     own_sysfs()
     shared = ",".join(["mode=1777,nosuid,nodev", *settings["shm_options"].split()])
-    mount("-t", "tmpfs", "-o", shared, "tmpfs", "/dev/shm")  # noqa: S108 - what it is about
+    mount("-t", "tmpfs", "-o", shared, "tmpfs", "/dev/shm")  # noqa: S108 - a mount point
     if os.path.isdir("/dev/mqueue"):
         mount("-t", "mqueue", "mqueue", "/dev/mqueue")
     own_data(settings["image"])
@@ -56,7 +56,7 @@ def set_up(settings: dict[str, str]) -> None:
 
 
 def own_sysfs() -> None:
-    """Show the host's own network interfaces, beside the control groups of the machine."""
+    """Mount a sysfs with the host's own network interfaces, and the machine's control groups."""
     kept = "/run/cgroup"
     os.mkdir(kept)
     mount("--rbind", "/sys/fs/cgroup", kept)
@@ -66,7 +66,7 @@ def own_sysfs() -> None:
 
 
 def own_data(image: str) -> None:
-    """The host's disk. Whoever is a user on the host may write there."""
+    """Mount the host's disk, writable for every user on the host."""
     os.mkdir(DATA)
     mount("-o", "loop,noatime", image, DATA)
     os.chmod(DATA, 0o1777)  # noqa: S103 - as /tmp
@@ -77,7 +77,7 @@ def own_data(image: str) -> None:
 
 
 def own_hosts_file(content: str) -> None:
-    """Let the hosts know each other by name."""
+    """Mount an /etc/hosts with the names of all hosts."""
     if os.path.isfile("/etc/hosts"):
         with open("/run/hosts", "w", encoding="ascii") as file:
             file.write(content)
@@ -85,12 +85,12 @@ def own_hosts_file(content: str) -> None:
 
 
 def mount(*words: str) -> None:
-    """Have something mounted; raises `CalledProcessError`."""
+    """Run `mount`; raises `CalledProcessError`."""
     subprocess.run(["mount", *words], check=True, capture_output=True)
 
 
 def let_go() -> None:
-    """Of the terminal, directory and files of whoever made this host."""
+    """Release the terminal, the directory and the files of the process that made this host."""
     os.chdir("/")
     null = os.open(os.devnull, os.O_RDWR)
     for descriptor in (0, 1, 2):
@@ -106,7 +106,7 @@ def reap() -> None:
             while os.waitpid(-1, os.WNOHANG)[0]:
                 continue
         except ChildProcessError:
-            pass  # nobody to wait for at the moment
+            pass  # there are no children at the moment
         signal.sigwait({signal.SIGCHLD})
 
 

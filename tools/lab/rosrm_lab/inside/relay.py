@@ -1,8 +1,8 @@
-"""Runs a command on a virtual host and stands for it outside: signals in, exit status out.
+"""Relay of a command on a virtual host for processes outside: signals in, exit status out.
 
-Executed within the host's namespaces, but as a process of the machine: its child is the first to
-be one of the host. What the terminal sends, the child gets by itself; what somebody sends to this
-process is passed on. When this process is killed, so is the child. Standard library only.
+Executed within the host's namespaces, but as a process of the machine: its child is the first
+process of the host. The child receives signals of the terminal directly; the relay passes on
+signals that a process sends to it. SIGKILL to the relay ends the child, too. Standard library only.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import signal
 import sys
 from typing import Any
 
-#: What is passed on. SIGTSTP is not here: it stops this process, as a shell expects.
+#: Signals that are passed on. Not SIGTSTP, which stops this process, as a shell expects.
 PASSED = frozenset(
     {
         signal.SIGHUP,
@@ -28,14 +28,14 @@ PASSED = frozenset(
         signal.SIGWINCH,
     }
 )
-#: As shells say it.
+#: Exit statuses as in shells.
 NOT_FOUND = 127
 NOT_EXECUTABLE = 126
 NO_HOST = 125
 
 
 def main() -> None:
-    """Start the command, relay, and end as it ends."""
+    """Start the command, relay signals, and end with its exit status."""
     order = json.loads(sys.argv[1])
     command = sys.argv[2:]
     os.chdir(order["directory"] if os.path.isdir(order["directory"]) else order["data"])
@@ -50,7 +50,7 @@ def main() -> None:
 
 
 def check(program: str, host: str) -> None:
-    """Say on whose behalf, when there is no such program."""
+    """Exit with a message that names the host, where there is no such program."""
     if shutil.which(program) is not None:
         return
     there = os.path.exists(program) and "/" in program
@@ -60,7 +60,7 @@ def check(program: str, host: str) -> None:
 
 
 def fork(host: str) -> int:
-    """As `os.fork`; the kernel gives a host that is just ending no process more."""
+    """Fork as `os.fork`; exit where the host is just ending, and the kernel refuses a process."""
     try:
         return os.fork()
     except OSError as error:
@@ -69,7 +69,7 @@ def fork(host: str) -> int:
 
 
 def become(order: dict[str, Any], command: list[str], mask: set[int]) -> None:
-    """In the child: enter the control groups, and be the command."""
+    """Enter the control groups, and execute the command; called in the child."""
     try:
         for door in order["doors"]:
             os.write(door, b"0")
@@ -77,7 +77,7 @@ def become(order: dict[str, Any], command: list[str], mask: set[int]) -> None:
     except OSError as error:
         print(f"rosrm: {order['host']} has gone: {error.strerror}", file=sys.stderr)
         os._exit(NO_HOST)
-    for number in (signal.SIGPIPE, signal.SIGXFSZ):  # Python ignores them; others should not
+    for number in (signal.SIGPIPE, signal.SIGXFSZ):  # ignored by Python, not by other programs
         signal.signal(number, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_SETMASK, mask)
     words = ["setpriv", "--pdeathsig", "KILL", *order["identity"], "--", *command]
@@ -85,14 +85,14 @@ def become(order: dict[str, Any], command: list[str], mask: set[int]) -> None:
 
 
 def relay(child: int) -> int:
-    """Pass signals on until the child has ended; returns its wait status."""
+    """Pass signals on until the child has ended; return its wait status."""
     while True:
         told = signal.sigwaitinfo(PASSED | {signal.SIGCHLD})
         if told.si_signo != signal.SIGCHLD:
-            if told.si_code <= 0:  # a process sent it; the kernel's own went to the child as well
+            if told.si_code <= 0:  # sent by a process; the child received the kernel's own as well
                 os.kill(child, told.si_signo)
             continue
-        while True:  # one signal may stand for several changes
+        while True:  # one signal may announce several changes
             pid, status = os.waitpid(child, os.WNOHANG | os.WUNTRACED)
             if not pid:
                 break
