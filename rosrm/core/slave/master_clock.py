@@ -12,10 +12,10 @@ class BeatClock:
     """Estimates the send time of beats, to tell a beat that waited in a socket from a prompt one.
 
     A slave that was stopped (SIGSTOP) finds old beats in its sockets. They name the hosts in
-    contact at their send time, not now. The monotonic clocks of two machines share only their rate. So the
-    fastest beat since the handshake gives the difference of the clocks, and a beat that took longer
-    was sent earlier by that time. The result is too late only by the transport time of the fastest
-    beat.
+    contact at their send time, not now. The monotonic clocks of two machines share only their rate.
+    So the fastest beat since the handshake gives the difference of the clocks, and a beat that took
+    longer was sent earlier by that time. The result is too late only by the transport time of the
+    fastest beat.
     """
 
     def __init__(self) -> None:
