@@ -24,7 +24,7 @@ SPEC_FIELDS: Final = tuple(f.name for f in fields(ProcessSpec))
 class UndeclaredField(LookupError):
     """A policy reads a field of a spec that its offer does not declare.
 
-    Not an AttributeError: `getattr` with a default would turn that into a wrong value in silence.
+    Not an AttributeError, because `getattr` with a default would silently return a wrong value.
     """
 
 
@@ -61,7 +61,7 @@ def declared_spec(spec: ProcessSpec, reads: tuple[str, ...]) -> ProcessSpec:
 
 
 def no_options(_strategy: str, _spec: ProcessSpec) -> Any:
-    """Return None: no offer says what the options of a strategy are."""
+    """Return None: no offer declares the options of a strategy."""
     return None
 
 
