@@ -215,7 +215,7 @@ class MigrationStrategy(Protocol):
     """Proposes the migration of a process, as data. Pure; the core carries the plan out."""
 
     def propose(self, move: Move) -> Plan:
-        """Return the plan of a migration; raise `ValueError` with the reason for none."""
+        """Return the plan of a migration; raise `ValueError` with the reason if there is none."""
 
 
 class SpecChecking(Protocol):
@@ -261,7 +261,7 @@ class Imaging(Protocol):
 
 
 class PeriodicImaging(Protocol):
-    """A migration strategy that dumps a running process now and then, to start it after a crash."""
+    """A migration strategy that dumps running processes periodically, for a start after a crash."""
 
     def checkpoint_every(self, spec: ProcessSpec) -> float:
         """Return the seconds between two dumps that the process asks for; 0.0: none. Pure."""

@@ -72,7 +72,7 @@ class Declared:
     Attributes:
         reads: fields of a spec that scoring policies read beyond the standard ones.
         options_of: returns the options of a strategy for a spec, merged and parsed; raises
-            `ValueError` for what the strategy does not take.
+            `ValueError` for an option that the strategy does not accept.
         executors: names by strategy, of the offers that are known.
         brought_by: the distribution by strategy, where it is known.
     """

@@ -1,10 +1,10 @@
 """Guarded calls of plugins by the core: a failed call costs one decision, and is counted.
 
 ============  ============================================================================
-a plugin      what changes that, and is recorded
+plugin state  recorded event, and the next state
 ============  ============================================================================
-selected      a call raises, is late, or answers what the contract does not allow: `failing`
-failing       a call fails with another error than was recorded last: recorded at most once in
+selected      a call raises, is late, or breaks the contract by its answer: `failing`
+failing       a call fails with an error other than the last recorded one: at most one record in
               `TOLD_AGAIN` seconds
 failing       a call is good, and no call has failed for `WORKS_AFTER` seconds: `selected`
 ============  ============================================================================

@@ -202,8 +202,8 @@ class Registry:
     def rows(self, *kinds: str, host: str = "") -> list[PluginRow]:
         """Return one row for each offer and each fault of these kinds (of all where none is given).
 
-        State and reason are those that the calls below have left: "available" until something was
-        made, then "selected", "absent" or "broken".
+        State and reason depend on the calls below: "available" until the object was made, then
+        "selected", "absent" or "broken".
         """
         rows = []
         for (kind, name), offered in sorted(self._offers.items()):

@@ -1,8 +1,8 @@
 """Quantities with units, for our settings and for the options of plugins.
 
-A field annotated with one of these takes a number in base units or text with a unit, and refuses
-what is out of its range. Nothing here imports pydantic until a file is validated, for the runtimes
-of master and slave start without it::
+A field annotated with one of these types accepts a number in base units or text with a unit, and
+refuses a value out of its range. This module imports pydantic only when a file is validated,
+because the runtimes of master and slave start without it::
 
     @dataclass(frozen=True)
     class Options:

@@ -159,7 +159,7 @@ class Health:
 
 @dataclass(frozen=True, slots=True)
 class ProcessSpec:
-    """One process to run, in the words of ROS 2 launch.
+    """One process to run, in the terms of ROS 2 launch.
 
     Exactly one of `package` with `executable`, `module` and `command` is given.
 
@@ -394,7 +394,7 @@ class ResourceDescription:
         name: "memory", "cpu", "disk", ...
         unit: base unit of `capacity`: "B", "core", "B/s", "1".
         capacity: what usage 1.0 stands for, > 0.
-        scope: measured unit: "machine", "cgroup", "slice" or a name of the probe's choice.
+        scope: of the measurement: "machine", "cgroup", "slice" or a name that the probe defines.
     """
 
     name: str

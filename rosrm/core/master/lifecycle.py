@@ -96,7 +96,7 @@ def reconcile(
 
 
 def _yet_to_start(state: MasterState, instance: Instance) -> bool:
-    """Return True if a plan has yet to order the start of an instance that it counts there."""
+    """Return True if a plan has reserved room for an instance and not ordered its start yet."""
     run = state.runs.get(instance.id.process)
     return run is not None and any(
         isinstance(step, Start) and step.instance == instance.id for step in run.ahead

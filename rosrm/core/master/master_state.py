@@ -34,9 +34,9 @@ from rosrm.wording import one_line
 
 #: Records of one process that `explain` shows.
 _HISTORY: Final = 12
-#: Instance numbers are made durable by so many at a time.
+#: Instance numbers that are reserved durably at a time.
 _RESERVED: Final = 1000
-#: Phases between the return of a host and its report of what runs there.
+#: Phases between the rejoin of a host and its report of its instances.
 _ON_THE_WAY_BACK: Final = frozenset({ProcessPhase.ASSIGNED, ProcessPhase.STARTING})
 #: Phases of processes that wait for a host.
 WAITING: Final = (ProcessPhase.QUEUED, ProcessPhase.SET_ASIDE)

@@ -138,7 +138,7 @@ def _submission_fault(state: MasterState, event: happened.SubmissionReceived) ->
 
 
 def _strategy_fault(state: MasterState, spec: ProcessSpec) -> str:
-    """Return why the strategy of a spec cannot move the process; "": it can, by what is known."""
+    """Return why the strategy of a spec cannot move the process; "": no reason is known."""
     name = spec.migration.strategy or ""
     strategy: object = state.strategies.get(name)
     if strategy is None:

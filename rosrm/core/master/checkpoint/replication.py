@@ -171,7 +171,7 @@ def _choose(
     if choice is None:
         choice = told.choice if told is not None and chosen else _as_kept(process, host, holdings)
     if not chosen and not choice.hosts:
-        return  # no other host keeps a state, and the policy has asked for none
+        return  # no other host has a replica, and the policy has chosen none
     incarnation = host.description.incarnation
     known = (
         told is not None

@@ -122,8 +122,8 @@ def _registered_again(
 def _forgive(state: MasterState, host: Host) -> None:
     """Clear the exclusions and reasons that stem from the former run of a host's slave.
 
-    The slave may find now what it lacked. The master also stops there any process that may have run
-    on in between.
+    The slave may have now what it lacked. The master also stops instances there that may have run
+    on while the slave was away.
     """
     for name in state.over:
         process = state.processes[name]

@@ -221,7 +221,7 @@ def _why_no_slot(hosts: Candidates, row: int) -> str:
 
 
 def _has_room(hosts: Candidates) -> BoolArray:
-    # A host without a resource has NaN there, which is over nothing.
+    # A host without a resource has NaN there, which exceeds no limit.
     limits = hosts.cells[LIMIT] - (hosts.demand.headroom - _CLOSE)
     has_room: BoolArray = ~np.logical_or.reduce(hosts.busy + hosts.need > limits)
     return has_room

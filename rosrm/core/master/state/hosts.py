@@ -26,8 +26,8 @@ from rosrm.core.master.state.host_arrays import (
 from rosrm.extensions.plugin_calls import Failing, Plugin
 from rosrm.model.values import HostDescription
 
-#: An estimate, unlike a declared need, fills at most this part of a host's limit: a guess alone
-#: must not keep a process off every host for ever.
+#: An estimate, unlike a declared need, fills at most this share of a host's limit, because a guess
+#: alone must not exclude a process from every host.
 _MOST_GUESSED: Final = 0.5
 
 

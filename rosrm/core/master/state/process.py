@@ -175,7 +175,7 @@ class Process:
         wall: unix time at which its phase began.
         out_of_sight: its phase when its host was lost, with the start of that phase (`since` and
             `wall`); None: its host reports, or the process has another phase since.
-        born: lowest number that an instance of it can have; snapshots of lower ones are not its.
+        born: lowest number that an instance of it can have; snapshots of lower ones are void.
         owner: number of the instance that owns the name; 0: none.
         instances: numbers of all its instances that may still run.
         excluded: host name to the reason why it cannot run there.
