@@ -1,1 +1,1 @@
-"""The pure part: it decides. No ROS, clock, thread, file or log; time is an argument."""
+"""Pure logic of master, slave and supervisor: no ROS, clock, thread, file or log; time is given."""

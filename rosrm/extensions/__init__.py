@@ -1,7 +1,7 @@
-"""Plugins: their contracts, their hooks, and the registry of what is installed.
+"""Plugins: contracts, hooks, and the registry of installed plugins.
 
 hookspecs.py         every hook, in one list
-contracts.py         what a probe, policy, strategy or port implements, and what it offers
+contracts.py         Protocols of probes, policies, strategies and ports, and their offers
 options.py           the options of a process, merged over those of the cluster
 units.py             numbers with units in options
 discovery.py         loads the installed plugins, and calls their hooks

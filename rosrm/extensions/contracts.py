@@ -1,4 +1,4 @@
-"""The Protocols that plugins and adapters implement, and the values that pass through them.
+"""Plugin contracts: Protocols that plugins and adapters implement, and the values they exchange.
 
 A plugin registers an *offer* of each thing it brings (`ProbeOffer`, `ScoringOffer`, ...): a name, a
 frozen dataclass of options, and a function that makes the object. The configuration chooses offers
@@ -33,7 +33,7 @@ BoolArray = npt.NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class NoOptions:
-    """For a plugin that has nothing to set."""
+    """Options of a plugin that has nothing to set."""
 
 
 # --- probes (slave) ---------------------------------------------------------------------------
@@ -48,10 +48,10 @@ class Probe(Protocol):
 
     @property
     def resources(self) -> Sequence[ResourceDescription]:
-        """What `read` reports, known when the probe is made; names are unique on a host."""
+        """Return the resources that `read` reports; fixed, with names unique on a host."""
 
     def read(self) -> Iterable[Reading]:
-        """The utilisation now: one reading for each of `resources`, fractions of the capacity."""
+        """Return the utilisation now: one reading per resource, fractions of the capacity."""
 
     def close(self) -> None:
         """Release what the probe holds; called once, at the slave's end."""
@@ -61,15 +61,15 @@ class Sessions(Protocol):
     """The sessions (process trees) that the slave runs, for probes whose scope is the slice."""
 
     def pids(self) -> Sequence[int]:
-        """Every known process of the slave's sessions; may be up to 1 s behind."""
+        """Return the pids of all processes in the slave's sessions; up to 1 s old."""
 
     def ended_cpu_time(self) -> float:
-        """Seconds of CPU that processes which have ended used; never falls."""
+        """Return the CPU seconds that ended processes used; never falls."""
 
 
 @dataclass(frozen=True)
 class ProbeContext:
-    """What a probe may know of its host when it is made.
+    """Facts about the host, for the creation of a probe.
 
     Attributes:
         scope: "machine", "cgroup" or "slice", as the host's configuration says; a probe's own
@@ -98,7 +98,7 @@ class ProbeOffer:
         period: seconds between reads.
         deadline: seconds after which a read counts as late.
         default: chosen where the configuration names no probes.
-        resources: names of all that it may read; (): one of its own name.
+        resources: names of all that it may read; (): one with the name of the probe.
     """
 
     name: str
@@ -111,7 +111,7 @@ class ProbeOffer:
     resources: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        """Fill in the resource of a probe that has one name for both."""
+        """Set the default of `resources`: one resource with the name of the probe."""
         object.__setattr__(self, "resources", tuple(self.resources) or (self.name,))
 
 
@@ -125,11 +125,11 @@ class HostView:
     Attributes:
         names: N host names.
         resources: R resource names, the columns.
-        usage: (N, R) reading + in-flight load, fractions of the capacity; NaN where a host does
+        usage: (N, R) reading + reservations, fractions of the capacity; NaN where a host does
             not measure such a resource. `column` has no NaN.
         limit: (N, R) upper limits, fractions; 1 where a host sets none.
         capacity: (N, R) base units for usage 1.0; NaN as in `usage`.
-        processes: (N,) processes held or promised.
+        processes: (N,) processes held or reserved.
         labels: N mappings, the labels of each host.
     """
 
@@ -146,12 +146,12 @@ class HostView:
 
         Args:
             resource: its name.
-            missing: stands where a host does not measure it.
+            missing: value for a host that does not measure it.
         """
         if resource not in self.resources:
             return np.full(len(self.usage), missing)
         column = self.usage[:, self.resources.index(resource)]
-        # One product tells whether there is any NaN, in a tenth of the time that replacing takes.
+        # One product shows any NaN, in a tenth of the time that a replacement takes.
         if math.isnan(column.dot(column)):
             return np.nan_to_num(column, nan=missing)
         return np.array(column)
@@ -159,13 +159,13 @@ class HostView:
 
 @dataclass(frozen=True)
 class ProcessView:
-    """What a scoring policy may know of the process to place.
+    """The process to place, for a scoring policy.
 
     Attributes:
-        spec: as submitted. A policy gets the standard fields (what it runs, `namespace`, `kind`,
+        spec: as submitted. A policy gets the standard fields (program, `namespace`, `kind`,
             `priority`, `needs` and labels) and those that its offer declares in `reads`; to read
             another one raises `UndeclaredField`.
-        need: (N, R) what it will use on each host, fractions of that host's capacity.
+        need: (N, R) demand of the process on each host, fractions of that host's capacity.
     """
 
     spec: ProcessSpec
@@ -179,8 +179,8 @@ class Scores:
     Attributes:
         value: (N,) finite where not vetoed.
         veto: (N,) True: this host may not take it; None: no vetoes.
-        veto_reason: says why the host at a row is vetoed.
-        reason: says how the value of the host at a row came about.
+        veto_reason: returns the reason of the veto on the host at a row.
+        reason: returns the origin of the value of the host at a row.
     """
 
     value: FloatArray
@@ -193,9 +193,9 @@ class ScoringPolicy(Protocol):
     """Orders the hosts that fit. Pure and deterministic: the same arguments, the same scores."""
 
     def score(self, hosts: HostView, process: ProcessView) -> Scores:
-        """Judge every row of `hosts` by itself: no row's score may depend on the other rows.
+        """Judge each row of `hosts` separately: no row's score may depend on the other rows.
 
-        The core asks for all hosts once and then anew for single rows that have changed.
+        The core calls this once for all hosts, and again for single rows that have changed.
         """
 
 
@@ -219,17 +219,17 @@ class ScoringOffer:
 
 
 class MigrationStrategy(Protocol):
-    """Proposes how a process moves, as data. Pure; the core carries the plan out."""
+    """Proposes the migration of a process, as data. Pure; the core carries the plan out."""
 
     def propose(self, move: Move) -> Plan:
-        """The steps of this move. Raises `ValueError` with the reason where it cannot move it."""
+        """Return the plan of a migration; raise `ValueError` with the reason if there is none."""
 
 
 class SpecChecking(Protocol):
-    """A migration strategy that says of a spec, before it is queued, whether it can move it."""
+    """A migration strategy that checks, before a spec is queued, that it can move the process."""
 
     def spec_fault(self, spec: ProcessSpec) -> str:
-        """What is wrong with it, its own `migration.options` included; "": nothing. Pure."""
+        """Return the fault of a spec, its own `migration.options` included; "": none. Pure."""
 
 
 class HostChecking(Protocol):
@@ -237,53 +237,54 @@ class HostChecking(Protocol):
 
     @property
     def ability(self) -> str:
-        """The executor that says of a host whether the strategy works there.
+        """Return the executor that checks on a host that the strategy works there.
 
-        It is asked once after each registration of a host, without arguments, and answers with
-        what must match on another host, text to text. Where it does not work it raises.
+        The core runs it once after each registration of a host, without arguments. It answers with
+        the properties that must match on another host, text to text. It raises where the strategy
+        does not work.
         """
 
     def host_fault(self, source: Mapping[str, str], destination: Mapping[str, str]) -> str:
-        """Why nothing can be moved so between two hosts of these answers; "": it can. Pure."""
+        """Return why nothing can move between hosts with these answers; "": it can. Pure."""
 
 
 class Imaging(Protocol):
     """A migration strategy that dumps a process into an image, and restores it on the same host."""
 
     def checkpoint(self, move: Move) -> Plan:
-        """The steps until the source has ended, and its image owns the name. Pure.
+        """Return the plan that ends the source and gives its name to its image. Pure.
 
-        They name one host, start nothing, and stop the source after the commit: it must not run
-        again. Raises `ValueError` with the reason where it can make no image of the process.
+        The steps name one host, start nothing, and stop the source after the commit: it must not
+        run again. Raises `ValueError` with the reason where no image of the process can be made.
         """
 
     def restore(self, move: Move) -> Plan:
-        """The steps until the destination goes on from the image of the source. Pure.
+        """Return the plan that restores the destination from the image of the source. Pure.
 
-        The source does not run. Before the commit each step is undone so that the image lies where
-        it lay; an undo that finds the destination going on already answers `active: true`, and the
-        plan goes forward from there. Raises `ValueError` as `checkpoint`.
+        The source does not run. Before the commit, each step has an undo that leaves the image in
+        its place. An undo that finds the destination running already answers `active: true`, and
+        the plan goes forward from there. Raises `ValueError` as `checkpoint`.
         """
 
 
 class PeriodicImaging(Protocol):
-    """A migration strategy that dumps a process which then goes on, for its start after a crash."""
+    """A migration strategy that dumps running processes periodically, for a start after a crash."""
 
     def checkpoint_every(self, spec: ProcessSpec) -> float:
-        """Seconds from one dump to the next, as the process asks for them; 0.0: none. Pure."""
+        """Return the seconds between two dumps that the process asks for; 0.0: none. Pure."""
 
     def periodic(self, spec: ProcessSpec, instance: InstanceId, host: str, now: int) -> Execute:
-        """The step that dumps an instance and lets it go on. Pure.
+        """Return the step that dumps an instance and resumes it. Pure.
 
-        Its answer may have `size` (bytes) and `seconds` (of each part, by its name). Whatever
-        fails, the process goes on. `now` is unix time, whole seconds.
+        Its answer may have `size` (bytes) and `seconds` (of each part, by its name). The process
+        must resume after any failure. `now` is unix time, whole seconds.
         """
 
     @property
     def discard(self) -> str:
-        """The executor that removes such images of instances that have ended from its host.
+        """Return the executor that removes such images of ended instances from its host.
 
-        Without arguments; it does not come for each of them, and may come in vain.
+        It runs without arguments, not for each of them, and possibly with nothing to remove.
         """
 
 
@@ -314,9 +315,9 @@ class MigrationOffer:
     Attributes:
         capabilities: what it can do; where that depends on options, a pure function of the options
             that hold for one process. It must not change `launcher`.
-        executors: what the open step of its plans may name; each runs on a slave with the step's
-            arguments (a JSON object) and answers with one.
-        own_options: what can be set for one process, where that is more than for all: a dataclass
+        executors: those that the open step of its plans may name; each runs on a slave with the
+            step's arguments (a JSON object) and answers with one.
+        own_options: options of one process, where they are more than those for all: a dataclass
             that derives from `options`.
     """
 
@@ -431,14 +432,14 @@ class LauncherOffer:
 
 @dataclass(frozen=True)
 class CheckpointView:
-    """What a checkpoint policy may know of a stateful process that runs.
+    """A running stateful process, for a checkpoint policy.
 
     Attributes:
         spec: as submitted.
-        host: where it runs; it keeps a state of its own there whatever the policy says.
-        age: seconds since a newer state was kept on any other host; None: on none it ever was.
-        size: bytes of its newest state.
-        kept_on: other hosts that keep a state of it now, the newest first.
+        host: of the process; its own snapshot is there whatever the policy decides.
+        age: seconds since another host got a newer replica; None: no other host ever had one.
+        size: bytes of its newest snapshot.
+        kept_on: other hosts with a replica now, the newest first.
         hosts: every host that is up, this one included, by name, with its labels.
     """
 
@@ -452,10 +453,10 @@ class CheckpointView:
 
 @dataclass(frozen=True)
 class CheckpointChoice:
-    """Where a state is kept from now on.
+    """Placement of the replicas of a snapshot from now on.
 
     Attributes:
-        hosts: other than the process's own; (): nowhere.
+        hosts: other than the process's own; (): none.
         every: seconds between two transfers to a host, at least.
     """
 
@@ -464,22 +465,22 @@ class CheckpointChoice:
 
 
 class CheckpointPolicy(Protocol):
-    """Decides where the state of a process is kept, and how often. Pure."""
+    """Decides on the hosts and the period of snapshot replication. Pure."""
 
     def choose(self, process: CheckpointView) -> CheckpointChoice | None:
-        """Where to keep it from now on; None: as before. Asked about once a second."""
+        """Return the placement from now on; None: unchanged. Called about once a second."""
 
 
 @dataclass(frozen=True)
 class MemoryView:
-    """What a checkpoint policy may know of a process that asks for periodic checkpoints.
+    """A process that asks for periodic checkpoints, for a checkpoint policy.
 
     Attributes:
         spec: as submitted.
-        host: where it runs.
-        asked: seconds from one checkpoint of its memory to the next, as it asks for them.
+        host: of the process.
+        asked: seconds between two checkpoints of its memory that the process asks for.
         size: bytes of the last one; 0: there is none yet.
-        pause: seconds for which the process stood still for it.
+        pause: seconds for which the dump paused the process.
     """
 
     spec: ProcessSpec
@@ -490,10 +491,10 @@ class MemoryView:
 
 
 class MemoryPacing(Protocol):
-    """A checkpoint policy that has the memory of processes dumped, too."""
+    """A checkpoint policy that also sets the period of memory dumps."""
 
     def pace(self, process: MemoryView) -> float | None:
-        """Seconds from the last checkpoint of its memory to the next one; None: none is made."""
+        """Return the seconds from the last checkpoint of its memory to the next one; None: none."""
 
 
 @dataclass(frozen=True)
@@ -514,9 +515,9 @@ class Record:
     """One line of the event record, and the intent that it changes.
 
     Attributes:
-        process: that it concerns; "" for none.
-        host: that it concerns; "" for none.
-        message: one sentence for people.
+        process: name; "" for none.
+        host: name; "" for none.
+        message: one sentence for logs and listings.
         facts: JSON-able particulars.
     """
 
@@ -545,12 +546,12 @@ class StoredRecord:
 
 @dataclass(frozen=True, slots=True)
 class Intent:
-    """What shall be, durably: the newest value under a key replaces the older ones.
+    """A desired value, durable: the newest value under a key replaces the older ones.
 
     Attributes:
         table: "process", "migration", "host", "learned", "cluster", "removed".
         key: within the table.
-        value: JSON-able; None: the key is gone.
+        value: JSON-able; None: the key is removed.
     """
 
     table: str
@@ -560,7 +561,7 @@ class Intent:
 
 @runtime_checkable
 class Journal(Protocol):
-    """Keeps intent and the event record. What `write` has returned from survives a SIGKILL."""
+    """Stores intents and the event record; data survives a SIGKILL once `write` has returned."""
 
     def write(
         self, records: Sequence[Record], intents: Sequence[Intent], now: float
@@ -568,14 +569,14 @@ class Journal(Protocol):
         """Append records and replace intents in one atomic group; raises `JournalError`."""
 
     def intents(self, table: str) -> Mapping[str, Mapping[str, Any]]:
-        """All intents of a table by key."""
+        """Return all intents of a table by key."""
 
     def records(
         self, *, after: int = 0, process: str = "", host: str = "", newest: int = 1000
     ) -> Sequence[StoredRecord]:
-        """The newest matching records after a sequence, oldest first.
+        """Return the newest matching records after a sequence, oldest first.
 
-        Those of a host include moves from it: their facts name the host as `from`.
+        Those of a host include migrations from it: their facts name the host as `from`.
         """
 
     def close(self) -> None:

@@ -26,7 +26,7 @@ SPEC_FIELDS: Final = tuple(f.name for f in fields(ProcessSpec))
 class UndeclaredField(LookupError):
     """A policy reads a field of a spec that its offer does not declare.
 
-    Not an AttributeError: `getattr` with a default would turn that into a wrong value in silence.
+    Not an AttributeError, because `getattr` with a default would silently return a wrong value.
     """
 
 
@@ -63,7 +63,7 @@ def declared_spec(spec: ProcessSpec, reads: tuple[str, ...]) -> ProcessSpec:
 
 
 def no_options(_strategy: str, _spec: ProcessSpec) -> Any:
-    """Return None: no offer says what the options of a strategy are."""
+    """Return None: no offer declares the options of a strategy."""
     return None
 
 
@@ -87,7 +87,7 @@ class Declared:
     Attributes:
         reads: fields of a spec that scoring policies read beyond the standard ones.
         options_of: returns the options of a strategy for a spec, merged and parsed; raises
-            `ValueError` for what the strategy does not take.
+            `ValueError` for an option that the strategy does not accept.
         executors: names by strategy, of the offers that are known.
         brought_by: the distribution by strategy, where it is known.
         capabilities_of: returns what the strategy of a process can do for it; never raises.

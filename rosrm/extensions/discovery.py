@@ -1,7 +1,7 @@
-"""Finds the installed plugins and calls their hooks, each by itself.
+"""Discovery of installed plugins: import, hooks, checks of their offers.
 
 A plugin that does not import, raises in a hook or misspells one is reported as broken, with its
-distribution, the hook and the place of its definition; the others go on.
+distribution, the hook and the place of its definition. It does not affect the other plugins.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ T = TypeVar("T")
 ChosenOffer: TypeAlias = "ProbeOffer | ScoringOffer | MigrationOffer | CheckpointOffer"
 Offer: TypeAlias = "ChosenOffer | LauncherOffer"
 
-#: What each hook registers, and of which type its offers are.
+#: Hook to the kind and the type of its offers.
 HOOKS: Final[Mapping[str, tuple[str, type[Any]]]] = {
     "register_probes": ("probe", ProbeOffer),
     "register_scoring_policies": ("scoring", ScoringOffer),
@@ -52,7 +52,7 @@ SLOW_LOADING: Final = 5.0
 #: Seconds for the import of a plugin, and for each of its hooks.
 LOADING_LIMIT: Final = 30.0
 
-#: What a plugin may do wrong; a plugin that calls `sys.exit` must not end the master.
+#: Exceptions of a faulty plugin; a plugin that calls `sys.exit` must not end the master.
 FAULTS: Final = (Exception, SystemExit)
 
 _log = logging.getLogger("rosrm.plugins")
@@ -60,7 +60,7 @@ _log = logging.getLogger("rosrm.plugins")
 
 @dataclass(frozen=True)
 class Source:
-    """Where a plugin comes from: its entry point's name, its distribution's name and version."""
+    """Origin of a plugin: its entry point's name, its distribution's name and version."""
 
     plugin: str
     distribution: str = ""
@@ -80,7 +80,7 @@ class Offered:
 
 @dataclass(frozen=True)
 class Broken:
-    """What cannot be used, and why; `kind` and `name` are "" where they are not known."""
+    """A fault of a plugin or offer; `kind` and `name` are "" where unknown."""
 
     source: Source
     reason: str
@@ -90,7 +90,7 @@ class Broken:
 
 @dataclass
 class Loaded:
-    """What the plugins bring."""
+    """Offers and faults of the loaded plugins."""
 
     offers: list[Offered]
     broken: list[Broken]
@@ -106,7 +106,7 @@ def load_addresses(addresses: Iterable[PluginAddress]) -> Loaded:
 
 
 def load_objects(plugins: Mapping[str, object]) -> Loaded:
-    """Take modules or objects as plugins, by name, without an installation (for tests)."""
+    """Load modules or objects as plugins, by name, without an installation (for tests)."""
     loaded = Loaded([], [])
     for name, plugin in plugins.items():
         _load(loaded, Source(name), name, lambda plugin=plugin: plugin)  # type: ignore[misc]
@@ -114,7 +114,7 @@ def load_objects(plugins: Mapping[str, object]) -> Loaded:
 
 
 def definition(function: object) -> str:
-    """Where a function or class is defined, for messages; "" where that is not known."""
+    """Return the place of a function's or class's definition, for messages; "" if unknown."""
     try:
         target: Any = inspect.unwrap(function)  # type: ignore[arg-type]
         return f"{inspect.getsourcefile(target)}:{inspect.getsourcelines(target)[1]}"
@@ -126,7 +126,7 @@ def _in_time(source: Source, what: str, call: Callable[[], T]) -> T:
     """Return the answer of plugin code; name it in the log when it is slow, end it when it hangs.
 
     Raises:
-        TimeoutError: it took longer than `LOADING_LIMIT`.
+        TimeoutError: the code took longer than `LOADING_LIMIT`.
     """
 
     def say() -> None:
@@ -160,7 +160,7 @@ def _load(loaded: Loaded, source: Source, target: str, load: Callable[[], object
 
 
 def _marked(plugin: object) -> Mapping[str, Callable[..., Any]]:
-    """The functions of a plugin that `@hookimpl` marks, by the hook that they implement."""
+    """Return the functions of a plugin that `@hookimpl` marks, by the hook that they implement."""
     marked: dict[str, Callable[..., Any]] = {}
     for name in dir(plugin):
         function = getattr(plugin, name, None)
@@ -209,7 +209,7 @@ def _take(loaded: Loaded, source: Source, hook: str, function: Callable[..., Any
 
 
 def _call(hook: str, function: Callable[..., Any]) -> Any:
-    """Through pluggy, which checks the arguments; alone: no plugin wraps the hooks of another."""
+    """Call one hook through pluggy, which checks the arguments, apart from all other plugins."""
     alone = pluggy.PluginManager(GROUP)
     alone.add_hookspecs(hookspecs)
     alone.register(SimpleNamespace(**{hook: function}))
@@ -218,7 +218,7 @@ def _call(hook: str, function: Callable[..., Any]) -> Any:
 
 
 def _fault_of(offer: object, wanted: type[Any]) -> str:
-    """Why an offer cannot be taken; "" where it can."""
+    """Return why an offer cannot be used; "" if it can."""
     if not isinstance(offer, wanted):
         return f"offers {offer!r}, which is not a {wanted.__name__}"
     name: object = getattr(offer, "name", None)
@@ -269,7 +269,7 @@ def _fault_of_capabilities(offer: MigrationOffer) -> str:
 
 
 def _fault_of_reads(offer: ScoringOffer) -> str:
-    """Return why the fields that a scoring policy declares to read cannot be; "": they can."""
+    """Return the fault of the fields that a scoring policy declares to read; "": none."""
     reads: object = offer.reads
     if isinstance(reads, str) or not isinstance(reads, Sequence):
         return f'`reads` is {reads!r}; a tuple of field names is required, as ("name",)'

@@ -33,24 +33,24 @@ hookimpl = pluggy.HookimplMarker(GROUP)
 
 @hookspec
 def register_probes() -> Sequence[ProbeOffer]:  # type: ignore[empty-body]  # a specification
-    """Offer probes: what reads the utilisation of a host's resources (loaded by slaves)."""
+    """Offer probes, which read the utilisation of a host's resources (loaded by slaves)."""
 
 
 @hookspec
 def register_scoring_policies() -> Sequence[ScoringOffer]:  # type: ignore[empty-body]
-    """Offer scoring policies: what orders the hosts that fit a process (loaded by the master)."""
+    """Offer scoring policies, which order the hosts that fit a process (loaded by the master)."""
 
 
 @hookspec
 def register_migration_strategies() -> Sequence[MigrationOffer]:  # type: ignore[empty-body]
-    """Offer migration strategies: what plans a move (master), and its executors (slaves)."""
+    """Offer migration strategies, which plan migrations (master), with their executors (slaves)."""
 
 
 @hookspec
 def register_checkpoint_policies() -> Sequence[CheckpointOffer]:  # type: ignore[empty-body]
-    """Offer checkpoint policies: when and where state is kept (loaded by the master)."""
+    """Offer checkpoint policies, which place replicas and time checkpoints (master)."""
 
 
 @hookspec
 def register_launchers() -> Sequence[LauncherOffer]:  # type: ignore[empty-body]
-    """Offer launchers: what starts an instance in another way than a command (loaded by slaves)."""
+    """Offer launchers, which start instances in another way than by a command (slaves)."""

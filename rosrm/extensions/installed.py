@@ -1,4 +1,4 @@
-"""Where the installed plugins and commands, and checks of files, are; nothing of them is loaded."""
+"""Addresses of the installed plugins, commands and file checks; none of them is loaded."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ CHECKS: Final = "rosrm.checks"
 
 @dataclass(frozen=True, slots=True)
 class PluginAddress:
-    """Where an installed plugin is.
+    """Address of an installed plugin.
 
     Attributes:
         name: of its entry point.
@@ -29,8 +29,8 @@ class PluginAddress:
 
 
 def installed_plugins(group: str = GROUP) -> list[PluginAddress]:
-    """Each entry point once, in the order of names, even where a folder is twice on the path."""
-    # Entry points are e-mail headers in zip files: a runtime does not load their readers.
+    """Return each entry point once, by name, even where a folder is twice on the path."""
+    # Entry points are read as e-mail headers in zip files. A runtime must not load those readers.
     from importlib.metadata import entry_points  # noqa: PLC0415 - see above
 
     found: dict[tuple[str, str], PluginAddress] = {}

@@ -1,6 +1,6 @@
-"""A process's own options of a migration strategy, merged over those of the cluster.
+"""Options of a migration strategy for one process, merged over those of the cluster.
 
-Imports no pydantic: the master merges them for each move.
+This module does not import pydantic, because the master merges options for each migration.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ def options_of(spec: ProcessSpec, cluster: Any, own: type[Any] | None = None) ->
     """Return the options that hold for one process, as `Move.options` has them.
 
     Args:
-        spec: its `migration.options` are given by name, as the work file has them: who submits it
-            may have no plugin that knows what is measured by them.
+        spec: its `migration.options` are given by name, as in the work file, because the client may
+            have no plugin that knows their units.
         cluster: the strategy's options for all processes.
-        own: those that one process may have, where they are more.
+        own: type of the options of one process, where they are more.
 
     Raises:
-        ValueError: for an unknown option, or a value that makes no sense.
+        ValueError: for an unknown option, or an invalid value.
     """
     wanted, given = own or type(cluster), spec.migration.options
     if not given and wanted is type(cluster):
@@ -52,7 +52,7 @@ def merged_options(wanted: type[T], cluster: Mapping[str, Any], own: Mapping[str
 
 
 def _in_base_units(wanted: type[Any], given: Mapping[str, Any]) -> dict[str, Any]:
-    """With a number for "5s" and the like; what is out of its range is refused."""
+    """Return the options with numbers in place of "5s" and the like; refuse values out of range."""
     hints = get_type_hints(wanted, include_extras=True) if given else {}
     return {name: _number(name, hints.get(name), value) for name, value in given.items()}
 

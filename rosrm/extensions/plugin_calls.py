@@ -1,10 +1,10 @@
-"""Every call of a plugin by the core: what the call raises costs one decision, and is counted.
+"""Guarded calls of plugins by the core: a failed call costs one decision, and is counted.
 
 ============  ============================================================================
-a plugin      what changes that, and is recorded
+plugin state  recorded event, and the next state
 ============  ============================================================================
-selected      a call raises, is late, or answers what the contract does not allow: `failing`
-failing       a call fails with another error than was recorded last: recorded at most once in
+selected      a call raises, is late, or breaks the contract by its answer: `failing`
+failing       a call fails with an error other than the last recorded one: at most one record in
               `TOLD_AGAIN` seconds
 failing       a call is good, and no call has failed for `WORKS_AFTER` seconds: `selected`
 ============  ============================================================================
@@ -27,7 +27,7 @@ Plugin = tuple[str, str]
 #: Carries a call out; may raise `TimeoutError` when the call takes too long.
 Limit = Callable[[Plugin, Callable[[], Any]], Any]
 
-#: What the kinds of offers are called in messages.
+#: Names of the kinds of offers in messages.
 TITLES: Final[Mapping[str, str]] = {
     "probe": "probe",
     "scoring": "scoring policy",
@@ -60,7 +60,7 @@ class Failing:
     _told_at: float = -inf
 
     def note(self, error: str, count: int, now: float) -> bool:
-        """Take in the newest error; return True if it is to be recorded."""
+        """Note the newest error; return True if it is to be recorded."""
         self.error, self.count, self.last = error, self.count + count, now
         if error == self._told or now - self._told_at < TOLD_AGAIN:
             return False
@@ -118,7 +118,7 @@ class PluginCalls:
         return answer
 
     def changes(self, now: float) -> list[tuple[Plugin, str]]:
-        """Return which plugins began to fail since the last call, or work again: "" for those."""
+        """Return the plugins that fail, or work again (""), since the last call."""
         found: list[tuple[Plugin, str]] = []
         for plugin, noted in self._failed.items():
             if self.failing.setdefault(plugin, Failing()).note(noted.error, noted.count, now):

@@ -1,7 +1,7 @@
-"""Chooses plugins by name, makes them, and says of each what became of it.
+"""Registry of plugins: selection by name, creation, outcome of each.
 
-Imports no pydantic: the runtimes of master and slave use it too. They get options that have been
-checked; `rosrm.config.options` checks those of a file against the same offers.
+This module does not import pydantic, because the runtimes of master and slave use it too. They get
+checked options; `rosrm.config.options` checks those of a file against the same offers.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ from rosrm.model.values import (
 )
 from rosrm.wording import counted, get_close_matches
 
-#: What the object of each kind must have.
+#: Members that the object of each kind must have.
 _METHODS: Final[Mapping[str, tuple[str, ...]]] = {
     "probe": ("resources", "read", "close"),
     "scoring": ("score",),
@@ -68,7 +68,7 @@ _METHODS: Final[Mapping[str, tuple[str, ...]]] = {
     "launcher": ("prepare",),
 }
 
-#: Where rosrm's own plugins of a kind are, for who has none.
+#: Distribution with rosrm's own plugins of a kind, for an installation without any.
 _SHIPPED_IN: Final[Mapping[str, str]] = {
     "probe": "rosrm-resources",
     "scoring": "rosrm-scoring",
@@ -79,9 +79,9 @@ _SHIPPED_IN: Final[Mapping[str, str]] = {
 #: Seconds for a `create`, which may load a large library.
 CREATE_LIMIT: Final = 30.0
 
-#: Seconds between two reads of what stands for a probe that could not be made.
+#: Seconds between two reads of a `FailedProbe`.
 _FAILED_PERIOD: Final = 10.0
-#: Broken plugins that a message names where none of them is certainly meant.
+#: Most broken plugins in a message where it is unclear which one is meant.
 _MOST_BROKEN: Final = 3
 
 _NO_CAPABILITIES: Final = Capabilities()
@@ -108,7 +108,7 @@ class Probes:
 
     Attributes:
         made: those present, and a `FailedProbe` for each that could not be made.
-        absent: name to the reason, of those that say that they are absent here.
+        absent: name to the reason, of probes that declare themselves absent here.
     """
 
     made: tuple[MadeProbe, ...]
@@ -118,7 +118,7 @@ class Probes:
 class FailedProbe:
     """Stands for a chosen probe that could not be made: each read fails with the reason.
 
-    So its resources are stale, and a limit on one of them keeps work away as it does where a probe
+    So its resources are stale, and a limit on one of them stops new work, as it does where a probe
     fails in reading.
 
     Attributes:
@@ -170,7 +170,7 @@ class OfferedExecutor:
 
 
 class Registry:
-    """The plugins of this installation. `discover` is how to get one."""
+    """The plugins of this installation; made by `discover`."""
 
     def __init__(self, loaded: Loaded) -> None:
         self._offers: dict[tuple[str, str], Offered] = {}
@@ -183,33 +183,33 @@ class Registry:
     def discover(cls) -> Registry:
         """Find and load the installed plugins.
 
-        What is broken is kept with its reason, and raises nothing.
+        Broken plugins are kept with their reason, and raise nothing.
         """
         return cls.load(installed_plugins())
 
     @classmethod
     def load(cls, addresses: Iterable[PluginAddress]) -> Registry:
-        """Load plugins that were found before; otherwise as `discover`."""
+        """Load plugins at known addresses, as `discover` does."""
         return cls(load_addresses(addresses))
 
     @classmethod
     def of(cls, **plugins: object) -> Registry:
-        """From modules or objects with hooks, without an installation (for tests)."""
+        """Return a registry of modules or objects, without an installation (for tests)."""
         return cls(load_objects(plugins))
 
-    # --- what there is ------------------------------------------------------------------------
+    # --- offers -------------------------------------------------------------------------------
 
     @property
     def broken(self) -> Sequence[Broken]:
-        """What cannot be used, and why."""
+        """Return the faults of plugins and offers."""
         return tuple(self._broken)
 
     def names(self, kind: str) -> tuple[str, ...]:
-        """The names on offer of one kind."""
+        """Return the offered names of one kind."""
         return tuple(sorted(name for of_kind, name in self._offers if of_kind == kind))
 
     def offer(self, kind: str, name: str) -> ChosenOffer:
-        """The offer of a name; raises `ConfigError` with what there is instead."""
+        """Return the offer of a name; raise `ConfigError` with the names that exist."""
         return cast(ChosenOffer, self._offered(kind, name).offer)
 
     def resources(self) -> tuple[str, ...]:
@@ -226,7 +226,7 @@ class Registry:
         )
 
     def default_probes(self) -> NameToOptions:
-        """The probes that a host has where its configuration names none, without options."""
+        """Return the default probes of a host without configured ones, without options."""
         offers = [self.offer("probe", name) for name in self.names("probe")]
         chosen = {o.name: EMPTY for o in offers if isinstance(o, ProbeOffer) and o.default}
         if not chosen:
@@ -238,10 +238,10 @@ class Registry:
         return chosen
 
     def rows(self, *kinds: str, host: str = "") -> list[PluginRow]:
-        """One row for each offer and each fault of these kinds (of all where none is given).
+        """Return one row for each offer and each fault of these kinds (of all where none is given).
 
-        State and reason are as the calls below have left them: "available" until something was
-        made, then "selected", "absent" or "broken".
+        State and reason depend on the calls below: "available" until the object was made, then
+        "selected", "absent" or "broken".
         """
         rows = []
         for (kind, name), offered in sorted(self._offers.items()):
@@ -254,7 +254,7 @@ class Registry:
             )
         return [row for row in rows if not kinds or row.kind in (*kinds, "plugin")]
 
-    # --- what is made of it -------------------------------------------------------------------
+    # --- creation -----------------------------------------------------------------------------
 
     def scoring(self, name: str, options: Mapping[str, Any] = EMPTY) -> ScoringPolicy:
         """Make a scoring policy; raises `ConfigError` or `PluginError`."""
@@ -294,7 +294,7 @@ class Registry:
                 raise self._fault("migration", name, fault)
 
     def declared(self, scoring: str, chosen: NameToOptions) -> Declared:
-        """Return what the offers of a scoring policy and of migration strategies declare."""
+        """Return the declarations in the offers of a scoring policy and of migration strategies."""
         offers = {name: self._strategy(name) for name in chosen}
         return Declared(
             reads=tuple(cast(ScoringOffer, self.offer("scoring", scoring)).reads),
@@ -375,7 +375,7 @@ class Registry:
         return MadeLaunchers(made, absent, broken)
 
     def executors(self) -> dict[str, OfferedExecutor]:
-        """Return what the open steps of plans may name on this host, from all migration offers."""
+        """Return the executors that plans may name on this host, from all migration offers."""
         return {
             executor: OfferedExecutor(name, function)
             for name in self.names("migration")
@@ -383,7 +383,7 @@ class Registry:
         }
 
     def broken_strategies(self) -> dict[str, str]:
-        """Return the migration offers that are broken here, by name, and why."""
+        """Return the migration offers that are broken here, name to reason."""
         return {
             broken.name or broken.source.plugin: f"{broken.source}: {broken.reason}"
             for broken in self._broken
@@ -396,7 +396,7 @@ class Registry:
     def probes(self, chosen: NameToOptions | None, context: ProbeContext) -> Probes:
         """Make the probes of a host, the default ones for None.
 
-        One that says that it is absent here is left out with its reason. One that fails in any
+        A probe that declares itself absent here is left out with its reason. One that fails in any
         other way is replaced by a `FailedProbe`.
 
         Raises:
@@ -422,7 +422,7 @@ class Registry:
         return Probes(tuple(made), absent)
 
     def _failed_probe(self, name: str, reason: str, others: Sequence[MadeProbe]) -> MadeProbe:
-        """Return what stands for a probe that could not be made."""
+        """Return a substitute for a probe that could not be made."""
         taken = {resource.name for other in others for resource in other.resources}
         declared = cast(ProbeOffer, self.offer("probe", name)).resources
         described = [
@@ -455,7 +455,7 @@ class Registry:
         return MadeProbe(name, probe, resources, offer.period, offer.deadline)
 
     def _required(self, kind: str, name: str, options: Mapping[str, Any]) -> Any:
-        """Make what the master cannot do without: absent here is an error."""
+        """Make an object that the master needs: its absence here is an error."""
         try:
             return self._make(kind, name, options)
         except SkipPlugin as skip:
@@ -484,7 +484,7 @@ class Registry:
 
         try:
             thing = limited(CREATE_LIMIT, partial(create, *given), late)
-        except (SkipPlugin, ConfigError):  # its own word on this host, or on its options
+        except (SkipPlugin, ConfigError):  # raised on purpose, for this host or these options
             raise
         except FAULTS as fault:
             reason = f"`create` ({definition(create)}) raised {describe_plugin_fault(fault)}"
@@ -501,10 +501,10 @@ class Registry:
             f"{TITLES[kind]} {name!r} of {self._offers[kind, name].source}: {reason}"
         )
 
-    # --- how a name is found ------------------------------------------------------------------
+    # --- lookup of names ----------------------------------------------------------------------
 
     def _keep_single(self, offers: Sequence[Offered]) -> None:
-        """A name that two plugins offer belongs to neither: which one runs must not be chance."""
+        """Keep the offers with a unique name: two plugins with one name would run by chance."""
         for offered in offers:
             key = (offered.kind, offered.offer.name)
             same = [other for other in offers if (other.kind, other.offer.name) == key]
@@ -516,7 +516,7 @@ class Registry:
                 self._broken.append(Broken(offered.source, reason, *key))
 
     def _refuse_shared_executors(self) -> None:
-        """Break all offers of which an executor has the same name: orders name nothing else.
+        """Mark offers as broken whose executors share a name, because orders hold only the name.
 
         Offers that share one function may share its name.
         """
@@ -556,13 +556,13 @@ class Registry:
     def _broken_note(self, kind: str, name: str = "") -> str:
         """Return the faults of the broken plugin that may be meant, and the number of the others.
 
-        A plugin is meant by the name of its offer or, where that is not known, by its own.
+        A plugin is matched by the name of its offer or, where that is unknown, by its own.
         """
         might = [b for b in self._broken if b.kind in ("", kind)]
         meant = [b for b in might if not name or name == b.name]
         if not meant:
             meant = [b for b in might if not b.name and _is_named_like(b.source, name)]
-        if not meant:  # any of those without a name may be what is looked for
+        if not meant:  # any plugin without a known offer may be the one
             meant = [b for b in might if not b.name][:_MOST_BROKEN]
         reasons = dict.fromkeys(f"{b.source}: {b.reason}" for b in meant)
         note = " Broken: " + "; ".join(reasons) + "." if reasons else ""
@@ -574,7 +574,7 @@ class Registry:
 
 
 def _is_named_like(source: Source, name: str) -> bool:
-    """Return True if an offer of this name may be one of a plugin that did not get so far."""
+    """Return True if a broken plugin without known offers may have one of this name."""
     words = {word for text in (source.plugin, source.distribution) for word in _words(text)}
     return bool(words & set(_words(name))) or bool(get_close_matches(name, [source.plugin], 1))
 
@@ -584,7 +584,7 @@ def _words(text: str) -> list[str]:
 
 
 def _missing_method(kind: str, thing: object) -> str:
-    """Return what is wrong with an object that an offer made; "": it has all its methods."""
+    """Return the fault of an object that an offer made; "": it has all its methods."""
     if thing is None:
         wanted = " and ".join(f"`{name}`" for name in _METHODS[kind])
         return f"None; an object with {wanted} is required (does it lack a `return`?)"
@@ -600,7 +600,7 @@ def _missing_method(kind: str, thing: object) -> str:
 def _fault_of_resources(
     resources: Sequence[ResourceDescription], offer: ProbeOffer, before: Sequence[MadeProbe]
 ) -> str:
-    """Why a host cannot take these resources, without its subject; "" where it can."""
+    """Return why a host cannot have these resources, without the subject; "" if it can."""
     taken = {resource.name: other.name for other in before for resource in other.resources}
     if not resources:
         return "describes no resource; raise SkipPlugin in `create` where there is nothing to read"
@@ -622,7 +622,7 @@ def _fault_of_resources(
 
 
 def close_quietly(probe: Probe) -> None:
-    """Close what is given up; that it fails to close as well adds nothing."""
+    """Close a probe that is given up; ignore a failure of the close."""
     try:
         probe.close()
     except FAULTS:

@@ -19,7 +19,7 @@ _AGAIN: Final = 0.05
 def limited(seconds: float, call: Callable[[], T], late: Callable[[], str]) -> T:
     """Return the answer of a call; only the main thread has a limit, because signals go there.
 
-    A loop inside C code that never returns to Python cannot be ended so.
+    A loop inside C code that never returns to Python cannot be interrupted.
 
     Raises:
         TimeoutError: the time was up; the text is that of `late`.
@@ -29,10 +29,10 @@ def limited(seconds: float, call: Callable[[], T], late: Callable[[], str]) -> T
     running = True
 
     def expired(_signal: int, _frame: FrameType | None) -> None:
-        if running:  # else the call ended in the very last moment
+        if running:  # otherwise the call ended at the last moment
             raise TimeoutError(late())
 
-    # A process has one timer: that of a test runner, or of an outer limit, is set again afterwards.
+    # A process has one timer: restore that of a test runner or an outer limit afterwards.
     before = signal.signal(signal.SIGALRM, expired)
     left, interval = signal.setitimer(signal.ITIMER_REAL, seconds, _AGAIN)
     try:

@@ -1,8 +1,8 @@
 """Quantities with units, for our settings and for the options of plugins.
 
-A field annotated with one of these takes a number in base units or text with a unit, and refuses
-what is out of its range. Nothing here imports pydantic until a file is validated, for the runtimes
-of master and slave start without it::
+A field annotated with one of these types accepts a number in base units or text with a unit, and
+refuses a value out of its range. This module imports pydantic only when a file is validated,
+because the runtimes of master and slave start without it::
 
     @dataclass(frozen=True)
     class Options:
@@ -37,7 +37,7 @@ _RATES: Final = {f"{unit}/s": factor for unit, factor in _SIZES.items()}
 _CORES: Final = {"core": 1.0, "cores": 1.0}
 _DURATIONS: Final = {"us": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0}
 
-#: Factors to the base unit, by what is measured.
+#: Factors to the base unit, by measured quantity.
 UNITS: Final[Mapping[str, Mapping[str, float]]] = {
     "number": {},
     "duration": _DURATIONS,
@@ -56,14 +56,14 @@ _NUMBER_AND_UNIT: Final = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\
 
 
 class UnfitAmount(ValueError):
-    """An amount that fits no resource; the resource, where it is known, says it better."""
+    """An amount that fits no resource; the message is better where the resource is known."""
 
     def __init__(self, text: str, given: object) -> None:
         super().__init__(text)
         self.given = given
 
     def of(self, resource: str) -> str:
-        """What is wrong with it as an amount of one resource."""
+        """Return the fault of the amount for one resource."""
         try:
             amount_of(resource, self.given)
         except ValueError as error:
@@ -76,12 +76,12 @@ class Quantity:
     """Marks a number that may carry a unit and must lie within a range.
 
     Attributes:
-        measures: a key of `UNITS`: which units may follow the number.
+        measures: a key of `UNITS`: the units that may follow the number.
         low: least value allowed.
         high: greatest value allowed.
         above: the value must be greater than `low`.
         whole: the value must be a whole number.
-        hint: said with a value that is out of range.
+        hint: added to the message on a value out of range.
     """
 
     measures: str = "number"
@@ -92,7 +92,7 @@ class Quantity:
     hint: str = ""
 
     def parse(self, given: object) -> float:
-        """The value in base units; raises `ValueError` with what is allowed."""
+        """Return the value in base units; raise `ValueError` with the allowed values."""
         value = self._number(given)
         if not math.isfinite(value) or self._outside(value):
             hint = f" ({self.hint})" if self.hint else ""
@@ -102,7 +102,7 @@ class Quantity:
         return int(value) if self.whole else value
 
     def range(self) -> str:
-        """The allowed values in words."""
+        """Return the allowed values as text."""
         if math.isfinite(self.high):
             form = ".0f" if self.whole else "g"
             return f"within {self.low:{form}}..{self.high:{form}}"
@@ -139,7 +139,7 @@ class Quantity:
         return f"a number, or text such as {_EXAMPLES[self.measures]}"
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
-        """Tells pydantic to call `parse`; pydantic alone calls this."""
+        """Return a schema by which pydantic calls `parse`; only pydantic calls this."""
         from pydantic_core import core_schema  # noqa: PLC0415 - only files need pydantic
 
         return core_schema.no_info_plain_validator_function(self._parse_in_file)
@@ -160,7 +160,7 @@ Fraction = Annotated[float, Quantity(high=1.0, hint="a fraction: 0.8 means 80 %"
 Count = Annotated[int, Quantity(high=2**31 - 1, whole=True)]
 PositiveCount = Annotated[int, Quantity(low=1, high=2**31 - 1, whole=True)]
 ANY_AMOUNT: Final = Quantity("amount")
-#: Of any resource; `amount_of` knows more where the resource is known.
+#: Amount of any resource; `amount_of` is stricter where the resource is known.
 Amount = Annotated[float, ANY_AMOUNT]
 
 
@@ -174,5 +174,5 @@ _MEASURES: Final = {"memory": "size", "disk": "size", "cpu": "cores"}
 
 
 def amount_of(resource: str, given: object) -> float:
-    """The amount of one resource in base units; raises `ValueError`, also for a strange unit."""
+    """Return an amount of one resource in base units; raise `ValueError`, also for a wrong unit."""
     return Quantity(_MEASURES.get(resource, "amount")).parse(given)

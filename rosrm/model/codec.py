@@ -1,7 +1,7 @@
-"""Frozen dataclasses to plain JSON values and back, without pydantic.
+"""Conversion of frozen dataclasses to plain JSON values and back, without pydantic.
 
-The values have been validated before: this checks only that the shape is right, as the two ends may
-be of different versions of rosrm or of a plugin.
+The values have been validated before. This module checks only their shape, because the two ends may
+have different versions of rosrm or of a plugin.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ T = TypeVar("T")
 
 
 def to_plain(value: Any) -> Any:
-    """A dataclass, mapping, sequence or scalar as JSON has it; raises `TypeError` for others."""
+    """Return a dataclass, mapping, sequence or scalar as JSON; raise `TypeError` for others."""
     if is_dataclass(value) and not isinstance(value, type):
         return {f.name: to_plain(getattr(value, f.name)) for f in fields(value)}
     if isinstance(value, Enum):
@@ -34,7 +34,7 @@ def to_plain(value: Any) -> Any:
 
 
 def from_plain(wanted: type[T], plain: Mapping[str, Any]) -> T:
-    """A dataclass from `to_plain`'s answer; raises `ValueError` that names the field."""
+    """Return a dataclass from plain values; raise `ValueError` that names the field."""
     hints = get_type_hints(wanted)
     known = {f.name: f for f in fields(wanted) if f.init}  # type: ignore[arg-type]
     strange = sorted(set(plain) - set(known))
@@ -59,7 +59,7 @@ def _value(hint: Any, plain: Any, where: str) -> Any:
     if origin in (list, set, frozenset, tuple):
         return _sequence(origin, arguments, plain, where)
     if not isinstance(hint, type):
-        return plain  # Any, Literal and the like: taken as they are
+        return plain  # Any, Literal and the like: unchanged
     return _scalar(hint, plain, where)
 
 

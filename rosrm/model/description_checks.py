@@ -1,4 +1,4 @@
-"""Checks of descriptions: of a host, as its slave sends it, and of a resource, by a probe too."""
+"""Checks of descriptions: of a host, sent by its slave, and of a resource, also of a probe."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import Final
 from rosrm.model.values import RESOURCE_SLOTS, HostDescription, ResourceDescription
 
 _RESOURCE_NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_.-]{0,63}")
-#: Of what stands in the description of a resource.
+#: Examples of fields in the description of a resource.
 _EXAMPLES: Final = {"unit": '"B", "core", "B/s" or "1"', "scope": '"machine"'}
 
 
 def description_fault(description: HostDescription) -> str:
-    """What is wrong with what a slave says of itself; "" for nothing."""
+    """Return the fault of a slave's description of its host; "" for none."""
     resources = description.resources
     if not description.name:
         return "a host needs a name"
@@ -30,7 +30,7 @@ def description_fault(description: HostDescription) -> str:
 
 
 def resource_fault(resource: object) -> str:
-    """Return what is wrong with the description of a resource; "": nothing."""
+    """Return the fault of the description of a resource; "": none."""
     if not isinstance(resource, ResourceDescription):
         return f"describes a resource by {resource!r}, which is not a ResourceDescription"
     name: object = resource.name

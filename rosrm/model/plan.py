@@ -1,8 +1,8 @@
-"""Plans as data: how a process moves, step by step, and the way back from each step.
+"""Migration plans as data: steps in order, each with its undo, and one commit.
 
-A strategy proposes a `Plan`; `executor.py` carries it out, and a `Run` holds how far it is. Before
+A strategy proposes a `Plan`; `executor.py` carries it out, and a `Run` holds its progress. Before
 the commit a failure undoes the steps done so far, newest first, back to a running source; after it
-the plan is rolled forward. What can be neither is STUCK, and said loudly.
+the plan is rolled forward. A plan that can do neither is STUCK, which is recorded and shown.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from rosrm.model.values import EMPTY, InstanceId, ProcessSpec, RestartPolicy
 
 @dataclass(frozen=True, slots=True)
 class Move:
-    """A process to be moved, for a strategy.
+    """Input of a strategy: a process to be migrated.
 
     Attributes:
         spec: as submitted.
         source: the running instance.
-        source_host: where it runs.
-        destination: the instance to be, already numbered.
-        destination_host: where it goes.
-        fallback: an instance for starting again at the source, should a stop be undone.
+        source_host: name of its host.
+        destination: the instance to be started, already numbered.
+        destination_host: name of its host.
+        fallback: an instance for a new start at the source, should a stop be undone.
         now: unix time, whole seconds (the alias of a handoff carries it).
-        source_node: under which the node of the source runs: an alias, if it came by a handoff.
+        source_node: name of the source's node: an alias, if a handoff started it.
         options: of the strategy for this process: those of the cluster with the process's own over
             them, an object of the offer's `own_options` or `options`.
     """
@@ -45,10 +45,10 @@ class Move:
 
 
 class Aim(str, Enum):
-    """What a plan is to bring about.
+    """Purpose of a plan.
 
-    Of a checkpoint the source ends in an image on its own host, and no destination is started; of a
-    restore the source is the instance that the image is of, which does not run any more.
+    In a checkpoint, the source ends in an image on its own host, and no destination is started. In
+    a restore, the source is the instance of the image, which does not run any more.
     """
 
     MOVE = "move"
@@ -57,7 +57,7 @@ class Aim(str, Enum):
 
 
 class HandoffPhase(IntEnum):
-    """What the master says of a handoff, as in `StateConfig`."""
+    """Phase that the master publishes for a handoff, as in `StateConfig`."""
 
     SHADOW = 1
     SWITCH = 2
@@ -71,7 +71,7 @@ _FORWARD: Final = (HandoffPhase.SHADOW, HandoffPhase.SWITCH, HandoffPhase.DONE)
 
 
 class ReportPhase(IntEnum):
-    """How far the source or the destination of a handoff is, as in `HandoffReport`."""
+    """Phase that the source or the destination of a handoff reports, as in `HandoffReport`."""
 
     ATTACHED = 1
     SILENT = 2
@@ -87,11 +87,11 @@ class ReportPhase(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """Start an instance on a host; done when the slave says that it runs.
+    """Start an instance on a host; done when the slave reports that it runs.
 
-    A shadow is the destination of a handoff: it has an alias, stays silent, and is not restarted.
-    One that is restored goes on from an image of the source, which earlier steps have brought to
-    the host while the source stands still; nor is it restarted. `remappings` come beside those of
+    A shadow is the destination of a handoff: it has an alias, stays silent, and is not restarted. A
+    restored instance starts from an image of the source, which earlier steps have brought to the
+    host while the source is frozen; it is not restarted either. `remappings` are added to those of
     the process's spec.
     """
 
@@ -107,7 +107,7 @@ class Start:
 
 @dataclass(frozen=True, slots=True)
 class AwaitReady:
-    """Wait until an instance is ready; done when its slave says so, and `settle` seconds later."""
+    """Wait until an instance is ready; done `settle` seconds after its slave reports so."""
 
     instance: InstanceId
     host: str
@@ -118,9 +118,9 @@ class AwaitReady:
 
 @dataclass(frozen=True, slots=True)
 class AwaitReleased:
-    """Wait until a silent source says that its last outputs have arrived, or for so long.
+    """Wait until a silent source reports that its last outputs have arrived, or the time-out.
 
-    It never fails: its successor is active, and what was sent is sent.
+    This step never fails: the successor is active, and outputs cannot be recalled.
     """
 
     instance: InstanceId
@@ -131,7 +131,7 @@ class AwaitReleased:
 
 @dataclass(frozen=True, slots=True)
 class Stop:
-    """Stop an instance; done when its slave says that it has ended."""
+    """Stop an instance; done when its slave reports that it has ended."""
 
     instance: InstanceId
     host: str
@@ -141,10 +141,10 @@ class Stop:
 
 @dataclass(frozen=True, slots=True)
 class Configure:
-    """Publish `state_config` with this phase to the source and the destination of the move.
+    """Publish `state_config` with this phase to the source and the destination of the migration.
 
-    Each phase is done when they have answered as in the handoff protocol; DONE, and any phase that
-    is not `awaited`, at once.
+    Each phase is done when they have answered by the handoff protocol; DONE, and any phase that is
+    not `awaited`, at once.
     """
 
     phase: HandoffPhase
@@ -155,7 +155,7 @@ class Configure:
 
 @dataclass(frozen=True, slots=True)
 class SetRestart:
-    """Give an instance another restart policy; done when its slave has taken it."""
+    """Set another restart policy of an instance; done when its slave has accepted it."""
 
     instance: InstanceId
     host: str
@@ -166,10 +166,10 @@ class SetRestart:
 
 @dataclass(frozen=True, slots=True)
 class Commit:
-    """From here on the destination owns the name; there is one in each plan.
+    """Make the destination the owner of the name; each plan has one commit.
 
-    In the plan of a checkpoint it is the image that does: no instance is the owner then. `image`
-    names the executor that removes one that nobody wants any more; "": this is no checkpoint.
+    In the plan of a checkpoint, the image becomes the owner, and no instance is. `image` names the
+    executor that removes an unwanted image; "": this is no checkpoint.
     """
 
     timeout: float = 0.0
@@ -179,10 +179,10 @@ class Commit:
 
 @dataclass(frozen=True, slots=True)
 class Execute:
-    """The open step: run an executor that the strategy's plugin registered on a slave.
+    """Run an executor that the strategy's plugin registered on a slave (the open step).
 
-    The executor is given the arguments and, as `results`, what the executors of earlier steps of
-    the same run have answered, by their names.
+    The executor gets the arguments and, as `results`, the answers of the executors of earlier steps
+    of the same migration, by their names.
     """
 
     executor: str
@@ -197,7 +197,7 @@ Step = Start | AwaitReady | AwaitReleased | Stop | Configure | SetRestart | Comm
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """How one process moves.
+    """Plan of the migration of one process.
 
     Attributes:
         steps: in order; exactly one is a `Commit`.
@@ -211,7 +211,7 @@ class Plan:
 
 
 def plan_fault(plan: Plan, move: Move, aim: Aim = Aim.MOVE) -> str:
-    """What is wrong with a plan that a strategy proposed for an aim; "" for a sound one."""
+    """Return the fault of a plan that a strategy proposed for an aim; "" for a sound one."""
     given: object = plan
     if not isinstance(given, Plan):
         return f"it is {'None' if given is None else type(given).__name__}, not a Plan"
@@ -232,7 +232,7 @@ def plan_fault(plan: Plan, move: Move, aim: Aim = Aim.MOVE) -> str:
 
 
 def _commit_fault(plan: Plan, move: Move, aim: Aim) -> str:
-    """Whether what owns the name after the commit is there before it."""
+    """Return why the owner of the name after the commit may not exist by then; "" if it does."""
     at = next(at for at, step in enumerate(plan.steps) if isinstance(step, Commit))
     before, commit, after = plan.steps[:at], plan.steps[at], plan.steps[at + 1 :]
     if isinstance(commit, Commit) and bool(commit.image) != (aim is Aim.CHECKPOINT):
@@ -251,7 +251,7 @@ def _commit_fault(plan: Plan, move: Move, aim: Aim) -> str:
 
 
 def _checkpoint_fault(plan: Plan, after: Iterable[Step], move: Move) -> str:
-    """The source must never run again beside its image, and nothing else is begun."""
+    """Return why the source may run beside its image, or what else is begun; "" for none."""
     if any(isinstance(step, Start) for step in all_steps(plan.steps)):
         return "a checkpoint starts an instance"
     if not any(isinstance(step, Stop) and step.instance == move.source for step in after):
@@ -288,7 +288,10 @@ def _shadow_fault(step: Start, move: Move) -> str:
 
 
 def _handoff_fault(step: Step) -> str:
-    """A source that has fallen silent is told to go on only when the destination never will."""
+    """Return the fault of a step of the handoff protocol; "": none.
+
+    A silent source may resume only when the destination never becomes active.
+    """
     if not isinstance(step, Configure):
         return ""
     if step.phase not in _FORWARD:
@@ -301,14 +304,14 @@ def _handoff_fault(step: Step) -> str:
 
 
 def executors_of(plan: Plan) -> Iterator[tuple[str, str]]:
-    """Return the executors that a plan names, those of its undo too, with their hosts."""
+    """Return the executors that a plan names, also in its undo, with their hosts."""
     for step in all_steps(plan.steps):
         if isinstance(step, Execute):
             yield step.executor, step.host
 
 
 def all_steps(steps: Iterable[Step]) -> Iterator[Step]:
-    """Steps with their undo, the undo of that, and so on."""
+    """Return the steps with their undo, the undo of that, and so on."""
     for step in steps:
         current: Step | None = step
         while current is not None:

@@ -1,4 +1,4 @@
-"""A plan as plain JSON values, for the journal: complete, and read strictly."""
+"""Conversion of plans to plain JSON values for the journal: complete, and read strictly."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _NAMES: Final = {kind: name for name, kind in _KINDS.items()}
 
 
 def plan_to_dict(plan: Plan) -> dict[str, Any]:
-    """All fields of a plan, as JSON has them."""
+    """Return all fields of a plan as JSON values."""
     return {
         "steps": [step_to_dict(step) for step in plan.steps],
         "overlap": plan.overlap,
@@ -46,10 +46,10 @@ def plan_to_dict(plan: Plan) -> dict[str, Any]:
 
 
 def plan_from_dict(plain: Mapping[str, Any]) -> Plan:
-    """The inverse of `plan_to_dict`.
+    """Return the plan of `plan_to_dict`'s answer.
 
     Raises:
-        ValueError: for what this version does not know.
+        ValueError: for a field or kind that this version does not know.
     """
     known = _known("Plan", Plan, plain)
     try:
@@ -80,7 +80,7 @@ def checked_step(step: Step) -> Step:
 
 
 def step_to_dict(step: Step) -> dict[str, Any]:
-    """All fields of a step and of its undo, and which kind it is."""
+    """Return all fields of a step and of its undo, with its kind."""
     plain: dict[str, Any] = {field.name: getattr(step, field.name) for field in fields(step)}
     for name in ("instance", "restart"):
         if name in plain:
@@ -95,7 +95,7 @@ def step_to_dict(step: Step) -> dict[str, Any]:
 
 
 def step_from_dict(plain: Mapping[str, Any]) -> Step:
-    """The inverse of `step_to_dict`; raises `ValueError` as `plan_from_dict`."""
+    """Return the step of `step_to_dict`'s answer; raise `ValueError` as `plan_from_dict`."""
     try:
         kind = _KINDS[plain["kind"]]
         given = {name: value for name, value in plain.items() if name != "kind"}
@@ -107,7 +107,7 @@ def step_from_dict(plain: Mapping[str, Any]) -> Step:
 
 
 def _known(name: str, kind: type[Any], plain: Any) -> Mapping[str, Any]:
-    """The fields of a dataclass, all that must be there and none that it does not have."""
+    """Return the fields of a dataclass; refuse missing and unknown ones."""
     given = _mapping(plain)
     strange = set(given).difference(field.name for field in fields(kind))
     if strange:
@@ -171,7 +171,7 @@ def _truth(plain: Any) -> bool:
     return plain
 
 
-#: How each field of a step and of a restart policy is read.
+#: Reader of each field of a step and of a restart policy.
 _READ: Final[Mapping[str, Callable[[Any], Any]]] = {
     "instance": _instance,
     "host": _text,

@@ -1,4 +1,4 @@
-"""How rosrm joins ROS: domain, discovery and transports. Imports no ROS itself."""
+"""ROS settings: domain, discovery and transports. This module does not import ROS."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from typing import Final
 
 from rosrm.errors import ConfigError
 
-#: The ports of a domain above are higher than UDP has.
+#: A higher domain would need ports beyond the range of UDP.
 HIGHEST_DOMAIN: Final = 232
 
 
 @dataclass(frozen=True, slots=True)
 class RosSettings:
-    """How a part of rosrm joins ROS; None and "" leave the environment's own word.
+    """ROS settings of a part of rosrm; None and "" keep the environment's value.
 
     Attributes:
         domain: ROS_DOMAIN_ID.
         discovery_range: "localhost", "subnet", "off" or "system_default".
         discovery_server: "host:port" of a Fast DDS discovery server, instead of multicast.
         transports: FASTDDS_BUILTIN_TRANSPORTS, for example "UDPv4".
-        namespace: under which rosrm's topics and services live.
+        namespace: of rosrm's topics and services.
     """
 
     domain: int | None = None
@@ -32,21 +32,21 @@ class RosSettings:
     namespace: str = "/rosrm"
 
     def environment(self) -> Mapping[str, str]:
-        """The environment variables that carry these settings, for ourselves and for children."""
+        """Return the environment variables with these settings, for this process and children."""
         variables = {
             "ROS_DOMAIN_ID": "" if self.domain is None else str(self.domain),
             "ROS_AUTOMATIC_DISCOVERY_RANGE": self.discovery_range.upper(),
             "ROS_DISCOVERY_SERVER": self.discovery_server,
-            # A plain client of a server is told only what it asked for: too little to see nodes.
+            # A plain client gets only its own topics from the server: too little to see nodes.
             "ROS_SUPER_CLIENT": "TRUE" if self.discovery_server else "",
             "FASTDDS_BUILTIN_TRANSPORTS": self.transports,
         }
         return {name: value for name, value in variables.items() if value}
 
     def check_domain(self) -> None:
-        """Raise `ConfigError` if the ROS_DOMAIN_ID that is in force is none.
+        """Raise `ConfigError` if the ROS_DOMAIN_ID in force is invalid.
 
-        DDS would print a fault of its own, or rclpy would raise a traceback.
+        Otherwise DDS would print a fault of its own, or rclpy would raise a traceback.
         """
         word = os.environ.get("ROS_DOMAIN_ID", "")
         if self.domain is not None or not word:
@@ -58,7 +58,7 @@ class RosSettings:
             )
 
     def describe(self) -> str:
-        """Domain, RMW and discovery in force, for messages."""
+        """Return domain, RMW and discovery in force, for messages."""
         joined = {**os.environ, **self.environment()}
         discovery = joined.get("ROS_DISCOVERY_SERVER") or joined.get(
             "ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET"

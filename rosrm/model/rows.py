@@ -1,4 +1,4 @@
-"""What the core shows of itself: plain rows for listings, tables and tests."""
+"""Rows of listings: plain values for clients, tables and tests."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class ProcessRow:
         state: "queued", "set_aside", "assigned", "starting", "running", "backoff", "stopping",
             "migrating", "checkpointed", "finished", "failed", "cancelled", "unreachable", "stuck"
             or "unknown" (its host is silent, and not lost yet).
-        host: where the owning instance is, or the image, or where it has ended; "" for none.
+        host: of the owning instance, or of the image, or of its end; "" for none.
         number: of the owning instance; 0: none.
         exit_code: of the last run, a signal as a negative number; None: unknown, or it runs.
         queue_position: 1 is the head; 0: not in the queue.
@@ -109,7 +109,7 @@ class EventRow:
 
 @dataclass(frozen=True, slots=True)
 class PluginRow:
-    """One thing that a plugin offers, or why it does not.
+    """One offer of a plugin, or a fault.
 
     Attributes:
         kind: "probe", "scoring", "migration" or "checkpoint".
@@ -128,13 +128,13 @@ class PluginRow:
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """An answer to a listing; what was not asked for is empty.
+    """An answer to a listing; parts that the client did not request are empty.
 
     Attributes:
         master: name of the master.
         uptime: of the master, seconds.
         last_sequence: of the event record.
-        trouble: why the master takes no new work now; "": it does.
+        trouble: why the master accepts no new work now; "": it does.
     """
 
     master: str

@@ -1,4 +1,4 @@
-"""A process spec as plain JSON values, for the journal: complete, so that defaults may change."""
+"""Conversion of process specs to JSON values for the journal: complete, so defaults may change."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _FIELDS: Final = {kind.__name__: tuple(f.name for f in fields(kind)) for kind in
 
 
 def spec_to_dict(spec: ProcessSpec) -> dict[str, Any]:
-    """All fields of a spec, as JSON has them."""
+    """Return all fields of a spec as JSON values."""
     plain = {name: getattr(spec, name) for name in _FIELDS["ProcessSpec"]}
     plain["kind"] = spec.kind.value
     for name in _TUPLES:
@@ -59,7 +59,7 @@ def spec_to_dict(spec: ProcessSpec) -> dict[str, Any]:
 
 
 def spec_from_dict(plain: Mapping[str, Any]) -> ProcessSpec:
-    """The inverse of `spec_to_dict`; what is missing has its default.
+    """Return the spec of `spec_to_dict`'s answer; a missing field has its default.
 
     Raises:
         ValueError: for a field that this version does not know.

@@ -1,6 +1,6 @@
-"""The values that the core thinks in.
+"""Values of the core: processes, instances, hosts, resources.
 
-Seconds, bytes and fractions 0..1 are the base units. All values are frozen; what changes lives in
+Seconds, bytes and fractions 0..1 are the base units. All values are frozen; mutable state lives in
 the reducers of `rosrm.core` and in the standing arrays of `hosts.py`.
 """
 
@@ -12,16 +12,16 @@ from enum import Enum
 from types import MappingProxyType
 from typing import Any, Final
 
-#: Slots of a `resource_info` message: as many resources can be reported by one host.
+#: Slots of a `resource_info` message: most resources of one host.
 RESOURCE_SLOTS: Final = 16
-#: A usage above this is no measurement but a mistake (a CPU reading of 1.2 can be real).
+#: A usage above this is an error, not a measurement (a CPU reading of 1.2 can be real).
 ABSURD_USAGE: Final = 64.0
 
 EMPTY: Final[Mapping[str, Any]] = MappingProxyType({})
 
 
 class Kind(str, Enum):
-    """How long a process is meant to run."""
+    """Duration of a process: until it is stopped (service), or until its own end (job)."""
 
     SERVICE = "service"
     JOB = "job"
@@ -29,7 +29,7 @@ class Kind(str, Enum):
 
 @dataclass(frozen=True, slots=True)
 class RestartPolicy:
-    """When a process that ended is started again on its host, with a bounded back-off.
+    """Restart of an ended process on its host, with a bounded back-off.
 
     Attributes:
         when: "never", "on-failure" or "always".
@@ -37,7 +37,7 @@ class RestartPolicy:
         max_delay: bound of the back-off, seconds.
         factor: by which the delay grows with each restart.
         attempts: most restarts within `window`; one more and the process has failed.
-        window: seconds; a process that ran as long without a restart starts afresh.
+        window: seconds; after as long without a restart, the count begins at 0 again.
     """
 
     when: str = "never"
@@ -50,7 +50,7 @@ class RestartPolicy:
 
 @dataclass(frozen=True, slots=True)
 class Readiness:
-    """When an instance counts as ready.
+    """Condition under which an instance counts as ready.
 
     Attributes:
         kind: "graph" (this instance is seen in the ROS graph), "running" (the process runs), or
@@ -62,13 +62,13 @@ class Readiness:
     timeout: float = 30.0
 
 
-#: Seconds beyond a process's own grace: a signal, a report and a message take a moment.
+#: Seconds beyond a process's own grace, for the signal, the report and the message.
 _STOP_MARGIN: Final = 5.0
 
 
 @dataclass(frozen=True, slots=True)
 class StopPolicy:
-    """How a process is stopped: SIGINT, then SIGTERM, then SIGKILL, to its whole process group.
+    """Stop of a process: SIGINT, then SIGTERM, then SIGKILL, to its whole process group.
 
     Attributes:
         interrupt_grace: seconds between SIGINT and SIGTERM.
@@ -80,13 +80,13 @@ class StopPolicy:
 
     @property
     def timeout(self) -> float:
-        """Seconds from the order to stop until it must be known that it has ended."""
+        """Return the seconds from the order to stop until the end must be reported."""
         return self.interrupt_grace + self.terminate_grace + _STOP_MARGIN
 
 
 @dataclass(frozen=True, slots=True)
 class MigrationPolicy:
-    """How a process moves to another host.
+    """Migration of a process to another host.
 
     Attributes:
         strategy: name of a migration strategy; None: it is never moved.
@@ -101,11 +101,11 @@ class MigrationPolicy:
 
 @dataclass(frozen=True, slots=True)
 class HostLossPolicy:
-    """What becomes of a process when its host is lost.
+    """Treatment of a process when its host is lost.
 
     Attributes:
-        then: "wait" for the host, go "elsewhere" (as soon as a host has room; the host that comes
-            back sooner keeps it), or "stop": it has failed.
+        then: "wait" for the host, go "elsewhere" (as soon as a host has room; the host keeps it if
+            it rejoins before), or "stop": it has failed.
         delay: seconds after the loss until that is done.
     """
 
@@ -115,7 +115,7 @@ class HostLossPolicy:
 
 @dataclass(frozen=True, slots=True)
 class IsolationPolicy:
-    """What a host does with a process when it and the master do not hear each other.
+    """Treatment of a process while its host and the master have no contact.
 
     Attributes:
         then: "keep" it running, or "stop" it.
@@ -128,7 +128,9 @@ class IsolationPolicy:
 
 @dataclass(frozen=True, slots=True)
 class StandbyPolicy:
-    """Whether a second instance on another host follows the state, to go on at once.
+    """Standby of a process: a second instance on another host that follows the state.
+
+    The standby takes over at once when the primary ends.
 
     Attributes:
         apart_by: host labels in which the host of the standby differs from that of the primary.
@@ -140,13 +142,13 @@ class StandbyPolicy:
 
 @dataclass(frozen=True, slots=True)
 class Health:
-    """What a process that runs must do to count as healthy; otherwise it has failed.
+    """Health checks of a running process; one that fails them has failed.
 
     Attributes:
         topic: that must be published at `rate`; "": none.
         rate: Hz, at least.
-        lifecycle: state in which its lifecycle node must be; "": not asked for.
-        timeout: seconds for which any of it may be amiss; 0: health is not watched.
+        lifecycle: state in which its lifecycle node must be; "": not checked.
+        timeout: seconds for which a check may fail; 0: health is not watched.
     """
 
     topic: str = ""
@@ -157,7 +159,7 @@ class Health:
 
 @dataclass(frozen=True, slots=True)
 class ProcessSpec:
-    """One process to run, in the words of ROS 2 launch.
+    """One process to run, in the terms of ROS 2 launch.
 
     Exactly one of `package` with `executable`, `module` and `command` is given.
 
@@ -166,7 +168,7 @@ class ProcessSpec:
         namespace: of the node; "" or absolute.
         parameters: ROS parameters, values as in JSON.
         remappings: ROS name to ROS name.
-        ros: it is a ROS node and is given its name, namespace, parameters and remappings.
+        ros: it is a ROS node and gets its name, namespace, parameters and remappings.
         needs: declared amounts by resource name, in base units.
         required_labels: host labels without which a host may never take it.
         preferred_labels: among hosts that fit, those with more of these go first.
@@ -203,12 +205,12 @@ class ProcessSpec:
 
     @property
     def ros_node(self) -> bool:
-        """Whether it is a ROS node, by its own word or as an executable of a ROS package."""
+        """Return True if it is a ROS node, as declared or as an executable of a ROS package."""
         return self.ros or self.package is not None
 
     @property
     def program(self) -> str:
-        """What it runs, in one word: the key under which its needs are learned."""
+        """Return the program as one text: the key under which its needs are learned."""
         if self.package is not None:
             return f"{self.package}/{self.executable}"
         if self.module is not None:
@@ -234,12 +236,12 @@ class InstanceId:
 
 @dataclass(frozen=True, slots=True)
 class Fence:
-    """When a host that is cut off stops an instance, by its own clock.
+    """Deadline at which a host without contact stops an instance, by its own clock.
 
     Attributes:
-        after: seconds since the host last knew that the master hears it.
+        after: seconds since the last contact: the newest time at which the master received from it.
         grace: seconds from there until SIGKILL at the latest.
-        alive: a host whose slave is at work counts as not cut off, whatever it hears.
+        alive: a running slave counts as contact, even without beats.
     """
 
     after: float
@@ -253,15 +255,15 @@ class Assignment:
 
     Attributes:
         epoch: of the master that gave it.
-        node_name: under which the node runs; differs from the process's name in a handoff.
-        shadow: it starts as the destination of a handoff: silent, and not restarted until its slave
-            is told otherwise.
-        fence: when its host stops it, if it and the master do not hear each other; None: never.
-        kept_on: hosts that keep a state of the process, the newest first.
-        kept_from: snapshots of instances with a lower number are of a former life of the name; 0:
-            its node publishes no state, and there are none.
-        restored: it starts from an image of a former instance that lies on the host, and is not
-            restarted until its slave is told otherwise.
+        node_name: name of its node; differs from the process's name in a handoff.
+        shadow: it starts as the destination of a handoff: silent, and not restarted until an order
+            to its slave allows it.
+        fence: deadline at which its host stops it without contact to the master; None: never.
+        kept_on: hosts with a snapshot of the process, the newest first.
+        kept_from: snapshots of instances with a lower number belong to an earlier process of the
+            name; 0: its node publishes no state, and there are none.
+        restored: it starts from the image of a former instance on the host, and is not restarted
+            until an order to its slave allows it.
     """
 
     instance: InstanceId
@@ -281,12 +283,12 @@ class Assignment:
 
     @property
     def on_trial(self) -> bool:
-        """It is the destination of a move that may still fail."""
+        """Return True for the destination of a migration that may still fail."""
         return self.shadow or self.restored
 
 
 class InstanceState(str, Enum):
-    """What a slave says of an instance that it holds."""
+    """State of an instance as its slave reports it."""
 
     HELD = "held"
     STARTING = "starting"
@@ -302,7 +304,7 @@ class InstanceState(str, Enum):
 
     @property
     def ended(self) -> bool:
-        """The slave holds no process for it any more and will start none."""
+        """Return True if the slave holds no process for it and will start none."""
         return self in _ENDED
 
 
@@ -316,7 +318,7 @@ _ENDED: Final = frozenset(
 
 @dataclass(frozen=True, slots=True)
 class InstanceStatus:
-    """What became of one instance on its slave.
+    """Status of one instance on its slave.
 
     Attributes:
         pid: of the session leader; 0: none.
@@ -326,7 +328,7 @@ class InstanceStatus:
         peak_memory: bytes, of the last run; 0: not known.
         cpu_time: seconds of CPU of the last run.
         run_time: seconds from start to end of the last run.
-        message: for people: why it failed or was refused.
+        message: why it failed or was refused, as text.
     """
 
     instance: InstanceId
@@ -353,16 +355,16 @@ class InstanceStatus:
 
     @property
     def succeeded(self) -> bool:
-        """It has exited, with 0 and on no signal."""
+        """Return True if it has exited with code 0 and without a signal."""
         return self.state is InstanceState.EXITED and not (self.exit_code or self.exit_signal)
 
 
 @dataclass(frozen=True, slots=True)
 class KeptState:
-    """A state that a host keeps of a process.
+    """A snapshot of a process on a host.
 
     Attributes:
-        instance: whose state it is.
+        instance: whose snapshot it is.
         sequence: cycles that it covers.
         size: bytes.
     """
@@ -380,7 +382,7 @@ class ResourceDescription:
         name: "memory", "cpu", "disk", ...
         unit: base unit of `capacity`: "B", "core", "B/s", "1".
         capacity: what usage 1.0 stands for, > 0.
-        scope: what is measured: "machine", "cgroup", "slice" or a word of the probe's own.
+        scope: of the measurement: "machine", "cgroup", "slice" or a name that the probe defines.
     """
 
     name: str
@@ -404,10 +406,10 @@ class Reading:
 
 @dataclass(frozen=True, slots=True)
 class HostDescription:
-    """All about a host that does not change while its slave runs.
+    """Facts about a host that do not change while its slave runs.
 
     Attributes:
-        name: one live slave for each name.
+        name: unique among live slaves.
         incarnation: random number of this run of the slave.
         resources: at most RESOURCE_SLOTS; the position is the slot in `resource_info`.
         max_processes: most processes held at a time; 0: no bound.

@@ -1,5 +1,5 @@
-"""The record of a master's run: everything that its core was told, so that it can be told again.
+"""Recording of a master's run: every input of its core, so that the run can be replayed.
 
-`frames` knows the file, `encoding` the events in it, and `reading` puts a run together again. All
-of it is pure; `rosrm.master.recorder` writes the file.
+`frames` handles the file, `encoding` the events in it, and `reader` assembles the run. All of it is
+pure; `rosrm.master.recorder` writes the file.
 """

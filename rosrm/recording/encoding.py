@@ -1,8 +1,8 @@
-"""Events of the master's core, and what it decided, as the content of frames and back.
+"""Conversion of the core's events and decisions to the content of frames and back.
 
 Readings and usages are arrays and stay so; everything else is JSON with the fields of its
-dataclass. Numbers come back bit by bit as they were: a replay must not decide otherwise because of
-the last digit.
+dataclass. Numbers keep every bit, because a difference in the last digit could change a decision in
+a replay.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from rosrm.recording.frames import FrameKind
 
 #: Seconds by the master's monotonic clock, and unix time.
 _TIMES: Final = struct.Struct("<dd")
-#: Readings in the frame, slots that differ from those behind them, usage and limit in the others.
+#: Number of readings, number of slots in use, and usage and limit of all other slots.
 _READINGS: Final = struct.Struct("<IIdd")
 _USAGES: Final = struct.Struct("<qQI")
 _COLUMNS: Final = (
@@ -39,7 +39,7 @@ _COLUMNS: Final = (
     ("accepting", "?"), ("stale", "<u4"),
 )  # fmt: skip
 
-#: Orders about kept states decide nothing of where anything runs.
+#: Orders about replicas do not decide where anything runs.
 _KEEPING: Final = frozenset({"keep", "drop_kept"})
 _KINDS: Final[Mapping[str, type[Any]]] = MappingProxyType(
     {kind.__name__: kind for kind in get_args(happened.Event)}
@@ -48,12 +48,12 @@ _KINDS: Final[Mapping[str, type[Any]]] = MappingProxyType(
 
 @dataclass(frozen=True, slots=True)
 class Happened:
-    """One event and when it was taken in.
+    """One event and the time at which the core handled it.
 
     Attributes:
         now: seconds by the master's monotonic clock.
         wall: unix time, as the core knew it.
-        decided: what the core decided, one line each (`decisions`); None: it is not recorded.
+        decided: the core's decisions, one line each (`decisions`); None: not recorded.
     """
 
     now: float
@@ -66,7 +66,7 @@ class Happened:
 
 
 def encode(event: happened.Event, now: float, wall: float) -> tuple[FrameKind, bytes]:
-    """An event as kind and content of a frame."""
+    """Return an event as kind and content of a frame."""
     times = _TIMES.pack(now, wall)
     if isinstance(event, happened.ReadingsReceived):
         return FrameKind.READINGS, times + _encoded_readings(event)
@@ -77,7 +77,7 @@ def encode(event: happened.Event, now: float, wall: float) -> tuple[FrameKind, b
 
 
 def decode(kind: FrameKind, content: bytes) -> Happened:
-    """The inverse of `encode`; raises `ValueError` for what makes no sense."""
+    """Return the event of a frame; raise `ValueError` for invalid content."""
     try:
         now, wall = _TIMES.unpack_from(content)
         rest = content[_TIMES.size :]
@@ -93,7 +93,7 @@ def decode(kind: FrameKind, content: bytes) -> Happened:
 
 
 def _encoded_readings(event: happened.ReadingsReceived) -> bytes:
-    """All columns; of usage and limit only the slots up to the last one that is in use."""
+    """Return all columns; of usage and limit only the slots up to the last one in use."""
     count = len(event.host_id)
     spare = (float(event.usage[0, -1]), float(event.limit[0, -1])) if count else (0.0, 0.0)
     used = np.zeros(RESOURCE_SLOTS, np.bool_)
@@ -143,7 +143,7 @@ def _decoded_usages(content: bytes) -> happened.UsagesReceived:
 
 
 def decisions(commands: Sequence[Command]) -> tuple[str, ...]:
-    """What of an event's commands decides where something runs, one line each, to be compared."""
+    """Return the commands that decide where something runs, one line each, for comparison."""
     return tuple(line for command in commands if (line := _decision(command)))
 
 
@@ -164,12 +164,12 @@ def _decision(command: Command) -> str:
 
 
 def encode_decisions(decided: Sequence[str]) -> bytes:
-    """The content of a frame of decisions: they belong to the event before them."""
+    """Return the content of a frame of decisions, which belong to the event before them."""
     return json.dumps(list(decided), separators=(",", ":")).encode()
 
 
 def decode_decisions(content: bytes) -> tuple[str, ...]:
-    """The inverse of `encode_decisions`; raises `ValueError`."""
+    """Return the decisions of a frame; raise `ValueError` for invalid content."""
     lines = json.loads(content)
     if not isinstance(lines, list) or not all(isinstance(line, str) for line in lines):
         raise ValueError("a list of decisions is required")

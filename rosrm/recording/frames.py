@@ -1,12 +1,12 @@
-r"""The file of a record: a line with its version, then frames with length and checksum.
+r"""File format of a recording: a line with its version, then frames with length and checksum.
 
     rosrm-record 1\n
     frame*                  length u32, CRC-32 u32 (both little-endian), then `length` bytes
 
-The first byte of a frame says what it holds (`FrameKind`). The first frame is the header, the last
-one of a record that was closed in good order says why it ends: without it the file is cut short. So
-it is where nothing but zeros follow, which is what a power loss leaves of bytes that were not on
-the disk yet.
+The first byte of a frame is its kind (`FrameKind`). The first frame is the header. The last frame
+of a closed recording states why it ends; without that frame the file is cut short. The file is also
+cut short where only zeros follow, because a power loss leaves zeros for bytes that were not on the
+disk yet.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from typing import BinaryIO, Final
 
 from rosrm.errors import RecordError
 
-#: Of the format below; one that is read has to be the same.
+#: Version of the format below; only files of this version are read.
 RECORD_VERSION: Final = 1
 MAGIC: Final = b"rosrm-record "
 _PREFIX: Final = struct.Struct("<II")
-#: Bytes: no frame is as large, so a larger length is damage and no reason to allocate.
+#: Bytes: every frame is smaller. A larger length is damage, so nothing is allocated for it.
 _LARGEST: Final = 2**30
 _LONGEST_LINE: Final = 64
-#: Bytes of a tail that are looked at in one go.
+#: Bytes of a tail that are read at once.
 _AT_ONCE: Final = 2**20
 
 
 class FrameKind(bytes, Enum):
-    """What a frame holds."""
+    """Kind of a frame."""
 
     HEADER = b"H"
     EVENT = b"E"
@@ -42,30 +42,30 @@ class FrameKind(bytes, Enum):
 
 
 def opening() -> bytes:
-    """The first line of a record."""
+    """Return the first line of a recording."""
     return MAGIC + f"{RECORD_VERSION}\n".encode()
 
 
 def is_record(beginning: bytes) -> bool:
-    """Whether a file that begins so is a record, of any version."""
+    """Return True if a file with this beginning is a recording, of any version."""
     return beginning.startswith(MAGIC)
 
 
 def frame(kind: FrameKind, content: bytes) -> bytes:
-    """One frame, as it stands in the file."""
+    """Return one frame as bytes of the file."""
     body = kind.value + content
     return _PREFIX.pack(len(body), zlib.crc32(body)) + body
 
 
 def frames(file: BinaryIO, name: str) -> Iterator[tuple[FrameKind, bytes, int]]:
-    """The frames of a record, each with its kind, its content and where it begins, in bytes.
+    """Return the frames of a recording, each with its kind, its content and its offset in bytes.
 
     Args:
         file: from its beginning.
         name: of the file, for messages.
 
     Raises:
-        RecordError: no record, another version, damaged, or cut within a frame.
+        RecordError: no recording, another version, damaged, or cut within a frame.
     """
     at = _check_opening(file, name)
     while prefix := file.read(_PREFIX.size):
@@ -106,7 +106,7 @@ def _check_opening(file: BinaryIO, name: str) -> int:
 
 
 def cut_short(name: str, at: int) -> RecordError:
-    """The file ends before the record does."""
+    """Return the error of a file that ends before the recording does."""
     return CutShort(
         f"{name}: the record is cut short at byte {at}: its master was killed, lost its power, "
         f"still runs, or the file was not copied as a whole. --cut accepts the complete part"
@@ -114,11 +114,11 @@ def cut_short(name: str, at: int) -> RecordError:
 
 
 class CutShort(RecordError):
-    """A record without its end; what is there is whole."""
+    """A recording without its end; the frames before are complete."""
 
 
 def _broken(file: BinaryIO, read: bytes, name: str, at: int) -> RecordError:
-    """A frame that does not fit: cut, where its end and all that follows are zeros, or damaged."""
+    """Return the error of an invalid frame: cut, where it ends in zeros to the end, or damaged."""
     if read.endswith(b"\0"):
         while rest := file.read(_AT_ONCE):
             if rest.strip(b"\0"):

@@ -1,4 +1,4 @@
-"""A record put together again: what the master began with, and all that happened to it."""
+"""Reader of recordings: the initial state of the master, and all its events."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _Table = Mapping[str, Mapping[str, Any]]
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """What a master began with.
+    """Initial state of a recorded master.
 
     Attributes:
         software: version of rosrm.
@@ -29,7 +29,7 @@ class Header:
         config: the master's settings, as `ClusterConfig.to_json` has them.
         epoch: of this run of the master.
         started: seconds by its monotonic clock when its state was restored.
-        intents: what it found in its journal, by table.
+        intents: content of its journal at the start, by table.
     """
 
     software: str
@@ -40,17 +40,17 @@ class Header:
     intents: Mapping[str, _Table]
 
     def encoded(self) -> bytes:
-        """The content of the header's frame."""
+        """Return the content of the header's frame."""
         return json.dumps(to_plain(self), separators=(",", ":")).encode()
 
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """A whole record.
+    """A whole recording.
 
     Attributes:
         name: of its file.
-        events: in the order in which the core took them in.
+        events: in the order in which the core handled them.
         end: why it ends: "stopped: SIGINT", "full: …"; "cut short" for one that was cut.
     """
 
@@ -61,20 +61,20 @@ class Recording:
 
     @property
     def length(self) -> float:
-        """Seconds from the master's start to the last event."""
+        """Return the seconds from the master's start to the last event."""
         return self.events[-1].now - self.header.started if self.events else 0.0
 
 
 def read_record(file: BinaryIO, name: str, *, cut: bool = False) -> Recording:
-    """Read a record.
+    """Read a recording.
 
     Args:
         file: from its beginning.
         name: of the file, for messages.
-        cut: take what is there of one that is cut short.
+        cut: accept the complete frames of a file that is cut short.
 
     Raises:
-        RecordError: it is none, damaged, cut short, or of another version.
+        RecordError: no recording, damaged, cut short, or of another version.
     """
     reader = _Reader(name)
     try:
@@ -90,7 +90,7 @@ def read_record(file: BinaryIO, name: str, *, cut: bool = False) -> Recording:
 
 
 class _Reader:
-    """Puts frames together."""
+    """Assembles frames to a recording."""
 
     def __init__(self, name: str) -> None:
         self.header: Header | None = None
@@ -100,7 +100,7 @@ class _Reader:
         self._events: list[Happened] = []
 
     def take(self, kind: FrameKind, content: bytes, at: int) -> None:
-        """The next frame."""
+        """Add the next frame."""
         self.at = at
         if (kind is FrameKind.HEADER) is not (self.header is None) or self.end:
             raise self._nonsense("a frame that does not belong there")
@@ -134,7 +134,7 @@ class _Reader:
         )
 
     def recording(self) -> Recording:
-        """All frames together."""
+        """Return the recording of all frames."""
         if self.header is None:
             raise cut_short(self._name, self.at)
         return Recording(self._name, self.header, tuple(self._events), self.end)

@@ -1,4 +1,4 @@
-"""What the master's core can ask its runtime for, in the imperative.
+"""Commands of the master's core to its runtime, in the imperative.
 
 The runtime writes all `Record` and `Intent` of one batch to the journal before it carries out
 anything else of that batch: intent is durable before it is acted on.
@@ -25,10 +25,10 @@ class Assign:
 
 @dataclass(frozen=True, slots=True)
 class Withdraw:
-    """Take an assignment back.
+    """Withdraw an assignment.
 
-    One that was not yet fetched yields `AssignmentWithdrawn`; for one that was, the slave is
-    ordered to stop it, so that it never runs or ends.
+    An assignment that the slave has not fetched yields `AssignmentWithdrawn`. For a fetched one, an
+    order to stop goes to the slave, so that it never runs or ends.
     """
 
     order: int
@@ -38,9 +38,9 @@ class Withdraw:
 
 @dataclass(frozen=True, slots=True)
 class Redeliver:
-    """Order the start of an assignment, as the answer that it was fetched with may have been lost.
+    """Order the start of a fetched assignment, because the answer that carried it may be lost.
 
-    One that was not yet fetched is left where it is: it can be taken back without a word.
+    An assignment that the slave has not fetched stays open: it can be withdrawn without an order.
     """
 
     order: int
@@ -50,7 +50,7 @@ class Redeliver:
 
 @dataclass(frozen=True, slots=True)
 class Order:
-    """Ask one slave for something; `OrderAnswered` follows, also when no answer comes.
+    """Send an order to one slave; `OrderAnswered` follows, also when no answer arrives.
 
     Attributes:
         action: "stop", "fence", "restart", "start", "execute", "report", "set_restart", "keep" or
@@ -76,7 +76,7 @@ class Order:
 
 @dataclass(frozen=True, slots=True)
 class PublishStateConfig:
-    """Tell the source and the destination of a handoff where it stands, on `state_config`.
+    """Publish the phase of a handoff on `state_config`, for its source and destination.
 
     Attributes:
         source, destination: instance numbers.

@@ -28,12 +28,12 @@ BAD_RESULT: Final = "bad_result"
 
 @dataclass(frozen=True, slots=True)
 class HostRegistered:
-    """A slave came and named itself.
+    """A slave registered its host.
 
     Attributes:
-        instances: what it holds already.
-        journal_seen: newest record that a former run of this master has told it of; 0: none.
-        kept: all states that it keeps.
+        instances: all that it holds already.
+        journal_seen: newest record that a former run of this master has reported to it; 0: none.
+        kept: all snapshots and replicas on the host.
     """
 
     request: int
@@ -45,7 +45,7 @@ class HostRegistered:
 
 @dataclass(frozen=True, slots=True)
 class HostLeft:
-    """A slave is stopped.
+    """A slave is being stopped.
 
     Attributes:
         kept: all instances of a slave that leaves them running; (): it stops them, and reports
@@ -118,7 +118,7 @@ class StatusesReceived:
 
 @dataclass(frozen=True, slots=True)
 class UsagesReceived:
-    """What each instance of a host uses: parallel arrays (cores, bytes)."""
+    """Resource usage of each instance of a host: parallel arrays (cores, bytes)."""
 
     host_id: int
     incarnation: int
@@ -129,7 +129,7 @@ class UsagesReceived:
 
 @dataclass(frozen=True, slots=True)
 class KeptStatesReceived:
-    """A host says all the states that it keeps, the newest of each process."""
+    """A host reported all its snapshots and replicas, the newest of each process."""
 
     host_id: int
     incarnation: int
@@ -138,7 +138,7 @@ class KeptStatesReceived:
 
 @dataclass(frozen=True, slots=True)
 class SubmissionReceived:
-    """Somebody submits processes: all are taken, or none."""
+    """A client submits processes: all are accepted, or none."""
 
     request: int
     specs: tuple[ProcessSpec, ...]
@@ -147,7 +147,7 @@ class SubmissionReceived:
 
 @dataclass(frozen=True, slots=True)
 class CancelRequested:
-    """Somebody cancels processes."""
+    """A client cancels processes."""
 
     request: int
     names: tuple[str, ...]
@@ -156,7 +156,7 @@ class CancelRequested:
 
 @dataclass(frozen=True, slots=True)
 class RestartRequested:
-    """Somebody restarts processes where they are, or queues ended ones anew."""
+    """A client restarts running processes in place, or queues ended ones again."""
 
     request: int
     names: tuple[str, ...]
@@ -165,7 +165,7 @@ class RestartRequested:
 
 @dataclass(frozen=True, slots=True)
 class MigrationRequested:
-    """Somebody moves a process; `host` None: the core chooses."""
+    """A client moves a process; `host` None: the core chooses."""
 
     request: int
     name: str
@@ -175,7 +175,7 @@ class MigrationRequested:
 
 @dataclass(frozen=True, slots=True)
 class CheckpointRequested:
-    """Somebody has a process dumped into an image, and stopped there."""
+    """A client has a process dumped into a checkpoint image, and stopped."""
 
     request: int
     name: str
@@ -184,7 +184,7 @@ class CheckpointRequested:
 
 @dataclass(frozen=True, slots=True)
 class RestoreRequested:
-    """Somebody has a process go on from its image."""
+    """A client has a process restored from its checkpoint image."""
 
     request: int
     name: str
@@ -193,7 +193,7 @@ class RestoreRequested:
 
 @dataclass(frozen=True, slots=True)
 class HostStateRequested:
-    """Somebody cordons, uncordons or drains a host."""
+    """A client cordons, uncordons or drains a host."""
 
     request: int
     host: str
@@ -232,20 +232,20 @@ class OrderAnswered:
 
 @dataclass(frozen=True, slots=True)
 class AssignmentWithdrawn:
-    """An assignment was taken back before its slave had fetched it."""
+    """An assignment was withdrawn before its slave had fetched it."""
 
     instance: InstanceId
 
 
 @dataclass(frozen=True, slots=True)
 class HandoffReported:
-    """The source or the destination of a handoff says how far it is.
+    """The source or the destination of a handoff reported its phase.
 
     Attributes:
         destination: instance number of the destination; it names the handoff.
-        instance: number of the one that says it.
-        sequence: cycles that its newest state covers.
-        message: for people.
+        instance: number of the reporting instance.
+        sequence: cycles that its newest snapshot covers.
+        message: a sentence for listings and logs.
     """
 
     process: str
@@ -258,7 +258,7 @@ class HandoffReported:
 
 @dataclass(frozen=True, slots=True)
 class PeerRefused:
-    """Somebody was turned away at the edge: another version, a message that makes no sense."""
+    """A message was refused at the network edge: another version, or malformed."""
 
     who: str
     reason: str
@@ -266,7 +266,7 @@ class PeerRefused:
 
 @dataclass(frozen=True, slots=True)
 class TimePassed:
-    """Nothing else happened; deadlines are looked at."""
+    """Time passed without another event; deadlines are checked."""
 
 
 Event = (

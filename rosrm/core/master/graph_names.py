@@ -1,4 +1,4 @@
-"""Names of nodes in the ROS graph, as far as specs tell them: which processes share one."""
+"""Node names in the ROS graph that several processes share, as far as specs tell."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ def shared_nodes(specs: Sequence[ProcessSpec], others: Iterable[ProcessSpec] = (
 
 
 def _node_of(spec: ProcessSpec) -> str:
-    """Return which node a process puts into the graph; "" if its spec does not tell.
+    """Return the node that a process adds to the graph; "" if its spec does not tell.
 
-    rosrm adds its name rule behind the arguments of the user, and the first rule counts.
+    rosrm appends its name rule to the arguments of the user, and the first rule counts.
     """
     words = (*spec.command, *spec.arguments)
     rules = dict(

@@ -1,4 +1,4 @@
-"""What becomes of instances, and what that means for their processes."""
+"""Lifecycle of instances, and its effect on their processes."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from rosrm.model.plan import Start
 from rosrm.model.values import EMPTY, InstanceId, InstanceState, InstanceStatus, Kind, RestartPolicy
 from rosrm.wording import standing
 
-#: What the state of the owning instance means for the process.
+#: Phase of a process by the state of its owning instance.
 _PHASE: Final = {
     None: ProcessPhase.ASSIGNED,
     InstanceState.HELD: ProcessPhase.ASSIGNED,
@@ -38,7 +38,7 @@ _PHASE: Final = {
     InstanceState.BACKOFF: ProcessPhase.BACKOFF,
     InstanceState.STOPPING: ProcessPhase.STOPPING,
 }
-#: The event of a process that has entered a phase.
+#: Kind of the record when a process enters a phase.
 _EVENT: Final = {
     ProcessPhase.ASSIGNED: EventKind.ASSIGNED,
     ProcessPhase.STARTING: EventKind.STARTING,
@@ -49,13 +49,13 @@ _EVENT: Final = {
     ProcessPhase.FAILED: EventKind.FAILED,
     ProcessPhase.CANCELLED: EventKind.CANCELLED,
 }
-#: What a slave says of an instance whose restart it has begun.
+#: States that a slave reports of an instance whose restart it has begun.
 _RESTARTS: Final = frozenset({InstanceState.STOPPING, InstanceState.STARTING})
 _ALIVE: Final = frozenset({InstanceState.STARTING, InstanceState.RUNNING, InstanceState.READY})
 
 
 def statuses_received(state: MasterState, event: happened.StatusesReceived, now: float) -> None:
-    """Take in what a slave says of its instances, in order; what comes late is known already."""
+    """Apply the status reports of a slave in order; late ones are known already."""
     host = state.hosts.find(event.host_id, event.incarnation)
     if host is None or state.hosts.condition_of(host) is HostCondition.DETACHED:
         return  # the last message of a slave that leaves processes running has all that it holds
@@ -78,10 +78,10 @@ def reconcile(
     state: MasterState, host: Host, statuses: Iterable[InstanceStatus], now: float,
     *, registering: bool = False,
 ) -> None:  # fmt: skip
-    """Compare all that a host holds with what is intended there.
+    """Reconcile all instances that a host holds with the desired ones.
 
-    An assignment of which the host has said nothing may be on its way, unless the host is
-    `registering`: a slave takes up nothing that was sent before its registration.
+    An assignment that the host has not reported yet may be on its way, unless the host is
+    `registering`: a slave accepts nothing that was sent before its registration.
     """
     held = {status.instance: status for status in statuses}
     state.skip_numbers(max((one.number for one in held), default=0))
@@ -96,7 +96,7 @@ def reconcile(
 
 
 def _yet_to_start(state: MasterState, instance: Instance) -> bool:
-    """A plan has it counted there, and this master has not given the order to start it."""
+    """Return True if a plan has reserved room for an instance and not ordered its start yet."""
     run = state.runs.get(instance.id.process)
     return run is not None and any(
         isinstance(step, Start) and step.instance == instance.id for step in run.ahead
@@ -104,7 +104,7 @@ def _yet_to_start(state: MasterState, instance: Instance) -> bool:
 
 
 def take_status(state: MasterState, host: Host, status: InstanceStatus, now: float) -> None:
-    """One instance changed."""
+    """Apply the status of one instance."""
     instance = state.instances.get(status.instance.number)
     if instance is None or instance.host is not host or instance.id != status.instance:
         _take_stranger(state, host, status, now)
@@ -126,12 +126,12 @@ def take_status(state: MasterState, host: Host, status: InstanceStatus, now: flo
     if process is None:
         return
     if process.restarts != status.restarts:
-        process.out_of_sight = None  # another run began while its host was silent
+        process.out_of_sight = None  # a new run began while its host was silent
     process.restarts = status.restarts
     if process.wanted is not Wanted.RUN and not instance.stopping:
         stop_instance(state, instance, now)
     if status.state is InstanceState.BACKOFF and failover.is_ready(state, process):
-        stop_instance(state, instance, now)  # its standby goes on sooner, and with its state
+        stop_instance(state, instance, now)  # its standby is ready sooner, and with the snapshot
     if process.name not in state.runs:
         _follow(state, process, instance, status, now, repeated=before is status.state)
 
@@ -140,12 +140,12 @@ def _follow(
     state: MasterState, process: Process, instance: Instance, status: InstanceStatus, now: float,
     *, repeated: bool,
 ) -> None:  # fmt: skip
-    """The process goes where its owning instance went."""
+    """Set the phase of a process by the status of its owning instance."""
     before = process.phase
     phase = phase_of(process, instance)
     state.set_phase(process, phase, now, status.message)
     if phase is not before:
-        # A job that has begun is not ready for anything: it runs to its end.
+        # A job has no ready state: it runs to its end.
         is_ready = phase is ProcessPhase.RUNNING and process.spec.kind is not Kind.JOB
         kind = EventKind.READY if is_ready else _EVENT[phase]
         kind = EventKind.REACHABLE if repeated else kind
@@ -160,17 +160,16 @@ def _follow(
 
 
 def phase_of(process: Process, owner: Instance) -> ProcessPhase:
-    """Where a process stands by what is known of the instance that owns its name."""
+    """Return the phase of a process by the state of the instance that owns its name."""
     if process.wanted is not Wanted.RUN:
         return ProcessPhase.STOPPING
     return _PHASE.get(owner.state, ProcessPhase.STARTING)
 
 
 def _take_stranger(state: MasterState, host: Host, status: InstanceStatus, now: float) -> None:
-    """An instance that nobody intends here must not run: it may have a successor elsewhere.
+    """Stop an instance that is not assigned to its host, because it may have a successor elsewhere.
 
-    It is kept on the books until it has ended, so that it is told to stop until it does, and no
-    successor is started beside it.
+    The master tracks it until it has ended: it repeats the order to stop, and starts no successor.
     """
     if readoption.take_back(state, host, status, now):
         take_status(state, host, status, now)
@@ -198,7 +197,7 @@ def _take_stranger(state: MasterState, host: Host, status: InstanceStatus, now: 
 
 
 def adopt_to_stop(state: MasterState, instance: InstanceId, host: Host, now: float) -> Instance:
-    """Keep an instance on the books that is only to end; what it uses shows in the readings."""
+    """Track an instance that is only to end; the readings show its usage, so none is reserved."""
     nothing = state.hosts.fractions_of(host, EMPTY)
     adopted = state.charge_instance(instance, host, now, EMPTY, frozenset(), nothing)
     adopted.stopping = True
@@ -206,7 +205,7 @@ def adopt_to_stop(state: MasterState, instance: InstanceId, host: Host, now: flo
 
 
 def stop_instance(state: MasterState, instance: Instance, now: float) -> None:
-    """Order an instance to stop, for good; asked again until it has ended."""
+    """Order an instance to stop for good; the order is repeated until it has ended."""
     instance.stopping = True
     instance.order, instance.order_at = state.order_id(), now
     action = "fence" if instance.at_once else "stop"
@@ -242,8 +241,8 @@ def _ended(
         requeue_if_clear(state, process, now)
         return
     if run is not None:
-        return  # the plan in hand knows what this end means
-    if instance.restarting:  # its end was on its way when the restart was ordered
+        return  # the current plan handles this end
+    if instance.restarting:  # it ended before the order to restart arrived
         missed = replace(status, message="it ended before it was restarted")
         end = End(missed, gone=True)
     conclude(state, process, end, instance.host, now)
@@ -252,7 +251,7 @@ def _ended(
 def _end(
     process: Process, instance: Instance, status: InstanceStatus, before: InstanceState | None
 ) -> End:
-    """How it ended: by itself, or because it was told to."""
+    """Return the end of an instance: completed, ordered, or unexpected."""
     completed = (
         process.spec.kind is Kind.JOB
         and status.succeeded
@@ -265,7 +264,7 @@ def _end(
 
 
 def conclude(state: MasterState, process: Process, end: End, host: Host, now: float) -> None:
-    """The owning instance has ended, and no plan is under way: what becomes of the process?"""
+    """Finish or requeue a process without a plan whose owning instance has ended."""
     if failover.take_over(state, process, end, now):
         return
     status = end.status
@@ -290,22 +289,22 @@ def conclude(state: MasterState, process: Process, end: End, host: Host, now: fl
 
 
 def restarts_after(policy: RestartPolicy, status: InstanceStatus) -> bool:
-    """Whether a slave would have started an instance again that ended so."""
+    """Return True if the restart policy would have restarted an instance with this end."""
     if status.state is InstanceState.REFUSED or policy.when == "never":
         return False
     if policy.when == "always" or status.state is InstanceState.FAILED:
-        return True  # the unhealthy have failed, though they may exit with 0
+        return True  # an unhealthy instance has failed, even if it exits with 0
     return bool(status.exit_code or status.exit_signal)
 
 
 def exclude(process: Process, host: Host, status: InstanceStatus) -> None:
-    """The host cannot run this process: it is not asked again."""
+    """Exclude a host from the placement of a process, because the host cannot run it."""
     process.excluded[host.name] = status.message or "its slave refused it"
     process.demand = None
 
 
 def _recalled(run: Run, instance: Instance) -> bool:
-    """A refusal may only say that the order to stop came before the order to start."""
+    """Return True if a refusal may only mean that the stop arrived before the start."""
     return instance.stopping or (run.undo is not None and instance.id == run.destination)
 
 
@@ -323,7 +322,7 @@ def _finish(
 
 
 def _requeue(state: MasterState, process: Process, host: Host, now: float, reason: str) -> None:
-    """Back to its place in the line, once no other instance of it can be active any more."""
+    """Return a process to its place in the queue once no other instance of it may be active."""
     state.record(
         now, EventKind.QUEUED,
         f"{process.name} returns to the queue: {reason}", process=process.name,
@@ -338,7 +337,7 @@ def _requeue(state: MasterState, process: Process, host: Host, now: float, reaso
 
 
 def _wait_for_ends(state: MasterState, process: Process, now: float) -> None:
-    """It is queued, at its place, once nothing of it runs any more."""
+    """Mark a process to be queued at its place once none of its instances runs."""
     state.unqueue(process)
     process.wanted = Wanted.REQUEUE
     note_awaited_ends(state, process, now)
@@ -346,13 +345,13 @@ def _wait_for_ends(state: MasterState, process: Process, now: float) -> None:
 
 
 def note_awaited_ends(state: MasterState, process: Process, now: float) -> None:
-    """Set the phase of a process without an owner, of which instances are still to end."""
+    """Set the phase of a process without an owner whose last instances must still end."""
     left = ", ".join(f"{one.id} on {one.host.name}" for one in state.instances_of(process))
     state.set_phase(process, ProcessPhase.STOPPING, now, f"waits until {left} has ended")
 
 
 def requeue_if_clear(state: MasterState, process: Process, now: float) -> bool:
-    """Queue or cancel a process as it is wanted, unless an instance of it may still run."""
+    """Queue or cancel a process as desired, unless an instance of it may still run."""
     if process.owner or process.instances or process.name in state.runs or process.phase.over:
         return False
     if process.wanted is Wanted.CANCEL:
@@ -369,7 +368,7 @@ def requeue_if_clear(state: MasterState, process: Process, now: float) -> bool:
 def gone(
     state: MasterState, instance: Instance, now: float, reason: str, *, comes_again: bool = True
 ) -> None:
-    """An instance that should be there is not, or counts as lost; nothing is known of its end."""
+    """Drop an instance that is missing or counts as lost; its end is unknown."""
     process = state.processes.get(instance.id.process)
     state.drop_instance(instance)
     if process is None:
@@ -389,14 +388,14 @@ def gone(
 def assignment_withdrawn(
     state: MasterState, event: happened.AssignmentWithdrawn, now: float
 ) -> None:
-    """The slave never saw it: the process goes back to its place."""
+    """Return a process to its place in the queue: the slave never fetched its assignment."""
     instance = state.instances.get(event.instance.number)
     if instance is not None:
         gone(state, instance, now, f"{instance.host.name} did not accept the assignment in time")
 
 
 def note_phase(state: MasterState, process: Process, owner: Instance, now: float) -> None:
-    """Set the phase of a process that no plan moves, by its owner and by the owner's host."""
+    """Set the phase of a process without a plan, by its owner and by the owner's host."""
     host = owner.host
     unreachable = state.hosts.why_unreachable(host)
     if process.wanted is Wanted.CANCEL:

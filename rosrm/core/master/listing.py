@@ -1,4 +1,4 @@
-"""The state as rows for people, and the story of one process."""
+"""Listings: hosts and processes as rows, and the explanation of one process."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ _CONDITION: Final = {
     HostCondition.EXPECTED: "lost",
     HostCondition.DETACHED: "detached",
 }
-#: Of hosts that report: one that leaves reports until all that it held has ended.
+#: Conditions in which a host reports: one that leaves reports until its instances have ended.
 _HEARD: Final = (HostCondition.UP, HostCondition.LEFT)
 _OUT_OF_REACH: Final = (HostCondition.LOST, HostCondition.DETACHED)
-#: Phases that a slave observes: of a silent host they are not known.
+#: Phases that a slave observes: while its host is silent they are unknown.
 _OBSERVED: Final = (ProcessPhase.STARTING, ProcessPhase.RUNNING, ProcessPhase.BACKOFF)
 
 
 def host_rows(state: MasterState, now: float) -> list[HostRow]:
-    """Every host, in order of registration."""
+    """Return every host, in order of registration."""
     return [_host_row(state, host, now) for host in state.hosts.listed()]
 
 
@@ -63,12 +63,12 @@ def _host_row(state: MasterState, host: Host, now: float) -> HostRow:
 
 
 def process_rows(state: MasterState, now: float) -> list[ProcessRow]:
-    """Every process, in order of submission."""
+    """Return every process, in order of submission."""
     return [process_row(state, process, now) for process in state.processes.values()]
 
 
 def process_row(state: MasterState, process: Process, now: float) -> ProcessRow:
-    """One process."""
+    """Return the row of one process."""
     owner = state.instances.get(process.owner)
     seen = owner.seen if owner else {}
     silence = _silence(state, owner, now)
@@ -100,7 +100,7 @@ def _silence(state: MasterState, owner: Instance | None, now: float) -> str:
 
 
 def _stopped_by_slave(state: MasterState, owner: Instance, stop: StopPolicy, reason: str) -> str:
-    """Return the reason with the cause and the longest duration where a slave ends its host."""
+    """Return the reason, extended by cause and longest duration where the slave is stopping."""
     if state.hosts.condition_of(owner.host) is not HostCondition.LEFT:
         return reason
     until = f"SIGKILL after {stop.interrupt_grace + stop.terminate_grace:g} s"
@@ -108,7 +108,7 @@ def _stopped_by_slave(state: MasterState, owner: Instance, stop: StopPolicy, rea
 
 
 def _awaited(state: MasterState, host: Host, now: float) -> str:
-    """Return for how long the end of a cancelled process waits for its host; "" if it does not."""
+    """Return the time for which a cancelled process waits for its host; "" if it does not."""
     condition = state.hosts.condition_of(host)
     if condition is HostCondition.DETACHED:
         return f" {now - host.detached_since:.0f} s ago"
@@ -129,7 +129,7 @@ def _of_standby(process: Process) -> str:
 
 
 def _awaited_node(process: Process, owner: Instance | None) -> str:
-    """Return which node a process that runs must show to be ready; "" for none."""
+    """Return the node that a running process must show to be ready; "" for none."""
     if owner is None or process.phase is not ProcessPhase.STARTING:
         return ""
     spec = process.spec
@@ -140,7 +140,7 @@ def _awaited_node(process: Process, owner: Instance | None) -> str:
 
 
 def explanation(state: MasterState, name: str, now: float) -> Mapping[str, Any] | None:
-    """Why a process is where it is, or why it waits; None: there is no such process."""
+    """Return why a process is where it is, or waits; None: no such process."""
     process = state.processes.get(name)
     if process is None:
         return None
@@ -166,7 +166,7 @@ def explanation(state: MasterState, name: str, now: float) -> Mapping[str, Any] 
 
 
 def _kept(state: MasterState, process: Process, now: float) -> list[Mapping[str, Any]]:
-    """Where a state of it is kept, the newest first."""
+    """Return the hosts with a replica of the snapshot, the newest first."""
     holdings = state.keeping.holdings
     known = holdings.of(process.name)
     return [
@@ -188,7 +188,7 @@ def _reason(state: MasterState, process: Process, row: ProcessRow) -> str:
 
 
 def _advice(state: MasterState, process: Process) -> str:
-    """Return the commands that help a process on; "" for none."""
+    """Return the commands that a user may run next; "" for none."""
     owner = state.instances.get(process.owner)
     if owner is not None and state.hosts.condition_of(owner.host) in _OUT_OF_REACH:
         return f"start the slave of {owner.host.name} again"

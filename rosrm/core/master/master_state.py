@@ -32,13 +32,13 @@ from rosrm.model.event_kinds import EventKind
 from rosrm.model.values import EMPTY, Assignment, InstanceId, ProcessSpec
 from rosrm.wording import one_line
 
-#: Records of one process that `explain` tells.
+#: Records of one process that `explain` shows.
 _HISTORY: Final = 12
-#: Instance numbers are made durable by so many at a time.
+#: Instance numbers that are reserved durably at a time.
 _RESERVED: Final = 1000
-#: Phases between the return of a host and its report of what runs there.
+#: Phases between the rejoin of a host and its report of its instances.
 _ON_THE_WAY_BACK: Final = frozenset({ProcessPhase.ASSIGNED, ProcessPhase.STARTING})
-#: Of processes that wait for a host.
+#: Phases of processes that wait for a host.
 WAITING: Final = (ProcessPhase.QUEUED, ProcessPhase.SET_ASIDE)
 #: Most removed processes of which replicas are still dropped.
 _REMOVED_KEPT: Final = 10_000
@@ -59,14 +59,14 @@ __all__ = [
 
 @dataclass(slots=True)
 class Tail:
-    """What is known of the end of the journal, as it was when this master started.
+    """Journal gap: the end of the journal as it was when this master started.
 
     Attributes:
         newest: sequence of its newest record.
         started: time of the start.
-        fell: the machine fell before it, and not every host has come back.
-        lost: records that are known to be lost.
-        short: some are, and not every host has had the time to be heard since.
+        fell: the machine had rebooted, and not every host has rejoined.
+        lost: number of records that are known to be lost.
+        short: some are lost, and some hosts may not have had the time to report since.
     """
 
     newest: int = _LARGEST
@@ -77,16 +77,16 @@ class Tail:
 
 
 class MasterState:
-    """The state of the master's core, with the few moves that every handler shares.
+    """The state of the master's core, with the changes that all handlers share.
 
     Attributes:
-        declared: what the offers of the selected plugins declare.
-        over: names of the processes that are over, in the order in which they ended.
+        declared: declarations in the offers of the selected plugins.
+        over: names of the terminal processes, in the order in which they ended.
         standbys: process name to the handoff whose destination is its standby.
-        wants_standby: names of the processes that ask for one and are not over.
+        wants_standby: names of the processes that ask for one and are not terminal.
         held_since: time since when placement waits for first requests for work; inf: it does not.
-        in_company_since: time since when at least one host has been heard; inf: none is.
-        tail: whether the journal has lost what was newest in it.
+        in_company_since: time since when at least one host reports; inf: none does.
+        tail: the journal gap, if there is one.
         plugins: guards every call of a plugin.
     """
 
@@ -148,11 +148,11 @@ class MasterState:
     # --- what handlers emit --------------------------------------------------------------
 
     def emit(self, command: Command) -> None:
-        """Add a command to the outcome of the event in hand."""
+        """Add a command to the outcome of the current event."""
         self._out.append(command)
 
     def take(self) -> list[Command]:
-        """The commands so far; the next event begins with none."""
+        """Return the commands of the current event; the next event begins with none."""
         for process in self._unsaved.values():
             self._out.append(self._intent_of(process))
         self._unsaved.clear()
@@ -178,7 +178,7 @@ class MasterState:
                 del known.history[0]
 
     def save(self, process: Process) -> None:
-        """Make what is intended with a process durable, as it stands after the event in hand."""
+        """Persist the desired state of a process, as it stands after the current event."""
         self._unsaved[process.name] = process
 
     def _intent_of(self, process: Process) -> Intent:
@@ -210,14 +210,14 @@ class MasterState:
         return None if run is None else run_to_dict(run, ())
 
     def save_run(self, run: Run) -> None:
-        """Make durable how far a move is, as it stands after the event in hand."""
+        """Persist the progress of a migration, as it stands after the current event."""
         if self.standbys.get(run.process) is run:
             self.save(self.processes[run.process])
             return
         self._unsaved_runs[run.process] = run
 
     def end_run(self, run: Run) -> None:
-        """A move is over."""
+        """Remove a migration that has ended."""
         del self.runs[run.process]
         self._unsaved_runs.pop(run.process, None)
         self.emit(Intent("migration", run.process, None))
@@ -228,7 +228,7 @@ class MasterState:
         return Intent("migration", run.process, run_to_dict(run, stopping))
 
     def order_id(self) -> int:
-        """A number for an order to a slave, unique within this run of the master."""
+        """Return a number for an order to a slave, unique within this run of the master."""
         self.next_order_id += 1
         return self.next_order_id - 1
 
@@ -259,13 +259,13 @@ class MasterState:
         process.since, process.wall = began
 
     def add_process(self, process: Process) -> None:
-        """One more is known; of a name that was known, this one is from now on."""
+        """Add a process; it replaces a terminal one of the same name."""
         self.processes.pop(process.name, None)  # listings are in order of submission
         self.processes[process.name] = process
         self._note_whether_over(process)
 
     def _note_whether_over(self, process: Process) -> None:
-        """Keep `over` in the order in which they ended."""
+        """Update `over`, which stays in the order in which processes ended."""
         if not process.phase.over:
             self.over.pop(process.name, None)
             if process.spec.standby.wanted:
@@ -275,7 +275,7 @@ class MasterState:
             self.wants_standby.discard(process.name)
 
     def forget_oldest(self) -> None:
-        """Of what is over keep the youngest `keep_ended`, and what is not quite gone."""
+        """Forget ended processes beyond the newest `keep_ended` that cannot run any more."""
         excess = len(self.over) - self.settings.keep_ended
         if excess <= 0:
             return
@@ -296,9 +296,9 @@ class MasterState:
         self.emit(Intent("process", name, None))
 
     def _note_removed(self, name: str) -> None:
-        """Journal that a process with state was removed: a host may return with a replica."""
+        """Journal the removal of a process with state: a host may return with a replica."""
         removed = self.keeping.removed
-        removed.pop(name, None)  # the oldest stand first
+        removed.pop(name, None)  # oldest first
         removed[name] = self.next_instance
         self.emit(Intent("removed", name, {"next": self.next_instance}))
         if len(removed) > _REMOVED_KEPT:
@@ -314,24 +314,24 @@ class MasterState:
         self.queue.add(process.name, process.spec.priority, process.order)
 
     def unqueue(self, process: Process) -> None:
-        """It waits for a host no more, or not yet again."""
+        """Remove the process from the queue and from the set-aside list."""
         if process.name in self.queue:
             self.queue.remove(process.name)
         self.set_aside.discard(process.name)
 
     def instances_of(self, process: Process) -> Iterable[Instance]:
-        """Every instance of a process that may still run."""
+        """Return every instance of a process that may still run."""
         return [self.instances[number] for number in sorted(process.instances)]
 
     def owned_by(self, instance: Instance) -> Process | None:
-        """The process of which this instance owns the name; None: it is a former or later one."""
+        """Return the process whose name this instance owns; None: it is not the owner."""
         process = self.processes.get(instance.id.process)
         return process if process and process.owner == instance.id.number else None
 
     # --- instances -----------------------------------------------------------------------
 
     def new_instance_id(self, process: Process) -> InstanceId:
-        """A number that no instance has had, in any run of the master."""
+        """Return a new instance id; no instance has had its number in any run of the master."""
         if self.next_instance >= self.reserved_instances:
             self._reserve_numbers()
         self.next_instance += 1
@@ -342,24 +342,24 @@ class MasterState:
         self.emit(Intent("cluster", "instances", {"next": self.reserved_instances}))
 
     def skip_numbers(self, seen: int) -> None:
-        """A slave holds an instance that was not numbered by us: our journal was lost.
+        """Skip instance numbers up to one that a slave reports, because the journal lost them.
 
-        Others may have been numbered after it, and have ended.
+        Other instances may have had later numbers, and have ended.
         """
         if self.next_instance <= seen < _LARGEST:
             self.next_instance = seen + _RESERVED
-            self._reserve_numbers()  # that slave may never say it again
+            self._reserve_numbers()  # the slave may never report it again
 
     def add_instance(
         self, instance: InstanceId, spec: ProcessSpec, host: Host, now: float
     ) -> Instance:
-        """Count an instance of a spec against a host from now on."""
+        """Add an instance of a spec, with a reservation on its host."""
         estimate = self.learned.estimate(spec, self.settings.default_needs)
         need = self.hosts.fractions_of(host, estimate.amounts, estimate.estimated)
         return self.charge_instance(instance, host, now, estimate.amounts, estimate.estimated, need)
 
     def _numbers_of(self, name: str) -> set[int]:
-        """Where the instances of a name are noted, of a process that is known or not."""
+        """Return the set of instance numbers of a name, known or not."""
         process = self.processes.get(name)
         return self.orphans.setdefault(name, set()) if process is None else process.instances
 
@@ -367,9 +367,9 @@ class MasterState:
         self, instance: InstanceId, host: Host, now: float, amounts: Mapping[str, float],
         estimated: frozenset[str], need: FloatArray,
     ) -> Instance:  # fmt: skip
-        """Count an instance against a host from now on.
+        """Add an instance, with a reservation on its host.
 
-        `need`, (R,), is what `amounts` are of the host's capacity.
+        `need`, (R,), is `amounts` as fractions of the host's capacity.
         """
         charged = need.copy()
         charged[charged == np.inf] = 0.0
@@ -383,14 +383,14 @@ class MasterState:
     def charge_ranked(
         self, instance: InstanceId, host: Host, now: float, ranking: Ranking
     ) -> Instance:
-        """As `charge_instance`, by the ranking that has chosen the host."""
+        """Add an instance with the reservation of the ranking that chose the host."""
         demand = ranking.demand
         return self.charge_instance(
             instance, host, now, demand.amounts, demand.estimated, ranking.need[:, host.column]
         )
 
     def drop_instance(self, instance: Instance) -> None:
-        """An instance has ended: it counts no more."""
+        """Remove an ended instance and its reservation."""
         del self.instances[instance.id.number]
         instance.host.instances.discard(instance.id.number)
         name = instance.id.process
@@ -403,7 +403,7 @@ class MasterState:
         self, instance: InstanceId, spec: ProcessSpec, node_name: str = "", *,
         shadow: bool = False, restored: bool = False,
     ) -> Assignment:  # fmt: skip
-        """The order for a slave to run an instance."""
+        """Return the assignment by which a slave runs an instance."""
         fence = fence_of(spec, self.settings)
         kept_on: tuple[str, ...] = ()
         kept_from = 0
@@ -425,7 +425,7 @@ class MasterState:
 
 
 def larger(first: Mapping[str, float], second: Mapping[str, float]) -> Mapping[str, float]:
-    """The larger amount of each resource."""
+    """Return the larger amount of each resource."""
     if not second:
         return first
     names = {**first, **second}

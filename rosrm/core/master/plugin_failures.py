@@ -1,4 +1,4 @@
-"""Plugins that fail, in the master or on a host: the begin and the end of it are recorded."""
+"""Records of plugins that fail or work again, in the master or on a host."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rosrm.model.event_kinds import EventKind
 
 
 def note(state: MasterState, now: float) -> None:
-    """Record which plugins of the master began to fail since the last call, or work again."""
+    """Record the plugins of the master that began to fail, or to work, since the last call."""
     for (kind, name), error in state.plugins.changes(now):
         event, outcome = (
             (EventKind.PLUGIN_FAILED, f"fails: {error}")
@@ -23,10 +23,10 @@ def note(state: MasterState, now: float) -> None:
 
 
 def note_on_host(state: MasterState, host: Host, failing: Mapping[Plugin, str], now: float) -> None:
-    """Note which plugins fail on a host by the report of its slave, and record what changed.
+    """Note the failing plugins of a host from its slave's report, and record the changes.
 
     Args:
-        failing: all that fail there, and why. A probe goes by the resource that it reads.
+        failing: all that fail there, and why. A probe is named after the resource that it reads.
     """
     for plugin in sorted(failing.keys() | host.failing.keys()):
         if plugin not in failing:

@@ -1,4 +1,4 @@
-"""Removing ended processes and departed hosts from memory, journal and listings."""
+"""Removal of ended processes and departed hosts from memory, journal and listings."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _DEPARTED: Final = (HostCondition.LEFT, HostCondition.DETACHED)
 
 
 def prune_requested(state: MasterState, event: happened.PruneRequested, now: float) -> None:
-    """Remove the named processes and hosts, or all that ended and left; all of them, or none."""
+    """Remove the named processes and hosts, or all that ended or left; all of them, or none."""
     if event.names or event.hosts:
         found = _named(state, event, now)
         if found is None:
@@ -48,7 +48,7 @@ def prune_requested(state: MasterState, event: happened.PruneRequested, now: flo
 def _named(
     state: MasterState, event: happened.PruneRequested, now: float
 ) -> tuple[list[Process], list[Host]] | None:
-    """The processes and hosts that a request names; None: it was refused."""
+    """Return the processes and hosts that a request names; None: it was refused."""
     processes = known_processes(state, event.request, event.names)
     if processes is None:
         return None
@@ -109,10 +109,10 @@ def _why_held(state: MasterState, host: Host, now: float) -> str:
 
 
 def _prune_host(state: MasterState, host: Host, by: str, now: float) -> str:
-    """Give up what may still run on a host; if the host returns, that is stopped there.
+    """Give up the instances that may still run on a host; stop them there if the host returns.
 
     Returns:
-        which processes may still run there, and what stops them; "" if none may.
+        the processes that may still run there, and the command that stops them; "" if none may.
     """
     ends_all = state.hosts.condition_of(host) is HostCondition.LEFT
     held = [] if ends_all else [state.instances[number] for number in sorted(host.instances)]

@@ -72,7 +72,7 @@ HANDLERS: Final[Mapping[type, _Handler]] = MappingProxyType(
 
 
 def step(state: MasterState, event: happened.Event, now: float) -> list[Command]:
-    """Take one event in.
+    """Handle one event.
 
     Args:
         state: changed in place.
@@ -80,7 +80,7 @@ def step(state: MasterState, event: happened.Event, now: float) -> list[Command]
         now: seconds by the master's monotonic clock; never less than before.
 
     Returns:
-        What to carry out, in order; records and intents first become durable.
+        Commands to carry out, in order; records and intents first become durable.
     """
     HANDLERS[type(event)](state, event, now)
     executor.advance_all(state, now)

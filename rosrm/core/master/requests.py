@@ -1,4 +1,4 @@
-"""What people ask for: submit, cancel, restart, migrate, checkpoint, restore, cordon, drain."""
+"""Requests of clients: submit, cancel, restart, migrate, checkpoint, restore, cordon, drain."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ from rosrm.wording import counted, listed, no_such
 
 
 def refuse(state: MasterState, request: int, message: str, code: str = "invalid") -> None:
-    """Answer a request that changes nothing."""
+    """Refuse a request; nothing has changed."""
     state.emit(Reply(request, False, code, message))
 
 
-#: The event of each action on a host.
+#: Kind of the record of each action on a host.
 _HOST_EVENTS: Final = {
     "cordon": EventKind.HOST_CORDONED,
     "uncordon": EventKind.HOST_UNCORDONED,
@@ -75,7 +75,7 @@ def submission_received(state: MasterState, event: happened.SubmissionReceived, 
 
 
 def _taken(state: MasterState, event: happened.SubmissionReceived) -> str:
-    """Which names cannot be given; "" for none."""
+    """Return why the submitted names cannot be used; "" if they can."""
     twice = [name for name, n in Counter(spec.name for spec in event.specs).items() if n > 1]
     if twice:
         return f"submitted twice at once: {listed(twice)}; names are unique. Nothing was queued"
@@ -94,7 +94,7 @@ def _taken(state: MasterState, event: happened.SubmissionReceived) -> str:
 
 
 def _in_use(state: MasterState, taken: list[str]) -> list[str]:
-    """Say that names belong to processes that are not over, and what frees them."""
+    """Return sentences: the names belong to live processes, and what frees them."""
     live = [name for name in taken if state.processes[name].wanted is not Wanted.CANCEL]
     ending: dict[str, list[str]] = {}
     for name in taken:
@@ -114,7 +114,7 @@ def _names(names: list[str]) -> str:
 
 
 def _still_stopping(state: MasterState, name: str) -> str:
-    """Of a process that is over or unknown, an instance that may still run; "" for none."""
+    """Return a sentence on an earlier instance that may still run; "" for none."""
     process = state.processes.get(name)
     numbers = state.orphans.get(name) if process is None else process.instances
     if not numbers:
@@ -142,7 +142,7 @@ def _submission_fault(state: MasterState, event: happened.SubmissionReceived) ->
 
 
 def _strategy_fault(state: MasterState, spec: ProcessSpec) -> str:
-    """Return why the strategy of a spec cannot move the process; "": it can, by what is known."""
+    """Return why the strategy of a spec cannot move the process; "": no reason is known."""
     name = spec.migration.strategy or ""
     strategy: object = state.strategies.get(name)
     if strategy is None:
@@ -172,7 +172,7 @@ def count(number: int) -> str:
 
 
 def known_processes(state: MasterState, request: int, names: Iterable[str]) -> list[Process] | None:
-    """The processes of these names; a name that nobody has refuses the whole request."""
+    """Return the processes of these names; an unknown name refuses the whole request."""
     unknown = [name for name in names if name not in state.processes]
     if unknown:
         refuse(state, request, no_such("process", unknown, reversed(state.processes)), "unknown")
@@ -193,7 +193,7 @@ def cancel_requested(state: MasterState, event: happened.CancelRequested, now: f
 
 
 def _cancelled(state: MasterState, processes: Iterable[Process], over: list[str]) -> str:
-    """Return what has become of cancelled processes; `over` had ended before."""
+    """Return the outcome of a cancellation; `over`: names that had ended before."""
     asked = [process for process in processes if process.name not in over]
     pending = [process for process in asked if not process.phase.over]
     said = [f"{count(len(asked) - len(pending))} cancelled"] if len(asked) > len(pending) else []
@@ -236,7 +236,7 @@ def _cancel(state: MasterState, process: Process, now: float, by: str) -> None:
         # Its owner has ended, and former instances are being stopped.
         if not lifecycle.requeue_if_clear(state, process, now):
             lifecycle.note_awaited_ends(state, process, now)
-    elif process.name not in state.runs:  # else the plan in hand turns back first
+    elif process.name not in state.runs:  # otherwise the current plan turns back first
         owner = state.instances[process.owner]
         lifecycle.note_phase(state, process, owner, now)
         lifecycle.stop_instance(state, owner, now)
@@ -244,7 +244,7 @@ def _cancel(state: MasterState, process: Process, now: float, by: str) -> None:
 
 
 def restart_requested(state: MasterState, event: happened.RestartRequested, now: float) -> None:
-    """Restart what runs where it runs; queue anew what has ended."""
+    """Restart running processes in place; queue ended ones again."""
     processes = known_processes(state, event.request, event.names)
     if processes is None:
         return
@@ -291,8 +291,8 @@ def _restart(state: MasterState, process: Process, now: float, by: str) -> None:
         state.next_order += 1
         state.enqueue(process, now)
     elif (owner := state.instances[process.owner]).state is not None:
-        # One that its slave has not taken up yet is about to start anyway: a restart that came
-        # before it would keep it from ever starting.
+        # An instance that its slave has not accepted yet starts anyway. An order to restart that
+        # arrives before the assignment would prevent the start for good.
         owner.restarting = True
         state.emit(Order(state.order_id(), owner.host.host_id, "restart", owner.id))
     state.save(process)
@@ -302,7 +302,7 @@ def _restart(state: MasterState, process: Process, now: float, by: str) -> None:
 
 
 def migration_requested(state: MasterState, event: happened.MigrationRequested, now: float) -> None:
-    """Begin to move a process."""
+    """Begin the migration of a process."""
     processes = known_processes(state, event.request, [event.name])
     if processes is None:
         return
@@ -359,12 +359,12 @@ def _begin(
 
 
 def asked_for(by: str) -> str:
-    """Return the cause of what a client asked for."""
+    """Return the cause, for records, of a change that a client requested."""
     return f"asked for by {by}" if by else "asked for"
 
 
 def known_host(state: MasterState, request: int, name: str) -> Host | None:
-    """The host of a name; a name that no listed host has refuses the whole request."""
+    """Return the host of a name; a name that is not listed refuses the whole request."""
     host = state.hosts.by_name.get(name)
     if host is not None and not host.pruned:
         return host

@@ -1,4 +1,4 @@
-"""What the core can be told to do differently; `rosrm.config` fills it from the file."""
+"""Settings of the master's core; `rosrm.config` fills them from the file."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ class CoreSettings:
     """Settings of the master's core.
 
     Attributes:
-        backfill: those behind a process that waits for room may pass it.
-        default_needs: base units by resource, for a process of which nothing is known.
+        backfill: processes behind one that waits for room may pass it.
+        default_needs: base units by resource, for a process without declared or learned needs.
         settle: seconds after which an estimate (not a declared need) no longer counts.
         suspect: seconds of silence after which a host gets no new work.
         lease: seconds of silence after which a host is lost.
-        delivery_timeout: seconds within which a slave must take up an assignment.
-        cooldown: seconds after a move in which a process is not moved again on the core's accord.
+        delivery_timeout: seconds within which a slave must accept an assignment.
+        cooldown: seconds after a migration in which the core does not migrate a process again.
         hysteresis: seconds that a host must be over a limit before anything moves.
         headroom: fraction by which a destination stays under each of its limits.
         max_migrations: most migrations in flight.
         automatic: the core moves processes from hosts that are over a limit.
-        order_retry: seconds after which an unanswered order is given again.
-        keep_ended: most processes that are over and still known.
+        order_retry: seconds after which an unanswered order is repeated.
+        keep_ended: most terminal processes that stay known.
     """
 
     backfill: bool = False

@@ -1,4 +1,4 @@
-"""What falls due with time alone: silence, delivery, orders to give again, limits held too long."""
+"""Tick: periodic work of the reducer (silence, delivery, repeated orders, limits)."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from rosrm.core.master.migration.eviction import relieve_hosts
 from rosrm.core.master.migration.standby import review_standbys
 from rosrm.core.master.recovery import journal_gap
 
-#: Seconds between two reviews of what need not be looked at with every event.
+#: Seconds between two ticks; this work need not be done with every event.
 _REVIEW_EVERY: Final = 0.2
-#: Seconds that a host may owe a status batch before it is asked for everything.
+#: Seconds for which a status batch may be missing before the host is asked for all statuses.
 _PATIENCE: Final = 1.0
 
 
 def time_passed(state: MasterState, event: happened.TimePassed, now: float) -> None:
-    """Look at every deadline."""
+    """Check every deadline."""
     review_liveness(state, now)
     if now - state.reviewed < _REVIEW_EVERY:
         return
@@ -65,7 +65,7 @@ def _review_instance(state: MasterState, instance: Instance, now: float) -> None
 
 
 def _review_delivery(state: MasterState, instance: Instance, age: float, now: float) -> None:
-    """Nothing was said of an assignment: the answer that it went with may have been lost."""
+    """Redeliver or withdraw an assignment without a report: the answer with it may be lost."""
     process = state.owned_by(instance)
     if process is None or process.phase is not ProcessPhase.ASSIGNED or instance.stopping:
         return
@@ -78,7 +78,7 @@ def _review_delivery(state: MasterState, instance: Instance, age: float, now: fl
 
 
 def _take_back(state: MasterState, instance: Instance, now: float) -> None:
-    """An assignment ahead waits for the wrong job: its process goes back to its place."""
+    """Return a prefetched process to its place in the queue, because its slot stays taken."""
     review_slots(state, instance.host, now)
     process = state.owned_by(instance)
     if process is not None and process.wanted is Wanted.RUN and process.name not in state.runs:
@@ -88,7 +88,7 @@ def _take_back(state: MasterState, instance: Instance, now: float) -> None:
 
 
 def _withdraw(state: MasterState, process: Process, instance: Instance, now: float) -> None:
-    """Take back an assignment that was not taken up: however it ends now, it is queued again."""
+    """Withdraw an assignment that was not accepted; its process is queued again in any case."""
     if instance.order and now - instance.order_at < state.settings.delivery_timeout:
         return
     if process.wanted is Wanted.RUN:

@@ -2,8 +2,8 @@
 
 reducer.py       one row for each event
 events.py, commands.py
-handlers.py      what follows each event
+handlers.py      one handler for each event
 state.py         the instances that the slave holds
-watches.py       the values of readiness and health; health.py judges them
+watches.py       the values of readiness and health; health.py judges health
 fencing.py, master_clock.py
 """

@@ -31,10 +31,13 @@ class Fence:
 
 @dataclass(frozen=True, slots=True)
 class Renew:
-    """Tell the supervisor when the master last heard this host, and that this slave is at work.
+    """Send the supervisor the time of the last contact, and the time at which this slave runs.
 
     Attributes:
-        at, alive: by the monotonic clock.
+        at: newest time at which the master received a message of this host.
+        alive: time at which this slave runs.
+
+    Both by the monotonic clock.
     """
 
     at: float
@@ -73,7 +76,7 @@ class Amend:
 
 @dataclass(frozen=True, slots=True)
 class Settle:
-    """Answer the order to set this restart policy; `refusal`: why it cannot be; "": it is."""
+    """Answer the order to set this restart policy; `refusal`: why that failed; "": it is set."""
 
     instance: InstanceId
     restart: RestartPolicy
@@ -82,7 +85,7 @@ class Settle:
 
 @dataclass(frozen=True, slots=True)
 class Remember:
-    """Have the supervisor keep this for a later run of this slave."""
+    """Have the supervisor keep these facts for a later run of this slave."""
 
     instance: InstanceId
     memo: Memo
@@ -97,7 +100,7 @@ class Forget:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """Tell the master; `complete`: these are all."""
+    """Report statuses to the master; `complete`: these are all."""
 
     statuses: tuple[InstanceStatus, ...]
     complete: bool = False

@@ -11,10 +11,10 @@ from rosrm.model.values import Assignment, InstanceId, InstanceStatus, RestartPo
 
 @dataclass(frozen=True, slots=True)
 class Registered:
-    """The master took this host in.
+    """The master registered this host.
 
     Attributes:
-        renumbers: it has lost its journal, and gives numbers again that were given before.
+        renumbers: the master has lost its journal, and may use instance numbers a second time.
     """
 
     epoch: int
@@ -23,7 +23,7 @@ class Registered:
 
 @dataclass(frozen=True, slots=True)
 class MasterLost:
-    """The contact with the master is lost: it may not learn of an end that follows."""
+    """The contact with the master is lost: later ends may not reach it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +31,7 @@ class AssignmentsReceived:
     """The master assigned instances to this host.
 
     Attributes:
-        given_at: when it did so at the earliest, by the slave's clock; None: just now.
+        given_at: earliest time of the assignment, by the slave's clock; None: just now.
     """
 
     assignments: tuple[Assignment, ...]
@@ -48,24 +48,24 @@ class LaunchRefused:
 
 @dataclass(frozen=True, slots=True)
 class StopOrdered:
-    """The master wants an instance to end for good."""
+    """The master ordered an instance to end for good."""
 
     instance: InstanceId
 
 
 @dataclass(frozen=True, slots=True)
 class FenceOrdered:
-    """The master wants an instance to be gone at once: it has a successor."""
+    """The master ordered an instance to end at once, because it has a successor."""
 
     instance: InstanceId
 
 
 @dataclass(frozen=True, slots=True)
 class MasterHears:
-    """The master that this host is registered with had heard it when it said so.
+    """The master reported that it receives messages from this host.
 
     Attributes:
-        at: when that was, by the slave's clock; not when it arrived.
+        at: time at which the master sent this, by the slave's clock; not the time of arrival.
     """
 
     at: float
@@ -73,14 +73,14 @@ class MasterHears:
 
 @dataclass(frozen=True, slots=True)
 class RestartOrdered:
-    """The master wants an instance to start again here."""
+    """The master ordered an instance to restart on this host."""
 
     instance: InstanceId
 
 
 @dataclass(frozen=True, slots=True)
 class RestartPolicySet:
-    """The master wants an instance to have another restart policy; a shadow is none any more."""
+    """The master set another restart policy for an instance; it is no shadow any more."""
 
     instance: InstanceId
     restart: RestartPolicy
@@ -88,7 +88,7 @@ class RestartPolicySet:
 
 @dataclass(frozen=True, slots=True)
 class RestartPolicyRecorded:
-    """The supervisor has written down which restart policy an instance has."""
+    """The supervisor has recorded the restart policy of an instance."""
 
     instance: InstanceId
     restart: RestartPolicy
@@ -96,12 +96,12 @@ class RestartPolicyRecorded:
 
 @dataclass(frozen=True, slots=True)
 class ReportRequested:
-    """The master wants to know of every instance."""
+    """The master asked for the status of every instance."""
 
 
 @dataclass(frozen=True, slots=True)
 class SupervisorReported:
-    """The supervisor says what became of instances."""
+    """The supervisor reported statuses of instances."""
 
     statuses: tuple[InstanceStatus, ...]
 
@@ -111,9 +111,9 @@ class SupervisorReplaced:
     """Another supervisor took over, or this slave found one at its start.
 
     Attributes:
-        statuses: all that it knows.
-        memos: what earlier runs of this slave had it remember of instances.
-        fenced: which of them have a fence.
+        statuses: all that it holds.
+        memos: facts about instances that earlier runs of this slave stored there.
+        fenced: the instances that have a fence.
     """
 
     statuses: tuple[InstanceStatus, ...]
@@ -123,17 +123,17 @@ class SupervisorReplaced:
 
 @dataclass(frozen=True, slots=True)
 class SeenInGraph:
-    """This very instance, not a namesake, is in the ROS graph."""
+    """This instance, not another one of the same name, is in the ROS graph."""
 
     instance: InstanceId
 
 
 @dataclass(frozen=True, slots=True)
 class LookedAt:
-    """One that is watched was looked at.
+    """A watched instance was observed.
 
     Attributes:
-        pid: of the run that was.
+        pid: of the observed run.
     """
 
     instance: InstanceId
@@ -143,7 +143,7 @@ class LookedAt:
 
 @dataclass(frozen=True, slots=True)
 class TimePassed:
-    """Nothing else happened; deadlines are looked at."""
+    """Time passed without another event; deadlines are checked."""
 
 
 Event = (

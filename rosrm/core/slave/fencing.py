@@ -1,7 +1,7 @@
-"""What a slave does so that an instance with a fence has ended before a successor starts elsewhere.
+"""Fences of instances on the slave's side: each ends before a successor starts elsewhere.
 
-The supervisor ends such an instance when it has not been told for too long that the master hears
-this host. The slave tells it: it alone hears the master.
+The supervisor ends an instance with a fence when too much time has passed since the last contact
+with the master. The slave reports the last contact to it, because only the slave receives beats.
 """
 
 from __future__ import annotations
@@ -13,23 +13,23 @@ from rosrm.core.slave.events import MasterHears
 from rosrm.core.slave.state import SlaveState
 from rosrm.model.values import Assignment, InstanceId
 
-#: Least seconds between two words to the supervisor.
+#: Least seconds between two `Renew` commands to the supervisor.
 RENEW_PERIOD: Final = 0.1
 
 
 def master_hears(state: SlaveState, event: MasterHears, now: float) -> list[Command]:
-    """Pass it on, where there is a fence that it renews."""
+    """Note the last contact, and renew the fences."""
     state.heard_at = max(state.heard_at, event.at)
     return renew_in_time(state, now)
 
 
 def renew_in_time(state: SlaveState, now: float) -> list[Command]:
-    """Tell the supervisor the newest, unless it was told a moment ago."""
+    """Renew the fences, unless they were renewed a moment ago."""
     return renew(state, now) if now - state.renewed_at >= RENEW_PERIOD else []
 
 
 def renew(state: SlaveState, now: float) -> list[Command]:
-    """Tell the supervisor the newest; what has no fence needs no word."""
+    """Send the supervisor the last contact, if any instance that has not ended has a fence."""
     if not any(held.fenced and not held.status.state.ended for held in state.held.values()):
         return []
     state.renewed_at = now
@@ -37,7 +37,7 @@ def renew(state: SlaveState, now: float) -> list[Command]:
 
 
 def too_late(state: SlaveState, assignment: Assignment, now: float) -> str:
-    """Why an instance must not be started any more; "": it may be."""
+    """Return why an instance must not be started any more; "" if it may."""
     fence = assignment.fence
     if fence is None or fence.alive or now < state.heard_at + fence.after:
         return ""
@@ -47,7 +47,7 @@ def too_late(state: SlaveState, assignment: Assignment, now: float) -> str:
 
 
 def too_old(state: SlaveState, assignment: Assignment, age: float) -> str:
-    """Why an assignment that has been on its way for so long is not taken up; "": it is."""
+    """Return why an assignment of this age (seconds) is not accepted; "" if it is."""
     fence = assignment.fence
     most = state.max_age
     if fence is not None and not fence.alive:
@@ -58,7 +58,7 @@ def too_old(state: SlaveState, assignment: Assignment, age: float) -> str:
 
 
 def late(state: SlaveState, now: float) -> dict[InstanceId, str]:
-    """Those that wait for their start and must not be started any more, and why."""
+    """Return the waiting instances that must not be started any more, with the reason."""
     return {
         instance: why
         for instance, assignment in state.waiting.items()

@@ -1,4 +1,4 @@
-"""What each kind of event does to the state of a slave."""
+"""Handlers of the slave's events."""
 
 from __future__ import annotations
 
@@ -44,26 +44,26 @@ from rosrm.core.slave.state import Held, SlaveState, awaits_graph, qualified_nam
 from rosrm.core.slave.watches import Awaited, Memo
 from rosrm.model.values import Assignment, InstanceId, InstanceState, InstanceStatus
 
-#: Seconds for which the end of an instance is kept for a master that did not hear of it.
+#: Seconds for which the end of an instance is kept for a master that may not have received it.
 REMEMBER_END: Final = 60.0
-#: Orders to stop what was never heard of that are remembered.
+#: Most remembered orders to stop an unknown instance.
 _TOMBSTONES: Final = 10_000
 
 _Commands = list[Command]
 
 
 def _registered(state: SlaveState, event: Registered, now: float) -> _Commands:
-    # Not the highest that was ever heard: a master whose journal was lost begins at 1 again.
+    # Not the highest epoch so far: a master whose journal was lost begins at 1 again.
     state.epoch = event.epoch
     state.registered = True
     if event.renumbers:
         state.tombstones.clear()
     for held in state.held.values():
-        held.ended_at = max(held.ended_at, now)  # told with the registration, not before
+        held.ended_at = max(held.ended_at, now)  # reported with the registration, not before
     if not state.unheard:
         return []
     state.unheard = False
-    # Not as complete: told late, it must not deny what has been assigned since.
+    # Not complete: a late report must not deny assignments made since.
     return [Report(state.statuses())]
 
 
@@ -77,7 +77,7 @@ def _assigned(state: SlaveState, event: AssignmentsReceived, now: float) -> _Com
     for assignment in event.assignments:
         instance = assignment.instance
         if instance in state.held:
-            continue  # the order came twice
+            continue  # the order arrived twice
         status = _refused(state, assignment, event.given_at, now)
         if status is not None:
             state.held[instance] = Held(status, ended_at=now)
@@ -97,7 +97,7 @@ def _assigned(state: SlaveState, event: AssignmentsReceived, now: float) -> _Com
 def _refused(
     state: SlaveState, assignment: Assignment, given_at: float | None, now: float
 ) -> InstanceStatus | None:
-    """What is said of an assignment that is not taken up; None: it is."""
+    """Return the status of an assignment that is not accepted; None: it is accepted."""
     reason = _why_not(state, assignment)
     if reason:
         return InstanceStatus(assignment.instance, InstanceState.REFUSED, message=reason)
@@ -111,7 +111,7 @@ def _refused(
 def _waiting(assignment: Assignment) -> Held:
     spec = assignment.spec
     awaited = None
-    if awaits_graph(spec) and not assignment.restored:  # that one joins the graph when it may
+    if awaits_graph(spec) and not assignment.restored:  # a restored one joins the graph later
         name = qualified_name(spec.namespace, assignment.node_name)
         awaited = Awaited(name, spec.readiness.timeout)
     status = InstanceStatus(assignment.instance, InstanceState.HELD)
@@ -120,7 +120,7 @@ def _waiting(assignment: Assignment) -> Held:
 
 
 def _start_waiting(state: SlaveState, now: float) -> _Commands:
-    """Launch what waits, as far as it may be started now."""
+    """Launch waiting instances, as far as the bounds allow."""
     refused = _refuse_late(state, now)
     launches = []
     while state.waiting and not state.why_wait():
@@ -131,7 +131,7 @@ def _start_waiting(state: SlaveState, now: float) -> _Commands:
 
 
 def _refuse_late(state: SlaveState, now: float) -> _Commands:
-    """Their successors may run elsewhere by now."""
+    """Refuse waiting instances whose fence has passed: successors may run elsewhere by now."""
     late = fencing.late(state, now)
     for instance, why in late.items():
         del state.waiting[instance]
@@ -151,7 +151,7 @@ def _why_not(state: SlaveState, assignment: Assignment) -> str:
 
 def _launch_refused(state: SlaveState, event: LaunchRefused, now: float) -> _Commands:
     held = state.held.get(event.instance)
-    if held is None:  # it went with a supervisor that was killed
+    if held is None:  # it ended with a supervisor that was killed
         return []
     held.status = InstanceStatus(event.instance, InstanceState.REFUSED, message=event.reason)
     held.ready_by, held.ended_at = None, now
@@ -199,7 +199,7 @@ def _restart_policy_set(state: SlaveState, event: RestartPolicySet, now: float) 
         return [Report((held.status,)), Settle(event.instance, event.restart)]
     news = _pause_or_watch(held, event)
     waiting = state.waiting.get(event.instance)
-    if waiting is not None:  # nobody but this slave knows of it yet
+    if waiting is not None:  # the supervisor does not know it yet
         spec = replace(waiting.spec, restart=event.restart)
         state.waiting[event.instance] = replace(waiting, spec=spec, shadow=False)
         return [Report((held.status,)), Settle(event.instance, event.restart)]
@@ -209,9 +209,10 @@ def _restart_policy_set(state: SlaveState, event: RestartPolicySet, now: float) 
 
 
 def _pause_or_watch(held: Held, order: RestartPolicySet) -> bool:
-    """Whether it is news: without its restart policy it is being moved, with it again it is not.
+    """Pause or resume the health watch by the restart policy; return True if that changed.
 
-    One that is never restarted cannot be told from one that moves; it is watched all the while.
+    A migration turns the restarts off and on again. An instance that is never restarted shows no
+    such change; it is watched all the time.
     """
     watch = held.watch
     if watch is None:
@@ -249,7 +250,7 @@ def _supervisor_reported(state: SlaveState, event: SupervisorReported, now: floa
         for reported in event.statuses
         if (status := _follow(state, reported, now)) is not None
     ]
-    # The next one first: the master hears of an end soon enough.
+    # Starts first, because the report of an end is less urgent.
     return [*_start_waiting(state, now), *([Report(tuple(changed))] if changed else [])]
 
 
@@ -261,7 +262,7 @@ def _supervisor_replaced(state: SlaveState, event: SupervisorReplaced, now: floa
         if lost and not held.status.state.ended:
             del state.held[instance]
             _bury(state, instance)
-        held.judgement = None  # what it ordered may be lost
+        held.judgement = None  # its order may be lost
         again += [
             _amend_again(RestartPolicySet(instance, restart), held, lost=lost)
             for restart in held.unsettled
@@ -277,7 +278,7 @@ def _supervisor_replaced(state: SlaveState, event: SupervisorReplaced, now: floa
 
 
 def _amend_again(order: RestartPolicySet, held: Held, *, lost: bool) -> Command:
-    """What was ordered may have been lost with the supervisor."""
+    """Return the command that repeats an order which may be lost with the supervisor."""
     if held.status.state.ended:
         return Settle(order.instance, order.restart)
     return _not_held(order) if lost else Amend(order.instance, order.restart)
@@ -286,7 +287,7 @@ def _amend_again(order: RestartPolicySet, held: Held, *, lost: bool) -> Command:
 def _follow(
     state: SlaveState, reported: InstanceStatus, now: float, memo: Memo | None = None
 ) -> InstanceStatus | None:
-    """Take over what the supervisor says; None: that is known."""
+    """Apply a status of the supervisor; return the new status, None: already known."""
     held = state.held.get(reported.instance)
     if held is None:
         known = memo or Memo()
@@ -309,7 +310,7 @@ def _follow(
 
 
 def _running(held: Held, reported: InstanceStatus, now: float) -> InstanceStatus:
-    """A new run: ready at once, or to be seen in the graph first."""
+    """Return the status of a new run: ready at once, or after it is seen in the graph."""
     if held.awaited is None or held.awaited.seen == reported.pid:
         return replace(reported, state=InstanceState.READY)
     held.ready_by = now + held.awaited.timeout
@@ -344,7 +345,7 @@ def _looked_at(state: SlaveState, event: LookedAt, now: float) -> _Commands:
     reason = held.judgement.look(event.look, now)
     if not reason:
         return []
-    held.judgement = None  # should the order be lost, it comes again
+    held.judgement = None  # judge again, in case the order is lost
     return [Fail(event.instance, event.pid, reason, kill=event.look.stopped)]
 
 

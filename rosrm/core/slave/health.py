@@ -1,7 +1,8 @@
-"""Judges whether an instance that is ready does what its spec wants of it: looks in, verdict out.
+"""Health of ready instances: observations in, verdicts out.
 
-What is amiss must have been so in every look for longer than the spec's `timeout`. Only time counts
-in which the slave looked: one that was itself stopped, or found no CPU, blames nobody.
+A check fails only if every look for longer than the spec's `timeout` found it failing. Only time in
+which the slave looked counts. A slave that was itself stopped, or got no CPU, therefore blames no
+instance.
 """
 
 from __future__ import annotations
@@ -15,21 +16,21 @@ from rosrm.model.values import Assignment, Health
 
 #: Seconds between two looks.
 LOOK_PERIOD: Final = 0.2
-#: Part of `timeout` over which a rate is counted, and the least number of periods of that rate.
+#: Share of `timeout` over which a rate is counted, and the least number of periods of that rate.
 _WINDOW: Final = 0.25
 _PERIODS: Final = 3.0
-#: A count may be short of this many messages: where the window begins is chance.
+#: A count may lack this many messages, because the window begins at a random phase.
 _SLACK: Final = 1.0
-#: Part of `timeout` that one look counts for at most, and the least of it in seconds.
+#: Most that one look counts: a share of `timeout`, but at least these seconds.
 _STRIDE: Final = 0.25
 _LEAST_STRIDE: Final = 1.5 * LOOK_PERIOD
 
 
-# --- what is watched --------------------------------------------------------------------------
+# --- checks -----------------------------------------------------------------------------------
 
 
 def watch_of(assignment: Assignment) -> Watch | None:
-    """What is watched of an instance; None: nothing."""
+    """Return the health checks of an instance; None: none."""
     wanted = assignment.spec.health
     if wanted.timeout <= 0.0:
         return None
@@ -43,7 +44,7 @@ def watch_of(assignment: Assignment) -> Watch | None:
 
 
 def _names(name: str, assignment: Assignment, scheme: str) -> tuple[str, ...]:
-    """Absolute names: below the node's visible name first, then below its alias, if it has one."""
+    """Return absolute names: below the node's visible name first, then below its alias, if any."""
     spec = assignment.spec
     nodes = dict.fromkeys((spec.name, assignment.node_name))
     resolved = (resolve(name, spec.namespace, node, spec.remappings, scheme) for node in nodes)
@@ -53,7 +54,7 @@ def _names(name: str, assignment: Assignment, scheme: str) -> tuple[str, ...]:
 def resolve(
     name: str, namespace: str, node: str, remappings: Mapping[str, str], scheme: str
 ) -> str:
-    """The absolute name of a topic or service after the remappings, as rcl finds it.
+    """Return the absolute name of a topic or service after the remappings, as rcl finds it.
 
     Args:
         name: absolute, relative to the namespace, or below the node ("~/scan").
@@ -80,11 +81,11 @@ def _absolute(name: str, namespace: str, node: str) -> str:
     return f"{inside}/{name}"
 
 
-# --- what was seen of it ----------------------------------------------------------------------
+# --- judgement --------------------------------------------------------------------------------
 
 
 class _Lasting:
-    """For how long something has been amiss without a break, since it was first seen so."""
+    """Duration for which a check has failed without a break, since the first failing look."""
 
     __slots__ = ("amiss", "seconds")
 
@@ -98,12 +99,12 @@ class _Lasting:
 
 
 class Judgement:
-    """Of one run of an instance.
+    """The health of one run of an instance.
 
     Args:
-        watch: what is watched.
+        watch: the checks.
         pid: of the run.
-        now: when it was ready.
+        now: time at which the run was ready.
 
     Attributes:
         pid: of the run.
@@ -121,7 +122,7 @@ class Judgement:
         self._rate = _Rate(watch.wanted)
 
     def look(self, seen: Look, now: float) -> str:
-        """Take a look in; what has been amiss for too long, for people; "": nothing."""
+        """Add a look; return the checks that have failed for too long, as text; "": none."""
         gap = now - self._looked
         passed = min(gap, self._stride)
         self._looked = now
@@ -149,10 +150,10 @@ class Judgement:
 
 
 class _Rate:
-    """Whether messages come often enough, counted over a sliding window.
+    """The rate of messages, counted over a sliding window.
 
     Attributes:
-        amiss: for how long they have not.
+        amiss: duration for which the rate has been too low.
     """
 
     __slots__ = ("_counts", "_heard", "_heard_amiss", "_idle", "_least", "_window", "amiss")
@@ -163,18 +164,18 @@ class _Rate:
         self._window = _WINDOW * wanted.timeout
         if wanted.rate > 0.0:
             self._window = max(self._window, _PERIODS / wanted.rate)
-        self._idle = wanted.timeout  # that a node has until it must publish
+        self._idle = wanted.timeout  # seconds that a node has until it must publish
         self._counts: deque[tuple[float, int]] = deque()
         self._heard = 0
         self._heard_amiss = 0
 
     @property
     def found(self) -> float:
-        """Hz, while it was amiss."""
+        """Return the rate in Hz while it was too low."""
         return self._heard_amiss / self.amiss.seconds
 
     def look(self, seen: Look, now: float, passed: float, *, missed: bool) -> None:
-        """Count; `missed`: so long after the look before that some may have been lost."""
+        """Count messages; `missed`: the last look is so long ago that some may have been lost."""
         if seen.heard is None or missed:
             self._counts.clear()
         self._heard += seen.heard or 0
@@ -187,7 +188,7 @@ class _Rate:
         self._heard_amiss = self._heard_amiss + (seen.heard or 0) if was_amiss else 0
 
     def _is_amiss(self, seen: Look, now: float) -> bool | None:
-        """None: it has not been listened to for long enough to say."""
+        """Return True if the rate is too low; None: not observed for long enough."""
         if seen.heard is None:
             return True
         self._counts.append((now, self._heard))

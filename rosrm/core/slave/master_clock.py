@@ -1,20 +1,21 @@
-"""When a beat of the master was said, by the clock of the slave."""
+"""Send times of the master's beats, by the clock of the slave."""
 
 from __future__ import annotations
 
 from typing import Final
 
-#: Part by which one monotonic clock may run faster than another: twice what `adjtimex` allows.
+#: Share by which one monotonic clock may run faster than another: twice what `adjtimex` allows.
 _DRIFT: Final = 1e-3
 
 
 class BeatClock:
-    """Tells a beat that has waited for somebody to take it in from one that comes at once.
+    """Estimates the send time of beats, to tell a beat that waited in a socket from a prompt one.
 
-    A slave that was stopped (SIGSTOP) finds old beats in its sockets: they say who was heard then,
-    not who is heard now. The clocks of two machines have nothing in common but their pace, so the
-    beat that was quickest on its way since the handshake gives the difference; a later one that
-    took longer was said so much earlier. The result is too new by the time of the quickest alone.
+    A slave that was stopped (SIGSTOP) finds old beats in its sockets. They name the hosts in
+    contact at their send time, not now. The monotonic clocks of two machines share only their rate.
+    So the fastest beat since the handshake gives the difference of the clocks, and a beat that took
+    longer was sent earlier by that time. The result is too late only by the transport time of the
+    fastest beat.
     """
 
     def __init__(self) -> None:
@@ -22,11 +23,11 @@ class BeatClock:
         self._noted_at = 0.0
 
     def restart(self) -> None:
-        """Another run of a master, or one that was away: its clock may be another."""
+        """Forget the difference of the clocks: a new or returned master may have another clock."""
         self._ahead = None
 
     def said_at(self, beat: float, now: float) -> float:
-        """When it was said, if it arrives `now`; seconds both, by the master's clock and ours."""
+        """Return the send time of a beat that arrives `now`; seconds, by master's and own clock."""
         ahead = now - beat
         if self._ahead is not None:
             ahead = min(ahead, self._ahead + _DRIFT * (now - self._noted_at))

@@ -127,7 +127,7 @@ __all__ = [
 
 
 def step(state: SlaveState, event: Event, now: float) -> Sequence[Command]:
-    """Take one event in.
+    """Handle one event.
 
     Args:
         state: changed in place.
@@ -141,9 +141,9 @@ def step(state: SlaveState, event: Event, now: float) -> Sequence[Command]:
 
 
 def step_all(state: SlaveState, events: Iterable[Event], now: float) -> list[Command]:
-    """Take several events in, in order.
+    """Handle several events, in order.
 
-    What one of them launches a later one may have lost sight of: then it is not launched.
+    A later event may drop an instance that an earlier one launches; then it is not launched.
     """
     commands = [command for event in events for command in step(state, event, now)]
     return [

@@ -1,4 +1,4 @@
-"""All that a slave's core knows, and what follows from its readings and from a spec alone."""
+"""State of the slave's core, and rules that depend only on readings or a spec."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ class Held:
         spec: None where this slave found it running at its own start.
         awaited: None: it is ready as soon as it runs.
         ready_by: deadline for becoming ready; None: it is ready, or does not run.
-        watch: what is watched of its health; None: nothing.
-        judgement: of the run that is watched; None: none is, or it begins anew.
+        watch: its health checks; None: none.
+        judgement: health of the watched run; None: not watched, or not begun yet.
         fenced: it has a fence.
         unready: why it was stopped, where it did not become ready in time.
         unsettled: restart policies that the master has set and the supervisor has not recorded
@@ -55,29 +55,30 @@ class Held:
 
     @property
     def memo(self) -> Memo:
-        """What a later run of this slave must know."""
+        """Return the facts that a later run of this slave needs."""
         return Memo(self.awaited, self.watch)
 
     @property
     def watched(self) -> Watch | None:
-        """What is watched of its health now; None: nothing."""
+        """Return the health checks in force now; None: none."""
         ready = self.status.state is InstanceState.READY
         return self.watch if ready and self.watch is not None and not self.watch.paused else None
 
 
 @dataclass(slots=True)
 class SlaveState:
-    """All that the slave's core knows.
+    """The state of the slave's core.
 
     Attributes:
         max_processes: most that run at a time; 0: no bound.
         max_starting: most that are started at a time, until they are ready; 0: no bound.
-        max_age: seconds after which an assignment that was on its way is not taken up.
-        waiting: assignments that are started as soon as they may be, in order.
-        unheard: something was reported while no master had this host: perhaps after its
+        max_age: seconds after which an assignment that was under way is not accepted.
+        waiting: assignments to be started as soon as the bounds allow, in order.
+        unheard: a report was made while no master had registered this host: perhaps after the
             registration was sent.
-        heard_at: when the master last heard this host, as far as is known; 0: not known.
-        renewed_at: the same, as the supervisor was told last.
+        heard_at: last contact: newest known time at which the master received from this host; 0:
+            unknown.
+        renewed_at: time of the last `Renew` to the supervisor.
     """
 
     max_processes: int = 0
@@ -93,23 +94,23 @@ class SlaveState:
     tombstones: dict[InstanceId, None] = field(default_factory=dict)
 
     def awaited_in_graph(self) -> Mapping[InstanceId, Held]:
-        """Instances that become ready by being seen in the ROS graph."""
+        """Return the instances that become ready when seen in the ROS graph."""
         return {instance: held for instance, held in self.held.items() if held.ready_by is not None}
 
     def watched(self) -> Mapping[InstanceId, Held]:
-        """Instances whose health is watched now."""
+        """Return the instances whose health is watched now."""
         return {one: held for one, held in self.held.items() if held.watched is not None}
 
     def statuses(self) -> tuple[InstanceStatus, ...]:
-        """Of every instance, ended ones that are still remembered included."""
+        """Return the status of every instance, including ended ones that are still remembered."""
         return tuple(held.status for held in self.held.values())
 
     def has_slot(self) -> bool:
-        """Whether one more process may run."""
+        """Return True if one more process may run."""
         return not self.max_processes or self.live() - len(self.waiting) < self.max_processes
 
     def why_wait(self) -> str:
-        """Why nothing more is started now, in words; "": it is."""
+        """Return why no more instances are started now; "" if they are."""
         if not self.has_slot():
             return "waits for a free slot there"
         if self.max_starting and self.starting() >= self.max_starting:
@@ -117,25 +118,25 @@ class SlaveState:
         return ""
 
     def starting(self) -> int:
-        """How many are being started, or run and are not ready yet."""
+        """Return the number of instances being started, or running and not ready yet."""
         return sum(
             held.status.state is InstanceState.STARTING or held.ready_by is not None
             for held in self.held.values()
         )
 
     def live(self) -> int:
-        """How many instances have not ended."""
+        """Return the number of instances that have not ended."""
         return sum(not held.status.state.ended for held in self.held.values())
 
 
 def under_limits(
     usage: npt.NDArray[np.float32], limit: npt.NDArray[np.float32], present: int, stale: int
 ) -> bool:
-    """Whether a host may ask for work: every reading that has a limit is fresh and under it.
+    """Return True if a host may ask for work: each limited reading is fresh and under its limit.
 
     Args:
         usage, limit: (slots,) fractions; 1 stands for no limit.
-        present, stale: bit i speaks of slot i.
+        present, stale: bit i stands for slot i.
     """
     limited = limit < 1.0
     used = limited & ((present & _SLOTS) != 0)
@@ -145,12 +146,12 @@ def under_limits(
 
 
 def awaits_graph(spec: ProcessSpec) -> bool:
-    """Whether an instance is ready when it is seen in the ROS graph, not as soon as it runs."""
+    """Return True if an instance is ready when seen in the ROS graph, not as soon as it runs."""
     kind = spec.readiness.kind
     return kind == "graph" or (kind == "auto" and spec.ros)
 
 
 def qualified_name(namespace: str, node_name: str) -> str:
-    """A node's name with its namespace: `/robot/camera`."""
+    """Return a node's name with its namespace: `/robot/camera`."""
     inside = namespace.strip("/")
     return f"/{inside}/{node_name}" if inside else f"/{node_name}"

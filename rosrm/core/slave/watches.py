@@ -27,10 +27,10 @@ class Watch:
     """Health checks of an instance that is ready.
 
     Attributes:
-        wanted: by its spec.
-        topics: absolute names of what it must publish, one of them; (): nothing.
-        services: absolute names under which its lifecycle state is asked; (): it is not.
-        restarts: its slave starts it again, unless a move is under way.
+        wanted: as its spec declares.
+        topics: absolute names, on one of which it must publish; (): none.
+        services: absolute names under which its lifecycle state is queried; (): it is not.
+        restarts: its slave restarts it, unless a migration is under way.
         paused: it is not watched for now: it is a shadow, or is being moved and may be silent.
     """
 
@@ -46,10 +46,10 @@ class Look:
     """Observation of an instance since the previous look.
 
     Attributes:
-        stopped: its session leader is, by a signal.
-        heard: messages on its topic; None: it cannot be listened to.
-        trouble: why it cannot; "": it can.
-        state: of its lifecycle; "": it does not answer; None: that is not known yet.
+        stopped: a signal has stopped its session leader.
+        heard: messages on its topic; None: the topic cannot be received.
+        trouble: why the topic cannot be received; "": it can.
+        state: of its lifecycle; "": no answer; None: not known yet.
     """
 
     stopped: bool = False

@@ -8,7 +8,7 @@ from rosrm.core.supervisor.rules import Key
 
 
 class Spawn(NamedTuple):
-    """Start it; answered by Spawned or SpawnFailed."""
+    """Start the instance; answered by Spawned or SpawnFailed."""
 
     instance: Key
 
@@ -20,26 +20,26 @@ class Unspawn(NamedTuple):
 
 
 class Signal(NamedTuple):
-    """Send a signal to every process of it."""
+    """Send a signal to every process of the instance."""
 
     instance: Key
     number: int
 
 
 class Tell(NamedTuple):
-    """Record its status, then tell the client."""
+    """Record the status of the instance, then send it to the client."""
 
     instance: Key
 
 
 class Drop(NamedTuple):
-    """Forget it durably."""
+    """Forget the instance durably."""
 
     instance: Key
 
 
 class Leave(NamedTuple):
-    """All has ended (or cannot be ended): the supervisor ends too."""
+    """End the supervisor: every instance has ended (or cannot be ended)."""
 
 
 Command = Spawn | Unspawn | Signal | Tell | Drop | Leave

@@ -8,11 +8,12 @@ from rosrm.core.supervisor.rules import FenceRule, Key, RestartRule, StopRule
 
 
 class StartOrdered(NamedTuple):
-    """The client wants it to run.
+    """The client ordered a start.
 
     Attributes:
-        fence: None: it is not stopped by the clock, whatever the client hears.
-        heard: when the master last heard this host, as far as the client knows; None: just now.
+        fence: None: no deadline stops the instance, even without contact to the master.
+        heard: last contact: newest time at which the master received from this host, as far as the
+            client knows; None: just now.
     """
 
     instance: Key
@@ -23,22 +24,23 @@ class StartOrdered(NamedTuple):
 
 
 class StopOrdered(NamedTuple):
-    """The client wants it to end, and not to be restarted."""
+    """The client ordered the instance to end, without a restart."""
 
     instance: Key
 
 
 class FenceOrdered(NamedTuple):
-    """The client wants all of it to be gone at once: it has a successor."""
+    """The client ordered all of the instance to end at once, because it has a successor."""
 
     instance: Key
 
 
 class Heard(NamedTuple):
-    """The client knows that the master heard this host `at` that time, by the monotonic clock.
+    """The client reported the last contact: the master received from this host at that time.
 
     Attributes:
-        alive: newest time at which the client itself was at work.
+        at: time of the last contact, by the monotonic clock.
+        alive: newest time at which the client itself ran.
     """
 
     at: float
@@ -46,25 +48,25 @@ class Heard(NamedTuple):
 
 
 class RestartOrdered(NamedTuple):
-    """The client wants it stopped and started again."""
+    """The client ordered a restart of the instance."""
 
     instance: Key
 
 
 class AmendOrdered(NamedTuple):
-    """The client wants another restart policy for it from now on."""
+    """The client set another restart policy for the instance."""
 
     instance: Key
     restart: RestartRule
 
 
 class FailOrdered(NamedTuple):
-    """The client has found that a run of it is not what it should be: it counts as failed.
+    """The client found a run unhealthy: it counts as failed.
 
     Attributes:
-        pid: of the run that is meant; another one is left alone.
-        reason: for people.
-        kill: it is stopped (SIGSTOP) and cannot end in good order: SIGKILL at once.
+        pid: of the unhealthy run; another run is left alone.
+        reason: a text for listings and logs.
+        kill: the run is stopped (SIGSTOP) and cannot handle SIGINT: SIGKILL at once.
     """
 
     instance: Key
@@ -74,26 +76,26 @@ class FailOrdered(NamedTuple):
 
 
 class Forgotten(NamedTuple):
-    """The client has kept its final status: this side need not."""
+    """The client has stored the final status: the supervisor need not keep it."""
 
     instance: Key
 
 
 class Resumed(NamedTuple):
-    """A restarted supervisor found that its start was ordered and never tried."""
+    """A restarted supervisor found a start that was ordered and never tried."""
 
     instance: Key
 
 
 class Spawned(NamedTuple):
-    """Its session leader runs."""
+    """The session leader runs."""
 
     instance: Key
     pid: int
 
 
 class SpawnFailed(NamedTuple):
-    """It could not be started; `transient`: the same may work later."""
+    """The instance could not be started; `transient`: a retry may work."""
 
     instance: Key
     message: str
@@ -101,12 +103,12 @@ class SpawnFailed(NamedTuple):
 
 
 class Exited(NamedTuple):
-    """Its session leader is no more.
+    """The session leader has ended.
 
     Attributes:
-        code: exit code; UNKNOWN_EXIT: nobody saw it end.
+        code: exit code; UNKNOWN_EXIT: its end was not observed.
         signal: that killed it; 0: none.
-        leftovers: other processes of its session live on.
+        leftovers: other processes of its session still run.
     """
 
     instance: Key
@@ -118,13 +120,13 @@ class Exited(NamedTuple):
 
 
 class Cleared(NamedTuple):
-    """Its session leader was gone already, and now the others are."""
+    """The other processes of the session have ended too, after the session leader."""
 
     instance: Key
 
 
 class FencePassed(NamedTuple):
-    """For too long it was not known that the master hears this host."""
+    """Too much time has passed since the last contact with the master."""
 
     instance: Key
 
@@ -134,11 +136,11 @@ class TimePassed(NamedTuple):
 
 
 class ShutdownOrdered(NamedTuple):
-    """Everything is to end, and the supervisor with it."""
+    """All instances are to end, and the supervisor with them."""
 
 
 class ClientLost(NamedTuple):
-    """Nobody listens. The instances keep running, each as long as its fence allows."""
+    """The client is gone. The instances keep running, each as long as its fence allows."""
 
 
 Event = (

@@ -1,4 +1,4 @@
-"""One instance of the supervisor: all that is known of it, and how it is said to people."""
+"""One instance of the supervisor: its state, and texts about it for listings."""
 
 from __future__ import annotations
 
@@ -18,40 +18,41 @@ FENCED: Final = "fenced"
 WITHDRAWN: Final = "withdrawn"
 ENDED: Final = frozenset({EXITED, FAILED, REFUSED, FENCED, WITHDRAWN})
 
-#: What becomes of a stopping instance when nothing of it is left.
+#: Next action for a stopping instance once no process of it is left.
 THEN_END: Final = "end"
 THEN_RESTART: Final = "restart"
 THEN_POLICY: Final = "policy"
 
 STEPS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
 _KILL: Final = len(STEPS) - 1
-#: Seconds between one SIGKILL and the next, for members that were forked in between.
+#: Seconds between one SIGKILL and the next, for child processes forked in between.
 KILL_AGAIN: Final = 1.0
 #: SIGKILLs after which a shutdown no longer waits (a process stuck in the kernel).
 MOST_KILLS: Final = 5
-#: The exit code of a run whose end nobody has seen.
+#: The exit code of a run whose end was not observed.
 UNKNOWN_EXIT: Final = -1
 
 
 class Instance:
-    """All that is known of one instance; JSON can hold every field.
+    """The state of one instance; JSON can hold every field.
 
     Attributes:
-        then: what becomes of it when nothing of it is left; "" while nobody wants it stopped.
+        then: next action once no process of it is left; "": it is not being stopped.
         pid: of its session leader; 0: none.
-        started: when its last run began.
-        recent: when the restarts within the policy's window were.
+        started: time at which its last run began.
+        recent: times of the restarts within the policy's window.
         deadline: of the next step (signal or restart); None: none is due.
-        kills: how often SIGKILL was sent in this stop.
+        kills: number of SIGKILLs in this stop.
         step: the last step of the stop, an index of STEPS; -1: none.
-        stop_began: when its stop began.
-        trail: the steps of the stop, for people.
-        fault: why its last run counts as failed, however it ended; "": by its exit alone.
-        fence: None: none; what it is at its start, it stays.
-        heard: when the master last heard this host, as far as is known, or when it was started.
-        fenced: why it was fenced, for people; "": it was not, or was meant to end already.
-        kill_by: when SIGKILL comes at the latest, once it is fenced; None: it is not.
-        withdrawn: the shutdown of the supervisor stops it; no order of the client does.
+        stop_began: time at which its stop began.
+        trail: the steps of the stop, as text.
+        fault: why its last run counts as failed, however it ended; "": its exit alone decides.
+        fence: None: none; never changes after the start.
+        heard: last contact: newest known time at which the master received from this host, or the
+            time of the start.
+        fenced: why it was fenced, as text; "": it was not, or was to end already.
+        kill_by: latest time of SIGKILL, once it is fenced; None: it is not.
+        withdrawn: the shutdown of the supervisor stops it, not an order of the client.
     """
 
     __slots__ = (
@@ -113,19 +114,19 @@ class Instance:
 
     @property
     def ended(self) -> bool:
-        """Nothing of it runs, and nothing will."""
+        """Return True if no process of the instance runs, and none will."""
         return self.phase in ENDED
 
     @property
     def fence_at(self) -> float | None:
-        """When it is fenced unless the master is known to hear this host; None: never (again)."""
+        """Return the time of its fence if there is no further contact; None: never (again)."""
         if self.fence is None or self.kill_by is not None or self.ended:
             return None
         return self.heard + self.fence.after
 
 
 def end(instance: Instance, phase: str, message: str) -> None:
-    """Nothing of it runs any more, and nothing will."""
+    """Set an instance to ended."""
     instance.phase = phase
     instance.then = ""
     instance.pid = 0
@@ -134,7 +135,7 @@ def end(instance: Instance, phase: str, message: str) -> None:
 
 
 def stopping(instance: Instance) -> str:
-    """Why and how far it is being stopped, for people."""
+    """Return the cause and progress of a stop, as text."""
     why = {
         THEN_RESTART: "to restart it: ",
         THEN_POLICY: f"{ending(instance)}; {_left_to_stop(instance)}: ",
@@ -149,7 +150,7 @@ def _left_to_stop(instance: Instance) -> str:
 
 
 def ending(instance: Instance) -> str:
-    """How its last run ended, for people."""
+    """Return the end of its last run, as text."""
     if instance.fault:
         return instance.fault
     if instance.exit_signal:
@@ -160,7 +161,7 @@ def ending(instance: Instance) -> str:
 
 
 def signal_name(number: int) -> str:
-    """SIGTERM for 15; a real-time signal by its number."""
+    """Return the name of a signal: SIGTERM for 15; a real-time signal by its number."""
     try:
         return signal.Signals(number).name
     except ValueError:

@@ -1,4 +1,4 @@
-"""All instances of one host, and what each event means for which of them."""
+"""All instances of one host, and the dispatch of events to them."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ from rosrm.core.supervisor.transitions import TRANSITIONS
 
 #: Process names whose dead numbers are remembered.
 MOST_TOMBSTONES: Final = 2000
-#: Restarts by policy that begin within `RESTART_SPAN` seconds: what crashed together is not started
-#: together.
+#: Most restarts by policy within `RESTART_SPAN` seconds, so that instances that crashed together do
+#: not start together.
 MOST_RESTARTS: Final = 8
 RESTART_SPAN: Final = 1.0
 
@@ -43,7 +43,7 @@ class Supervision:
 
     Attributes:
         instances: all that are not forgotten.
-        dead: process name to the highest number that was forgotten: those up to it never start.
+        dead: process name to the highest forgotten number; instances up to it never start.
         closing: a shutdown was ordered.
     """
 
@@ -55,21 +55,21 @@ class Supervision:
         self._restarted: list[float] = []
 
     def restore(self, instance: Instance) -> None:
-        """Take over what an earlier supervisor of this host recorded."""
+        """Restore an instance that an earlier supervisor of this host recorded."""
         self.instances[instance.key] = instance
         self._watch_deadline(instance)
 
     def deadline(self) -> float | None:
-        """When `TimePassed` is due; None: never, as things are."""
+        """Return the time at which `TimePassed` is due; None: never, as things are."""
         return min(self._timed.values(), default=None)
 
     @property
     def idle(self) -> bool:
-        """Nothing runs, and nothing will unless somebody orders it."""
+        """Return True if no instance runs, and none will without an order."""
         return all(instance.ended for instance in self.instances.values())
 
     def handle(self, event: Event, now: float) -> list[Command]:
-        """What follows from `event`."""
+        """Handle an event, and return the commands."""
         commands = list(self._follow(event, now))
         if self.closing and self._nothing_to_wait_for():
             commands.append(Leave())
@@ -97,7 +97,7 @@ class Supervision:
             yield from self._unknown(event, now)
 
     def _renew(self, heard: float, alive: float) -> None:
-        """The clocks of the fences start afresh; what is fenced already stays so."""
+        """Renew the fences; instances that are fenced already stay so."""
         for instance in self.instances.values():
             if instance.fence is None or instance.fence_at is None:
                 continue
@@ -113,7 +113,7 @@ class Supervision:
         return self._apply(instance, FencePassed(instance.key), now)
 
     def _has_turn(self, instance: Instance, now: float) -> bool:
-        """Whether its step is due, and a restart may begin; False: it is due later."""
+        """Return True if its step is due and a restart may begin; otherwise it is due later."""
         if instance.deadline is None or now < instance.deadline:
             return False
         if instance.phase != BACKOFF:

@@ -1,4 +1,4 @@
-"""What the supervisor of one host does with its instances: a pure state machine.
+"""The supervisor's reducer for the instances of one host: a pure state machine.
 
     phase     event            what follows                                  next phase
     -         StartOrdered     Spawn                                         starting
@@ -41,21 +41,22 @@
               AmendOrdered     - (if the policy now allows no restart)       failed, backoff
     ended     Forgotten        Drop; its number is dead                      -
 
-An instance may have a fence: `FencePassed` comes by itself when nobody has said for too long that
-the master hears this host (`Heard`; its start counts as such) or, where the fence is `alive`, that
-the slave is at work. What was fenced is not restarted
-here, whatever its policy and whatever is ordered afterwards.
+An instance may have a fence: `FencePassed` follows without an order when the last contact with the
+master (`Heard`; the start counts as one) is too long ago. Where the fence is `alive`, a running
+slave counts as contact. A fenced instance is not restarted here, whatever its policy and whatever
+is ordered afterwards.
 
-`ShutdownOrdered` stops every instance as `StopOrdered` does. What no order had stopped before ends
-as withdrawn, not exited: the master must know that neither the process nor the master ended it.
+`ShutdownOrdered` stops every instance as `StopOrdered` does. An instance that no order had stopped
+before ends as withdrawn, not exited, so that the master knows: neither the process nor the master
+ended it.
 
 `ClientLost` changes nothing: each instance keeps running as long as its fence allows.
 
-Whatever is not in the table changes nothing; an order that changes nothing has its status told
-again, as DDS may repeat it. Every change of an instance is told (`Tell`). A signal goes to every
-process that is left of an instance, and none is sent after its end.
+An event that is not in the table changes nothing. An order that changes nothing has its status
+reported again, because DDS may repeat it. Every change of an instance is reported (`Tell`). A
+signal goes to every process that is left of an instance, and none is sent after its end.
 
-This package is imported by the supervisor, which must stay small: so nothing of
+The supervisor imports this package and must stay small. So the package uses nothing of
 `rosrm.model.values` (dataclasses alone cost 2 MiB); a test compares the values that are in both.
 """
 

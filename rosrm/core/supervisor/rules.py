@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-#: Process name and number: what `InstanceId` holds.
+#: Process name and number, as in `InstanceId`.
 Key = tuple[str, int]
 
 
 class RestartRule(NamedTuple):
-    """`rosrm.model.values.RestartPolicy`, without its weight."""
+    """Lightweight copy of `rosrm.model.values.RestartPolicy`."""
 
     when: str = "never"
     delay: float = 1.0
@@ -20,14 +20,14 @@ class RestartRule(NamedTuple):
 
 
 class StopRule(NamedTuple):
-    """`rosrm.model.values.StopPolicy`, without its weight."""
+    """Lightweight copy of `rosrm.model.values.StopPolicy`."""
 
     interrupt_grace: float = 5.0
     terminate_grace: float = 5.0
 
 
 class FenceRule(NamedTuple):
-    """`rosrm.model.values.Fence`, without its weight."""
+    """Lightweight copy of `rosrm.model.values.Fence`."""
 
     after: float
     grace: float

@@ -1,4 +1,4 @@
-"""The supervisor's table of transitions: each changes an instance and says what follows."""
+"""The supervisor's table of transitions: each changes an instance and returns commands."""
 
 from __future__ import annotations
 
@@ -47,8 +47,8 @@ from rosrm.core.supervisor.rules import RestartRule
 from rosrm.wording import counted
 
 _KILL: Final = len(STEPS) - 1
-#: Part of a wait by which a restart may come sooner, so that what crashed together does not start
-#: together.
+#: Share of a wait by which a restart may be earlier, so that instances that crashed together do not
+#: start together.
 _JITTER: Final = 0.2
 
 Transition = Callable[[Instance, "Event", float], list[Command]]
@@ -119,7 +119,7 @@ def _restart(instance: Instance, event: Event, now: float) -> list[Command]:
 def _fail(instance: Instance, event: Event, now: float) -> list[Command]:
     assert isinstance(event, FailOrdered)
     if event.pid != instance.pid:
-        return []  # that run has ended meanwhile
+        return []  # that run has already ended
     instance.fault = event.reason
     return _begin_stop(instance, THEN_POLICY, now, _KILL if event.kill else 0)
 
@@ -141,7 +141,7 @@ def _mean_to_restart(instance: Instance, event: Event, now: float) -> list[Comma
 
 
 def _escalate(instance: Instance, event: Event, now: float) -> list[Command]:
-    """The next step of a stop; after SIGKILL only that again."""
+    """Take the next step of a stop; after SIGKILL only SIGKILL again."""
     instance.step = _KILL if _must_be_gone(instance, now) else min(instance.step + 1, _KILL)
     number = STEPS[instance.step]
     after = f" after {now - instance.stop_began:.1f} s" if instance.trail else ""
@@ -246,7 +246,7 @@ TRANSITIONS: Final[dict[tuple[str, type], Transition]] = {
 }
 
 
-# --- what the transitions are made of ---------------------------------------------------------
+# --- parts of transitions ---------------------------------------------------------------------
 
 
 def _start_again(instance: Instance) -> list[Command]:
@@ -258,7 +258,7 @@ def _start_again(instance: Instance) -> list[Command]:
 
 
 def _begin_stop(instance: Instance, then: str, now: float, first: int = 0) -> list[Command]:
-    """Begin with the step `first`."""
+    """Begin a stop with the step `first`."""
     instance.phase = STOPPING
     instance.then = then
     instance.step = first - 1
@@ -269,7 +269,7 @@ def _begin_stop(instance: Instance, then: str, now: float, first: int = 0) -> li
 
 
 def _take_fence(instance: Instance, event: Event, now: float) -> None:
-    """From here on it is on its way out, and dead in time; what was to end anyway ends as meant."""
+    """Fence an instance: it ends in time; one that was to end anyway ends as ordered."""
     if isinstance(event, FenceOrdered) or instance.fence is None:
         why, by = "it has a successor", now
     else:
@@ -287,7 +287,7 @@ def _must_be_gone(instance: Instance, now: float) -> bool:
 
 
 def _grace(instance: Instance, now: float) -> float:
-    """Seconds until the next step; SIGINT and SIGTERM share what a fence leaves."""
+    """Return the seconds until the next step; SIGINT and SIGTERM share the time left by a fence."""
     if instance.step == _KILL:
         return KILL_AGAIN
     graces = (instance.stop.interrupt_grace, instance.stop.terminate_grace)
@@ -341,19 +341,19 @@ def _by_policy(instance: Instance, ending: str, *, succeeded: bool, now: float) 
 
 
 def _recent_restarts(instance: Instance, now: float) -> int:
-    """How many restarts lie within the policy's window; older ones count no more."""
+    """Return the number of restarts within the policy's window; drop older ones."""
     instance.recent = [at for at in instance.recent if now - at < instance.restart.window]
     return len(instance.recent)
 
 
 def _chance(instance: Instance) -> float:
-    """From 0 to below 1, another one for each restart of each instance, and always the same."""
+    """Return a number from 0 to below 1, constant for each restart of each instance."""
     name, number = instance.key
     return zlib.crc32(f"{name}#{number}/{instance.restarts}".encode()) / 2**32
 
 
 def backoff(rule: RestartRule, done: int) -> float:
-    """Seconds before the next restart, after `done` of them within the window."""
+    """Return the seconds before the next restart, after `done` of them within the window."""
     wait = rule.delay
     for _ in range(done):
         wait = min(wait * rule.factor, rule.max_delay)

@@ -1,4 +1,4 @@
-"""Serving the queue: its head goes to the asking host that fits with the largest margin."""
+"""Assignment of queued processes to the fitting host with the largest margin."""
 
 from __future__ import annotations
 
@@ -35,7 +35,10 @@ _NOBODY: Final[frozenset[str]] = frozenset()
 
 
 def demand_of(state: MasterState, process: Process) -> Demand:
-    """What decides where a process may go; made anew only when something of it has changed."""
+    """Return the demand of a process; rebuild it only after a change.
+
+    Changes that count: the learned needs, and the hosts with a replica of the snapshot.
+    """
     version = state.learned.version
     near = state.keeping.holdings.hosts_of(process.name, process.born)
     known = process.demand
@@ -54,7 +57,10 @@ def demand_to_move(
     state: MasterState, process: Process, seen: Mapping[str, float], source: str, headroom: float,
     lacking: Mapping[str, str] = EMPTY,
 ) -> Demand:  # fmt: skip
-    """What decides where a running process may go on; `lacking`: hosts without an executor."""
+    """Return the demand of a running process at the destination of its migration.
+
+    `lacking`: hosts without a needed executor, each with the reason.
+    """
     excluded = {
         **process.excluded, **unable(state, process, source), **lacking,
         source: "it is the source of the move",
@@ -66,16 +72,16 @@ def demand_to_move(
 
 
 def demand_to_restore(state: MasterState, process: Process, seen: Mapping[str, float]) -> Demand:
-    """What its host must have for a process that goes on from an image that lies there."""
+    """Return the demand of a process on the host of its image, where it is to be restored."""
     return Demand(process.spec, *amounts_of(state, process, seen), reads=state.declared.reads)
 
 
 def amounts_of(
     state: MasterState, process: Process, seen: Mapping[str, float]
 ) -> tuple[Mapping[str, float], frozenset[str]]:
-    """Return what a process needs of each resource, and which of that is a guess.
+    """Return the amount that a process needs of each resource, and the resources that are guessed.
 
-    What was seen of its use is no guess.
+    An amount that was measured is not a guess.
     """
     estimate = state.learned.estimate(process.spec, state.settings.default_needs)
     amounts = larger(estimate.amounts, seen)
@@ -84,7 +90,7 @@ def amounts_of(
 
 
 def unable(state: MasterState, process: Process, source: str) -> dict[str, str]:
-    """Hosts to which its strategy cannot move it, with the reason."""
+    """Return the hosts to which the strategy cannot move the process, each with the reason."""
     strategy = process.spec.migration.strategy or ""
     here = state.hosts.by_name[source]
     faults = {
@@ -94,7 +100,7 @@ def unable(state: MasterState, process: Process, source: str) -> dict[str, str]:
 
 
 def ranking_of(state: MasterState, demand: Demand) -> Ranking:
-    """All hosts judged for a demand, up to date; kept while only assignments change it."""
+    """Return the current ranking of all hosts for a demand; only assignments update it in place."""
     if state.rankings_version != state.hosts.version:
         state.rankings.clear()
         state.demands.clear()
@@ -109,12 +115,12 @@ def ranking_of(state: MasterState, demand: Demand) -> Ranking:
 
 
 def decide_now(state: MasterState, process: Process) -> Decision:
-    """What would be decided about a waiting process at this moment."""
+    """Return the decision that placement would make now about a waiting process."""
     return decide(ranking_of(state, demand_of(state, process)))
 
 
 def place_waiting(state: MasterState, now: float) -> None:
-    """Assign from the queue until its head fits nowhere (with `backfill`, until nobody fits)."""
+    """Assign from the queue until its head fits nowhere (`backfill`: until no process fits)."""
     head = state.queue.head()
     if head is None or state.placed_at == _versions(state):
         return
@@ -136,10 +142,10 @@ def place_waiting(state: MasterState, now: float) -> None:
 
 
 def _first_request_awaited(state: MasterState, now: float) -> str:
-    """Return why placement waits for hosts that have registered just now; "" if it does not.
+    """Return why placement waits for recently registered hosts; "" if it does not wait.
 
-    Without the wait, the host whose request comes first takes all that was submitted while the
-    hosts register. Further hosts that register do not prolong the wait.
+    Without the wait, the host whose request arrives first takes every process that was submitted
+    while the hosts register. Hosts that register later do not prolong the wait.
     """
     awaited = state.hosts.about_to_ask(now - _FIRST_REQUEST)
     if not len(awaited):
@@ -153,7 +159,7 @@ def _first_request_awaited(state: MasterState, now: float) -> str:
 
 
 def _passed_over(state: MasterState, now: float) -> frozenset[str]:
-    """Who is not placed yet, and holds nobody up who is behind."""
+    """Return the processes that wait for a snapshot and do not block those behind them."""
     if not np.isin(state.hosts.condition, _AWAY).any():
         return _NOBODY
     names = (name for name in state.queue if awaits_states(state, state.processes[name], now))
@@ -176,7 +182,10 @@ def _next_in_line(state: MasterState, passed_over: frozenset[str]) -> str | None
 
 
 def _versions(state: MasterState) -> tuple[int, ...]:
-    """As long as none of these grows, who did not fit does not fit."""
+    """Return version counters of all that placement depends on.
+
+    While none of them grows, a process that did not fit still does not fit.
+    """
     hosts = state.hosts
     return (hosts.version, len(hosts.touched), state.queue.version, state.learned.version)
 
@@ -193,7 +202,7 @@ def _place_any(state: MasterState, passed_over: frozenset[str], now: float) -> N
 
 
 def _place_or_set_aside(state: MasterState, process: Process, now: float) -> bool:
-    """False: it goes on waiting, and those behind it with it."""
+    """Place a process, or set it aside; return False if it keeps waiting and blocks the queue."""
     demand = demand_of(state, process)
     ranking = ranking_of(state, demand)
     column = ranking.best()
@@ -253,16 +262,16 @@ def _why_aside(reason: str) -> str:
 
 
 def _keep_aside(state: MasterState, process: Process, reason: str, now: float) -> None:
-    """Replace the reason of a process that is set aside, if there is another one now."""
+    """Replace the reason of a process that is set aside, if the reason has changed."""
     if process.reason != _why_aside(reason):
         state.set_phase(process, ProcessPhase.SET_ASIDE, now, _why_aside(reason))
         state.save(process)
 
 
 def reconsider_set_aside(state: MasterState, now: float) -> None:
-    """Return what a host may take now to the queue, in order; keep the other reasons current.
+    """Requeue in order every process that a host may take now; update the reasons of the others.
 
-    As long as the limits of the hosts are not known, a process keeps its place and its reason.
+    While the limits of the hosts are unknown, a process keeps its place and its reason.
     """
     if not state.set_aside:
         return
@@ -288,7 +297,7 @@ def reconsider_set_aside(state: MasterState, now: float) -> None:
 
 
 def _tell_waiting(state: MasterState, process: Process, demand: Demand, now: float) -> None:
-    """Say once that the head of the queue waits, and why."""
+    """Record once that the head of the queue waits, and the reason."""
     if not state.hosts.listed():
         _tell_waits(state, process, "no host has registered yet", now)
         return
@@ -302,7 +311,7 @@ def _tell_waits(
     state: MasterState, process: Process, reason: str, now: float,
     facts: Mapping[str, Any] = EMPTY,
 ) -> None:  # fmt: skip
-    """Say so once."""
+    """Record the reason for which a process waits, once per reason."""
     if process.reason != reason:
         process.reason = reason
         state.record(

@@ -1,10 +1,10 @@
-"""A short job ahead: where jobs that end soon take every slot of a host, one more waits there.
+"""Prefetch of short jobs: one assignment beyond `max_processes`, held by the slave.
 
 Between the end of one job and the start of the next lie several messages, which is much for a job
-of a tenth of a second. So a host with `max_processes` may be given one assignment beyond it, which
-its slave holds and starts by itself as soon as a slot is free. Only the run times of earlier runs
-of the same program allow this, so that nothing waits long behind the wrong job; what waits longer
-than expected all the same returns to its place in the queue.
+of 0.1 s. So a host with `max_processes` may get one assignment more. Its slave holds that job and
+starts it without a further order as soon as a slot is free. Prefetch needs run times of earlier
+runs of the same program, so that no job waits long behind a long one. A job that waits longer than
+expected all the same returns to its place in the queue.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ _NEWEST: Final = 0.3
 
 
 def learn_run_time(state: MasterState, spec: ProcessSpec, status: InstanceStatus) -> None:
-    """Remember how long a job ran."""
+    """Update the mean run time of a program with a job that has exited."""
     if spec.kind is Kind.JOB and status.state is InstanceState.EXITED and status.run_time > 0.0:
         before = state.run_times.get(spec.program, status.run_time)
         state.run_times[spec.program] = before + _NEWEST * (status.run_time - before)
 
 
 def review_slots(state: MasterState, host: Host, now: float) -> None:
-    """Open or close the place ahead of a host whose processes have changed."""
+    """Allow or forbid the prefetched assignment of a host whose processes have changed."""
     most = host.description.max_processes
     if not most:
         return
@@ -53,10 +53,10 @@ def _ends_soon(state: MasterState, instance: Instance, now: float) -> bool:
 
 
 def waits_too_long(instance: Instance, now: float) -> bool:
-    """Whether an assignment ahead waits for a job that is not short after all."""
+    """Return True if a prefetched assignment waits for a job that turned out to be long."""
     return (
         instance.state is InstanceState.HELD
-        and instance.host.description.max_processes > 0  # else it waits for others to start
+        and instance.host.description.max_processes > 0  # otherwise it waits for other starts
         and not instance.stopping
         and now - instance.since >= PROVED_LONG
     )

@@ -1,4 +1,4 @@
-"""In-flight load: what counts against a host until its readings show it, and what is learned."""
+"""Reservations (load that the readings do not show yet), and learned needs."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from rosrm.core.master.master_state import Instance, MasterState
 from rosrm.extensions.contracts import Intent
 from rosrm.model.values import InstanceState, InstanceStatus, ProcessSpec
 
-#: A run shorter than this says nothing about the CPU that a program uses: it is all start-up.
+#: Seconds: a shorter run is mostly start-up, so it does not show the CPU use of a program.
 _TELLING_RUN: Final = 1.0
 
 
 def settle_charge(state: MasterState, instance: Instance, now: float) -> None:
-    """Lower what is counted in flight to what does not show in the readings yet."""
+    """Lower the reservation of an instance to the part that the readings do not show yet."""
     table = state.hosts
     instance.settled = now - instance.since >= state.settings.settle
     left = {}
@@ -35,7 +35,7 @@ def settle_charge(state: MasterState, instance: Instance, now: float) -> None:
 def learn_from(
     state: MasterState, spec: ProcessSpec, instance: Instance, status: InstanceStatus
 ) -> None:
-    """Remember what a run used, for the next process of the same program."""
+    """Learn the needs of a program from the resources that a run used."""
     if status.state is InstanceState.REFUSED:
         return
     cpu = status.cpu_time / status.run_time if status.run_time >= _TELLING_RUN else 0.0

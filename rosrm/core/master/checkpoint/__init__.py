@@ -1,1 +1,1 @@
-"""Replicas of snapshots and checkpoint images: which are made, and where they are kept."""
+"""Replicas of snapshots and checkpoint images: creation, placement, removal."""

@@ -1,8 +1,8 @@
-"""Checkpoint and restore of a process on its own host: how they begin, and what they leave.
+"""Checkpoint and restore of a process on its own host: beginning and outcome.
 
-They are plans as those of moves, and `moves` carries them out: undone before the commit, rolled
-forward after it. A checkpoint commits to an image (`images`), and no instance owns the name then; a
-restore commits to the instance that goes on from it.
+Both are plans like those of migrations, and `executor` carries them out: undone before the commit,
+rolled forward after it. A checkpoint commits to a checkpoint image (`images`), and no instance owns
+the name then. A restore commits to the instance that is restored from the image.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from rosrm.model.plan import Aim, Commit, Execute, Move
 from rosrm.model.values import InstanceId
 from rosrm.wording import listed, standing
 
-#: Kinds of the records by which each begins.
+#: Kind of the record that marks the begin of each.
 _BEGUN: Final = {
     Aim.CHECKPOINT: EventKind.CHECKPOINT_BEGUN,
     Aim.RESTORE: EventKind.RESTORE_BEGUN,
@@ -41,7 +41,7 @@ def begin_checkpoint(state: MasterState, process: Process, cause: str, now: floa
     """Begin to dump a running process into an image.
 
     Returns:
-        "" or why it cannot be; then nothing has changed.
+        "", or the reason for the refusal; then nothing has changed.
     """
     refusal = _why_no_checkpoint(state, process)
     if refusal:
@@ -80,7 +80,10 @@ def _why_no_checkpoint(state: MasterState, process: Process) -> str:
 
 
 def _strategy_of(state: MasterState, process: Process) -> str:
-    """Its own strategy if that takes images, else the first that does; "": none does."""
+    """Return the process's own strategy if it supports images, else the first that does.
+
+    "": no selected strategy supports images.
+    """
     own = process.spec.migration.strategy or ""
     names = [*([own] if own in state.strategies else []), *state.strategies]
     return next((name for name in names if implements(state.strategies[name], Imaging)), "")
@@ -99,7 +102,11 @@ def _why_no_strategy(state: MasterState, process: Process) -> str:
 
 
 def begin_restore(state: MasterState, process: Process, cause: str, now: float) -> str:
-    """Begin to restore a process from its image, where that lies; returns as `begin_checkpoint`."""
+    """Begin to restore a process from its image, on the host of the image.
+
+    Returns:
+        "", or the reason for the refusal; then nothing has changed.
+    """
     image = process.image
     refusal = _why_no_restore(state, process)
     if refusal or image is None:
@@ -148,7 +155,7 @@ def _why_no_restore(state: MasterState, process: Process) -> str:
 def _planned(
     state: MasterState, process: Process, source: InstanceId, host: Host, node: str
 ) -> Move:
-    """What a strategy is told of a process that stays on its host."""
+    """Return the input of a strategy for a process that stays on its host."""
     return Move(
         process.spec, source, host.name, state.new_instance_id(process), host.name,
         state.new_instance_id(process), int(state.wall), node,
@@ -159,7 +166,10 @@ def _begin(
     state: MasterState, process: Process, move: Move, strategy: str, aim: Aim, now: float,
     *, cause: str, ranking: Ranking | None = None,
 ) -> str:  # fmt: skip
-    """Have the strategy plan it, and begin; `ranking`: by which the destination is charged."""
+    """Let the strategy plan, and begin the plan; return "", or the reason for the refusal.
+
+    `ranking`: the reservation at the destination follows it.
+    """
     plan = proposed(state, strategy, move, aim)
     if isinstance(plan, str):
         return plan
@@ -189,7 +199,7 @@ def _begin(
 
 
 def commit_to_image(state: MasterState, process: Process, run: Run, step: Commit) -> None:
-    """The source stands still for good: its image owns the name."""
+    """Make the image the owner of the name; its source stays frozen."""
     source: Instance | None = state.instances.get(run.source.number)
     needs = {} if source is None else source.measured
     image = Image(
@@ -201,10 +211,10 @@ def commit_to_image(state: MasterState, process: Process, run: Run, step: Commit
 
 
 def leave_behind(state: MasterState, run: Run, step: Execute) -> bool:
-    """Whether a plan that may not stop goes on without an executor: nobody is there to need it.
+    """Return True if a plan that may not stop can skip an executor, because nothing needs the step.
 
-    What stood still there, or waited to be told to go on, still does if it is there at all. So it
-    is not taken back when its host is heard: it is ended then.
+    Anything frozen on that host is still frozen. When the host returns, it is
+    killed, not re-adopted.
     """
     if run.aim is Aim.CHECKPOINT:
         if run.undo is None or run.source.number not in run.ended:
@@ -220,7 +230,7 @@ def leave_behind(state: MasterState, run: Run, step: Execute) -> bool:
 
 
 def _remove_unmade(state: MasterState, run: Run) -> None:
-    """What may lie on its host of an image that nobody waits for."""
+    """Remove the partial image that an undone checkpoint may have left on its host."""
     commit = run.plan.steps[run.commit_index]
     if isinstance(commit, Commit):
         number = run.source.number
@@ -228,7 +238,7 @@ def _remove_unmade(state: MasterState, run: Run) -> None:
 
 
 def settle(state: MasterState, process: Process, run: Run, now: float) -> None:
-    """A plan has ended, and an image owns the name: it waits, unless nobody wants it."""
+    """Set the phase after a plan that ends with an image; drop the image of a cancelled process."""
     if process.wanted is Wanted.CANCEL:
         images.drop(state, process, run.destination.number)
         state.set_phase(process, ProcessPhase.CANCELLED, now)
@@ -244,7 +254,7 @@ def settle(state: MasterState, process: Process, run: Run, now: float) -> None:
 
 
 def ending_of(run: Run) -> tuple[EventKind, str]:
-    """The kind and the words of the record by which a plan ends."""
+    """Return the kind and the message of the record that marks the end of a plan."""
     name, done = run.process, run.undo is None
     here, there = run.source_host.name, run.destination_host.name
     if run.aim is Aim.CHECKPOINT:

@@ -1,11 +1,11 @@
-"""Images of processes that are checkpointed, and the end of those that nobody wants.
+"""Checkpoint images: ownership of the name, and removal of unwanted images.
 
 ===========================  ===================================================================
 the process                  its image
 ===========================  ===================================================================
 is checkpointed              owns the name, also while its host is lost, closed or switched off
-is restored                  is gone with the commit: it has become the process again
-is cancelled or restarted    is removed as soon as its host is heard; until then that is an intent
+is restored                  ends with the commit: it has become the process again
+is cancelled or restarted    is removed once its host reports; until then the removal is an intent
 ===========================  ===================================================================
 """
 
@@ -25,10 +25,10 @@ from rosrm.model.event_kinds import EventKind
 if TYPE_CHECKING:
     from rosrm.core.master.master_state import MasterState
 
-#: Seconds for a removal, and until one that failed is asked for again.
+#: Seconds for a removal, and until a failed removal is retried.
 _PATIENCE: Final = 30.0
 _ASK_AGAIN: Final = 60.0
-#: Where what is unwanted is kept, in the table "cluster".
+#: Key of the unwanted images in the journal's table "cluster".
 _KEY: Final = "unwanted_images"
 
 
@@ -36,7 +36,7 @@ _KEY: Final = "unwanted_images"
 
 
 def set_image(state: MasterState, process: Process, image: Image | None) -> None:
-    """From now on an image owns the name of a process, or none does any more."""
+    """Set the image that owns the name of a process; None: no image owns it."""
     process.image = image
     if image is None:
         state.images.of.discard(process.name)
@@ -45,20 +45,20 @@ def set_image(state: MasterState, process: Process, image: Image | None) -> None
 
 
 def note_checkpointed(state: MasterState, process: Process, now: float, trouble: str = "") -> None:
-    """It waits in its image until somebody asks for it; `trouble`: of the last restore."""
+    """Set a process to checkpointed; `trouble`: why the last restore failed."""
     state.set_phase(process, ProcessPhase.CHECKPOINTED, now, trouble)
     if process.image is not None:  # the wall clock may have been set back
         process.since = now - max(0.0, state.wall - process.image.made_at)
 
 
 def why_away(state: MasterState, image: Image) -> str:
-    """Why nothing can be done with an image now: its host is not there; "": it is."""
+    """Return why the host of an image is not available; "" if it is up."""
     host = state.hosts.by_name.get(image.host)
     return "is not known" if host is None else state.hosts.condition_of(host).words()
 
 
 def reason_of(state: MasterState, process: Process) -> str:
-    """Where the image of a process is and how it fares, for people; else the process's reason."""
+    """Return the place and condition of a process's image, else the reason of the process."""
     image = process.image
     if image is None or process.phase is not ProcessPhase.CHECKPOINTED:
         return process.reason
@@ -67,14 +67,14 @@ def reason_of(state: MasterState, process: Process) -> str:
     return f"{where}; {process.reason}" if process.reason else where
 
 
-# --- those that nobody wants ------------------------------------------------------------------
+# --- removal of unwanted images ---------------------------------------------------------------
 
 
 def drop(state: MasterState, process: Process, *numbers: int) -> None:
-    """A process does without its image, if it has one; it is removed.
+    """Detach the image of a process, if it has one, and have it removed.
 
     Args:
-        numbers: of other instances under which it may lie on its host.
+        numbers: of other instances under which the image may lie on its host.
     """
     image = process.image
     if image is not None:
@@ -86,13 +86,13 @@ def drop(state: MasterState, process: Process, *numbers: int) -> None:
 def remove(
     state: MasterState, process: str, host: str, drop: str, number: int, *numbers: int
 ) -> None:
-    """Have an image removed from a host, as soon as that is heard; as the fields of `Unwanted`."""
+    """Have an image removed once its host is up; the arguments are those of `Unwanted`."""
     state.images.unwanted[number] = Unwanted(process, host, drop, (number, *numbers))
     _save(state)
 
 
 def review(state: MasterState, now: float) -> None:
-    """Ask the hosts that are up to remove what nobody wants."""
+    """Order hosts that are up to remove unwanted images."""
     for one in state.images.unwanted.values():
         host = state.hosts.by_name.get(one.host)
         if host is None or now < one.ask_at:
@@ -110,7 +110,7 @@ def review(state: MasterState, now: float) -> None:
 
 
 def order_answered(state: MasterState, event: happened.OrderAnswered, now: float) -> bool:
-    """Whether the answer was to a removal; it is noted then."""
+    """Handle the answer to a removal; return True if it was one."""
     for number, one in state.images.unwanted.items():
         if one.order == event.order:
             _note_answer(state, number, one, event, now)
@@ -122,7 +122,7 @@ def _note_answer(
     state: MasterState, number: int, one: Unwanted, event: happened.OrderAnswered, now: float
 ) -> None:
     one.order = 0
-    if event.accepted or event.code == happened.BAD_RESULT:  # it ran, though it answered nothing
+    if event.accepted or event.code == happened.BAD_RESULT:  # it ran without a result
         del state.images.unwanted[number]
         state.record(
             now, EventKind.IMAGE_REMOVED, f"the image of {one.process} was removed from {one.host}",
@@ -149,7 +149,7 @@ def _save(state: MasterState) -> None:
 
 
 def restore(state: MasterState, cluster: Mapping[str, Mapping[str, Any]]) -> None:
-    """What was unwanted when the last master ended still is.
+    """Restore the unwanted images from the journal.
 
     Args:
         cluster: the journal's table of that name.

@@ -1,15 +1,15 @@
-"""Periodic checkpoints: dumps of processes that go on, and start from the newest after a crash.
+"""Periodic checkpoints: dumps of processes that keep running; a crash starts from the newest.
 
 ==================================  ==========================================================
-what is seen                        what is ordered
+observed                            ordered
 ==================================  ==========================================================
 a process asks for them, and runs   `execute` of its strategy's step, at the policy's pace
-that fails                          it is said once, and tried again at the same pace
-an instance of such a one is gone   its images are removed from its host
+a dump fails                        recorded once, and retried at the same pace
+an instance with images is gone     its images are removed from its host
 ==================================  ==========================================================
 
-Nothing of it is durable. The slave that dumps a process lets it go on by itself, whoever is there;
-and its supervisor starts it from its image.
+Nothing of this is durable. The slave that dumps a process resumes it without an order of the
+master, and its supervisor starts it from its image.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ from rosrm.wording import size
 if TYPE_CHECKING:
     from rosrm.core.master.master_state import MasterState
 
-#: Seconds between two looks.
+#: Seconds between two reviews.
 _LOOK_EVERY: Final = 1.0
 #: Seconds for a removal.
 _PATIENCE: Final = 30.0
 
 
 def review(state: MasterState, now: float) -> None:
-    """Once a second: have dumped what is due, and removed what is over."""
+    """Order due dumps and remove the images of ended instances, once a second."""
     known = state.periodic
     if now - known.looked < _LOOK_EVERY:
         return
@@ -57,7 +57,7 @@ def review(state: MasterState, now: float) -> None:
 
 
 def order_answered(state: MasterState, event: happened.OrderAnswered, now: float) -> bool:
-    """Whether the answer was to an order of this module; it is noted then."""
+    """Handle the answer to an order of this module; return True if it was one."""
     if event.order <= BEFORE_FIRST:
         return False
     for dumped in state.periodic.of.values():
@@ -67,7 +67,7 @@ def order_answered(state: MasterState, event: happened.OrderAnswered, now: float
 
 
 def of_process(state: MasterState, process: Process, now: float) -> Mapping[str, Any] | None:
-    """The newest checkpoint of the instance that owns the name, for people; None: none is asked."""
+    """Return the newest checkpoint of the owning instance, for listings; None: none requested."""
     dumped = state.periodic.of.get(process.owner)
     if dumped is None:
         return None
@@ -92,7 +92,7 @@ def _review(state: MasterState, process: Process, now: float) -> None:
         discard = _discard_of(state, name)
         dumped = state.periodic.of[number] = Dumped(process.name, host.name, name, discard, now)
     if dumped.order and dumped.asked != host.description.incarnation:
-        dumped.order, dumped.since = 0, now  # it ended with the slave that was at it
+        dumped.order, dumped.since = 0, now  # the dump ended with the slave that made it
     if dumped.order or not _may_be_dumped(state, process, owner):
         return
     pace, trouble = _pace(state, process, strategy, host, dumped)
@@ -107,7 +107,7 @@ def _review(state: MasterState, process: Process, now: float) -> None:
 
 
 def _discard_of(state: MasterState, name: str) -> str | None:
-    """Return the executor with which a strategy removes images; "": none; None: the call failed."""
+    """Return the executor by which a strategy removes images; "": none; None: the call failed."""
     strategy: object = state.strategies.get(name)
     if not implements(strategy, PeriodicImaging):
         return ""
@@ -119,7 +119,7 @@ def _discard_of(state: MasterState, name: str) -> str | None:
 
 
 def _may_be_dumped(state: MasterState, process: Process, owner: Instance) -> bool:
-    """Nobody else is at it, and its host is heard."""
+    """Return True if a process runs, its host is up, and no plan or stop is under way."""
     return (
         process.phase is ProcessPhase.RUNNING
         and owner.runs
@@ -132,7 +132,7 @@ def _may_be_dumped(state: MasterState, process: Process, owner: Instance) -> boo
 def _pace(
     state: MasterState, process: Process, strategy: PeriodicImaging, host: Host, dumped: Dumped
 ) -> tuple[float | None, str]:
-    """Seconds from one to the next, None for none, and what is wrong with that."""
+    """Return the seconds between two dumps (None: no dump), and the error if there is one."""
     policy, name = state.keeping.policy, state.keeping.policy_name
     if policy is None:
         return None, "no checkpoint policy is selected: name one in the cluster's file"
@@ -157,7 +157,7 @@ def _pace(
 
 
 def sound_pace(pace: float | None) -> float | None:
-    """A pace that keeps to the contract; raises for any other."""
+    """Return the pace unchanged; raise PluginError for a pace that breaks the contract."""
     if pace is not None and not 0.0 < pace < inf:
         raise PluginError(f"one every {pace} s; allowed: more than 0")
     return pace
@@ -188,7 +188,7 @@ def _order(
     )  # fmt: skip
 
 
-# --- what came of it --------------------------------------------------------------------------
+# --- results ----------------------------------------------------------------------------------
 
 
 def _note(state: MasterState, dumped: Dumped, event: happened.OrderAnswered, now: float) -> None:
@@ -217,7 +217,7 @@ def _number(value: Any) -> float:
 
 
 def _say_trouble(state: MasterState, dumped: Dumped, trouble: str, now: float) -> None:
-    """Once, until something else is the matter."""
+    """Record a failure of periodic checkpoints, once until the reason changes."""
     if not trouble or trouble == dumped.trouble:
         return
     dumped.trouble = trouble

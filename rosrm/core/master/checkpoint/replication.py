@@ -1,26 +1,26 @@
-"""Keeping states: where they are kept by the checkpoint policy, and which are kept no more.
+"""Snapshot replication: placement of replicas by the checkpoint policy, and their removal.
 
-A node keeps its newest state on its own host by itself. What this decides is told to the slaves
-again and again until the books say that it is so; nothing of it is durable. Each stateful process
-is looked at about once a second.
+A node keeps its newest snapshot on its own host without an order. The master repeats each order to
+a slave until the slave's report confirms it; nothing of this is durable. Each stateful process is
+reviewed about once a second.
 
 ==========================================  =====================================================
-what is seen                                what is ordered
+observed                                    ordered
 ==========================================  =====================================================
-it runs, and the policy chooses hosts       `keep`: its slave ships the state to them from now on,
-                                            beginning with the first that this instance has
-its slave was told something else before    `keep`: the new choice
+it runs, and the policy chooses hosts       `keep`: its slave ships the snapshot to them from now
+                                            on, beginning with the first of this instance
+its slave has an older choice               `keep`: the new choice
 it runs, and the policy gives no answer     as it chose last; where it has not chosen since the
-                                            master started, `keep` on the hosts that keep a state
-it is cancelled, or has finished            `drop_kept` wherever something is kept of it
-it was submitted anew                       `drop_kept` of what is kept of its former life
-it was removed, says the journal            `drop_kept` wherever something is kept of it
-a host that is not chosen keeps a state     `drop_kept`, once a newer one lies where it should;
+                                            master started, `keep` on the hosts with a replica
+it is cancelled, or has finished            `drop_kept` of every replica
+it was submitted again                      `drop_kept` of the replicas from before
+it was removed, by the journal              `drop_kept` of every replica
+a host that is not chosen has a replica     `drop_kept`, once a newer one lies where it should;
                                             never before the policy has chosen
 ==========================================  =====================================================
 
-What is kept of any other name that this master does not know is left alone: its journal may be
-lost. Of the removed names the journal has the last 10,000.
+Replicas under any other name that this master does not know are left alone: its journal may be
+lost. The journal keeps the last 10,000 removed names.
 """
 
 from __future__ import annotations
@@ -40,39 +40,39 @@ from rosrm.extensions.plugin_calls import required
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.values import InstanceId, KeptState
 
-#: Seconds between two looks at the same process.
+#: Seconds between two reviews of the same process.
 _LOOK_EVERY: Final = 1.0
-#: Most drop orders remembered, so as not to repeat them at once.
+#: Most drop orders remembered, so that none is repeated at once.
 _REMEMBERED: Final = 10_000
-#: What is kept of a process that ended so is of no use any more.
+#: Phases after which the replicas of a process have no use.
 _DONE: Final = frozenset({ProcessPhase.FINISHED, ProcessPhase.CANCELLED})
 
 
-# --- what is heard ----------------------------------------------------------------------------
+# --- reports ----------------------------------------------------------------------------------
 
 
 def kept_states_received(
     state: MasterState, event: happened.KeptStatesReceived, now: float
 ) -> None:
-    """Note all that a host keeps."""
+    """Record all replicas that a host reports."""
     host = state.hosts.find(event.host_id, event.incarnation)
     if host is not None:
         note_states(state, host, event.states, now)
 
 
 def note_states(state: MasterState, host: Host, states: tuple[KeptState, ...], now: float) -> None:
-    """A host says all that it keeps."""
-    # Of a journal that was lost: no instance may get a number that a kept state has already.
+    """Replace the known replicas of a host by its complete report."""
+    # The journal may be lost: no instance may get a number that a snapshot has already.
     state.skip_numbers(max((one.instance.number for one in states), default=0))
     state.keeping.holdings.replace(host.name, states, now)
 
 
 def awaits_states(state: MasterState, process: Process, now: float) -> bool:
-    """A host that keeps a state of a process, or may, is away, and may come back at any moment.
+    """Return True if a host that has or may have a replica is away and may return at any moment.
 
-    Started now it might begin from nothing beside its own state. So it waits for hosts that have
-    not come back since the master started, until they are lost; and, where nobody else is in reach
-    who keeps its state, for a host that was lost beside its own, for one lease.
+    A process that starts now might begin without its snapshot. So it waits for hosts that have not
+    returned since the master started, until they are lost. If no replica is in reach, it also waits
+    for a lost host other than its own, for one lease.
     """
     if not state.declared.has_snapshots(process.spec):
         return False
@@ -91,12 +91,15 @@ def _may_come_back(state: MasterState, host: Host, now: float) -> bool:
 
 
 def _was_left_on(process: Process, host: str) -> bool:
-    """Its own host is lost: that is why it waits, and alone no reason to wait longer."""
+    """Return True if the lost host is the process's own.
+
+    That loss is why the process waits, and alone no reason to wait longer.
+    """
     return process.left_behind is not None and process.left_behind.host == host
 
 
 def order_answered(state: MasterState, event: happened.OrderAnswered) -> bool:
-    """Whether the answer was to an order of this module; it is noted then."""
+    """Handle the answer to an order of this module; return True if it was one."""
     name = state.keeping.orders.pop(event.order, None)
     if name is None:
         return False
@@ -106,20 +109,20 @@ def order_answered(state: MasterState, event: happened.OrderAnswered) -> bool:
     return True
 
 
-# --- what is asked for ----------------------------------------------------------------------
+# --- requests -------------------------------------------------------------------------------
 
 
 def begin_anew(state: MasterState, process: Process) -> None:
-    """A process that is over is asked for again: a finished or cancelled one has no past."""
+    """Start a terminal process without its past: discard its snapshots if finished or cancelled."""
     if process.phase in _DONE:
         process.born = state.next_instance
 
 
-# --- the rounds -------------------------------------------------------------------------------
+# --- periodic review --------------------------------------------------------------------------
 
 
 def review(state: MasterState, now: float) -> None:
-    """Look at some of the processes of which a state is kept: at all of them once a second."""
+    """Review a share of the processes with replicas, so that each is reviewed once a second."""
     keeping = state.keeping
     names = keeping.holdings.processes()
     if len(keeping.dropped_at) > _REMEMBERED:
@@ -161,14 +164,14 @@ def _review(state: MasterState, process: Process, now: float) -> None:
 def _choose(
     state: MasterState, process: Process, host: Host, holdings: Mapping[str, Holding], now: float
 ) -> None:
-    """Ask the policy, and tell the slave what is new to it."""
+    """Ask the policy, and send its choice to the slave if it is new there."""
     choice = _choice(state, process, host, holdings, now)
     told = state.keeping.told.get(process.name)
     chosen = choice is not None or (told is not None and told.chosen)
     if choice is None:
         choice = told.choice if told is not None and chosen else _as_kept(process, host, holdings)
     if not chosen and not choice.hosts:
-        return  # no other host keeps a state, and the policy has asked for none
+        return  # no other host has a replica, and the policy has chosen none
     incarnation = host.description.incarnation
     known = (
         told is not None
@@ -200,7 +203,7 @@ def _choose(
 def _as_kept(
     process: Process, host: Host, holdings: Mapping[str, Holding]
 ) -> CheckpointChoice:  # fmt: skip
-    """Choose the other hosts whose slaves report a state of this life of the process."""
+    """Choose the other hosts with a replica that is not from before the last submission."""
     kept = (name for name, one in holdings.items() if one.number >= process.born)
     return CheckpointChoice(tuple(sorted(name for name in kept if name != host.name)))
 
@@ -213,7 +216,10 @@ def _is_same(one: CheckpointChoice, other: CheckpointChoice) -> bool:
 def _choice(
     state: MasterState, process: Process, host: Host, holdings: Mapping[str, Holding], now: float
 ) -> CheckpointChoice | None:
-    """What the policy says; None: as before. One that raises, or makes no sense, is named."""
+    """Return the choice of the policy; None: keep the last one.
+
+    A policy that raises or breaks its contract is recorded by name.
+    """
     keeping = state.keeping
     if keeping.policy is None:
         return CheckpointChoice(())
@@ -242,7 +248,10 @@ def _choice(
 
 
 def _may_keep(state: MasterState, host: Host, keepers: tuple[str, ...]) -> bool:
-    """A host that is silent for a moment is not given up as a keeper."""
+    """Return True if a host may keep a replica.
+
+    A suspect host stays a keeper, because it may only be silent for a moment.
+    """
     condition = state.hosts.condition_of(host)
     return condition is HostCondition.UP or (
         condition is HostCondition.SUSPECT and host.name in keepers
@@ -254,7 +263,7 @@ def _newest_size(holdings: Mapping[str, Holding]) -> int:
 
 
 def sound_choice(choice: CheckpointChoice | None, view: CheckpointView) -> CheckpointChoice | None:
-    """A choice that keeps to the contract; raises for any other."""
+    """Return the choice unchanged; raise PluginError for a choice that breaks the contract."""
     if choice is None:
         return None
     required(choice, CheckpointChoice)
@@ -273,7 +282,7 @@ def _is_stale(
     state: MasterState, process: Process, host: str, holding: Holding,
     holdings: Mapping[str, Holding],
 ) -> bool:  # fmt: skip
-    """Nobody will go on from it, as far as can be known."""
+    """Return True if, as far as the master knows, no instance will start from a replica."""
     if holding.number < process.born or process.phase in _DONE:
         return True
     owner, told = state.instances.get(process.owner), state.keeping.told.get(process.name)
@@ -283,7 +292,7 @@ def _is_stale(
         return False
     if host in told.choice.hosts:
         return False
-    # A copy that is no longer wanted is worth something until there is a newer one elsewhere.
+    # Keep an undesired replica until a newer one exists elsewhere.
     better = told.choice.hosts or (owner.host.name,)
     return any(name in holdings and holdings[name].age > holding.age for name in better)
 
@@ -291,7 +300,7 @@ def _is_stale(
 def _drop(state: MasterState, process: str, name: str, holding: Holding, now: float) -> None:
     host = state.hosts.by_name.get(name)
     if host is None or state.hosts.condition_of(host) is not HostCondition.UP:
-        return  # it says again what it keeps when it comes back
+        return  # it reports its replicas again when it rejoins
     at = state.keeping.dropped_at.get((process, name), -math.inf)
     if now - at < state.settings.order_retry:
         return

@@ -1,15 +1,15 @@
-"""Where a migration strategy works: each host is asked, by an executor of the strategy's plugin.
+"""Capabilities of hosts: each host is asked by an executor of the migration strategy's plugin.
 
 =============================  ==============================================================
-of a host                      what is done
+a host                         action
 =============================  ==============================================================
-it is up, and was not asked    `execute` of the strategy's executor
-it has answered                its answer holds until it registers anew
-it did not answer              it is asked again after a while
+is up, and was not asked       `execute` of the strategy's executor
+has answered                   its answer holds until it registers again
+did not answer                 it is asked again after a while
 the plugin's `ability` fails   the plugin is asked again after a while
 =============================  ==============================================================
 
-Nothing of it is durable, and until a host has answered nothing is moved to or from it.
+Nothing of this is durable. Until a host has answered, nothing is moved to or from it.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from rosrm.wording import listed
 if TYPE_CHECKING:
     from rosrm.core.master.master_state import MasterState
 
-#: Seconds for an answer, and until a host that gave none is asked again.
+#: Seconds for an answer, and until a host that did not answer is asked again.
 _PATIENCE: Final = 30.0
 _ASK_AGAIN: Final = 10.0
 
@@ -68,7 +68,7 @@ def _ask(state: MasterState, name: str, strategy: HostChecking, host: Host, now:
         return
     if ability not in host.description.executors:
         reason = why_broken(host, name) or f"the plugin of {name!r} is not installed there"
-        # Looked at again, because the slave reports what is broken after its registration.
+        # Asked again, because the slave reports broken plugins only after its registration.
         state.abilities.answers[name, host.name] = Answer(
             incarnation, 0, reason=reason, ask_at=now + _ASK_AGAIN
         )
@@ -82,7 +82,7 @@ def _ask(state: MasterState, name: str, strategy: HostChecking, host: Host, now:
 
 
 def order_answered(state: MasterState, event: happened.OrderAnswered, now: float) -> bool:
-    """Whether the answer was to a question of this module; it is noted then."""
+    """Handle the answer to a question of this module; return True if it was one."""
     if event.order <= BEFORE_FIRST:
         return False
     for (strategy, host), answer in state.abilities.answers.items():
@@ -114,10 +114,10 @@ def _note(
 
 
 def fault(state: MasterState, strategy: str, source: Host, destination: Host) -> str:
-    """Why a strategy cannot move anything from one host to another; "": it can, by what is known.
+    """Return why a strategy cannot move anything from one host to another; "" if it can.
 
     Args:
-        strategy: its name; one that works everywhere has no fault.
+        strategy: its name; a strategy without a check of the hosts has no fault.
     """
     checking: object = state.strategies.get(strategy)
     if not implements(checking, HostChecking):
@@ -154,7 +154,7 @@ def faults(state: MasterState, strategy: str, source: Host) -> list[str]:
 
 
 def _absent(strategy: str, answer: Answer | None, hosts: Sequence[str]) -> str:
-    """Say that a strategy does not work on hosts, or has not answered there yet."""
+    """Return a sentence: the strategy does not work on hosts, or they have not answered yet."""
     if answer is None or not answer.reason:
         return f"it is not known yet whether {strategy} works on {listed(hosts, most=3)}"
     return f"{strategy} does not work on {listed(hosts, most=3)}: {answer.reason}"

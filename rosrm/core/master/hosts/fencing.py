@@ -1,9 +1,9 @@
-"""When a host that is cut off from the master stops an instance by itself.
+"""Fences: deadlines by which a host that is cut off from the master stops an instance.
 
 A lease in the sense of Gray and Cheriton (1989), with one difference: the master need not answer
-each host. It names in its beats those that it does not hear, so that a beat which does not name a
-host tells it that it was heard at most `suspect` seconds before. From there the host counts by its
-own monotonic clock; clocks may differ, if only they run equally fast.
+each host. Its beats name the hosts that it does not hear. A beat that does not name a host proves
+that the master received a message from the host at most `suspect` seconds before. From there the
+host counts by its own monotonic clock: clocks may differ, but must run equally fast.
 """
 
 from __future__ import annotations
@@ -14,19 +14,19 @@ from typing import Final
 from rosrm.core.master.settings import CoreSettings
 from rosrm.model.values import Fence, ProcessSpec
 
-#: Seconds for a beat on its way, and for the master and the host to look at their clocks.
+#: Seconds for the transport of a beat, and for the clock reads of master and host.
 _MARGIN: Final = 0.1
-#: Part of the time until a successor may start that a process is given to end by itself.
+#: Share of the time until a successor may start that a process gets for a graceful stop.
 _TO_END: Final = 0.25
 
 
 def fence_of(spec: ProcessSpec, settings: CoreSettings) -> Fence | None:
-    """When its host stops an instance of a process; None: never.
+    """Return the fence of an instance of a process; None: its host never stops it.
 
-    Where a successor may start elsewhere when its host is lost, it has ended before that, unless
-    its own `isolation.after` is longer. One that is to go on while its host is cut off
-    (`isolation: keep`) ends only when its slave is not at work: then it is the host alone that says
-    nothing, and both would be heard by others.
+    Where a successor may start elsewhere after the loss of the host, the instance ends before that,
+    unless its own `isolation.after` is longer. With `isolation: keep`, a process that may have a
+    successor ends only when its slave does not run. Then only the slave's messages are missing, and
+    other nodes would still receive those of both instances.
     """
     follows = spec.host_loss.then == "elsewhere" or spec.standby.wanted
     stops = spec.isolation.then == "stop"
@@ -42,9 +42,9 @@ def fence_of(spec: ProcessSpec, settings: CoreSettings) -> Fence | None:
 
 
 def ended_after_loss(spec: ProcessSpec, settings: CoreSettings) -> float:
-    """Return the seconds after a host is lost by which its fence has ended every instance.
+    """Return the seconds after the loss of a host by which the fence has ended every instance.
 
-    inf: the fence may not end the instance at all, because a slave that is at work keeps it.
+    inf: the fence may not end the instance at all, because a running slave keeps it.
     """
     fence = fence_of(spec, settings)
     if fence is None or fence.alive:

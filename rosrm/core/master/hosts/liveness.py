@@ -1,10 +1,10 @@
-"""Silence: a host is first suspect (no new work), then, after its lease, lost.
+"""Liveness of hosts: a silent host is first suspect (no new work), then, after its lease, lost.
 
-A host whose slave was stopped and left processes running is detached instead. What becomes of them
-follows the same lease (`host_loss`).
+A host whose slave was stopped and left processes running is detached instead. Its processes
+follow the same lease (`host_loss`).
 
-Ages are judged by the master's own monotonic clock alone, and never by the ROS graph. A host that
-reports seldom, by its own word, is given as much more time as it needs for a few reports.
+The master judges ages by its own monotonic clock alone, and never by the ROS graph. A host that
+declares a long report period gets additional time for a few reports.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ def review_liveness(state: MasterState, now: float) -> None:
     gone = age >= lease
     up, suspect = condition == HostCondition.UP, condition == HostCondition.SUSPECT
     lost = condition == HostCondition.LOST
-    # Of a host that left nothing more is expected, unless it still holds something; one that is
-    # expected back has its lease from this master's start on.
+    # A host that left need not report any more, unless it still holds instances. The lease of an
+    # expected host begins at the start of this master.
     left = (condition == HostCondition.LEFT) & (table.processes > 0)
     past_lease = (up | suspect | left | (condition == HostCondition.EXPECTED)) & gone
     for column in np.flatnonzero(up & ~fresh & ~past_lease):
@@ -58,7 +58,7 @@ def lease_of(state: MasterState, host: Host) -> float:
 
 
 def lease_end(state: MasterState, host: Host) -> float:
-    """Return the time at which the lease of a host ends, unless the host is heard before."""
+    """Return the time at which the lease of a host ends if it sends nothing before."""
     return float(state.hosts.heard[host.column]) + lease_of(state, host)
 
 
@@ -68,7 +68,10 @@ def _grace(state: MasterState) -> FloatArray:
 
 
 def _note_company(state: MasterState, heard: bool, now: float) -> None:
-    """Whether any host is heard at all: a master that hears none may itself be cut off."""
+    """Note the time since when at least one host is up.
+
+    A master that receives nothing from any host may itself be cut off.
+    """
     state.in_company_since = min(state.in_company_since, now) if heard else inf
 
 
@@ -92,7 +95,7 @@ def _lose(state: MasterState, host: Host, age: float, lease: float, now: float) 
 
 
 def welcome_back(state: MasterState, host: Host, now: float) -> None:
-    """A host that was suspect or lost is heard again."""
+    """Return a suspect or lost host that reports again to the condition up."""
     was_lost = state.hosts.condition_of(host) is HostCondition.LOST
     state.hosts.set_condition(host, HostCondition.UP)
     state.record(now, EventKind.HOST_BACK, f"{host.name} reports again", host=host.name)

@@ -1,25 +1,24 @@
-"""What becomes of the processes of a host that is lost, and of those that it brings back.
+"""Loss of a host: when its processes are given up, and rejoin.
 
-A detached host, whose slave was stopped and left processes running, is as a lost one when its lease
+A detached host, whose slave was stopped and left processes running, counts as lost when its lease
 has passed: no process of it may start elsewhere sooner than after a loss.
 
 =========================  ======================================================================
-on a lost host             what follows
+on a lost host             action
 =========================  ======================================================================
-the owner of the name      given up at once, where a standby can take over
-                           by `host_loss`: `wait`; after `delay` go `elsewhere`, or `stop`
-one that may be the owner  as the owner: the destination of a move that may be active, or the last
-                           that is left of a process
+the owner of the name      given up at once, where a standby can take over;
+                           else by `host_loss`: `wait`; after `delay` go `elsewhere`, or `stop`
+one that may be the owner  as the owner: the destination of a migration that may be active, or the
+                           last instance of a process
 one that is cancelled      kept until its host reports it ended, or is pruned; with `elsewhere` and
                            `isolation: stop` given up after `delay`, when its fence has ended it
-is being restored          never: its memory is there alone
+one that is being restored never given up: its memory is on that host alone
 any other                  given up at once: a former source, a shadow
 =========================  ======================================================================
 
-What is given up may still run where nobody hears it; `coming_back` says what becomes of it then.
-
-Nothing is given up while the master hears no host at all, nor for one lease after: then it is
-the master that was cut off, and its hosts come back one by one.
+An instance that is given up may still run while its host is silent; `readoption` handles it then.
+Nothing is given up while no host reports to the master, nor for one lease after: in that case the
+master was cut off, and its hosts rejoin one by one.
 """
 
 from __future__ import annotations
@@ -48,14 +47,14 @@ _OUT_OF_REACH: Final = (HostCondition.LOST, HostCondition.DETACHED)
 
 
 def lose_sight(state: MasterState, host: Host, now: float) -> None:
-    """A host is lost: its processes are out of reach, not gone."""
+    """Mark a host as lost: its processes are out of reach, not ended."""
     host.lost_since = now
     _note_phases(state, host, now)
     _review(state, host, now)
 
 
 def detach(state: MasterState, host: Host, lease_end: float, now: float) -> None:
-    """The slave of a host was stopped and left processes running, which are out of reach now."""
+    """Mark a host as detached: its stopped slave left processes running, out of reach now."""
     host.detached_since, host.lost_since = now, lease_end
     _note_phases(state, host, now)
 
@@ -68,7 +67,7 @@ def _note_phases(state: MasterState, host: Host, now: float) -> None:
 
 
 def regain_sight(state: MasterState, host: Host, now: float) -> None:
-    """A lost host is heard again: its processes are again what their instances were last."""
+    """Restore the phases of a lost host's processes from their last status when it rejoins."""
     for number in host.instances:
         instance = state.instances[number]
         process = state.owned_by(instance)
@@ -80,7 +79,7 @@ def regain_sight(state: MasterState, host: Host, now: float) -> None:
 
 
 def review_lost_hosts(state: MasterState, now: float) -> None:
-    """Give up what is due on every lost or detached host."""
+    """Give up every due instance on lost or detached hosts."""
     for column in np.flatnonzero(np.isin(state.hosts.condition, _OUT_OF_REACH)):
         _review(state, state.hosts.hosts[column], now)
 
@@ -110,14 +109,14 @@ def _is_given_up(state: MasterState, instance: Instance, now: float) -> bool:
     policy = process.spec.host_loss
     lost_for = now - instance.host.lost_since
     if process.wanted is Wanted.CANCEL:
-        # Its name becomes free now, so it must have ended: only an expired fence ensures that.
+        # Giving it up frees its name, so it must have ended: only an expired fence ensures that.
         ends_at = max(policy.delay, ended_after_loss(process.spec, state.settings))
         return policy.then == "elsewhere" and lost_for >= ends_at
     return policy.then in ("elsewhere", "stop") and lost_for >= policy.delay
 
 
 def _may_be_active(state: MasterState, instance: Instance) -> bool:
-    """The destination of a move may be the only one that is active, without our knowing."""
+    """Return True if the destination of a migration may be active, unknown to the master."""
     run = state.runs.get(instance.id.process)
     if run is None or run.committed or run.destination != instance.id:
         return False
@@ -140,7 +139,7 @@ def _give_up(state: MasterState, instance: Instance, now: float) -> None:
 
 
 def _may_be_taken_back(process: Process, instance: Instance) -> bool:
-    """It owns the name, and nobody has told it to stop."""
+    """Return True if the instance owns the name and was not ordered to stop."""
     runs_on = process.wanted is Wanted.RUN and not instance.stopping
     return (
         runs_on

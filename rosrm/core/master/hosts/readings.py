@@ -1,4 +1,4 @@
-"""Taking in what the slaves read: a batch of a thousand hosts in a few numpy calls."""
+"""Intake of readings: a batch of a thousand hosts in a few numpy calls."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ _SLOT_BITS: Final = np.left_shift(np.uint32(1), np.arange(RESOURCE_SLOTS, dtype=
 
 
 def take_readings(table: HostTable, readings: ReadingsReceived, now: float) -> BoolArray:
-    """Take in a batch of readings.
+    """Store a batch of readings.
 
-    One that is older than what is known already is left out: it came late. Of one that makes no
-    sense nothing is used; but its host lives, and what it had said before is stale.
+    A reading older than the stored one arrived late and is dropped. An invalid reading is dropped
+    too, but it renews the last contact of its host and makes the host's stored reading stale.
 
     Returns:
         (N,) True where a reading was refused: an unknown or former host, NaN, a negative or absurd
@@ -69,7 +69,7 @@ def _store(
 def _store_alike(
     table: HostTable, rows: IntArray, columns: IntArray, usage: FloatArray, limit: FloatArray
 ) -> None:
-    """The common case: all of these hosts have the same resources in the same slots."""
+    """Store readings of hosts that all have the same resources in the same slots (common case)."""
     for slot, row in enumerate(rows):
         if row >= 0:
             table.usage[row, columns] = usage[:, slot]

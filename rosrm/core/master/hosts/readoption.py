@@ -1,7 +1,7 @@
-"""What a host brings back that was given up when it was lost.
+"""Re-adoption: instances of a returning host that were given up when it was lost.
 
-Where nothing has followed the instance yet, it is the owner again, and its process leaves the
-queue; a job that has completed meanwhile has completed. Where something has, it is fenced.
+If no successor has started, the instance owns the name again, and its process leaves the queue; a
+job that has completed in between is complete. If a successor has started, the instance is fenced.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from rosrm.model.values import InstanceId, InstanceState, InstanceStatus
 
 
 def take_back_all(state: MasterState, host: Host, now: float) -> None:
-    """A host is heard again: what nothing has followed is its own, until it says otherwise."""
+    """Re-adopt every instance of a host without a successor, until the host reports otherwise."""
     for name in [*state.queue, *sorted(state.set_aside)]:
         process = state.processes[name]
         if process.left_behind is not None and process.left_behind.host == host.name:
@@ -23,10 +23,10 @@ def take_back_all(state: MasterState, host: Host, now: float) -> None:
 
 
 def take_back(state: MasterState, host: Host, status: InstanceStatus, now: float) -> bool:
-    """The first that is heard of a host is of an instance that was given up; as `take_back_all`.
+    """Re-adopt one reported instance that was given up, as `take_back_all` does.
 
     Returns:
-        False: it is not that.
+        False: the instance is not one that can be re-adopted.
     """
     process = state.processes.get(status.instance.process)
     left = None if process is None else process.left_behind
@@ -43,7 +43,7 @@ def _take_back(
 ) -> None:
     state.unqueue(process)
     instance = state.add_instance(InstanceId(process.name, left.number), process.spec, host, now)
-    # Not as one that was assigned a moment ago: if the host does not hold it, it is gone.
+    # A state is set, unlike for a new assignment: if the host does not hold it, it is gone.
     instance.node_name, instance.state = left.node_name, InstanceState.RUNNING
     process.owner, process.left_behind = left.number, None
     state.set_phase(process, ProcessPhase.STARTING, now)
@@ -52,15 +52,15 @@ def _take_back(
         process=process.name, host=host.name, facts={"number": left.number},
     )  # fmt: skip
     state.save(process)
-    # A move that was under way when its host was lost had told the slave not to restart it.
+    # A migration under way at the loss may have ordered the slave not to restart it.
     restart = process.spec.restart
     state.emit(Order(state.order_id(), host.host_id, "set_restart", instance.id, restart=restart))
 
 
 def has_successor(state: MasterState, status: InstanceStatus) -> bool:
-    """Another instance owns the name that this one ran under, or is about to.
+    """Return True if another instance owns the name of this one, or is about to.
 
-    It is where a plan goes on as if this one had ended, and where its image owns the name.
+    True also where a plan treats this instance as ended, or its image owns the name.
     """
     process = state.processes.get(status.instance.process)
     number, run = status.instance.number, state.runs.get(status.instance.process)

@@ -1,4 +1,4 @@
-"""What hosts say of themselves: they come, ask for work, report readings, leave."""
+"""Registration of hosts, requests for work, readings, departure."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from rosrm.model.plan import Execute
 from rosrm.model.values import InstanceStatus
 from rosrm.wording import counted
 
-#: Seconds between two records about the same nonsense from the same host.
+#: Seconds between two records of the same fault of the same host.
 _TOLD_EVERY = 10.0
 
 
 def host_registered(state: MasterState, event: happened.HostRegistered, now: float) -> None:
-    """Take a host in, unless a live slave has its name."""
+    """Register a host, unless a live slave has its name."""
     description = event.description
     fault = description_fault(description)
     if fault:
@@ -59,7 +59,7 @@ def host_registered(state: MasterState, event: happened.HostRegistered, now: flo
         },
     )  # fmt: skip
     note_seen(state, host.name, event.journal_seen, now)
-    replication.note_states(state, host, event.kept, now)  # it decides where what is queued goes on
+    replication.note_states(state, host, event.kept, now)  # replicas decide on placement
     loss.regain_sight(state, host, now)
     stopping = [number for number in sorted(host.instances) if state.instances[number].stopping]
     lifecycle.reconcile(state, host, event.instances, now, registering=True)
@@ -71,19 +71,19 @@ def host_registered(state: MasterState, event: happened.HostRegistered, now: flo
 
 
 def _stop_again(state: MasterState, stopping: list[int], now: float) -> None:
-    """Order the stops again at once that the former run of a slave may not have taken."""
+    """Repeat at once the stops that the former run of a slave may not have carried out."""
     for number in stopping:
         if number in state.instances:
             lifecycle.stop_instance(state, state.instances[number], now)
 
 
 def _live(held: Iterable[InstanceStatus]) -> str:
-    """Return how many of the instances that a slave reports have not ended: "2 processes"."""
+    """Count the instances in a slave's report that have not ended: "2 processes"."""
     return counted(sum(not one.state.ended for one in held), "process", "processes")
 
 
 def _execute_again(state: MasterState, host: Host) -> None:
-    """What an executor of the slave's former run had in hand ended with it: it begins anew."""
+    """Repeat the steps whose executor ended with the slave's former run."""
     for run in state.runs.values():
         step = run.step_in_hand
         if isinstance(step, Execute) and step.host == host.name:
@@ -96,7 +96,7 @@ def _refuse_host(
     known = state.hosts.by_name.get(event.description.name)
     if known is None:
         state.record(now, EventKind.HOST_REFUSED, why, host=event.description.name)
-    else:  # a slave whose name is taken asks again for a moment
+    else:  # a slave whose name is taken retries for a moment
         _tell(state, known, EventKind.HOST_REFUSED, now, why)
     state.emit(Reply(event.request, False, code, why))
 
@@ -104,10 +104,10 @@ def _refuse_host(
 def _registered_again(
     state: MasterState, host: Host, event: happened.HostRegistered, now: float
 ) -> None:
-    """The same run of a slave once more: its first answer was lost, or the request came twice.
+    """Answer a repeated registration: the first answer was lost, or the request arrived twice.
 
-    Nothing that it has said since is forgotten, and what it says it holds may be old news: it is
-    asked for everything in order.
+    Keep all later reports of the slave. The instances in this request may be outdated, so order a
+    full report in sequence.
     """
     state.hosts.heard[host.column] = now
     replication.note_states(state, host, event.kept, now)
@@ -120,9 +120,10 @@ def _registered_again(
 
 
 def _forgive(state: MasterState, host: Host) -> None:
-    """Forget what was held against a host before its slave was started again.
+    """Clear the exclusions and reasons that stem from the former run of a host's slave.
 
-    It may find what it lacked, and the master stops there what may have run on while it was away.
+    The slave may have now what it lacked. The master also stops instances there that may have run
+    on while the slave was away.
     """
     for name in state.over:
         process = state.processes[name]
@@ -146,7 +147,7 @@ def _name_taken(state: MasterState, known: Host | None, event: happened.HostRegi
 
 
 def save_host(state: MasterState, host: Host) -> None:
-    """Make durable what is intended with a host."""
+    """Persist the desired state of a host."""
     state.emit(
         Intent(
             "host",
@@ -161,7 +162,10 @@ def save_host(state: MasterState, host: Host) -> None:
 
 
 def host_left(state: MasterState, event: happened.HostLeft, now: float) -> None:
-    """A slave is stopped: what it ends goes back to the queue, and what it keeps is detached."""
+    """Handle the stop of a slave.
+
+    Processes that the slave ends return to the queue; a slave that leaves them running is detached.
+    """
     host = state.hosts.find(event.host_id, event.incarnation)
     if host is None:
         state.emit(Reply(event.request, False, "unknown", "this host is not registered"))
@@ -181,7 +185,7 @@ def host_left(state: MasterState, event: happened.HostLeft, now: float) -> None:
 
 
 def _detach(state: MasterState, host: Host, kept: tuple[InstanceStatus, ...], now: float) -> None:
-    """Take in what a slave that was stopped left running; what it does not hold has not begun."""
+    """Detach a host: adopt the reported instances; an instance not reported has not begun."""
     state.hosts.set_condition(host, HostCondition.DETACHED)
     state.record(
         now, EventKind.HOST_DETACHED,
@@ -193,7 +197,7 @@ def _detach(state: MasterState, host: Host, kept: tuple[InstanceStatus, ...], no
 
 
 def process_requested(state: MasterState, event: happened.ProcessRequested, now: float) -> None:
-    """Note that a host asks for work; the request stays open until there is some."""
+    """Note the open request for work of a host; the answer follows when there is work."""
     host = state.hosts.find(event.host_id, event.incarnation)
     if host is None:
         state.emit(Reply(event.request, False, "unknown", "register first"))
@@ -202,7 +206,7 @@ def process_requested(state: MasterState, event: happened.ProcessRequested, now:
 
 
 def readings_received(state: MasterState, event: happened.ReadingsReceived, now: float) -> None:
-    """Note a batch of readings; nonsense is refused and said."""
+    """Store a batch of readings; refuse and record invalid ones."""
     first = bool(state.set_aside) and bool(state.hosts.without_reading().any())
     refused = take_readings(state.hosts, event, now)
     if first:  # before the queue is served, which keeps the order
@@ -228,7 +232,7 @@ def _tell(state: MasterState, host: Host, kind: EventKind, now: float, message: 
 
 
 def usages_received(state: MasterState, event: happened.UsagesReceived, now: float) -> None:
-    """What now shows of an instance no longer counts as in flight."""
+    """Lower reservations by the usage that readings now show."""
     host = state.hosts.find(event.host_id, event.incarnation)
     if host is None:
         return
@@ -252,5 +256,5 @@ def usages_received(state: MasterState, event: happened.UsagesReceived, now: flo
 
 
 def peer_refused(state: MasterState, event: happened.PeerRefused, now: float) -> None:
-    """Somebody was turned away at the edge."""
+    """Record a message that was refused at the network edge."""
     state.record(now, EventKind.PEER_REFUSED, f"{event.who} was refused: {event.reason}")

@@ -1,7 +1,8 @@
-"""Which process leaves a host that is over a limit or is being drained, and where it goes.
+"""Eviction: processes leave a host that is over a limit or is being drained.
 
-It must relieve the resource that is over, fit where it goes without putting that host over, and of
-those the one with the largest relief goes. When no host has room nothing moves.
+An evicted process must lower the usage that is over its limit, and fit on its destination without
+putting that host over a limit. Among such processes, the one with the largest usage moves. When no
+host has room, nothing moves.
 """
 
 from __future__ import annotations
@@ -31,15 +32,15 @@ from rosrm.model.event_kinds import EventKind
 from rosrm.model.values import InstanceState
 from rosrm.wording import counted, few, listed
 
-#: Least seconds between two records that nothing can be moved off a host, for different reasons.
+#: Least seconds between two records, with different reasons, that nothing can leave a host.
 _TOLD_EVERY = 10.0
-#: Reasons against hosts that one answer names.
+#: Most reasons against hosts in one answer.
 _MOST_SAID: Final = 3
 _ALONE: Final = "there is no other host"
 
 
 def relieve_hosts(state: MasterState, now: float) -> None:
-    """Move processes off hosts that were over a limit for long enough, and off drained ones."""
+    """Move processes off draining hosts and off hosts over a limit for long enough."""
     _note_limits(state, now)
     for host in state.hosts.listed():
         if host.draining:
@@ -55,10 +56,10 @@ def relieve_hosts(state: MasterState, now: float) -> None:
 
 
 def _note_limits(state: MasterState, now: float) -> None:
-    """Note since when each host is over which of its limits."""
+    """Note for each host the limits that it exceeds, and since when."""
     over = {int(column) for column in state.hosts.hosts_over_limit()}
     for host in state.hosts.listed():
-        # A stale reading tells neither that the host is over its limit nor that it is under it.
+        # A stale reading does not show on which side of its limit the host is.
         stale = state.hosts.stale_resources(host) if state.hosts.stale[host.column] else ()
         names = state.hosts.over_limit(host.column) if host.column in over else []
         names = [name for name in names if name not in stale]
@@ -93,7 +94,7 @@ def _note_under_limit(state: MasterState, host: Host, now: float) -> None:
 
 def _relieve(state: MasterState, host: Host, now: float) -> None:
     if any(run.source_host is host for run in state.runs.values()):
-        return  # see first what the move under way brings
+        return  # first await the effect of the current migration
     for resource, since in list(host.over_since.items()):
         if now - since >= state.settings.hysteresis:
             _relieve_resource(state, host, resource, now)
@@ -122,7 +123,7 @@ def _largest_first(state: MasterState, host: Host, resource: str) -> list[Instan
 
 
 def relief_of(instance: Instance, resource: str) -> float:
-    """What leaves the host with an instance, base units of the resource."""
+    """Return the usage that leaves the host with an instance, in base units of the resource."""
     return instance.seen.get(resource, instance.amounts.get(resource, 0.0))
 
 
@@ -151,7 +152,7 @@ def try_move(
     A host that lacks an executor of the plan is passed over, unless it was given.
 
     Returns:
-        "" or why it cannot go; then nothing has changed.
+        "", or the reason for the refusal; then nothing has changed.
     """
     refusal = why_immovable(state, process)
     if refusal:
@@ -204,7 +205,7 @@ def _is_alone(state: MasterState, source: Host) -> bool:
 
 
 def _and_why(state: MasterState, process: Process, source: Host) -> str:
-    """What its strategy has against hosts, a few of them; "" for nothing."""
+    """Return a few of the reasons of the strategy against hosts; "" for none."""
     faults = capabilities.faults(state, process.spec.migration.strategy or "", source)
     return "".join(f"; {fault}" for fault in few(faults, _MOST_SAID))
 
@@ -213,7 +214,7 @@ def _and_why(state: MasterState, process: Process, source: Host) -> str:
 
 
 def departures(state: MasterState, host: Host) -> str:
-    """Return which processes leave a draining host, and which cannot and why."""
+    """Return the processes that leave a draining host, and those that cannot, with the reason."""
     leaving, staying = _leaving(state, host), _staying(state, host)
     if not leaving:
         return f"nothing can leave: {'; '.join(few(staying))}" if staying else "no process is left"
@@ -223,7 +224,7 @@ def departures(state: MasterState, host: Host) -> str:
 
 
 def _leaving(state: MasterState, host: Host) -> list[str]:
-    """Names of the processes of which an instance is on a host and will leave it or end."""
+    """Return the processes with an instance on a host that will leave it or end."""
     held = [state.instances[number] for number in host.instances]
     return sorted({one.id.process for one in held if not _why_it_stays(state, one)})
 
@@ -271,7 +272,7 @@ def _why_it_stays(state: MasterState, instance: Instance) -> str:
 
 
 def _note_drained(state: MasterState, host: Host, now: float) -> None:
-    """Say once that nothing which can leave a host is left on it."""
+    """Record once that no process which can leave a host is left on it."""
     if state.hosts.why_unreachable(host):
         return
     held = (state.instances[number] for number in host.instances)
@@ -300,7 +301,7 @@ def _drain(state: MasterState, host: Host, now: float) -> None:
 
 
 def _images_on(state: MasterState, host: Host) -> list[tuple[str, str]]:
-    """An image is restored where it lies: what is checkpointed leaves with nobody."""
+    """Return a reason for each image on a host: it is restored in place, so it cannot leave."""
     names = sorted(state.images.of)
     of_host = ((name, state.processes[name].image) for name in names)
     return [

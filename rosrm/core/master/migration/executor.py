@@ -1,22 +1,22 @@
-"""Carrying out plans: one step at a time, forward, or back before the commit.
+"""Execution of migration plans: one step at a time, forward, or back before the commit.
 
 ========  ==================  ==============================================================
-the run   a step              what follows
+the plan  a step              consequence
 ========  ==================  ==============================================================
-forward   is done             the next step; after the last, the move is complete
+forward   is done             the next step; after the last, the migration is complete
 forward   fails, no commit    the undo of every step so far, newest first
-forward   fails, committed    it is tried again; the process is shown as stuck until it is done
-back      is done             the next undo; after the last, the source goes on
-back      fails               it is tried again; the process is shown as stuck until it is done
+forward   fails, committed    it is retried; the process is shown as stuck until it is done
+back      is done             the next undo; after the last, the source resumes
+back      fails               it is retried; the process is shown as stuck until it is done
 any       cannot be done      it is left out: an instance that has ended never starts again, and
-                              what an executor had to do for one whose host is lost has no use.
-                              An executor that ran and answered no object counts as done
-back      destination active  forward to the commit: in a handoff it decides itself; of a restore
-                              an executor has found that it goes on
+                              an executor step for an instance whose host is lost has no use.
+                              An executor that ran and returned no object counts as done
+back      destination active  forward to the commit: in a handoff the destination itself decides;
+                              in a restore an executor has found that the process runs
 ========  ==================  ==============================================================
 
-A process that is to be cancelled turns back; one that is stuck is given up, and all its instances
-are stopped. When neither source nor destination is left, the process returns to the queue.
+Cancelling a process turns its migration back; a stuck one is given up, and all its instances are
+stopped. When neither source nor destination is left, the process returns to the queue.
 """
 
 from __future__ import annotations
@@ -46,25 +46,25 @@ from rosrm.model.event_kinds import EventKind
 from rosrm.model.plan import Aim, AwaitReady, Commit, Configure, Execute, Start, Step, Stop
 from rosrm.model.values import InstanceId, InstanceState
 
-#: What a commit means.
+#: Message of the record of a commit.
 _COMMITTED: Final = {
     Aim.MOVE: "the process is now the one at the destination: the move cannot be undone any more",
     Aim.CHECKPOINT: "the process is now in its image: the checkpoint cannot be undone any more",
     Aim.RESTORE: "the process is now the restored one: the restore cannot be undone any more",
 }
 
-# --- go on ------------------------------------------------------------------------------------
+# --- steps ------------------------------------------------------------------------------------
 
 
 def advance_all(state: MasterState, now: float) -> None:
-    """Take every run as far as it goes now."""
+    """Advance every migration as far as possible now."""
     for run in list(state.runs.values()):
         while run.process in state.runs and _advance(state, run, now):
             pass
 
 
 def order_answered(state: MasterState, event: happened.OrderAnswered, now: float) -> None:
-    """A slave took an order, refused it, or did not answer in time."""
+    """Handle the answer of a slave to an order: accepted, refused, or none in time."""
     if (
         periodic.order_answered(state, event, now)
         or replication.order_answered(state, event)
@@ -82,7 +82,7 @@ def order_answered(state: MasterState, event: happened.OrderAnswered, now: float
 
 
 def _advance(state: MasterState, run: Run, now: float) -> bool:
-    """Look at the step in hand; True: there may be more to do at once."""
+    """Handle the current step; return True if more may be done at once."""
     _choose_way(state, run, now)
     step = run.step_in_hand
     if step is None or (run.stuck and state.processes[run.process].wanted is Wanted.CANCEL):
@@ -108,7 +108,10 @@ def _advance(state: MasterState, run: Run, now: float) -> bool:
 
 
 def _choose_way(state: MasterState, run: Run, now: float) -> None:
-    """Before the commit: a destination that is active decides, or else what befell the source."""
+    """Choose the direction before the commit.
+
+    A destination that is active decides; otherwise the fate of the source does.
+    """
     if run.committed:
         return
     if handoff.is_active(state, run) or run.went_on:
@@ -121,9 +124,9 @@ def _choose_way(state: MasterState, run: Run, now: float) -> None:
 
 
 def _is_expected(state: MasterState, run: Run, step: Step) -> bool:
-    """A host that the step needs has not come back since the master started.
+    """Return True if a host that the step needs has not returned since the master started.
 
-    It is waited for until its lease is over; then the step is begun, and its own time-out judges.
+    The step waits for it until its lease ends; then the step begins, and its own time-out decides.
     """
     if isinstance(step, Commit):
         return False
@@ -136,7 +139,7 @@ def _is_expected(state: MasterState, run: Run, step: Step) -> bool:
 
 
 def _outcome(state: MasterState, run: Run, step: Step, now: float) -> str | None:
-    """Of the step in hand, now; what can be done about one that takes its time is done."""
+    """Return the outcome of the current step; repeat its order or end it at its time-out."""
     outcome = outcome_of(step, state, run, now)
     if outcome is None:
         give_order_again(state, run, step, now)
@@ -168,19 +171,19 @@ def _commit(state: MasterState, run: Run, step: Commit, now: float) -> None:
     else:
         process.owner = run.destination.number
         images.set_image(state, process, None)
-    process.left_behind = None  # a source whose host was lost meanwhile has a successor now
+    process.left_behind = None  # a source on a lost host has a successor now
     process.migrations += run.aim is Aim.MOVE
     process.moved_at = now
     if process.wanted is Wanted.REQUEUE:
-        process.wanted = Wanted.RUN  # that was meant for the host which it has left
+        process.wanted = Wanted.RUN  # the requeue was meant for the source host
     state.save(process)
 
 
 def _cannot_be_done(state: MasterState, run: Run, step: Step, now: float) -> bool:
-    """Trying again would never help: the instance has ended, or its slot was given away."""
+    """Return True if a retry cannot help: the instance has ended, or its slot was given away."""
     if isinstance(step, Execute):
-        # Asked again the executor would answer so for ever. Of a restore the answer may say that
-        # the destination is active, so that plan waits until the plugin is corrected.
+        # A retry would give the same bad result. In a restore, the result may say that the
+        # destination is active, so that plan waits until the plugin is corrected.
         done = run.bad_result and run.aim is not Aim.RESTORE
         return done or image_requests.leave_behind(state, run, step)
     if not isinstance(step, (Start, AwaitReady)):
@@ -193,7 +196,7 @@ def _cannot_be_done(state: MasterState, run: Run, step: Step, now: float) -> boo
 
 
 def _go_on(state: MasterState, run: Run, now: float) -> None:
-    """To the next step, or the next undo."""
+    """Go to the next step, or the next undo."""
     run.index += 1
     run.begun = False
     run.retry_at = now
@@ -234,7 +237,7 @@ def _failed(state: MasterState, run: Run, step: Step, reason: str, now: float) -
 
 
 def _turn_back(state: MasterState, run: Run, reason: str, now: float) -> None:
-    """Before the commit: undo every step so far, the one in hand included, newest first."""
+    """Undo every step so far before the commit, the current one included, newest first."""
     run.failure = reason
     run.turn_back()
     state.record(
@@ -247,7 +250,7 @@ def _turn_back(state: MasterState, run: Run, reason: str, now: float) -> None:
 
 
 def _go_forward(state: MasterState, run: Run, now: float) -> None:
-    """On the way back it turns out that the destination is active: it owns the name."""
+    """Turn forward again, because the destination is active and owns the name."""
     run.undo, run.index, run.begun = None, run.commit_index, False
     run.retry_at = now
     if run.stuck:
@@ -261,7 +264,7 @@ def _go_forward(state: MasterState, run: Run, now: float) -> None:
 
 
 def _why_turn_back(state: MasterState, run: Run) -> str:
-    """Why the steps before the commit are not worth going on with; "" if they are."""
+    """Return why a plan must turn back before its commit; "" if it need not."""
     if state.processes[run.process].wanted is Wanted.CANCEL:
         return f"{run.process} is to be cancelled"
     end = run.ended.get(run.source.number)
@@ -272,7 +275,7 @@ def _why_turn_back(state: MasterState, run: Run) -> str:
 
 
 def _has_left_in_image(run: Run) -> bool:
-    """The destination is being made of an image of the source, which stands still: all is in it."""
+    """Return True if the destination is restored from an image of the frozen source."""
     return any(
         isinstance(step, Start) and step.restored and step.instance.number in run.launched
         for step in run.plan.steps
@@ -280,14 +283,14 @@ def _has_left_in_image(run: Run) -> bool:
 
 
 def _goes_on(state: MasterState, run: Run) -> bool:
-    """The process is to go on where it was: nobody cancelled it, and it has not completed."""
+    """Return True if the source shall run on: the process is neither cancelled nor completed."""
     end = run.ended.get(run.source.number)
     completed = end is not None and end.completed
     return not completed and state.processes[run.process].wanted is Wanted.RUN
 
 
 def _told_to_stop(run: Run, instance: InstanceId) -> bool:
-    """The plan has ordered this instance to stop."""
+    """Return True if the plan has ordered this instance to stop."""
     return any(isinstance(step, Stop) and step.instance == instance for step in run.so_far)
 
 
@@ -295,7 +298,7 @@ def _told_to_stop(run: Run, instance: InstanceId) -> bool:
 
 
 def _conclude(state: MasterState, run: Run, now: float) -> None:
-    """The last step is done: the process goes its own way again."""
+    """End a migration after its last step: stop leftover instances, record the outcome."""
     handoff.close(state, run)
     state.end_run(run)
     process = state.processes[run.process]
@@ -306,11 +309,11 @@ def _conclude(state: MasterState, run: Run, now: float) -> None:
     for instance in state.instances_of(process):
         if instance.id.number not in kept and not instance.stopping:
             if instance.state is None and instance.id.number not in run.launched:
-                state.drop_instance(instance)  # it was counted, and never started
+                state.drop_instance(instance)  # it had a reservation, and never started
             else:
                 lifecycle.stop_instance(state, instance, now)
     for name in run.source_host.over_since:
-        run.source_host.over_since[name] = now  # see first what this move brings
+        run.source_host.over_since[name] = now  # first await the effect of this migration
     kind, message = image_requests.ending_of(run)
     state.record(
         now, kind, message,
@@ -327,7 +330,7 @@ def _conclude(state: MasterState, run: Run, now: float) -> None:
 
 
 def _parts(run: Run) -> dict[str, Any]:
-    """What executors say of their own time, by their names."""
+    """Return the durations that executors report, by their names."""
     return {name: result["seconds"] for name, result in run.results.items() if "seconds" in result}
 
 
@@ -347,7 +350,7 @@ def _settle_owner(state: MasterState, process: Process, run: Run, now: float) ->
 
 
 def _end_of_owner(process: Process, run: Run) -> End:
-    """How the owner ended, if a move had not been in the way."""
+    """Return the end of the owner as it would be without the migration."""
     end = run.ended[process.owner]
     policy = process.spec.restart
     if process.owner == run.source.number and _told_to_stop(run, run.source) and not end.completed:

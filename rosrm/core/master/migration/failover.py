@@ -1,8 +1,8 @@
-"""A standby goes on in the place of its primary.
+"""Failover: a standby replaces its primary.
 
-A standby is the first half of a handoff that waits: its plan was begun, and stands before the step
-in which the destination becomes active. When the primary has ended, that step is taken: the
-destination is told to take over, and the plan goes its usual way, forward or back.
+A standby is the first half of a handoff: its plan was begun, and waits before the step in which the
+destination becomes active. When the primary has ended, that step is carried out: the destination
+receives the order to take over, and the plan continues as usual, forward or back.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _OVER: Final = frozenset({ReportPhase.FAILED, ReportPhase.ABORTED})
 
 
 def index_of(phase: HandoffPhase, steps: Sequence[Step]) -> int:
-    """Where in a plan a phase of a handoff is awaited; -1: nowhere."""
+    """Return the index of the step that awaits a phase of a handoff; -1: none."""
     for at, step in enumerate(steps):
         if isinstance(step, Configure) and step.phase is phase and step.awaited:
             return at
@@ -28,7 +28,7 @@ def index_of(phase: HandoffPhase, steps: Sequence[Step]) -> int:
 
 
 def is_ready(state: MasterState, process: Process) -> bool:
-    """It has a standby that could go on now."""
+    """Return True if a process has a standby that could take over now."""
     standby = state.standbys.get(process.name)
     if standby is None or standby.source.number != process.owner:
         return False
@@ -41,10 +41,10 @@ def is_ready(state: MasterState, process: Process) -> bool:
 
 
 def take_over(state: MasterState, process: Process, end: End, now: float) -> bool:
-    """The primary has ended: its standby goes on.
+    """Let the standby of an ended primary take over.
 
     Returns:
-        False: it has none that could, or has come to its end as it was meant to.
+        False: no standby could take over, or the primary has completed as intended.
     """
     if _succeeded(end) or not is_ready(state, process):
         return False

@@ -1,8 +1,8 @@
-"""What the master says of a handoff, what it makes of the answers, and which way that decides.
+"""Handoff protocol on the master's side: phases sent, reports received, decision.
 
-The destination alone decides when it becomes active. From the moment at which it was told to SWITCH
-the master may guess that it has not, but never act on the guess: the source is told to go on only
-when the destination has said that it never will be active, or has ended.
+The destination alone decides when it becomes active. After the master has published SWITCH, it may
+guess that the destination is not active, but never act on the guess. It orders the source to resume
+only when the destination has reported that it never will be active, or has ended.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from rosrm.model.plan import Configure, HandoffPhase, ReportPhase
 from rosrm.model.values import InstanceId, ProcessSpec
 
 DONE: Final = ""
-#: What a destination says when it follows the source, or is further still.
+#: Reports of a destination that follows the source, or is further still.
 _READY: Final = frozenset({ReportPhase.READY, ReportPhase.SWITCHING, ReportPhase.ACTIVE})
 
-#: What the master asks for in each phase, as the subject of a sentence.
+#: Action that the master orders in each phase, as the subject of a sentence.
 TITLES: Final[Mapping[HandoffPhase, str]] = {
     HandoffPhase.SHADOW: "copying the state to the destination",
     HandoffPhase.SWITCH: "switching from the source to the destination",
@@ -32,7 +32,7 @@ TITLES: Final[Mapping[HandoffPhase, str]] = {
     HandoffPhase.RESUME: "letting the source publish again",
     HandoffPhase.DONE: "ending the handoff",
 }
-#: What a node reports, as a sentence with the node as its subject.
+#: Predicate of a sentence for each report, with the node as its subject.
 _REPORTS: Final[Mapping[ReportPhase, str]] = {
     ReportPhase.ATTACHED: "takes part in the handoff",
     ReportPhase.SILENT: "has stopped publishing",
@@ -47,11 +47,11 @@ _REPORTS: Final[Mapping[ReportPhase, str]] = {
 }
 
 
-# --- what is said -----------------------------------------------------------------------------
+# --- phases sent ------------------------------------------------------------------------------
 
 
 def publish(state: MasterState, run: Run, phase: HandoffPhase) -> None:
-    """Say to the source and the destination where the handoff stands."""
+    """Publish the phase of a handoff to its source and destination."""
     spec = state.processes[run.process].spec
     state.emit(
         PublishStateConfig(
@@ -68,14 +68,17 @@ def qualified(spec: ProcessSpec, node_name: str) -> str:
 
 
 def close(state: MasterState, run: Run) -> None:
-    """The move is over: if anything was said of it, nothing more will be."""
+    """Publish the end of a handoff, if anything was published of it before."""
     said = [step.phase for step in run.so_far if isinstance(step, Configure)]
     if said and HandoffPhase.DONE not in said:
         publish(state, run, HandoffPhase.DONE)
 
 
 def say_again(state: MasterState, run: Run, step: Configure, now: float) -> None:
-    """A phase that was not answered may not have been heard; a lost source needs another one."""
+    """Repeat a phase without an answer, because the message may be lost.
+
+    If the source has ended, publish the order to take over in its place.
+    """
     if _needs_take_over(state, run, step):
         _take_over(state, run, step, now)
     elif step.awaited and now - run.order_at >= state.settings.order_retry:
@@ -84,7 +87,10 @@ def say_again(state: MasterState, run: Run, step: Configure, now: float) -> None
 
 
 def _needs_take_over(state: MasterState, run: Run, step: Configure) -> bool:
-    """The source ended while it was to fall silent: its successor goes on from what it has."""
+    """Return True if the source ended while the master awaited its silence.
+
+    The destination takes over from the state that it has.
+    """
     alone = run.source.number not in state.instances and run.destination.number in state.instances
     return step.phase is HandoffPhase.SWITCH and alone and not is_active(state, run)
 
@@ -104,11 +110,11 @@ def _take_over(state: MasterState, run: Run, step: Configure, now: float) -> Non
     publish(state, run, HandoffPhase.TAKE_OVER)
 
 
-# --- what is heard ----------------------------------------------------------------------------
+# --- reports received -------------------------------------------------------------------------
 
 
 def handoff_reported(state: MasterState, event: happened.HandoffReported, now: float) -> None:
-    """Note how far the source or the destination is."""
+    """Note the reported phase of the source or the destination."""
     for run in (state.runs.get(event.process), state.standbys.get(event.process)):
         if run is not None and run.destination.number == event.destination:
             _note(state, run, event, now)
@@ -119,7 +125,7 @@ def _note(state: MasterState, run: Run, event: happened.HandoffReported, now: fl
         return
     heard = run.heard.setdefault(event.instance, Heard())
     if event.phase not in heard.phases:
-        # What a destination waits for is over when it receives the state; a time-out names it.
+        # A destination that receives the state waits no more; a time-out shows the older message.
         is_news = event.message and event.phase is not ReportPhase.SHADOWING
         said = f": {event.message}" if is_news else ""
         message = f"{run.process}#{event.instance} {_REPORTS[event.phase]}{said}"
@@ -132,9 +138,9 @@ def _note(state: MasterState, run: Run, event: happened.HandoffReported, now: fl
 
 
 def is_active(state: MasterState, run: Run) -> bool:
-    """The destination has said that it is active, and nobody has ordered it to stop since.
+    """Return True if the destination has reported that it is active, with no order to stop since.
 
-    If somebody has, only its end decides.
+    After an order to stop, only its end decides.
     """
     instance = state.instances.get(run.destination.number)
     if instance is None or instance.stopping:
@@ -144,24 +150,24 @@ def is_active(state: MasterState, run: Run) -> bool:
 
 
 def is_released(state: MasterState, run: Run, instance: InstanceId) -> bool:
-    """A silent source has nothing more to do, or has ended."""
+    """Return True if a silent source has handed everything over, or has ended."""
     ended = instance.number not in state.instances
     return ended or ReportPhase.RELEASED in run.phases_of(instance)
 
 
 def is_switching(run: Run) -> bool:
-    """The step in hand is the one in which the destination becomes active."""
+    """Return True if the current step is the one in which the destination becomes active."""
     step = run.step_in_hand
     if run.undo is not None or not isinstance(step, Configure):
         return False
     return step.phase is HandoffPhase.SWITCH
 
 
-# --- when a phase is done ---------------------------------------------------------------------
+# --- outcome of a phase -----------------------------------------------------------------------
 
 
 def outcome(step: Configure, state: MasterState, run: Run) -> str | None:
-    """Of the phase in hand: None: not yet; "": done; else why it failed."""
+    """Return the outcome of the current phase: None: pending; "": done; else the failure."""
     return _OUTCOMES[step.phase](state, run) if step.awaited else DONE
 
 
@@ -177,7 +183,7 @@ def _switching(state: MasterState, run: Run) -> str | None:
 
 
 def _fault(state: MasterState, run: Run) -> str:
-    """Why the destination cannot become active any more; "" if it can."""
+    """Return why the destination can no longer become active; "" if it can."""
     if run.destination.number not in state.instances:
         how = run.how_ended(run.destination)
         return f"{run.destination} ended on {run.destination_host.name}: {how}"
@@ -199,7 +205,7 @@ def _aborting(state: MasterState, run: Run) -> str | None:
 def _resuming(state: MasterState, run: Run) -> str | None:
     resumed = ReportPhase.RESUMED in run.phases_of(run.source)
     ended = run.source.number not in state.instances
-    # One that follows no protocol says nothing, and never fell silent.
+    # A source without the protocol reports nothing, and never stopped publishing.
     deaf = not was_switched(run) and not run.phases_of(run.source)
     return DONE if resumed or ended or deaf else None
 
@@ -218,19 +224,19 @@ _OUTCOMES: Final[Mapping[HandoffPhase, Callable[[MasterState, Run], str | None]]
 
 
 def was_switched(run: Run) -> bool:
-    """The destination may have been told to switch, so that the source may be silent."""
+    """Return True if SWITCH may have been published, so that the source may be silent."""
     return any(
         isinstance(step, Configure) and step.phase is HandoffPhase.SWITCH for step in run.so_far
     )
 
 
-# --- when its time has passed -----------------------------------------------------------------
+# --- time-outs --------------------------------------------------------------------------------
 
 
 def timed_out(state: MasterState, run: Run, step: Configure, now: float) -> str | None:
-    """What the passing of a phase's time means: as `outcome`."""
+    """Return the outcome of a phase after its time-out, as `outcome` does."""
     if step.phase is HandoffPhase.RESUME and not was_switched(run):
-        return DONE  # it was never asked for silence
+        return DONE  # it was never ordered to be silent
     if step.phase is HandoffPhase.ABORT:
         instance = state.instances[run.destination.number]
         if not instance.stopping:
@@ -240,7 +246,7 @@ def timed_out(state: MasterState, run: Run, step: Configure, now: float) -> str 
 
 
 def _stop_unheard(state: MasterState, run: Run, now: float) -> None:
-    """It may become active at any moment, or be so: only its end makes sure that it never is."""
+    """Stop a destination that does not answer: only its end ensures that it is never active."""
     stop = state.processes[run.process].spec.stop
     lifecycle.stop_instance(state, state.instances[run.destination.number], now)
     run.deadline = now + stop.timeout
@@ -253,7 +259,7 @@ def _stop_unheard(state: MasterState, run: Run, now: float) -> None:
 
 
 def _waited(run: Run) -> str:
-    """What is still waited for, in the words of those who wait."""
+    """Return the newest report of source and destination, for a time-out."""
     source, destination = run.heard.get(run.source.number), run.heard.get(run.destination.number)
     if source is None and destination is None:
         return (

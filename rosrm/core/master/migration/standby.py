@@ -1,17 +1,17 @@
-"""Standbys: a second instance on another host follows the state of a process that asks for one.
+"""Standbys: a second instance on another host follows the state of a process.
 
 ======================  =====================================================================
-the process             what is done about its standby
+the process             action on its standby
 ======================  =====================================================================
 runs, has none          one is started on another host that has room, as a shadow
-has one that runs       source and standby are told of each other, until it says READY
+has one that runs       `state_config` names source and standby, until the standby is READY
 has one that gave up    it is stopped; another one is started after a while, ever longer
-waits for its restart   it is stopped for good: its end hands over to the standby
-moves                   it is kept until the move is committed: a move may fail
-is over                 the standby is stopped
+waits for its restart   the primary is stopped for good, and its end hands over to the standby
+moves                   it is kept until the migration is committed, because that may fail
+has ended               the standby is stopped
 ======================  =====================================================================
 
-`failover` says what follows when the primary has ended.
+`failover` handles the end of the primary.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from rosrm.core.master.state.process import Process, ProcessPhase, Wanted
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.plan import HandoffPhase, ReportPhase, Start
 
-#: Seconds until another standby is tried after one that failed; doubled with each.
+#: Seconds until another standby is started after a failed one; doubled with each failure.
 _FIRST_WAIT: Final = 2.0
 _LONGEST_WAIT: Final = 60.0
 #: Most standbys that are begun in one review.
@@ -39,7 +39,7 @@ _AT_A_TIME: Final = 2
 
 
 def review_standbys(state: MasterState, now: float) -> None:
-    """See to the standby of every process that asks for one."""
+    """Review every standby, and begin those that are missing."""
     for run in list(state.standbys.values()):
         _review(state, run, now)
     begun = 0
@@ -55,7 +55,7 @@ def _lacks_one(state: MasterState, process: Process, now: float) -> bool:
     return alone and calm and len(process.instances) == 1 and now >= process.standby_at
 
 
-# --- a new one --------------------------------------------------------------------------------
+# --- start of a standby -----------------------------------------------------------------------
 
 
 def _begin(state: MasterState, process: Process, now: float) -> bool:
@@ -85,7 +85,7 @@ def _begin(state: MasterState, process: Process, now: float) -> bool:
 
 
 def _can_wait(run: Run) -> bool:
-    """Its plan is one of a handoff: with a shadow that is ready before it is active."""
+    """Return True if the plan is a handoff, with a shadow that is ready before it is active."""
     shadow, switch = (
         failover.index_of(phase, run.plan.steps)
         for phase in (HandoffPhase.SHADOW, HandoffPhase.SWITCH)
@@ -96,7 +96,7 @@ def _can_wait(run: Run) -> bool:
 
 
 def _demand(state: MasterState, process: Process, primary: Host) -> Demand:
-    """As of the process itself, on a host that is apart from that of the primary."""
+    """Return the demand of a standby: that of the process, on a host apart from the primary's."""
     own = demand_of(state, process)
     excluded = {**process.excluded, primary.name: "the primary runs there"}
     labels = primary.description.labels
@@ -115,7 +115,7 @@ def _demand(state: MasterState, process: Process, primary: Host) -> Demand:
 
 
 def _wait(state: MasterState, process: Process, why: str, now: float) -> None:
-    """Said once, tried again after a while."""
+    """Delay the next standby; record the reason once."""
     process.standby_at = now + _FIRST_WAIT
     if process.standby_reason != why:
         process.standby_reason = why
@@ -129,7 +129,7 @@ def _order_start(state: MasterState, run: Run, now: float) -> None:
     give_order(state, run, start, now)
 
 
-# --- one that is there ------------------------------------------------------------------------
+# --- review of a standby ----------------------------------------------------------------------
 
 
 def _review(state: MasterState, run: Run, now: float) -> None:

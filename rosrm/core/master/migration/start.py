@@ -1,4 +1,4 @@
-"""Beginning a move: is there a way, a room and a plan?"""
+"""Start of a migration: strategy, plan, executors, destination."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from rosrm.model.plan import Aim, Commit, Move, Plan, Start, executors_of, plan_
 from rosrm.model.plan_json import checked_plan
 from rosrm.wording import listed, standing
 
-#: The method of a strategy that plans for an aim.
+#: Method of a strategy that plans for each aim.
 _HOOKS: Final = {Aim.MOVE: "propose", Aim.CHECKPOINT: "checkpoint", Aim.RESTORE: "restore"}
 
 
 def begin_move(
     state: MasterState, process: Process, run: Run, ranking: Ranking, now: float
 ) -> None:
-    """Begin a planned move to a host that has room for the process by a ranking."""
+    """Begin a planned migration to a host that has room for the process by a ranking."""
     destination, cause = run.destination_host, run.cause
     state.runs[process.name] = run
     state.charge_ranked(run.destination, destination, now, ranking)
@@ -49,7 +49,7 @@ def begin_move(
 def plan_move(
     state: MasterState, process: Process, destination: Host, cause: str, now: float
 ) -> Run | str:
-    """What its strategy proposes for a move of a running process, or why there is no plan."""
+    """Return the planned migration of a running process, or why there is no plan."""
     source = state.instances[process.owner]
     name = process.spec.migration.strategy or ""
     move = Move(
@@ -67,19 +67,19 @@ def plan_move(
 
 
 def moves_under_way(state: MasterState) -> int:
-    """How many processes are moving; one that is stuck does not keep others from moving."""
+    """Return the number of migrations in flight; a stuck one does not block others."""
     return sum(not run.stuck for run in state.runs.values())
 
 
 def why_busy(run: Run) -> str:
-    """What is under way with a process already."""
+    """Return a sentence that names the plan under way for a process."""
     if run.aim is Aim.MOVE:
         return f"{run.process} is moving already, to {run.destination_host.name}"
     return f"{run.process} is busy: {run.course}"
 
 
 def why_immovable(state: MasterState, process: Process) -> str:
-    """Why a process cannot be moved now; "" if it can."""
+    """Return why a process cannot be moved now; "" if it can."""
     if process.name in state.runs:
         return why_busy(state.runs[process.name])
     if process.phase is ProcessPhase.CHECKPOINTED:
@@ -109,15 +109,15 @@ def why_never_movable(state: MasterState, process: Process) -> str:
 
 
 def why_no_executor(state: MasterState, run: Run) -> str:
-    """Return which host of a plan lacks an executor that it names; "": none does."""
+    """Return a sentence on the host that lacks an executor of a plan; "": none does."""
     lacking = _lacking(state, run)
     return "" if lacking is None else _lacks(state, run, lacking[0], [lacking[1].name])
 
 
 def without_executor(state: MasterState, run: Run) -> tuple[list[str], str]:
-    """Return all hosts that lack the executor that the destination of a plan lacks, and say so.
+    """Return all hosts that lack the executor missing at a plan's destination, with a sentence.
 
-    No host, if the plan can be carried out on its destination.
+    Return no host if the plan can be carried out on its destination.
     """
     lacking = _lacking(state, run)
     if lacking is None or lacking[1] is not run.destination_host:
@@ -134,7 +134,7 @@ def without_executor(state: MasterState, run: Run) -> tuple[list[str], str]:
 def _lacking(state: MasterState, run: Run) -> tuple[str, Host] | None:
     """Return an executor that a plan names and the host that lacks it."""
     if run.strategy not in state.declared.executors:
-        return None  # its offer is not known
+        return None  # its offer is unknown
     commit = run.plan.steps[run.commit_index]
     named = [*executors_of(run.plan)]
     if isinstance(commit, Commit) and commit.image:
@@ -166,12 +166,12 @@ def _lacks(state: MasterState, run: Run, executor: str, hosts: list[str]) -> str
 
 
 def proposed(state: MasterState, name: str, move: Move, aim: Aim = Aim.MOVE) -> Plan | str:
-    """The plan of a strategy, or why there is none; a strategy that raises is named.
+    """Return the plan of a strategy, or why there is none, with the name of a strategy that raises.
 
     Args:
-        state: guards the call, and says what the strategy's offer declares.
+        state: guards the call, and holds the declarations of the strategy's offer.
         name: of the strategy.
-        move: to be planned; it is given its options.
+        move: to be planned; the strategy's options are added to it.
         aim: of the plan.
     """
 
@@ -193,7 +193,7 @@ def proposed(state: MasterState, name: str, move: Move, aim: Aim = Aim.MOVE) -> 
 
 
 def _strange_executor(state: MasterState, name: str, plan: Plan) -> str:
-    """Return what is wrong with an executor of a plan that its own offer lacks; "": nothing."""
+    """Return the fault of a plan that names an executor its own offer lacks; "": none."""
     own = state.declared.executors.get(name)
     images = [step.image for step in plan.steps if isinstance(step, Commit) and step.image]
     for executor in [*(executor for executor, _ in executors_of(plan)), *images]:
@@ -204,7 +204,7 @@ def _strange_executor(state: MasterState, name: str, plan: Plan) -> str:
 
 
 def destination_node(plan: Plan, move: Move) -> str:
-    """The name under which the node of the destination runs, without its namespace."""
+    """Return the name of the destination's node, without its namespace."""
     starts = (step for step in plan.steps if isinstance(step, Start))
     aliases = [step.node_name for step in starts if step.instance == move.destination]
     return next(iter(aliases), "") or move.spec.name

@@ -1,4 +1,4 @@
-"""The steps of a plan: what is asked of a slave for each, and when each is done or has failed."""
+"""Steps of a migration plan: the order for each, and its outcome."""
 
 from __future__ import annotations
 
@@ -46,12 +46,12 @@ _TITLES: Final[Mapping[type[Step], str]] = {
     Stop: "stopping {0.instance} on {0.host}",
     Execute: "the step {0.executor!r} of the migration strategy on {0.host}",
 }
-#: Of a host that answers nothing, and may never do so again.
+#: Conditions of a host that does not answer, and may never answer again.
 _AWAY: Final = (HostCondition.LOST, HostCondition.LEFT, HostCondition.DETACHED)
 
 
 def give_order(state: MasterState, run: Run, step: Step, now: float) -> None:
-    """Ask the slave for what the step needs; the nodes themselves, in a handoff."""
+    """Send the order of a step to its slave, or in a handoff to the nodes themselves."""
     if isinstance(step, Commit | AwaitReady | AwaitReleased):
         return
     if isinstance(step, Configure):
@@ -84,7 +84,7 @@ def _arguments(run: Run, step: Execute) -> Mapping[str, Any]:
 
 
 def note_result(run: Run, result: Mapping[str, Any]) -> None:
-    """What an executor has answered is for those of later steps."""
+    """Keep the result of an executor for those of later steps."""
     step = run.step_in_hand
     if isinstance(step, Execute):
         run.results[step.executor] = result
@@ -119,10 +119,10 @@ def _order_start(state: MasterState, run: Run, step: Start, host: Host, now: flo
 
 
 def _in_the_way(state: MasterState, run: Run, step: Start, now: float) -> bool:
-    """Another instance of the name may still run, and the plan does not allow two at a time.
+    """Return True if another instance of the name may run, and the plan does not allow two.
 
-    A source of which there is an image stands still.
-    On the way back it is stopped, whatever the plan says: the step that did not stop it failed.
+    A source with an image is frozen, so it does not count. On the way back, stop any other instance
+    whatever the plan allows: the step that should have stopped it failed.
     """
     process = state.processes[run.process]
     back = run.undo is not None
@@ -137,9 +137,10 @@ def _in_the_way(state: MasterState, run: Run, step: Start, now: float) -> bool:
 
 
 def give_order_again(state: MasterState, run: Run, step: Step, now: float) -> None:
-    """Order again a start, a stop or a restart policy: one may be lost, and two do no harm.
+    """Repeat the order for a start, a stop or a restart policy, because orders may be lost.
 
-    A start that another instance delayed is ordered as soon as that one has ended.
+    A second order does no harm. A start that another instance delayed is ordered as soon as that
+    one has ended.
     """
     if isinstance(step, Configure):
         handoff.say_again(state, run, step, now)
@@ -155,7 +156,7 @@ def _has_waited(run: Run, step: Step) -> bool:
 
 
 def timed_out(state: MasterState, run: Run, step: Step, now: float) -> str | None:
-    """What the passing of a step's time means: as `outcome_of`."""
+    """Return the outcome of a step after its time-out, as `outcome_of` does."""
     if isinstance(step, Configure):
         return handoff.timed_out(state, run, step, now)
     if isinstance(step, AwaitReleased):
@@ -165,7 +166,7 @@ def timed_out(state: MasterState, run: Run, step: Step, now: float) -> str | Non
 
 @singledispatch
 def outcome_of(step: Any, state: MasterState, run: Run, now: float) -> str | None:
-    """Of the step in hand: None: not yet; "": done; else why it failed."""
+    """Return the outcome of the current step: None: pending; "": done; else the failure."""
     raise TypeError(step)
 
 
@@ -175,7 +176,7 @@ def _(step: Start, state: MasterState, run: Run, now: float) -> str | None:
         return f"{step.instance} ended on {step.host}: {run.how_ended(step.instance)}"
     instance = state.instances.get(step.instance.number)
     if instance is None:
-        return None  # what is in its way has to end first
+        return None  # another instance has to end first
     if run.answer is not None and not run.answer[0]:
         return f"{step.host} refused to start {step.instance}: {run.answer[1]}"
     return DONE if instance.runs else None
@@ -228,8 +229,8 @@ def _(step: Commit, state: MasterState, run: Run, now: float) -> str | None:
 def _(step: Execute, state: MasterState, run: Run, now: float) -> str | None:
     if run.answer is None:
         away = state.hosts.condition_of(state.hosts.by_name[step.host]).words(*_AWAY)
-        # Who stands still meanwhile is not to wait for a time-out that may be long. On a way that
-        # has to be gone to its end, the host is waited for as long as somebody is there.
+        # A frozen instance must not wait for a long time-out. A plan that may not stop waits for
+        # the host as long as an instance of it may be there.
         turns = run.undo is None and not run.committed
         return f"{step.host} {away}" if away and (turns or nobody_there(state, run, step)) else None
     accepted, message = run.answer
@@ -237,9 +238,9 @@ def _(step: Execute, state: MasterState, run: Run, now: float) -> str | None:
 
 
 def nobody_there(state: MasterState, run: Run, step: Execute) -> bool:
-    """Whether a host is away, and the instances of a move that it held have ended or count as lost.
+    """Return True if a host is away, and its instances of a migration have ended or count as lost.
 
-    An executor of it could do nothing for them, and its host may never come back.
+    An executor could do nothing for them there, and the host may never return.
     """
     host = state.hosts.by_name[step.host]
     if run.aim is not Aim.MOVE or state.hosts.condition_of(host) not in _AWAY:

@@ -1,1 +1,1 @@
-"""What the master does after a restart, and while its journal cannot be written."""
+"""Recovery: restart of the master, journal gap, journal stall."""

@@ -1,19 +1,18 @@
-"""What the journal has lost, as far as the hosts show it, and what the master does about it.
+"""Journal gap: records that the journal has lost, as far as hosts show, and the master's response.
 
-A power failure (with `sync: normal`), a damaged write-ahead log or an older copy put back take the
-newest part of a journal without a word. What was decided in it is unknown: who was submitted,
-where something runs. A process that is queued by what is left of the journal may run on a host
-that has not been heard yet. So no work is given
+A power failure (with `sync: normal`), a damaged write-ahead log or a restored older copy silently
+removes the newest part of a journal. Its decisions are unknown: submissions, and the hosts on which
+instances run. A process that is queued by the rest of the journal may run on a host that has not
+reported yet. So the master assigns no work
 
-- after a fall of the machine, until every host that the journal knows has come back or is lost;
+- after a reboot of the machine, until every host in the journal has rejoined or is lost;
 - once a host has seen more of the journal than there is, for one lease from the master's start.
 
-What runs unknown is stopped when its host registers, and what is queued under its name waits for
-that end.
+An unknown instance is stopped when its host registers, and a queued process of the same name waits
+for that end.
 
-A master that is killed or stopped while it waits leaves that to the next one: it is an intent,
-`unheard`, until it has been waited for. A loss that hosts told of is waited for anew, for a lease
-from the next start, as they tell it to one master only.
+A master that ends while it waits leaves the wait to the next one, as an intent `unheard`. A loss
+that hosts have shown is waited for again, for a whole lease.
 """
 
 from __future__ import annotations
@@ -31,34 +30,35 @@ _KEY: Final = "unheard"
 
 
 def begin(state: MasterState, newest: int, now: float, *, fell: bool) -> None:
-    """A master starts.
+    """Begin the wait of a master that starts.
 
     Args:
         state: as it was restored.
         newest: sequence of the newest record that the journal holds.
-        fell: the machine was started anew, and the last master had not stopped before.
+        fell: the machine was rebooted, and the last master had not stopped before.
 
-    Then `intent` is to become durable, together with what tells the next start from this one.
+    Afterwards `intent` is to become durable, together with the mark that distinguishes the next
+    start from this one.
     """
     state.tail.newest, state.tail.started = newest, now
     state.tail.fell = state.tail.fell or fell
 
 
 def restore(state: MasterState, cluster: Mapping[str, Mapping[str, Any]]) -> None:
-    """Take over what a former master had still to wait for, from the intents `cluster`."""
+    """Take over the wait of a former master from the intents `cluster`."""
     kept = cluster.get(_KEY, {})
     state.tail.fell, state.tail.short = bool(kept.get("fell")), bool(kept.get("short"))
 
 
 def intent(state: MasterState) -> Intent:
-    """What the next master has to wait for, were it to start now."""
+    """Return the intent with the conditions that a master started now would wait for."""
     tail = state.tail
     waits = {"fell": tail.fell, "short": tail.short}
     return Intent("cluster", _KEY, waits if any(waits.values()) else None)
 
 
 def review(state: MasterState, now: float) -> None:
-    """What has been waited for is done with, for the next master too."""
+    """End the waits that are over, in the journal too."""
     tail = state.tail
     before = (tail.fell, tail.short)
     if not any(before):
@@ -70,13 +70,13 @@ def review(state: MasterState, now: float) -> None:
 
 
 def note_seen(state: MasterState, host: str, seen: int, now: float) -> None:
-    """A host says how much of the journal a former run of this master had said there was."""
+    """Compare the journal with the newest record that a host has seen, and begin a wait."""
     tail = state.tail
     lost = seen - tail.newest
     if lost <= tail.lost:
         return
     tail.lost = lost
-    state.skip_numbers(state.next_instance + lost)  # each may have told of a new instance
+    state.skip_numbers(state.next_instance + lost)  # each may have held a new instance
     left = tail.started + state.settings.lease - now
     if left > 0 and not tail.short:
         tail.short = True
@@ -97,7 +97,7 @@ def note_seen(state: MasterState, host: str, seen: int, now: float) -> None:
 
 
 def why_no_work(state: MasterState, now: float) -> str:
-    """Why nobody is given work just now; "" if they may be."""
+    """Return why the master assigns no work now; "" if it does."""
     review(state, now)
     if state.tail.short:
         return "the journal has lost its newest records: the master waits for all hosts to report"

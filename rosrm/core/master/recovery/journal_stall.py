@@ -1,7 +1,7 @@
-"""What may be taken in while nothing can be decided, because no decision could be made durable.
+"""Journal stall: intake of readings while no decision can be made durable.
 
-Time stands still for the core meanwhile: its clock is not that of the outside. So no deadline
-passes and no host falls silent because of a full disk; what was due is due when it goes on.
+The core's own clock stops during a stall. So no deadline passes, and no host becomes lost because
+of a full disk; deadlines continue where they were when the stall ends.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from rosrm.core.master.state.hosts import HostCondition
 
 
 def note_readings(state: MasterState, event: happened.ReadingsReceived, now: float) -> None:
-    """Note a batch of readings: they tell which hosts live, and decide nothing by themselves.
+    """Store a batch of readings: they renew the last contact of hosts, and decide nothing.
 
-    A host that was suspect is heard again, and is told so with the next beat: what runs there may
-    have to stop otherwise. What a lost one brings back must be decided: it stays lost.
+    A suspect host becomes up again, and the next beat shows it so; otherwise instances there might
+    have to stop. The rejoin of a lost host needs a decision, so the host stays lost.
     """
     take_readings(state.hosts, event, now)
     table = state.hosts

@@ -1,4 +1,4 @@
-"""The state as the journal's intents have it, at the start of a master."""
+"""Restoration of the state from the journal's intents, at the start of a master."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ _Table = Mapping[str, Mapping[str, Any]]
 
 
 def restore(state: MasterState, intents: Callable[[str], _Table], now: float) -> None:
-    """Fill an empty state with what was intended.
+    """Fill an empty state with the intents.
 
-    Nothing is started or stopped here: processes that run are expected on their hosts, and are
-    compared with what those hold when their slaves register. A migration under way goes on with the
-    step that was in hand, which is given once more; every step can be.
+    This starts and stops nothing. Running processes are expected on their hosts, and are compared
+    with the instances there when the slaves register. A migration under way continues with its
+    current step, whose order is repeated; every step can be repeated.
 
     `intents` gives the journal's table of a name; the state must know the wall clock.
     """
@@ -58,7 +58,7 @@ def restore(state: MasterState, intents: Callable[[str], _Table], now: float) ->
 
 def _restore_process(state: MasterState, item: Mapping[str, Any], now: float) -> Process:
     phase, exit_code = ProcessPhase(item["phase"]), item["exit_code"]
-    wall = float(item.get("since", state.wall))  # older journals say nothing of it
+    wall = float(item.get("since", state.wall))  # older journals lack it
     process = Process(
         spec_from_dict(item["spec"]), int(item["order"]), phase,
         now - max(0.0, state.wall - wall), wall=wall,  # the clock may have been set back
@@ -90,7 +90,7 @@ def _restore_instances(
     state: MasterState, process: Process, item: Mapping[str, Any],
     move: Mapping[str, Any] | None, now: float,
 ) -> None:  # fmt: skip
-    """Put on the books what may still run: the owner, what moves, and any other to be stopped."""
+    """Add the instances that may still run: the owner, moving ones, and others to be stopped."""
     aliases, standby = item.get("node_names", {}), item.get("standby")
     moving = _numbers_of(move) | ({int(standby["destination"])} if standby else frozenset())
     ended = move.get("ended", {}) if move is not None else {}
@@ -124,14 +124,14 @@ def _expect_to_run(state: MasterState, process: Process, now: float) -> None:
 def _restore_standby(
     state: MasterState, process: Process, item: Mapping[str, Any], now: float
 ) -> None:
-    """It is told of its primary again, and says how far it is."""
+    """Restore the standby of a process; it learns its primary again and reports its phase."""
     standby = item.get("standby")
     if standby is None or int(standby["destination"]) not in process.instances:
         return
     try:
         run = _run_of(state, process, standby, now)
     except (KeyError, TypeError, ValueError):
-        state.instances[int(standby["destination"])].stopping = True  # another one follows
+        state.instances[int(standby["destination"])].stopping = True  # it is replaced
         return
     run.index = 0
     state.standbys[process.name] = run
@@ -141,7 +141,7 @@ def _restore_standby(
 
 
 def _numbers_of(move: Mapping[str, Any] | None) -> frozenset[int]:
-    """The instances of a move; none, where it cannot be taken up again."""
+    """Return the instances of a migration; none, where it cannot be continued."""
     if move is None or "plan" not in move:
         return frozenset()
     return frozenset({int(move["source"]), int(move["destination"]), *map(int, move["launched"])})
@@ -151,7 +151,7 @@ def _restore_move(
     state: MasterState, process: Process, item: Mapping[str, Any], move: Mapping[str, Any],
     now: float,
 ) -> bool:  # fmt: skip
-    """Take a move up again; False: nobody can, and it is over."""
+    """Continue a migration; return False if that is impossible, and drop it."""
     try:
         run = _run_of(state, process, move, now)
     except (KeyError, TypeError, ValueError) as fault:
@@ -177,8 +177,8 @@ def _restore_move(
 def _run_of(state: MasterState, process: Process, move: Mapping[str, Any], now: float) -> Run:
     hosts = state.hosts.by_name
     plan = plan_from_dict(move["plan"])
-    wall = float(move.get("wall", state.wall))  # older journals say nothing of it
-    started = now - max(0.0, state.wall - wall)  # it may have been set back
+    wall = float(move.get("wall", state.wall))  # older journals lack it
+    started = now - max(0.0, state.wall - wall)  # the clock may have been set back
     run = Run(
         process.name, plan, move["strategy"], InstanceId(process.name, int(move["source"])),
         hosts[move["source_host"]], InstanceId(process.name, int(move["destination"])),
@@ -199,9 +199,9 @@ def _run_of(state: MasterState, process: Process, move: Mapping[str, Any], now: 
 def _forget_move(
     state: MasterState, process: Process, move: Mapping[str, Any], fault: str, now: float
 ) -> None:
-    """The owner of the name goes on, and any other instance is stopped.
+    """Drop a migration: the owner of the name runs on, any other instance is stopped.
 
-    The source may have been told to stop already.
+    The source may have been ordered to stop already.
     """
     source = state.instances.get(int(move["source"]))
     if source is not None and process.owner == source.id.number:

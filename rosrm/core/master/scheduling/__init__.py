@@ -1,4 +1,4 @@
-"""On which host a process is placed.
+"""Placement of processes on hosts.
 
 filters.py      the placement rules: which hosts may take a process, and why not the others
 ranking.py      filter, score, pick

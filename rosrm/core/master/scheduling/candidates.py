@@ -1,4 +1,4 @@
-"""Some hosts beside one demand: what the placement filters and the scoring policies judge."""
+"""Candidates: some hosts and one demand, the input of placement filters and scoring policies."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Columns = slice | IntArray
 
 @dataclass(slots=True)  # not frozen: that costs a microsecond for each of thousands
 class Candidates:
-    """Some hosts, n of them, beside one demand.
+    """Some hosts, n of them, with one demand.
 
     The arrays hold all that assignments change. With an array of columns they are copies.
 
@@ -25,7 +25,7 @@ class Candidates:
         need: (R, n) fractions of the capacity of each host; inf where it lacks the resource.
         cells: (planes, R, n) as in `HostColumns`.
         busy: (R, n) reading plus reservations.
-        processes: (n,) held or promised.
+        processes: (n,) held or reserved.
         bound: (n,) most processes.
         empty: True for hosts as if no process ran on them.
     """
@@ -55,7 +55,7 @@ def candidates(
     table: HostTable, demand: Demand, need: FloatArray, columns: Columns,
     more: IntArray | None = None,
 ) -> Candidates:  # fmt: skip
-    """Return some hosts as they are, beside a demand.
+    """Return some hosts in their current condition, with a demand.
 
     Args:
         need: (R, H) fractions, of every host.
@@ -72,7 +72,7 @@ def candidates(
 
 
 def as_if_empty(table: HostTable, demand: Demand, columns: Columns) -> Candidates:
-    """Return some hosts as if no process ran on them, beside a demand."""
+    """Return some hosts as if no process ran on them, with a demand."""
     need = table.fractions(demand.amounts, demand.estimated)
     hosts = candidates(table, demand, need, columns)
     hosts.busy, hosts.processes = np.zeros_like(hosts.busy), np.zeros_like(hosts.processes)

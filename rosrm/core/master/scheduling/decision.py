@@ -1,7 +1,7 @@
-"""Why this host and not the others: the outcome of a ranking, with its reasons.
+"""Placement decisions: the outcome of a ranking, with the reasons for and against hosts.
 
-Many decisions are made and few are read, so a decision copies what was known of the few hosts that
-it names, and spells its verdicts out when somebody reads them.
+Most decisions are never read. So a decision copies the values of the few hosts that it names, and
+formats its verdicts only when they are read.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _NAMED_HOSTS: Final = 16
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What was found of one host.
+    """The verdict on one host.
 
     Attributes:
         verdict: "chosen", "fits", "full", "vetoed" or "excluded".
@@ -43,7 +43,7 @@ class Verdict:
     reason: str
 
     def to_json(self) -> dict[str, Any]:
-        """As it stands in the event record."""
+        """Return the verdict as the event record has it."""
         return {
             "name": self.host, "verdict": self.verdict, "score": self.score, "reason": self.reason,
         }  # fmt: skip
@@ -51,11 +51,11 @@ class Verdict:
 
 @dataclass(slots=True)  # not frozen: that costs a microsecond for each of thousands
 class Moment:
-    """What was known of n hosts when a decision was made; copies, which change no more.
+    """The values of n hosts at the time of a decision; copies, which no longer change.
 
     Attributes:
         plugins: guards the calls of the policy.
-        hosts: with copies of what assignments change.
+        hosts: with copies of the arrays that assignments change.
         value: (n,) score plus tie-break; inf where it did not fit.
         standing: the first filter that each failed, of those that assignments do not change.
     """
@@ -67,7 +67,7 @@ class Moment:
     standing: tuple[Refusal | None, ...]
 
     def scores(self) -> Scores | None:
-        """The policy's judgement once more (it is pure), for its reasons; None: it has none."""
+        """Return the policy's scores again (it is pure), for their reasons; None: none."""
         if self.policy is None or not len(self.hosts):
             return None
         name, policy = self.policy
@@ -77,7 +77,7 @@ class Moment:
                 "scoring", name, "score", lambda: required(policy.score(hosts, process), Scores)
             )
         except PluginError:
-            return None  # the decision is made already
+            return None  # the decision was made before
 
     def refusals(self) -> list[Refusal | None]:
         """Return for each host the first filter that it failed."""
@@ -86,14 +86,14 @@ class Moment:
 
 
 class Decision(Lazy):
-    """The outcome for one process; as a mapping, it is what stands in the event record.
+    """The outcome for one process; as a mapping, it has the form of the event record.
 
     Attributes:
-        kind: "assigned", "waits", "migrated", "stayed" (it was to move, and did not), ...
+        kind: "assigned", "waits", "migrated", "stayed" (its migration was undone), ...
         column: of the chosen host; -1: none fits now.
         policy: name of the policy that decided, and which was left out.
         needs: base units by resource.
-        omitted: how many hosts had which verdict beside those that are named.
+        omitted: verdict to the number of hosts with it, beside those that are named.
     """
 
     __slots__ = ("_moment", "column", "kind", "omitted", "policy")
@@ -115,11 +115,11 @@ class Decision(Lazy):
 
     @property
     def verdicts(self) -> tuple[Verdict, ...]:
-        """Of up to 16 hosts; the chosen one first."""
+        """Return the verdicts on up to 16 hosts; the chosen one first."""
         return _verdicts(self._moment, chosen=self.column >= 0)
 
     def render(self) -> Mapping[str, Any]:
-        """As it stands in the event record."""
+        """Return the decision as the event record has it."""
         verdicts = self.verdicts
         return {
             "kind": self.kind,
@@ -132,7 +132,7 @@ class Decision(Lazy):
 
 
 def decide(ranking: Ranking, *, chosen: int | None = None) -> Decision:
-    """The outcome of a ranking with its reasons.
+    """Return the outcome of a ranking with its reasons.
 
     Args:
         ranking: refreshed.
@@ -143,7 +143,7 @@ def decide(ranking: Ranking, *, chosen: int | None = None) -> Decision:
     if len(listed) <= _NAMED_HOSTS:
         moment = _moment(ranking, _first(column, listed))
         return Decision(column, ranking.policy_name, moment, EMPTY)
-    # Of many hosts only those that were nearly chosen are of interest, and time is short.
+    # With many hosts, only the runners-up are named, because this path must be quick.
     nearly = ranking.lowest() if column >= 0 else listed[:_NAMED_HOSTS]
     moment = _moment(ranking, _first(column, nearly))
     named, fitting = len(moment.value), int(np.count_nonzero(ranking.value < np.inf))
@@ -156,7 +156,7 @@ def decide(ranking: Ranking, *, chosen: int | None = None) -> Decision:
 
 
 def _first(column: int, columns: Sequence[int]) -> list[int]:
-    """The columns, the chosen one first; one that is none of them takes the last one's place."""
+    """Return the columns, the chosen one first; a chosen one outside replaces the last."""
     if column < 0:
         return list(columns)
     others = [other for other in columns if other != column]
@@ -164,7 +164,7 @@ def _first(column: int, columns: Sequence[int]) -> list[int]:
 
 
 def verdict_of(ranking: Ranking, column: int) -> Verdict:
-    """What is found of one host."""
+    """Return the verdict on one host."""
     return _verdicts(_moment(ranking, [column]), chosen=False)[0]
 
 
@@ -178,7 +178,7 @@ def _moment(ranking: Ranking, columns: list[int]) -> Moment:
 
 
 def _verdicts(moment: Moment, *, chosen: bool) -> tuple[Verdict, ...]:
-    """The verdicts on the hosts of a moment; `chosen`: the first one was."""
+    """Return the verdicts on the hosts of a moment; `chosen`: the first host was chosen."""
     scores, refused = moment.scores(), moment.refusals()
     return tuple(
         _verdict(moment, scores, refused[at], at, chosen=chosen and at == 0)
@@ -200,7 +200,7 @@ def _verdict(
 
 
 def _said(moment: Moment, scores: Scores | None, at: int, *, veto: bool) -> str:
-    """The policy's own reason; one that raises says nothing."""
+    """Return the policy's own reason, or a note that the policy failed."""
     if scores is None or moment.policy is None:
         return ""
     hook, reason = ("veto_reason", scores.veto_reason) if veto else ("reason", scores.reason)

@@ -1,4 +1,4 @@
-"""Whether any known host may ever take a process, and why not: it is set aside then."""
+"""Feasibility: hosts that may ever take a process; one that fits none is set aside."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _LASTING: Final = tuple(one for one in FILTERS if one.lasts is not Lasts.MOMENT)
 
 
 def why_never(table: HostTable, demand: Demand) -> str:
-    """Return why no host may take a process before something lasting changes; "" if one may.
+    """Return why no host may take a process before a lasting change; "" if one may.
 
     A host that is away may not, as long as another one is there: a process that waits for that host
     must not block the others.
@@ -60,7 +60,7 @@ def refused_everywhere(table: HostTable, demand: Demand) -> bool:
 
 
 def may_ever_take(table: HostTable, demand: Demand) -> BoolArray:
-    """Return which hosts, (H,), fit a demand if nothing else runs there.
+    """Return a mask, (H,), of the hosts that fit a demand if nothing else runs there.
 
     A host without a reading counts, because its limits are not known yet; a pruned one does not.
     """
@@ -85,7 +85,7 @@ def _fit_empty(hosts: Candidates) -> BoolArray:
 
 
 def _possible(table: HostTable, demand: Demand) -> BoolArray:
-    """Return which hosts, (H,), may take a demand before something lasting changes."""
+    """Return a mask, (H,), of the hosts that may take a demand before a lasting change."""
     hosts = _every(table, demand)
     possible = _fit_empty(hosts) & passing([EXCLUSION], hosts)
     there = passing(_AWAY, hosts)
@@ -108,7 +108,7 @@ def _host_by_host(filters: Sequence[Filter], table: HostTable, demand: Demand) -
 
 
 def _unmeasured(table: HostTable, demand: Demand) -> str:
-    """Return which resource no host reports, with the nearest one that is; "" if there is none."""
+    """Return a sentence: no host reports a resource; name the nearest one. "": all are reported."""
     for resource in sorted(demand.declared - set(table.resources)):
         near = get_close_matches(resource, table.resources, n=1)
         hint = f"; did you mean {near[0]!r}?" if near else ""

@@ -1,4 +1,4 @@
-"""The placement rules: which hosts may take a process, and why another host may not.
+"""Placement filters: the rules by which hosts may take a process, with the reasons against a host.
 
 `FILTERS` is the whole list. Each entry has a mask over many hosts, by which a ranking chooses, and
 beside it the reason against one host, which `rosrm explain` prints. A new rule is one more entry.
@@ -20,13 +20,13 @@ from rosrm.wording import amount, counted
 
 #: Sums of fractions are compared with this much tolerance.
 _CLOSE: Final = 1e-9
-#: As plain numbers, because a comparison with those takes half the time.
+#: As plain numbers, because a comparison with them takes half the time.
 _SUSPECT, _EXPECTED = int(HostCondition.SUSPECT), int(HostCondition.EXPECTED)
 _FIRST_GONE: Final = int(HostCondition.LOST)
 
 
 class Lasts(Enum):
-    """How long a host fails a filter."""
+    """Duration for which a host fails a filter."""
 
     MOMENT = "until a message or the end of a process changes it"
     RETURN = "until the slave reports to this run of the master, which is expected"
@@ -70,7 +70,7 @@ class Refusal:
 def passing(
     filters: Iterable[Filter], hosts: Candidates, among: BoolArray | None = None
 ) -> BoolArray:
-    """Return which hosts, of all or of those that are True in `among`, pass all of some filters."""
+    """Return the mask of hosts (of all, or of those True in `among`) that pass the filters."""
     passes = among
     for one in filters:
         mask = one.mask(hosts)
@@ -80,7 +80,7 @@ def passing(
 
 
 def refusals(filters: Iterable[Filter], hosts: Candidates) -> list[Refusal | None]:
-    """Return for each host the first of some filters that it fails."""
+    """Return for each host the first of the given filters that it fails."""
     found: list[Refusal | None] = [None] * len(hosts)
     for one in filters:
         mask = one.mask(hosts)
@@ -145,7 +145,7 @@ def _why_no_resources(hosts: Candidates, row: int) -> str:
     return f"it has no {min(hosts.demand.declared - there)}"
 
 
-# --- whether the host is there ----------------------------------------------------------------
+# --- presence of the host ---------------------------------------------------------------------
 
 
 def _is_not_gone(hosts: Candidates) -> BoolArray:
@@ -172,7 +172,7 @@ def _why_not_open(hosts: Candidates, row: int) -> str:
     return "it is being drained" if hosts.host(row).draining else "it is cordoned"
 
 
-# --- what the host reports --------------------------------------------------------------------
+# --- reports of the host ----------------------------------------------------------------------
 
 
 def _is_fresh(hosts: Candidates) -> BoolArray:
@@ -208,7 +208,7 @@ def _why_not_asked(_hosts: Candidates, _row: int) -> str:
     return "it has not asked for work yet"
 
 
-# --- what an assignment changes ---------------------------------------------------------------
+# --- filters that an assignment changes -------------------------------------------------------
 
 
 def _has_slot(hosts: Candidates) -> BoolArray:
@@ -221,7 +221,7 @@ def _why_no_slot(hosts: Candidates, row: int) -> str:
 
 
 def _has_room(hosts: Candidates) -> BoolArray:
-    # A host without a resource has NaN there, which is over nothing.
+    # A host without a resource has NaN there, which exceeds no limit.
     limits = hosts.cells[LIMIT] - (hosts.demand.headroom - _CLOSE)
     has_room: BoolArray = ~np.logical_or.reduce(hosts.busy + hosts.need > limits)
     return has_room
@@ -247,7 +247,7 @@ def _why_no_room(hosts: Candidates, row: int) -> str:
 # --- the list ---------------------------------------------------------------------------------
 
 EXCLUSION: Final = Filter("exclusion", _is_not_excluded, _why_excluded, Lasts.PERMANENT)
-#: In this order: of several that a host fails, the first one says why.
+#: In order: if a host fails several, the first one gives the reason.
 FILTERS: Final = (
     EXCLUSION,
     Filter("labels", _has_labels, _why_no_labels, Lasts.PERMANENT),

@@ -1,4 +1,4 @@
-"""Hosts as scoring policies see them, and the check of what a policy answers."""
+"""Views of hosts for scoring policies, and the check of a policy's scores."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ T = TypeVar("T")
 
 
 def host_view(hosts: Candidates) -> HostView:
-    """Return some hosts as a policy sees them."""
+    """Return the view of some hosts for a policy."""
     return HostView(
         _Names(hosts), hosts.resources, _read_only(hosts.busy.T),
         _read_only(hosts.cells[LIMIT].T), _read_only(hosts.cells[CAPACITY].T),
@@ -30,19 +30,19 @@ def host_view(hosts: Candidates) -> HostView:
 
 
 def process_view(hosts: Candidates) -> ProcessView:
-    """Return a process with what it needs of each host, as a policy sees it."""
+    """Return the view of a process for a policy, with its needs on each host."""
     spec = declared_spec(hosts.demand.spec, hosts.demand.reads)
     return ProcessView(spec, _read_only(hosts.need.T))
 
 
 def _read_only(view: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Close a view of a standing array to a policy that would write into it."""
+    """Make a view of a standing array read-only, because a policy might write into it."""
     view.flags.writeable = False
     return view
 
 
 class _PerHost(Sequence[T]):
-    """Something of each host on demand: a thousand of them are not listed for each decision."""
+    """A sequence over hosts, made on demand: it costs too much to list a thousand per decision."""
 
     def __init__(self, hosts: Candidates) -> None:
         self._hosts = hosts
@@ -75,7 +75,7 @@ class _Labels(_PerHost[Mapping[str, str]]):
 
 
 def sound(scores: Scores, hosts: HostView, fits: BoolArray) -> tuple[FloatArray, BoolArray | None]:
-    """The value and veto of an answer that keeps to the contract; raises for any other."""
+    """Return value and veto of a policy's answer; raise PluginError if it breaks the contract."""
     size = len(fits)
     required(scores, Scores)
     try:
@@ -107,7 +107,7 @@ def sound(scores: Scores, hosts: HostView, fits: BoolArray) -> tuple[FloatArray,
 
 
 def _unread_by(hosts: HostView, row: int) -> str:
-    """Return what a host does not measure, as that is where a NaN comes from; "": nothing."""
+    """Return the resources that a host does not measure, the source of a NaN; "": none."""
     names = [
         name for name, usage in zip(hosts.resources, hosts.usage[row], strict=True)
         if np.isnan(usage)

@@ -1,9 +1,9 @@
-"""Which host takes a process: filter, score, pick.
+"""Ranking of hosts for a process: filter, score, pick.
 
 A host fits when it passes every filter of `filters.py` and the policy does not veto it. Among the
-hosts that fit the lowest score goes first (Eq. 1 of the paper with the policy `weighted`). A
-`Ranking` keeps the scores of one demand, so that a queue of equal processes is judged once and then
-only where an assignment has changed a host.
+hosts that fit, the one with the lowest score goes first (Eq. 1 of the paper with the policy
+`weighted`). A `Ranking` keeps the scores of one demand. So a queue of equal processes is judged
+once, and then only where an assignment has changed a host.
 
 This module is the hot path of the master: a ranking is made once for each demand and batch of
 readings (one pass over all hosts), and one refresh and one argmin follow for each assignment.
@@ -34,9 +34,9 @@ from rosrm.extensions.plugin_calls import PluginCalls
 
 #: Equal scores: the host with fewer processes goes first, then the one registered first.
 TIE: Final = 1e-9
-#: Of many hosts, so many that were nearly chosen are named beside the one that was.
+#: Number of runners-up that an explanation names beside the chosen host, of many hosts.
 RUNNERS_UP: Final = 3
-#: Equal processes that a host may take one after the other are judged so many at a time.
+#: Number of equal processes on one host that are judged in one call.
 _AT_A_TIME: Final = 8
 
 #: A scoring policy with its name.
@@ -49,7 +49,7 @@ class Ranking:
     Attributes:
         need: (R, H) fractions of each host's capacity.
         value: (H,) score plus tie-break; inf where the host does not fit now.
-        judge: the policy that judges; None: every one was left out, all that fit score 0.
+        judge: the policy that judges; None: every policy was left out, each fitting host scores 0.
         plugins: guards every call of a policy.
         failure: why policies were left out.
     """
@@ -78,23 +78,23 @@ class Ranking:
 
     @property
     def judge(self) -> NamedPolicy | None:
-        """The policy that judges now, with its name."""
+        """Return the policy that judges now, with its name."""
         return self._left[0] if self._left else None
 
     @property
     def policy_name(self) -> str:
-        """The name of the policy that judges, and which was left out, and why."""
+        """Return the name of the policy that judges, and the policies left out, with reasons."""
         name = self._left[0][0] if self._left else ""
         if not self.failure:
             return name
         return f"{name} ({self.failure})" if name else self.failure
 
     def took(self) -> None:
-        """The newest change of the table was an assignment of this very demand."""
+        """Note that the newest change of the table was an assignment of this demand."""
         self._own = len(self.table.touched)
 
     def refresh(self) -> None:
-        """Judge anew the columns that assignments have changed since."""
+        """Judge again the columns that assignments have changed since."""
         touched = self.table.touched
         if len(touched) == self._seen:
             return
@@ -109,12 +109,12 @@ class Ranking:
         self._judge(np.fromiter(columns, np.int64, len(columns)))
 
     def best(self) -> int:
-        """The column with the lowest value; -1: none fits."""
+        """Return the column with the lowest value; -1: none fits."""
         best = self.lowest()
         return best[0] if best else -1
 
     def lowest(self) -> list[int]:
-        """The few columns that fit with the lowest values, best first."""
+        """Return the few fitting columns with the lowest values, best first."""
         if self._lowest is None:
             self._lowest = self._find_lowest() if len(self.value) else []
         return self._lowest
@@ -134,11 +134,11 @@ class Ranking:
         return found
 
     def fits(self, column: int) -> bool:
-        """True: this host may take it now."""
+        """Return True if this host may take the process now."""
         return bool(self.value[column] < np.inf)
 
     def standing_refusals(self, columns: Sequence[int]) -> tuple[Refusal | None, ...]:
-        """Return for each host the first filter that it fails, of those that last with this."""
+        """Return for each host the first failed filter that assignments do not change."""
         new = [
             column for column in columns
             if not self._standing[column] and column not in self._refusals
@@ -160,8 +160,8 @@ class Ranking:
     def _judge_ahead(self, column: int) -> None:
         """Set `value` of a column that just took a process of this demand.
 
-        Thousands of equal processes may be waiting, so what the host will be worth with the next
-        few of them is judged in one go, as if it were several hosts.
+        Thousands of equal processes may be waiting. So one call judges the host with the next few
+        of them, as if it were several hosts.
         """
         values = self._ahead.get(column)
         if not values:
@@ -174,9 +174,9 @@ class Ranking:
         self.value[column] = values.pop()
 
     def _value(self, columns: Columns, more: IntArray | None = None) -> FloatArray | None:
-        """What some hosts are worth; None: the policy was left out, all are to be judged anew.
+        """Return the values of some hosts; None: the policy was left out, judge all hosts again.
 
-        `more`, (n,), supposes so many further processes of this demand on each host.
+        `more`, (n,), adds this number of further processes of this demand to each host.
         """
         judged = candidates(self.table, self.demand, self.need, columns, more)
         fits = passing(BY_ASSIGNMENT, judged, self._standing[columns])
@@ -199,14 +199,14 @@ class Ranking:
         return np.where(fits, value + tie, np.inf)
 
     def _leave_out(self, error: PluginError) -> None:
-        """The policy raised or answered nonsense: the next one decides, or none, and it is said."""
+        """Leave out a policy that raised or broke its contract: the next one decides, or none."""
         name, _ = self._left.pop(0)
         reason = f"left out: {name!r}, {error}"
         self.failure = f"{self.failure}; {reason}" if self.failure else reason
         self._ahead.clear()
 
     def _preferred(self) -> FloatArray:
-        """The values, only those of the best tier of labels that any fitting host is in."""
+        """Return the values of the best tier of labels among fitting hosts; inf elsewhere."""
         if self._tier is None:
             return self.value
         fitting = self.value < np.inf
@@ -217,7 +217,10 @@ class Ranking:
 
 
 def _tiers(table: HostTable, demand: Demand) -> IntArray | None:
-    """(H,) lower goes first: avoided labels count up, preferred ones down; None: all are alike."""
+    """Return the tier of each host, (H,), lower first; None: all are alike.
+
+    Avoided labels count up, preferred labels and hosts count down.
+    """
     spec = demand.spec
     if not spec.preferred_labels and not spec.avoided_labels and not demand.near:
         return None

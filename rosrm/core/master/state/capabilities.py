@@ -1,4 +1,4 @@
-"""What each host answered about each strategy that does not work on every host."""
+"""Capabilities: the answer of each host about each strategy that does not work on all hosts."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ from dataclasses import dataclass, field
 from math import inf
 from typing import Final
 
-#: Numbers of the orders are apart from those of all else: a record that is replayed without a
-#: strategy must not number its orders otherwise.
+#: These orders have numbers of their own, because a recording that is replayed without a strategy
+#: must give the other orders the same numbers.
 BEFORE_FIRST: Final = 1 << 41
 
 
 @dataclass(slots=True)
 class Answer:
-    """What one host says of one strategy.
+    """The answer of one host about one strategy.
 
     Attributes:
         incarnation: of the slave that was asked.
         order: by which it was asked.
         facts: None: it has not answered, or the strategy does not work there.
-        reason: why it does not.
-        ask_at: when it is asked again; inf: there is no need.
+        reason: why the strategy does not work there.
+        ask_at: time at which it is asked again; inf: never.
     """
 
     incarnation: int
@@ -33,7 +33,7 @@ class Answer:
 
 @dataclass(slots=True)
 class Abilities:
-    """What all hosts say of all strategies that are not for every host.
+    """The capabilities of all hosts, for all strategies that do not work on every host.
 
     Attributes:
         answers: by strategy and host.

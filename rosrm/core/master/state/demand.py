@@ -1,4 +1,4 @@
-"""What decides where a process may go."""
+"""Demand of a process: all that placement depends on."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from rosrm.model.values import EMPTY, ProcessSpec
 
 @dataclass(frozen=True, slots=True)
 class Demand:
-    """What decides where a process may go; equal demands share a ranking.
+    """All that the placement of a process depends on; equal demands share a ranking.
 
     Attributes:
         amounts: needs in base units by resource.
         estimated: resources whose amount is a guess, not declared and not measured.
         excluded: host name to the reason why it must not go there.
         headroom: fraction by which a host must stay under each limit.
-        near: hosts that are preferred, as by one more preferred label: a state is kept there.
+        near: hosts with a replica of its snapshot; preferred as by one more preferred label.
         reads: fields of the spec that scoring policies read beyond the standard ones.
         key: equal for processes that every host judges alike.
     """
@@ -47,7 +47,7 @@ class Demand:
 
     @property
     def declared(self) -> frozenset[str]:
-        """Resources that a host must have."""
+        """Return the resources that a host must have."""
         return frozenset(name for name, much in self.amounts.items() if much > 0) - self.estimated
 
 

@@ -1,7 +1,7 @@
-"""The standing arrays of the hosts: one column a host, one row a resource.
+"""Standing arrays of the hosts: one column per host, one row per resource.
 
-They grow by doubling and are never rebuilt; what is known of every host is one block of memory, so
-that a snapshot of a few hosts is one copy.
+They grow by doubling and are never rebuilt. The values of every host lie in one block of memory, so
+that a few hosts can be copied in one step.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
 
-#: Planes of the block, and what stands there for a host that has no such resource.
+#: Planes of the block, and their values for a host that has no such resource.
 USAGE, LOAD, LIMIT, CAPACITY, BUSY = range(5)
 _ABSENT: Final = (np.nan, 0.0, 1.0, np.nan, np.nan)
 
@@ -31,22 +31,22 @@ class HostColumns:
     Attributes:
         resources: names of the rows.
         usage: (R, H) newest reading, fraction; NaN where a host has no such resource.
-        load: (R, H) promised to instances that do not show in the readings yet, fraction.
+        load: (R, H) reservations of instances that the readings do not show yet, fraction.
         limit: (R, H) fraction; 1 where a host has no such resource.
         capacity: (R, H) base units; NaN where a host has no such resource.
         busy: (R, H) usage + load.
         condition: (H,) HostCondition.
-        asking: (H,) it has asked for work since it came up.
-        accepting: (H,) its newest reading says that it is under all its limits.
+        asking: (H,) it has asked for work since its registration.
+        accepting: (H,) by its newest reading it is under all its limits.
         closed: (H,) cordoned or draining.
-        untold: (H,) it was lost, and has not said yet what it holds.
+        untold: (H,) it was lost, and has not reported its instances since.
         stale: (H,) bit i: the reading of slot i, which has a limit, is stale.
-        heard, registered: (H,) time of the newest message; of the registration.
+        heard, registered: (H,) time of the last contact; of the registration.
         period: (H,) seconds between its readings.
-        processes, bound: (H,) held or promised; most of them.
+        processes, bound: (H,) held or reserved; most of them.
         incarnation, sequence: (H,) of the slave's run; of its newest reading.
-        reported: (H,) sequence of the newest status batch that it says it has sent.
-        status_sequence: (H,) sequence of the newest status batch that has come.
+        reported: (H,) sequence of the newest status batch that it claims to have sent.
+        status_sequence: (H,) sequence of the newest status batch that has arrived.
         row_of_slot: (H, RESOURCE_SLOTS) slot of a message -> row here; -1: not in use.
     """
 
@@ -82,7 +82,7 @@ class HostColumns:
         }
 
     def add_column(self) -> int:
-        """Room for one more host; returns its column."""
+        """Add a column for one more host, and return it."""
         if self._count == self._cells.shape[2]:
             cells, lines = self._cells, self._lines
             self._allocate(len(self.resources), 2 * self._count)
@@ -94,7 +94,7 @@ class HostColumns:
         return self._count - 1
 
     def add_resource(self, name: str) -> None:
-        """One more row; no host has this resource yet."""
+        """Add a row; no host has this resource yet."""
         self.resources = (*self.resources, name)
         row = np.empty((len(_ABSENT), 1, self._cells.shape[2]))
         row[:] = np.reshape(_ABSENT, (-1, 1, 1))
@@ -102,7 +102,7 @@ class HostColumns:
         self._trim()
 
     def _trim(self) -> None:
-        """The arrays as views of the columns in use; made anew only when the shape changes."""
+        """Set the arrays as views of the columns in use; called only when the shape changes."""
         self.cells: FloatArray = self._cells[:, :, : self._count]
         self.usage: FloatArray = self.cells[USAGE]
         self.load: FloatArray = self.cells[LOAD]
@@ -128,7 +128,7 @@ class HostColumns:
         self.row_of_slot: IntArray = used["row_of_slot"]
 
     def clear_column(self, column: int) -> None:
-        """The host of a column tells anew which resources it has; what is promised to it stays."""
+        """Clear a column before its host registers its resources again; reservations stay."""
         for plane in (USAGE, LIMIT, CAPACITY, BUSY):
             self.cells[plane, :, column] = _ABSENT[plane]
         self.row_of_slot[column] = -1

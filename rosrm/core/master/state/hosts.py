@@ -1,7 +1,7 @@
-"""The hosts: what they say of themselves, what is promised to them, and who may be given work.
+"""Table of hosts: descriptions, readings, reservations, conditions.
 
-What placement and liveness need of a thousand hosts at once stands in `host_arrays.py`; what is
-asked of one host at a time (its description, its labels) lives in `Host` beside them.
+`host_arrays.py` holds the values that placement and liveness need of a thousand hosts at once. The
+values of single hosts (description, labels) are in `Host`.
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ from rosrm.core.master.state.host_arrays import (
 from rosrm.extensions.plugin_calls import Failing, Plugin
 from rosrm.model.values import HostDescription
 
-#: An estimate, unlike a declared need, fills at most this part of a host's limit: a guess alone
-#: must not keep a process off every host for ever.
+#: An estimate, unlike a declared need, fills at most this share of a host's limit, because a guess
+#: alone must not exclude a process from every host.
 _MOST_GUESSED: Final = 0.5
 
 
 class HostCondition(IntEnum):
-    """How well a host is heard. From LOST on the host is gone until it registers or is heard."""
+    """Liveness of a host; from LOST on the host is gone until it registers or rejoins."""
 
     UP = 0
     SUSPECT = 1
-    EXPECTED = 2  # known from the journal, not heard since this master's start
+    EXPECTED = 2  # known from the journal, no contact since this master's start
     LOST = 3
     LEFT = 4
     DETACHED = 5  # its slave was stopped and left processes running
 
     def words(self, *only: HostCondition) -> str:
-        """Return how a host that is not up stands, without its name; "": in none of `only`."""
+        """Return the condition of a host as a predicate; "" if it is up or not in `only`."""
         return _WORDS.get(self, "") if self in (only or _WORDS) else ""
 
 
@@ -57,23 +57,23 @@ _WORDS: Final[Mapping[HostCondition, str]] = {
 
 @dataclass(slots=True, eq=False)
 class Host:
-    """What is asked of one host at a time.
+    """One host: the values that are read for single hosts.
 
     Attributes:
         column: of this host in the arrays of `HostTable`.
-        instances: numbers of the instances that it holds or was promised.
+        instances: numbers of the instances that it holds or that are assigned to it.
         over_since: resource name to the time since when it is over its limit.
-        over_at: resource name to the time at which it was last seen over its limit; of those whose
-            excess is on record, and whose end is not.
+        over_at: resource name to the time at which it was last seen over its limit; only resources
+            whose excess is on record without its end.
         drained: it is draining, and no process is left on it that can leave.
         pruned: it is in no listing, until it registers.
-        told: kind of a record that is not repeated at once, to when it was made.
-        blocked: why nothing could leave it, by what was to be relieved: as last recorded.
+        told: kind of a record that is not repeated at once, to the time of the record.
+        blocked: cause of an eviction to the last recorded reason why nothing could leave.
         detached_since: time at which its slave was stopped, while it is detached.
         lost_since: time at which it was lost, while it is; of a detached host the time at which its
             lease ends.
-        failing: kind and name of the plugins that fail there, as the slave reports. A probe goes by
-            the resource that it reads.
+        failing: kind and name of the plugins that fail there, as the slave reports. A probe is
+            named after the resource that it reads.
     """
 
     column: int
@@ -93,12 +93,12 @@ class Host:
 
     @property
     def host_id(self) -> int:
-        """The number under which this host reports; 0 is never given."""
+        """Return the number under which this host reports; 0 is never used."""
         return self.column + 1
 
     @property
     def name(self) -> str:
-        """The name of the host."""
+        """Return the name of the host."""
         return self.description.name
 
 
@@ -124,7 +124,7 @@ class HostTable(HostColumns):
     def expect(
         self, name: str, now: float = 0.0, *, cordoned: bool = False, draining: bool = False
     ) -> Host:
-        """Give a host its column before it is heard, so that its number stays across restarts."""
+        """Add a host before its first contact, so that its number stays across restarts."""
         host = Host(self.add_column(), HostDescription(name, 0))
         self.hosts.append(host)
         self.by_name[name] = host
@@ -135,7 +135,7 @@ class HostTable(HostColumns):
         return host
 
     def register(self, description: HostDescription, now: float) -> Host:
-        """Take in a host, or a new run of a known one; its readings are still to come."""
+        """Register a host, or a new run of a known one; its readings are still to come."""
         host = self.by_name.get(description.name) or self.expect(description.name)
         column = host.column
         host.description, host.pruned = description, False
@@ -175,48 +175,48 @@ class HostTable(HostColumns):
         self.set_condition(host, HostCondition.LEFT)
 
     def find(self, host_id: int, incarnation: int) -> Host | None:
-        """The host of this number, if it is this run of it."""
+        """Return the host of this number; None if the incarnation differs."""
         column = host_id - 1
         if not 0 <= column < len(self.hosts) or int(self.incarnation[column]) != incarnation:
             return None
         return self.hosts[column]
 
     def listed(self) -> Sequence[Host]:
-        """Return every host that was not pruned; kept, because each decision asks for them."""
+        """Return every host that was not pruned; cached, because each decision needs them."""
         if self._listed is None:
             self._listed = [host for host in self.hosts if not host.pruned]
         return self._listed
 
     def labelled(self, key: str, value: str) -> BoolArray:
-        """(H,) True: the host has this label; kept until a host registers."""
+        """Return the mask, (H,), of hosts with this label; cached until a host registers."""
         known = self._labelled.get((key, value))
         if known is None or len(known) != len(self):
             found = [host.description.labels.get(key) == value for host in self.hosts]
             known = self._labelled[key, value] = np.array(found, np.bool_)
         return known
 
-    # --- what changes --------------------------------------------------------------------
+    # --- changes -------------------------------------------------------------------------
 
     def changed(self) -> None:
-        """Many hosts changed: rankings made before are void."""
+        """Note that many hosts changed: rankings made before are void."""
         self.version += 1
         self.touched.clear()
 
     def ask(self, host: Host) -> None:
-        """The host asked for work. Its readings say how much: before the first it is given none."""
+        """Note a request for work. The readings show how much; before the first, none is given."""
         if not self.asking[host.column]:
             self.asking[host.column] = True
             self.changed()
 
     def set_condition(self, host: Host, condition: HostCondition) -> None:
-        """Note how well a host is heard."""
+        """Set the condition of a host."""
         self.condition[host.column] = condition
         if condition in (HostCondition.LEFT, HostCondition.DETACHED):
             self.asking[host.column] = False
         self.changed()
 
     def condition_of(self, host: Host) -> HostCondition:
-        """How well a host is heard."""
+        """Return the condition of a host."""
         return HostCondition(int(self.condition[host.column]))
 
     def set_closed(self, host: Host, *, cordoned: bool, draining: bool) -> None:
@@ -226,13 +226,13 @@ class HostTable(HostColumns):
         self.changed()
 
     def set_bound(self, host: Host, bound: int) -> None:
-        """How many processes a host may hold or be promised from now on."""
+        """Set the most processes that a host may hold or have reserved."""
         if int(self.bound[host.column]) != bound:
             self.bound[host.column] = bound
             self.touched.append(host.column)
 
     def charge(self, host: Host, amount: FloatArray, processes: int = 0) -> None:
-        """Add to (or, negative, take from) the in-flight load and process count of one host.
+        """Add to (or, negative, take from) the reservations and process count of one host.
 
         `amount` is (R',) fractions, R' at most the resources known now.
         """
@@ -241,17 +241,17 @@ class HostTable(HostColumns):
         load = cell[LOAD]
         load += amount
         if processes <= 0:
-            np.maximum(load, 0.0, out=load)  # what is left of a sum may be below 0 by rounding
+            np.maximum(load, 0.0, out=load)  # rounding may leave less than 0
         np.add(cell[USAGE], load, out=cell[BUSY])
         self.processes[column] += processes
         self.touched.append(column)
 
-    # --- what is asked -------------------------------------------------------------------
+    # --- queries -------------------------------------------------------------------------
 
     def fractions(
         self, amounts: Mapping[str, float], estimated: frozenset[str] = frozenset()
     ) -> FloatArray:
-        """(R, H): base-unit amounts as fractions of each host's capacity.
+        """Return base-unit amounts as fractions, (R, H), of each host's capacity.
 
         inf where a host has no such resource, and 0 there for an amount that is only estimated.
         """
@@ -260,7 +260,7 @@ class HostTable(HostColumns):
     def fractions_of(
         self, host: Host, amounts: Mapping[str, float], estimated: frozenset[str] = frozenset()
     ) -> FloatArray:
-        """(R,): as `fractions`, for one host."""
+        """Return base-unit amounts as fractions, (R,), of one host, as `fractions` does."""
         one = slice(host.column, host.column + 1)
         return self._fractions(one, amounts, estimated)[:, 0]
 
@@ -282,13 +282,13 @@ class HostTable(HostColumns):
         return need
 
     def without_reading(self) -> BoolArray:
-        """(H,) True: no reading of this run has come, so that the limits are unknown."""
-        # A reading that was refused has marked all that the host reads as stale.
+        """Return the mask, (H,), of hosts without a reading of this run: unknown limits."""
+        # A refused reading has marked every resource of the host as stale.
         unread = (self.sequence == 0) & (self.stale == 0)
         return np.asarray((self.incarnation == 0) | unread)
 
     def about_to_ask(self, since: float) -> IntArray:
-        """Columns of hosts that registered after a time and will ask for their first work."""
+        """Return the hosts that registered after a time and will ask for their first work."""
         young = (self.registered > since) & (self.condition == HostCondition.UP) & ~self.closed
         if not young.any():
             return np.flatnonzero(young)
@@ -296,7 +296,7 @@ class HostTable(HostColumns):
         return np.flatnonzero(young & silent)
 
     def unheard(self) -> list[int]:
-        """Numbers of the hosts that have reported, and have been silent for a moment or longer."""
+        """Return the numbers of hosts that have reported and are silent now."""
         silent = np.isin(self.condition, _SILENT)
         return [int(column) + 1 for column in np.flatnonzero(silent)]
 
@@ -305,38 +305,37 @@ class HostTable(HostColumns):
         return self.condition_of(host).words(*_NO_ANSWER)
 
     def stale_resources(self, host: Host) -> Sequence[str]:
-        """Names of the limited resources of a host whose reading is stale."""
+        """Return the limited resources of a host whose reading is stale."""
         bits = int(self.stale[host.column])
         described = host.description.resources
         return [resource.name for slot, resource in enumerate(described) if bits >> slot & 1]
 
     def over_limit(self, column: int) -> list[str]:
-        """Names of the resources whose reading is at or over the limit of a host."""
+        """Return the resources whose reading is at or over the limit of a host."""
         over = _over(self.usage[:, column], self.limit[:, column])
         return [self.resources[row] for row in np.flatnonzero(over)]
 
     def hosts_over_limit(self) -> IntArray:
-        """Columns of the hosts that are up and at or over any limit."""
+        """Return the columns of the hosts that are up and at or over any limit."""
         over = _over(self.usage, self.limit).any(axis=0)
         return np.flatnonzero(over & (self.condition == HostCondition.UP))
 
     def statuses_missing(self) -> IntArray:
-        """Columns of hosts from which statuses are missing, by their own word or since a loss."""
+        """Return the columns of hosts with missing statuses, by their report or since a loss."""
         behind = (self.reported > self.status_sequence) | self.untold
         return np.flatnonzero(behind & (self.condition == HostCondition.UP))
 
     def set_untold(self, host: Host, *, untold: bool) -> None:
-        """A host that was lost has come back, or has said what it holds."""
+        """Set whether a lost host has rejoined without a report of its instances yet."""
         if bool(self.untold[host.column]) is not untold:
             self.untold[host.column] = untold
             self.changed()
 
     def note_statuses(self, host: Host, sequence: int, now: float) -> bool | None:
-        """Take note of a status batch.
+        """Note the sequence of a status batch.
 
         Returns:
-            None: it is older than what is known; True: it is the next; False: one before it was
-            missed.
+            None: older than the newest; True: the next; False: one before it was missed.
         """
         newest = int(self.status_sequence[host.column])
         if sequence <= newest:
@@ -346,15 +345,15 @@ class HostTable(HostColumns):
         return sequence == newest + 1
 
     def is_accepting(self, host: Host) -> bool:
-        """Under all its limits, and it has asked."""
+        """Return True if a host is under all its limits and has asked for work."""
         return bool(self.accepting[host.column] and self.asking[host.column])
 
 
 def _over(usage: FloatArray, limit: FloatArray) -> BoolArray:
-    """True: at or over its limit. A limit of 1 is none; NaN, no such resource, is over nothing."""
+    """Return the mask of usage at or over its limit; a limit of 1 or a usage of NaN never is."""
     return np.asarray((usage >= limit) & (limit < 1.0))
 
 
-#: Of hosts that reported before, and do not now.
+#: Conditions of hosts that reported before, and do not now.
 _SILENT: Final = (HostCondition.SUSPECT, HostCondition.LOST, HostCondition.DETACHED)
 _NO_ANSWER: Final = (HostCondition.LOST, HostCondition.DETACHED, HostCondition.EXPECTED)

@@ -1,4 +1,4 @@
-"""The checkpoint images that the master knows, and those that are to be removed."""
+"""Known checkpoint images, and images to be removed."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ class Unwanted:
     """An image that is to be removed.
 
     Attributes:
-        process: that it was of.
-        host: name of the host on which it lies.
+        process: name of its process.
+        host: name of the host that stores it.
         drop: the executor that removes it.
-        numbers: of the instances that it is of, or that were to be restored from it.
-        order: by which that is asked for; 0: it is not.
-        ask_at: when it is asked for (again).
+        numbers: of the instance that was dumped, and of those that were to be restored from it.
+        order: of the removal; 0: none is under way.
+        ask_at: time of the next order to remove it.
     """
 
     process: str
@@ -28,7 +28,7 @@ class Unwanted:
 
 @dataclass(slots=True)
 class Images:
-    """What the master knows of images.
+    """All images that the master knows.
 
     Attributes:
         of: names of the processes that are checkpointed.

@@ -1,4 +1,4 @@
-"""A mapping that is made when it is first read: who hands over facts need not spell them out."""
+"""Mapping that is rendered when first read, because most facts are never read."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 
 class Lazy(Mapping[str, Any]):
-    """Renders itself once, from values that do not change any more (a snapshot, a frozen spec)."""
+    """A mapping rendered once, from values that no longer change (a copy, a frozen spec)."""
 
     __slots__ = ("_rendered",)
 
@@ -15,7 +15,7 @@ class Lazy(Mapping[str, Any]):
         self._rendered: Mapping[str, Any] | None = None
 
     def render(self) -> Mapping[str, Any]:
-        """Make the mapping; must not look at anything that changes."""
+        """Return the mapping; read only values that no longer change."""
         raise NotImplementedError
 
     def _made(self) -> Mapping[str, Any]:

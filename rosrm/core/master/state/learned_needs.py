@@ -1,4 +1,4 @@
-"""What a process will use: as declared, else as learned from earlier runs, else a default."""
+"""Needs of a process: as declared, else as learned from earlier runs, else a default."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import Final
 
 from rosrm.model.values import ProcessSpec
 
-#: Weight of the newest run: a program that changed is known again after a few runs.
+#: Weight of the newest run: the mean follows a changed program within a few runs.
 _NEWEST: Final = 0.3
-#: The amount that counts follows the mean only when it is off by this part: so equal processes
-#: keep equal demands while runs of them end, and the journal is not told of every run.
+#: The learned amount follows the mean only when it differs by this share. So equal processes keep
+#: equal demands while runs of them end, and the journal need not hold every run.
 _NOTICEABLE: Final = 0.1
 
 
@@ -27,7 +27,7 @@ class LearnedNeeds:
     """Peaks of earlier runs by program, as a moving mean.
 
     Attributes:
-        version: grows whenever what counts for any program has changed.
+        version: grows whenever the learned amount of any program has changed.
     """
 
     def __init__(self) -> None:
@@ -36,12 +36,12 @@ class LearnedNeeds:
         self._mean: dict[str, dict[str, float]] = {}
 
     def restore(self, program: str, amounts: Mapping[str, float]) -> None:
-        """Take over what an earlier run of the master learned."""
+        """Restore the learned needs of a program from the journal."""
         self._counts[program] = dict(amounts)
         self._mean[program] = dict(amounts)
 
     def learn(self, program: str, amounts: Mapping[str, float]) -> Mapping[str, float] | None:
-        """Take in one run's peaks; returns what counts from now on, None: as before."""
+        """Learn the peaks of one run; return the new learned needs, None: unchanged."""
         mean = self._mean.setdefault(program, {})
         counts = self._counts.setdefault(program, {})
         changed = False
@@ -59,7 +59,7 @@ class LearnedNeeds:
         return dict(counts)
 
     def estimate(self, spec: ProcessSpec, default: Mapping[str, float]) -> Estimate:
-        """What to count against a host for one instance of a process."""
+        """Return the needs of one instance of a process."""
         guessed = {**default, **self._counts.get(spec.program, {})}
         amounts = {**guessed, **spec.needs}
         return Estimate(amounts, frozenset(guessed) - frozenset(spec.needs))

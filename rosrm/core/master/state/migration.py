@@ -1,4 +1,4 @@
-"""What the master knows of each move under way."""
+"""State of each migration."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from rosrm.wording import one_line
 
 @dataclass(frozen=True, slots=True)
 class End:
-    """How an instance ended.
+    """The end of an instance.
 
     Attributes:
-        ordered: it had been told to stop, so that its exit code says nothing.
-        completed: a job that came to its end by itself, whatever it had been told meanwhile.
-        gone: its host does not hold it any more and says nothing of its end.
+        ordered: it had been ordered to stop, so that its exit code has no meaning.
+        completed: a job that ran to its own end, even if an order to stop was under way.
+        gone: its host no longer holds it and reports no end.
     """
 
     status: InstanceStatus
@@ -32,10 +32,10 @@ class End:
 
 @dataclass(slots=True)
 class Heard:
-    """What the source or the destination of a handoff has said.
+    """Reports of the source or the destination of a handoff.
 
     Attributes:
-        phases: all of them, with the newest message of each.
+        phases: all reported phases, with the newest message of each.
         message: the newest of all.
     """
 
@@ -44,7 +44,7 @@ class Heard:
 
 
 class PlainPlan(Lazy):
-    """A plan as JSON has it: made once for all the intents that it is in."""
+    """A plan as JSON, rendered once for all the intents that contain it."""
 
     __slots__ = ("_plan",)
 
@@ -53,37 +53,38 @@ class PlainPlan(Lazy):
         self._plan = plan
 
     def render(self) -> Mapping[str, Any]:
-        """All fields of the plan."""
+        """Return all fields of the plan."""
         return plan_to_dict(self._plan)
 
 
 @dataclass(slots=True)
 class Run:
-    """A plan that is being carried out.
+    """A migration: the execution of a plan.
 
     Attributes:
-        started: when it began, by this master's clock; before its own start, where it was taken up.
+        started: time of its begin by this master's clock; before the master's own start, where a
+            former master began it.
         wall: unix time at which it began.
         source_node, destination_node: names of their nodes, without the namespace.
-        index: of the step in hand, in the plan or, going back, in `undo`.
+        index: of the current step, in the plan or, going back, in `undo`.
         undo: steps still to be done on the way back; None: going forward.
-        turned_at: index of the step in hand when it turned back.
+        turned_at: index of the current step when it turned back.
         committed: the destination owns the name.
-        deadline: of the step in hand.
-        begun: the step in hand has been ordered.
-        order: of the step in hand, 0: none.
-        stuck: a step that must be done failed; it is tried again from `retry_at` on.
-        answer: of the slave to the order of the step in hand: accepted, message.
-        bad_result: the executor of the step in hand ran to its end, but answered no JSON object.
+        deadline: of the current step.
+        begun: the current step has been ordered.
+        order: of the current step, 0: none.
+        stuck: a step that must be done failed; it is retried from `retry_at` on.
+        answer: of the slave to the order of the current step: accepted, message.
+        bad_result: the executor of the current step ran to its end, but returned no JSON object.
         launched: numbers of the instances that were ordered to start.
-        suspended: numbers of the instances whose slave was told not to restart them. It may have
-            been told otherwise since: its answer may come before the news of an end.
-        ended: how its instances ended, by number.
-        heard: what they said of a handoff, by number.
-        taking_over: the destination was told to go on without its source.
-        results: what executors have answered, by their names.
-        aim: what it is to bring about. Source and destination of a checkpoint or a restore have the
-            same host.
+        suspended: numbers of the instances whose slave was ordered not to restart them. A later
+            order may have allowed it again: its answer may arrive before the report of an end.
+        ended: instance number to the end of that instance.
+        heard: instance number to its reports on a handoff.
+        taking_over: the destination was ordered to take over without its source.
+        results: executor name to its result.
+        aim: purpose of the plan. Source and destination of a checkpoint or a restore have the same
+            host.
     """
 
     process: str
@@ -125,13 +126,13 @@ class Run:
 
     @property
     def step_in_hand(self) -> Step | None:
-        """The step that is being done, or is to be done next; None: all are done."""
+        """Return the current or next step; None: all are done."""
         steps = self._steps
         return steps[self.index] if self.index < len(steps) else None
 
     @property
     def ahead(self) -> Sequence[Step]:
-        """The steps that have not been begun, on the way on which it is."""
+        """Return the steps not begun yet, in the current direction."""
         return self._steps[self.index + self.begun :]
 
     @property
@@ -140,18 +141,18 @@ class Run:
 
     @property
     def so_far(self) -> Sequence[Step]:
-        """The steps of the plan that were begun, or may have been, on the way forward."""
+        """Return the steps of the plan that were or may have been begun on the way forward."""
         reached = self.index if self.undo is None else self.turned_at
         return self.plan.steps[: reached + 1]
 
     @property
     def went_on(self) -> bool:
-        """An executor has answered that the destination goes on already: there is no way back."""
+        """Return True if an executor has found the destination running: there is no way back."""
         return any(result.get("active") is True for result in self.results.values())
 
     @property
     def course(self) -> str:
-        """What happens to the process meanwhile, for people."""
+        """Return the reason shown for the process during the migration."""
         host = self.destination_host.name
         return {
             Aim.MOVE: f"to {host}",
@@ -161,17 +162,17 @@ class Run:
 
     @property
     def commit_index(self) -> int:
-        """Where in the plan its commit is."""
+        """Return the index of the plan's commit."""
         return next(at for at, step in enumerate(self.plan.steps) if isinstance(step, Commit))
 
     def turn_back(self) -> None:
-        """From here on undo every step so far, the one in hand included, newest first."""
+        """Undo from now on every step so far, the current one included, newest first."""
         self.turned_at = self.index
         self.undo = way_back(self.plan, self.turned_at)
         self.index, self.begun = 0, False
 
     def how_ended(self, instance: InstanceId) -> str:
-        """How one of its instances ended, for people."""
+        """Return a text on the end of one of its instances."""
         end = self.ended.get(instance.number)
         if end is None:
             return "it was never started"
@@ -181,24 +182,24 @@ class Run:
         )
 
     def phases_of(self, instance: InstanceId) -> Mapping[ReportPhase, str]:
-        """All that the source or the destination has said."""
+        """Return all phases that the source or the destination has reported."""
         heard = self.heard.get(instance.number)
         return heard.phases if heard is not None else {}
 
 
 def way_back(plan: Plan, turned_at: int) -> Sequence[Step]:
-    """What undoes the steps of a plan up to one of them, newest first."""
+    """Return the undo of the steps of a plan up to one of them, newest first."""
     so_far = plan.steps[: turned_at + 1]
     return [step.undo for step in reversed(so_far) if step.undo is not None]
 
 
 def run_to_dict(run: Run, stopping: Sequence[int]) -> dict[str, Any]:
-    """All that a master which was started anew must know of a run.
+    """Return all facts about a migration that a restarted master needs.
 
-    What is heard of a handoff is not in it: it is heard again.
+    Reports of a handoff are left out, because the nodes send them again.
 
     Args:
-        run: it.
+        run: the migration.
         stopping: numbers of its instances that were ordered to stop.
     """
     return {
@@ -225,7 +226,7 @@ def _end_to_dict(end: End) -> dict[str, Any]:
 
 
 def end_from_dict(instance: InstanceId, plain: Mapping[str, Any]) -> End:
-    """How an instance ended, as `run_to_dict` has it; what nobody asks for later is not in it."""
+    """Return the end of an instance from `run_to_dict`, which has only the fields used later."""
     status = InstanceStatus(
         instance, InstanceState(plain["state"]), exit_code=int(plain["exit_code"]),
         exit_signal=int(plain["exit_signal"]), message=str(plain["message"]),

@@ -1,4 +1,4 @@
-"""The periodic checkpoints of running instances."""
+"""State of the periodic checkpoints of running instances."""
 
 from __future__ import annotations
 
@@ -6,25 +6,25 @@ from dataclasses import dataclass, field
 from math import inf
 from typing import Final
 
-#: Numbers of the orders are apart from those of all else: a record that is replayed without the
-#: plugins must not number its orders otherwise.
+#: These orders have numbers of their own, because a recording that is replayed without the plugins
+#: must give the other orders the same numbers.
 BEFORE_FIRST: Final = 1 << 42
 
 
 @dataclass(slots=True)
 class Dumped:
-    """What is known of the checkpoints of one instance.
+    """The checkpoints of one instance.
 
     Attributes:
         process, host: names.
         strategy: name of the strategy that makes them.
         discard: the executor that removes its images; None: the strategy failed to name it.
-        since: time of the last one, or since when the first is due.
-        made: there is one.
-        size: its bytes.
-        pause: seconds for which the process stood still.
-        order: by which one is made just now; 0: none is.
-        asked: incarnation of the slave that was ordered so.
+        since: time of the last dump, or time since when the first is due.
+        made: at least one exists.
+        size: bytes of the newest.
+        pause: seconds for which the newest dump paused the process.
+        order: of the dump under way; 0: none is.
+        asked: incarnation of the slave that received the order.
         trouble: why there is none, or no newer one.
     """
 
@@ -43,11 +43,11 @@ class Dumped:
 
 @dataclass(slots=True)
 class Periodic:
-    """All of them, by the number of the instance.
+    """All periodic checkpoints, by the number of the instance.
 
     Attributes:
-        looked: time of the last look.
-        last_order: that was given.
+        looked: time of the last review.
+        last_order: number of the last order.
     """
 
     of: dict[int, Dumped] = field(default_factory=dict)

@@ -1,4 +1,4 @@
-"""What the master knows of each process and of each of its instances."""
+"""State of each process and of each of its instances."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from rosrm.model.values import InstanceId, InstanceState, ProcessSpec
 
 
 class ProcessPhase(str, Enum):
-    """Where a process stands, as the master sees it."""
+    """Phase of a process as the master sees it."""
 
     QUEUED = "queued"
     SET_ASIDE = "set_aside"
@@ -37,7 +37,7 @@ class ProcessPhase(str, Enum):
 
     @property
     def over(self) -> bool:
-        """Nothing more will happen to it unless somebody asks."""
+        """Return True for a terminal phase, which only a client's request leaves."""
         return self in _OVER
 
 
@@ -45,7 +45,7 @@ _OVER: Final = frozenset({ProcessPhase.FINISHED, ProcessPhase.FAILED, ProcessPha
 
 
 class Wanted(str, Enum):
-    """What is to come of a process once its instance has ended."""
+    """Desired state of a process once its instance has ended."""
 
     RUN = "run"
     CANCEL = "cancel"
@@ -57,21 +57,21 @@ class Instance:
     """One run of a process on one host, as the master sees it.
 
     Attributes:
-        state: as the slave said last; None: assigned, nothing said yet.
-        charged: (R',) fractions that still count against its host.
-        amounts: base units counted for it when it was assigned.
+        state: as last reported by the slave; None: assigned, nothing reported yet.
+        charged: (R',) reservation on its host, fractions.
+        amounts: base units that the assignment reserved.
         estimated: resources whose amount is an estimate and stops counting after `settle`.
         since: time of the assignment.
         seen: newest usage in base units.
         peak: highest usage seen.
-        settled: its estimates stopped counting.
-        restarting: it was ordered to restart, and has not been seen to do so yet.
-        given_again: the assignment was delivered anew, since its slave did not take it up.
-        recalled: a master ordered it to stop and was itself restarted: its end is not its own.
-        at_once: it is to end without delay, as another instance owns the name.
+        settled: its estimates no longer count.
+        restarting: it was ordered to restart, and no report shows the restart yet.
+        given_again: the assignment was delivered again, because its slave did not accept it.
+        recalled: a former run of the master ordered it to stop, so its end counts as ordered.
+        at_once: it is to end without delay, because another instance owns the name.
         order: of an unanswered stop, 0: none.
-        order_at: when it was given.
-        node_name: under which its node runs, where that is not the process's name.
+        order_at: time of that order.
+        node_name: name of its node, where that is not the process's name.
         ready_at: time at which this master learned that it is ready.
     """
 
@@ -99,12 +99,12 @@ class Instance:
 
     @property
     def runs(self) -> bool:
-        """Its slave says that it runs, ready or not."""
+        """Return True if its slave reports that it runs, ready or not."""
         return self.state in _RUNS
 
     @property
     def measured(self) -> dict[str, float]:
-        """Newest usage of the resources that a probe of its host reads, base units."""
+        """Return the newest usage of the resources that a probe of its host reads, base units."""
         probed = {resource.name for resource in self.host.description.resources}
         return {name: amount for name, amount in self.seen.items() if name in probed}
 
@@ -114,12 +114,12 @@ _RUNS: Final = frozenset({InstanceState.RUNNING, InstanceState.READY})
 
 @dataclass(frozen=True, slots=True)
 class LeftBehind:
-    """The owner that a process had on a host which was lost, as long as nothing has followed it.
+    """The owning instance of a process on a host that was lost, as long as it has no successor.
 
     Attributes:
         number: of the instance.
         host: name of the host.
-        node_name: under which its node runs, where that is not the process's name.
+        node_name: name of its node, where that is not the process's name.
     """
 
     number: int
@@ -129,16 +129,16 @@ class LeftBehind:
 
 @dataclass(frozen=True, slots=True)
 class Image:
-    """What a process goes on from that was checkpointed: it owns the name.
+    """The checkpoint image of a checkpointed process; it owns the name.
 
     Attributes:
-        number: of the instance that it is of.
-        host: name of the host on which it lies.
-        strategy: that made it, and restores it.
+        number: of the instance that was dumped.
+        host: name of the host that stores it.
+        strategy: name of the strategy that made and restores it.
         drop: the executor that removes it.
         made_at: unix time.
-        node_name: under which its node runs, where that is not the process's name.
-        needs: base units that it was seen to use, by resource.
+        node_name: name of the node, where that is not the process's name.
+        needs: resource name to the measured usage of the instance, base units.
     """
 
     number: int
@@ -151,7 +151,7 @@ class Image:
 
 
 class PlainSpec(Lazy):
-    """A spec as JSON has it: made once for all the intents that it is in."""
+    """A spec as JSON, rendered once for all the intents that contain it."""
 
     __slots__ = ("_spec",)
 
@@ -160,7 +160,7 @@ class PlainSpec(Lazy):
         self._spec = spec
 
     def render(self) -> Mapping[str, Any]:
-        """All fields of the spec."""
+        """Return all fields of the spec."""
         return spec_to_dict(self._spec)
 
 
@@ -169,27 +169,26 @@ class Process:
     """One submitted process.
 
     Attributes:
-        order: place in the line; kept when it returns to the queue.
-        since: when its phase began, by this master's clock; before its own start, where the journal
-            says so.
+        order: place in the queue; kept when it returns to the queue.
+        since: start of its phase by this master's clock; before the master's own start, where the
+            journal has it.
         wall: unix time at which its phase began.
         out_of_sight: its phase when its host was lost, with the start of that phase (`since` and
             `wall`); None: its host reports, or the process has another phase since.
-        born: lowest number that an instance of it can have; what lower ones kept is not its own.
+        born: lowest number that an instance of it can have; snapshots of lower ones are void.
         owner: number of the instance that owns the name; 0: none.
         instances: numbers of all its instances that may still run.
         excluded: host name to the reason why it cannot run there.
-        exit_code: of its last run, a signal as a negative number; None: it is not known, or it
-            runs.
+        exit_code: of its last run, a signal as a negative number; None: unknown, or it runs.
         ended_on: name of the host on which it has ended; "": it has not, or ran nowhere.
         decision: the newest one about it, with its kind.
         left_behind: the instance that may still run on a lost host, while this process waits in the
             queue for another one.
-        image: what it goes on from, when it is restored; None: it is not checkpointed.
+        image: checkpoint image from which it is to be restored; None: it is not checkpointed.
         standby_at: time before which no standby is begun.
         standby_tries: standbys that were lost, one after the other.
-        standby_reason: how it stands with its standby, for people.
-        demand: what decides where it may go, and the version of what was learned that is in it.
+        standby_reason: condition of its standby, for listings.
+        demand: its demand, with the version of the learned needs in it.
     """
 
     spec: ProcessSpec
@@ -225,5 +224,5 @@ class Process:
 
     @property
     def name(self) -> str:
-        """Its name."""
+        """Return its name."""
         return self.spec.name

@@ -1,4 +1,4 @@
-"""The waiting processes: first in, first out, within a priority."""
+"""Queue of waiting processes: first in, first out, within a priority."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Queue:
         self._of: dict[str, _Key] = {}
 
     def add(self, name: str, priority: int, order: int) -> None:
-        """Queue a process; one that comes back with its old `order` gets its old place."""
+        """Queue a process; one that returns with its old `order` gets its old place."""
         if name in self._of:
             raise ValueError(f"{name} is in the queue already")
         key = (-priority, order, name)
@@ -30,7 +30,7 @@ class Queue:
         self._of[name] = key
 
     def remove(self, name: str) -> None:
-        """Take a process out, wherever it stands."""
+        """Remove a process from any place."""
         key = self._of.pop(name)
         del self._keys[bisect_left(self._keys, key)]
         self.version += 1
@@ -45,10 +45,10 @@ class Queue:
         return (name for _, _, name in list(self._keys))
 
     def head(self) -> str | None:
-        """Who is served next."""
+        """Return the process that is served next."""
         return self._keys[0][2] if self._keys else None
 
     def position(self, name: str) -> int:
-        """1 is the head; 0: not in the queue."""
+        """Return the place of a process; 1: head; 0: not in the queue."""
         key = self._of.get(name)
         return 0 if key is None else bisect_left(self._keys, key) + 1

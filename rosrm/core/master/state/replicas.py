@@ -1,6 +1,6 @@
-"""The books of kept states: which host keeps which, by the slaves' own word. Nothing is durable.
+"""Index of state replicas as reported by slaves. Not persisted.
 
-What one host says is complete: it replaces all that it said before.
+Each report of a host is complete and replaces its former one.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ _IN_REACH: Final = frozenset({HostCondition.UP, HostCondition.SUSPECT})
 
 @dataclass(frozen=True, slots=True)
 class Holding:
-    """The newest state of a process on one host.
+    """The newest snapshot of a process on one host.
 
     Attributes:
-        number: of the instance whose state it is.
+        number: of the instance whose snapshot it is.
         sequence: cycles that it covers.
         size: bytes.
-        since: when this master learned of it.
+        since: time at which this master learned of it.
     """
 
     number: int
@@ -35,19 +35,19 @@ class Holding:
 
     @property
     def age(self) -> tuple[int, int]:
-        """The larger, the newer."""
+        """Return a key that is larger for newer snapshots."""
         return self.number, self.sequence
 
 
 class Holdings:
-    """Process to host to what it keeps."""
+    """Index of snapshots: process to host to the newest snapshot there."""
 
     def __init__(self) -> None:
         self._of: dict[str, dict[str, Holding]] = {}
         self._on: dict[str, set[str]] = {}
 
     def replace(self, host: str, states: Iterable[KeptState], now: float) -> None:
-        """A host says all that it keeps."""
+        """Replace the snapshots of a host by its report."""
         told = {state.instance.process: state for state in states}
         for process in self._on.get(host, set()) - told.keys():
             self._forget(process, host)
@@ -65,11 +65,11 @@ class Holdings:
             del self._of[process]
 
     def of(self, process: str) -> Mapping[str, Holding]:
-        """By host; empty where none is known."""
+        """Return the snapshots of a process by host; empty where none is known."""
         return self._of.get(process, EMPTY)
 
     def hosts_of(self, process: str, since: int) -> tuple[str, ...]:
-        """Where states of instances from a number on lie, the newest first."""
+        """Return the hosts with snapshots of instances from a number on, the newest first."""
         known = self._of.get(process)
         if known is None:
             return ()
@@ -77,20 +77,20 @@ class Holdings:
         return tuple(name for _, name in sorted(found, key=lambda one: one[0], reverse=True))
 
     def processes(self) -> list[str]:
-        """All of which a state is kept anywhere."""
+        """Return all processes with a snapshot anywhere."""
         return list(self._of)
 
 
 @dataclass(slots=True)
 class Told:
-    """What a slave was ordered to do with the state of an instance.
+    """The last order to a slave about replicas of an instance's snapshot.
 
     Attributes:
         number: of the instance.
         incarnation: of the slave.
-        chosen: the policy has chosen so since the master started. False: it gives no answer, and
-            the hosts are those that keep a state already.
-        taken: it has said yes.
+        chosen: the policy has made this choice since the master started. False: the policy gives no
+            answer, and the hosts are those with a replica already.
+        taken: the slave has accepted.
     """
 
     number: int
@@ -104,21 +104,21 @@ class Told:
 
 @dataclass(slots=True)
 class Keeping:
-    """What is known of kept states.
+    """State of snapshot replication.
 
     Attributes:
-        policy: that chooses where states are kept; None: on their own hosts alone.
+        policy: chooses the hosts of replicas; None: snapshots stay on their own hosts alone.
         policy_name: in the configuration.
-        holdings: which host keeps which.
-        told: what the slave of each process was ordered last.
+        holdings: index of snapshots by process and host.
+        told: process name to the last order to its slave.
         orders: process of each order without an answer.
-        next_order: their numbers are apart from those of all else: a record that is replayed
-            without the policy must not number its orders otherwise.
-        dropped_at: when a host was last told to drop what it keeps of a process.
+        next_order: these orders have numbers of their own, because a recording that is replayed
+            without the policy must give the other orders the same numbers.
+        dropped_at: time of the last order to a host to drop its replica of a process.
         removed: stateful processes that were removed, each with a number above those of all its
             instances.
-        waiting: processes that are still to be looked at in this round.
-        looked: time of the last look.
+        waiting: processes still to be reviewed in this round.
+        looked: time of the last review.
     """
 
     policy: CheckpointPolicy | None = None
@@ -133,15 +133,15 @@ class Keeping:
     looked: float = -inf
 
     def order_id(self) -> int:
-        """A number for an order about kept states."""
+        """Return a number for an order about replicas."""
         self.next_order += 1
         return self.next_order
 
     def in_reach(self, process: str, since: int, hosts: HostTable) -> tuple[str, ...]:
-        """Hosts that are heard and keep a state of an instance from a number on, newest first.
+        """Return the hosts in reach with a snapshot of an instance from a number on, newest first.
 
-        Before them those that were to be given one, and have said nothing of it yet: it may have
-        come there since they spoke, and is newer than all else then.
+        Before them come the hosts that were to get a replica and have not reported one yet: it may
+        have arrived since their report, and would then be newer than all others.
         """
         known = self.holdings.hosts_of(process, since)
         told = self.told.get(process)
