@@ -1,4 +1,4 @@
-"""What a node's author imports to make it migratable: `Node` in place of rclpy's.
+"""Base class of migratable nodes: `Node` replaces rclpy's.
 
     from rosrm.node import Node
 
@@ -10,8 +10,8 @@
             self.create_timer(0.1, self.tick)
             self.keep_state("~/state", Int64, self.save, self.restore)
 
-`docs/how-to/stateful-node.md` has the rest; `docs/reference/handoff-protocol.md`, what happens.
-`PortableNode` and `run_portable` are for nodes whose memory moves as it is, by CRIU:
+`docs/how-to/stateful-node.md` has the rest, `docs/reference/handoff-protocol.md` the protocol.
+`PortableNode` and `run_portable` are for nodes whose memory moves unchanged, by CRIU:
 `docs/how-to/portable-node.md`.
 """
 
