@@ -34,7 +34,7 @@ def connect_or_start(state: Path, start: bool, log: LogLimits, deadline: float) 
         if problem and "another supervisor" not in problem:
             raise SupervisorError(f"the supervisor of {state} did not start: {problem}")
         if problem:
-            # Another slave's supervisor is about to listen or to end: neither can be awaited here.
+            # Another supervisor is about to listen or to end: neither can be awaited from here.
             time.sleep(0.02)
 
 

@@ -41,7 +41,7 @@ class Handoff:
         self._subscription: Any = None
 
     def begin(self) -> None:
-        """Take the first role; called once the node exists, before the author's constructor."""
+        """Take the first role; called by the node's constructor, before the author's continues."""
         node = self.member.node
         for fault in self._damaged:
             node.get_logger().warning(f"a kept state is damaged, and left alone: {fault}")
@@ -97,7 +97,7 @@ class Handoff:
         with self.member.turn:
             try:
                 role.configure(config)
-            except Exception as error:  # noqa: BLE001 - no word of the master ends the author's node
+            except Exception as error:  # noqa: BLE001 - no message of the master ends the node
                 what = f"{type(error).__name__}: {error}"
                 self.member.node.get_logger().error(f"a state_config cannot be followed: {what}")
 

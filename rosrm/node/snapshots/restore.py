@@ -17,7 +17,7 @@ from rosrm.snapshots import Kept, newest
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs.msg import StateMark
 
-#: Seconds for the author's constructor to name all parts if it spins first; between two checks.
+#: Seconds for the author's constructor to name all parts if it spins first; check interval.
 _PATIENCE: Final = 10.0
 _LOOK: Final = 0.02
 _REMEDY: Final = (

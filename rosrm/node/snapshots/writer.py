@@ -25,7 +25,7 @@ from rosrm_msgs.msg import CoveredInput, StateMark
 
 #: Most bytes of one part. Fast DDS carried 400 MB, but a node takes 3 s to serialise 200 MB.
 LARGEST_PART: Final = 256 << 20
-#: Greatest share of a node's time for saving its state, where no other bound applies.
+#: Share of a node's time for saving its state; `keep_every` may require a larger one.
 _SHARE: Final = 0.02
 #: Seconds for the last snapshot at the end, first for its lock, then for its writing.
 _LAST_WORDS: Final = 5.0
@@ -34,7 +34,7 @@ _TOLD_EVERY: Final = 60.0
 
 
 class Keeper:
-    """Saves snapshots between cycles, as often as `_SHARE` allows, and at least each `keep_every`.
+    """Saves snapshots between cycles, as often as `_SHARE` allows, at least each `keep_every` s.
 
     Args:
         member: the node, whose identity names the directory.
