@@ -182,4 +182,4 @@ def failed_response(service_type: Any, reason: str) -> Any:
 
 
 def _nothing() -> None:
-    """Do nothing; as a task this ends a waiting `spin_once`, and the executor's `wake` does not."""
+    """Do nothing; running it ends a waiting `spin_once`, which the executor's `wake` does not."""

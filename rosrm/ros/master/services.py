@@ -1,4 +1,4 @@
-"""Services of the master for slaves and clients: requests become events, replies answers."""
+"""Master services for slaves and clients: requests become events, replies become answers."""
 
 from __future__ import annotations
 

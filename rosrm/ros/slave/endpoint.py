@@ -372,7 +372,8 @@ class SlaveEndpoint:
     ) -> None:
         """Publish each instance's use: cores and bytes, in parallel sequences.
 
-        The newest reading is sent first, so that it shows the use that these usages explain.
+        The newest reading is sent first: the master reduces reservations by these usages, so its
+        readings must already include that load.
         """
         if self.link is Link.REGISTERED:
             self._reporter.tell()
