@@ -202,7 +202,7 @@ class Source:
         self._look_again = steady_timer(member.plain, _LOOK, self._release_when_heard)
 
     def _release_when_heard(self) -> None:
-        """Report RELEASED once readers have acknowledged all outputs: a stop would lose others."""
+        """Report RELEASED when all outputs are acknowledged (a stop loses others) or time is up."""
         with self._member.turn:
             heard = all(one.wait_for_all_acked(_AT_ONCE) for one in self._member.outputs)
             if heard or time.monotonic() - self._silent_since >= _LAST_WORDS:
