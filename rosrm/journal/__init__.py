@@ -1,6 +1,6 @@
-"""The durable record of intent: what shall run, the queue, assignments and migrations.
+"""Journal of intent: desired processes, the queue, assignments and migrations, durably stored.
 
 sqlite.py     the journal
-errors.py     which failures of a disk pass, and which do not
-recovery.py   a journal that lost its newest records or cannot be read
+errors.py     failures of a disk: those that may pass, and permanent ones
+recovery.py   repair of a journal with a gap, or of an unreadable one
 """

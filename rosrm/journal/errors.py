@@ -1,4 +1,4 @@
-"""What is wrong with a journal, and what to do about it, in words for people."""
+"""Error messages about a journal, each with its cause and remedy."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _OTHER_STATE = "give the master another `state:`"
 
 
 def fault_of(path: Path, error: sqlite3.Error | OSError) -> JournalError:
-    """The error for the user; a `JournalBlocked` where it may pass by itself."""
+    """Return the error for the user; a `JournalBlocked` where the failure may pass."""
     text = str(error)
     said = f"the journal {path} cannot be used ({text}); "
     if path.is_dir():
@@ -42,7 +42,7 @@ _NOTHING_LOST = "no acknowledged request is lost"
 
 
 def unreadable(path: Path, fault: Exception) -> JournalError:
-    """The file is whole, and what is written in it makes no sense."""
+    """Return the error for a sound database whose content makes no sense."""
     return JournalError(
         f"the journal {path} cannot be used ({type(fault).__name__}: {fault}); it was not written "
         f"by this rosrm: restore it from a backup, or move it away to start with an empty journal"
@@ -59,7 +59,7 @@ DAMAGED = (
 
 
 def other_version(path: Path, version: int, ours: int) -> JournalError:
-    """The file is of a later or earlier rosrm."""
+    """Return the error for a journal of a later or earlier rosrm."""
     return JournalError(
         f"{path} was written by another version of rosrm (tables {version}, here {ours}); use that "
         f"version, or move the file away to start with an empty journal"
@@ -67,7 +67,7 @@ def other_version(path: Path, version: int, ours: int) -> JournalError:
 
 
 def no_journal(path: Path) -> JournalError:
-    """The file is a database, but none of ours."""
+    """Return the error for a database that is no journal of rosrm."""
     return JournalError(
         f"the journal {path} cannot be used: it is a database of another program. Move it away, or "
         f"{_OTHER_STATE}"

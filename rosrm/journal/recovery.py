@@ -1,8 +1,8 @@
-"""What can still be read of a damaged journal goes into a new one; the damaged one is kept aside.
+"""Recovery of a damaged journal: its readable part goes into a new journal; the old file is kept.
 
-A page that is damaged takes the intents and events on it with it, so the new journal is one that
-has lost a part: what ran by a lost intent is stopped as its slave registers. What a lost intent
-could make run twice is put right here: hosts that processes are on, and the numbers of instances.
+A damaged page takes its intents and events with it, so the new journal has a gap. A process whose
+intent is lost is stopped as its slave registers. Two things that could start a process twice are
+repaired here: the hosts that processes are on, and the numbers of instances.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from rosrm.runtime.disk_space import room_for
 from rosrm.wording import counted
 
 _BESIDE: Final = ("-wal", "-shm")
-#: A damaged page hides all that is behind it in a scan. So events are read by a few, and from the
-#: end; intents from both ends, then one by one by the names that the events know.
+#: A damaged page hides all rows behind it in a scan. So events are read in small groups, and from
+#: the end; intents from both ends, then one by one by the names that the events mention.
 _EVENTS: Final = "SELECT * FROM record WHERE sequence BETWEEN ? AND ? AND facts IS NOT NULL"
 _NEWEST_EVENTS: Final = "SELECT * FROM record WHERE facts IS NOT NULL ORDER BY sequence DESC"
 _FEW: Final = 50
@@ -38,18 +38,18 @@ _INTENTS: Final = (
     "SELECT tbl, key, value FROM intent ORDER BY tbl DESC, key DESC",
 )
 _INTENT: Final = "SELECT tbl, key, value FROM intent WHERE tbl = ? AND key = ?"
-#: Bytes, at most, by which a file that was cut short is filled up (sparsely).
+#: Most bytes that are added (sparsely) to a truncated file.
 _MOST_EMPTY: Final = 2**30
-#: Numbers left free above the largest that is known.
+#: Instance numbers left unused above the largest known one.
 _FREE: Final = 1000
-#: Under these names events tell numbers of instances; no real one is as large as that.
+#: Facts of events that hold instance numbers, and a bound above all real numbers.
 _NUMBERS: Final = ("number", "source", "destination")
 _NO_NUMBER: Final = 2**53
 
 
 @dataclass(slots=True)
 class _Found:
-    """What could be read: intents by table and key, events by sequence, as they are stored."""
+    """The rows that could be read: intents by table and key, events by sequence, as stored."""
 
     intents: dict[tuple[str, str], dict[str, Any]] = field(default_factory=dict)
     events: dict[int, tuple[Any, ...]] = field(default_factory=dict)
@@ -57,25 +57,25 @@ class _Found:
 
 
 def recover(path: Path, wall: Callable[[], float] = time.time) -> str:
-    """Make a new journal of what is left of a damaged one.
+    """Write a new journal from the readable part of a damaged one.
 
     Args:
         path: of the journal; no master may have it open.
         wall: unix time, seconds.
 
     Returns:
-        What was found and where the damaged file is now, for people.
+        A summary for the user: the recovered records, and the new path of the damaged file.
 
     Raises:
-        JournalError: it is not damaged, or nothing can be read of it, or there is no room, or a
-            right is missing; the journal is as it was.
+        JournalError: the journal is not damaged, nothing in it can be read, or space or a
+            permission is missing; the journal is unchanged.
     """
     _check_damaged(path)
     try:
         return _recover(path, wall)
     except (OSError, sqlite3.Error) as error:
         raise _not_recovered(path, error) from error
-    except JournalBlocked as blocked:  # of the new one
+    except JournalBlocked as blocked:  # raised by the new journal
         raise _not_recovered(path, blocked.__cause__ or blocked) from blocked
 
 
@@ -85,7 +85,7 @@ def _recover(path: Path, wall: Callable[[], float]) -> str:
         new = Path(place) / "new.sqlite"
         aside = path.with_name(f"{path.name}.damaged-{int(wall())}")
         _write(new, found, aside)
-        # Killed at any point, there is a journal: to a master that finds none all are strangers.
+        # A kill at any point leaves a journal: without one, a master stops every process.
         os.link(path, aside)
         for suffix in _BESIDE:
             with contextlib.suppress(FileNotFoundError):
@@ -120,7 +120,7 @@ def _check_damaged(path: Path) -> None:
 
 
 def _salvage(path: Path, place: Path) -> _Found:
-    """Read a copy, as reading would write to the original (`-shm`, a checkpoint)."""
+    """Read a copy, because reading would write to the original (`-shm`, a checkpoint)."""
     copy = place / "damaged.sqlite"
     for suffix in ("", "-wal"):
         with contextlib.suppress(FileNotFoundError):
@@ -140,7 +140,7 @@ def _salvage(path: Path, place: Path) -> _Found:
 
 
 def _fill_up(copy: Path) -> None:
-    """SQLite reads nothing of a file that is shorter than its head says: add empty pages."""
+    """Add empty pages: SQLite reads nothing of a file that is shorter than its header says."""
     head = copy.read_bytes()[:32]
     page, count = int.from_bytes(head[16:18], "big"), int.from_bytes(head[28:32], "big")
     size = copy.stat().st_size
@@ -173,7 +173,7 @@ def _read_intents(database: sqlite3.Connection, found: _Found) -> None:
 def _rows(
     database: sqlite3.Connection, found: _Found, query: str, *values: object
 ) -> Iterator[tuple[Any, ...]]:
-    """Rows up to the first that cannot be read."""
+    """Yield rows up to the first that cannot be read."""
     try:
         yield from database.execute(query, values)
     except sqlite3.Error:
@@ -197,7 +197,7 @@ def _write(path: Path, found: _Found, aside: Path) -> None:
 
 
 def _put_right(found: _Found) -> None:
-    """What the intents that are left presume of those that may be lost."""
+    """Restore the rows that the remaining intents depend on and that may be lost."""
     hosts = {key for table, key in found.intents if table == "host"}
     ids = [int(found.intents["host", name].get("host_id", 0)) for name in hosts]
     largest = _largest_told(found)
@@ -213,13 +213,13 @@ def _put_right(found: _Found) -> None:
                 found.intents["host", host] = known
     found.intents.setdefault(("cluster", "instances"), {"next": largest + _FREE})
     epoch = found.intents.setdefault(("cluster", "epoch"), {"epoch": 0})
-    epoch["boot"] = "recovered"  # as after a fall: all hosts are heard before work is given
+    epoch["boot"] = "recovered"  # as after a reboot: all hosts report before work is assigned
 
 
 def _largest_told(found: _Found) -> int:
-    """The largest number that an instance had by the events, of those that have ended too.
+    """Return the largest instance number in the events, those of ended instances included.
 
-    A supervisor that has forgotten the end of a number starts none up to it any more.
+    A supervisor that has forgotten the end of a number refuses to start any number up to it.
     """
     largest = 0
     for event in found.events.values():

@@ -1,8 +1,8 @@
 """The journal in SQLite: intent, and the event record.
 
-One group of records and intents is one transaction. In WAL mode with `synchronous=NORMAL` what was
-committed survives the death of the process at any instant; `full` adds a disk flush for each group
-and survives a power failure too.
+One group of records and intents is one transaction. In WAL mode with `synchronous=NORMAL` a
+committed group survives the death of the process at any instant; `full` adds a disk flush for each
+group and survives a power failure too.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from rosrm.extensions.contracts import Intent, Record, StoredRecord
 from rosrm.journal.errors import fault_of, no_journal, other_version
 from rosrm.model.event_kinds import EventKind
 
-#: Version of the tables; a file of another one is refused.
+#: Version of the tables; a file with another version is refused.
 SCHEMA: Final = 1
 
 _TABLES: Final = """
@@ -33,17 +33,17 @@ CREATE TABLE IF NOT EXISTS intent (
 ) WITHOUT ROWID;
 """
 
-#: Milliseconds for which a write waits for another program that holds the file.
+#: Milliseconds for which a write waits while another program holds the file.
 _PATIENCE_MS: Final = 200
-#: Old records are deleted once so many too many have gathered.
+#: Excess of records at which old ones are deleted.
 _PRUNE_EVERY: Final = 1000
 
 
 class SqliteJournal:
-    """Keeps intent and events in one file.
+    """Intents and events in one SQLite file.
 
     Args:
-        path: of the file; it and its folder are made where missing.
+        path: of the file; file and folder are created where missing.
         sync: "normal" or "full".
         keep_events: newest records kept.
         wall: unix time, seconds.
@@ -106,7 +106,7 @@ class SqliteJournal:
 
     @property
     def last_sequence(self) -> int:
-        """Of the newest record; 0: there is none."""
+        """Sequence of the newest record; 0: there is none."""
         return self._sequence
 
     def write(
@@ -115,7 +115,7 @@ class SqliteJournal:
         """Append records and replace intents in one atomic group.
 
         Raises:
-            JournalBlocked: not just now; nothing was changed, and the same may be tried again.
+            JournalBlocked: a failure that may pass; nothing was changed, and a retry is safe.
             JournalError: the file is damaged.
         """
         wall = self._wall()
@@ -130,7 +130,7 @@ class SqliteJournal:
         return stored
 
     def _prune(self) -> None:
-        """What was asked for is written; where this fails there is a next time."""
+        """Delete old records; ignore a failure, because the next call tries again."""
         self._since_pruned = 0
         oldest = self._sequence - self._keep
         with contextlib.suppress(sqlite3.Error):
@@ -173,7 +173,7 @@ class SqliteJournal:
             raise
 
     def intents(self, table: str) -> Mapping[str, Mapping[str, Any]]:
-        """All intents of a table by key."""
+        """Return all intents of a table by key."""
         rows = self._guarded(
             lambda: self._database.execute(
                 "SELECT key, value FROM intent WHERE tbl = ?", (table,)
@@ -184,13 +184,13 @@ class SqliteJournal:
     def records(
         self, *, after: int = 0, process: str = "", host: str = "", newest: int = 1000
     ) -> Sequence[StoredRecord]:
-        """The newest matching records after a sequence, oldest first."""
+        """Return the newest matching records after a sequence, oldest first."""
         where, values = ["sequence > ?"], [after]
         matched: list[Any] = list(values)
         if process:
             where.append("process = ?")
             matched.append(process)
-        if host:  # or a move from there, by the text of the facts: damaged facts are no JSON
+        if host:  # or a migration from it, matched as text, because damaged facts are no JSON
             where.append("(host = ? OR instr(facts, ?))")
             matched += [host, f'"from": {json.dumps(host)}']
         rows = self._guarded(
@@ -222,7 +222,7 @@ class SqliteJournal:
 
 
 def _facts(text: str) -> Mapping[str, Any]:
-    """A record is for people: damaged facts must not keep them from reading the others."""
+    """Return a record's facts; damaged ones as text, so that the other records stay readable."""
     try:
         facts = json.loads(text)
     except ValueError:
@@ -231,7 +231,7 @@ def _facts(text: str) -> Mapping[str, Any]:
 
 
 def _plain(value: object) -> object:
-    """What JSON does not know by itself: read-only mappings, numpy numbers."""
+    """Return the JSON equivalent of a read-only mapping or numpy number."""
     if isinstance(value, Mapping):
         return dict(value)
     item = getattr(value, "item", None)

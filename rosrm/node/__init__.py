@@ -1,4 +1,4 @@
-"""What a node's author imports to make it migratable: `Node` in place of rclpy's.
+"""Base class of migratable nodes: `Node` replaces rclpy's.
 
     from rosrm.node import Node
 
@@ -10,7 +10,7 @@
             self.create_timer(0.1, self.tick)
             self.keep_state("~/state", Int64, self.save, self.restore)
 
-`docs/how-to/stateful-node.md` has the rest; `docs/reference/handoff-protocol.md`, what happens.
+`docs/how-to/stateful-node.md` has the rest, `docs/reference/handoff-protocol.md` the protocol.
 """
 
 from rosrm.node.arrays import arrays_message, arrays_of

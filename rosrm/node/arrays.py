@@ -1,4 +1,4 @@
-"""Numpy arrays as a message: npz without pickled objects, neither written nor read."""
+"""Numpy arrays as a message: npz that neither contains nor loads pickled objects."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def arrays_message(arrays: Mapping[str, npt.ArrayLike]) -> Arrays:
     """Pack arrays by name, with their types and shapes.
 
     Raises:
-        ValueError: one of them holds Python objects, which would have to be pickled.
+        ValueError: an array holds Python objects, which would have to be pickled.
     """
     plain = {name: np.asarray(value) for name, value in arrays.items()}
     for name, value in plain.items():
@@ -26,16 +26,16 @@ def arrays_message(arrays: Mapping[str, npt.ArrayLike]) -> Arrays:
                 f"the array {name!r} holds Python objects: numbers or text are required"
             )
     packed = io.BytesIO()
-    # The names go in as a mapping's, so that an array may be called "file" too.
+    # The prefix makes every name usable: `savez` has an argument called "file" itself.
     np.savez(packed, **{f"_{name}": value for name, value in plain.items()})  # type: ignore[arg-type]
     return Arrays(npz=array("B", packed.getvalue()))
 
 
 def arrays_of(message: Arrays) -> dict[str, npt.NDArray[Any]]:
-    """Unpack what `arrays_message` packed.
+    """Unpack a message of `arrays_message`.
 
     Raises:
-        ValueError: it is no npz, or holds pickled objects.
+        ValueError: the bytes are no npz, or hold pickled objects.
     """
     try:
         with np.load(io.BytesIO(message.npz), allow_pickle=False) as packed:

@@ -1,4 +1,4 @@
-"""The author's publishers, inputs, timers and services, as a node that can be moved holds them."""
+"""Wrappers of the author's publishers, inputs, timers and services in a migratable node."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.publisher import Publisher
 from rclpy.qos import HistoryPolicy, ReliabilityPolicy
 
-#: Source time stamps of the newest messages of each input that go with every mark.
+#: Source time stamps in every mark: those of the newest messages of each input.
 COVERED_KEPT: Final = 256
-#: Most messages that are taken from one reader at a time.
+#: Most messages that are taken from one reader in a row.
 _AT_A_TIME: Final = 1000
-#: Bytes that a part of a message is taken for that has no size of its own.
+#: Bytes assumed for a field without a size of its own.
 _SMALL: Final = 32
 
 
 @dataclass(slots=True)
 class Gate:
-    """Whether what the author publishes goes out."""
+    """The switch of the author's publishers: messages are sent while it is open."""
 
     is_open: bool
 
 
 class GatedPublisher(Publisher):  # type: ignore[misc]  # rclpy brings no types
-    """A publisher that is silent while its node is a shadow, or has fallen silent."""
+    """A publisher that sends nothing while its node is a shadow or silent."""
 
     gate: Gate
 
     def publish(self, msg: Any) -> None:
-        """Send a message, if this node is the active one; else it is dropped."""
+        """Send a message if this node is active; otherwise drop it."""
         if self.gate.is_open:
             super().publish(msg)
 
@@ -47,10 +47,10 @@ class Input:
         topic: fully qualified.
         key: the topic, or `/topic#2` for a second subscription of it.
         callback: the author's.
-        with_info: it wants the message's information too.
-        buffered: in a handoff its messages are kept.
+        with_info: the callback takes the message's information too.
+        buffered: its messages are kept during a handoff.
         wants_all: every message counts, not only the newest.
-        covered: source time stamps of the newest messages that were processed, ns.
+        covered: source time stamps of the newest processed messages, ns.
         subscription: rclpy's.
     """
 
@@ -64,11 +64,11 @@ class Input:
     subscription: Any = None
 
     def is_ordered(self) -> bool:
-        """Its messages come to the callback in the order of their publisher."""
+        """Return True if the callback receives messages in the order of their publisher."""
         return isinstance(self.subscription.callback_group, MutuallyExclusiveCallbackGroup)
 
     def serve(self, message: Any, info: Any) -> None:
-        """Have the author's callback process a message."""
+        """Let the author's callback process a message."""
         if self.with_info:
             self.callback(message, info)
         else:
@@ -77,7 +77,7 @@ class Input:
 
 
 def size_of(message: Any) -> int:
-    """Bytes of a message, about: the first of a list stands for all."""
+    """Return the approximate bytes of a message: a list counts as copies of its first item."""
     if isinstance(message, bytes | bytearray | str):
         return len(message)
     if isinstance(message, list | tuple):
@@ -92,7 +92,7 @@ def size_of(message: Any) -> int:
 
 
 def wants_all(qos: Any) -> bool:
-    """Whether an input is to have every message, and not only the newest."""
+    """Return True if an input needs every message, and not only the newest."""
     if isinstance(qos, int):
         return qos > 1
     if qos.reliability is ReliabilityPolicy.BEST_EFFORT:
@@ -101,10 +101,10 @@ def wants_all(qos: Any) -> bool:
 
 
 def waiting(subscription: Any) -> Iterator[tuple[Any, Any]]:
-    """Messages that have come and that the executor has not served yet, with their information.
+    """Yield received messages that the executor has not served yet, with their information.
 
-    They are taken, as the executor would have taken them; there is an end, even where they come
-    faster than they are taken.
+    They are taken from the reader, as by the executor. Their number is limited, so the loop ends
+    even if messages arrive faster than it takes them.
     """
     handle = subscription.handle
     with handle:
@@ -116,7 +116,7 @@ def waiting(subscription: Any) -> Iterator[tuple[Any, Any]]:
 
 
 def wants_info(callback: Callable[..., Any]) -> bool:
-    """Whether an input's callback takes (message, information), as rclpy tells it."""
+    """Return True if a callback takes (message, information), by rclpy's rule."""
     signature = inspect.signature(callback)
     try:
         signature.bind(object())
@@ -126,10 +126,10 @@ def wants_info(callback: Callable[..., Any]) -> bool:
 
 
 def refuse_coroutine(callback: Callable[..., Any], what: str) -> None:
-    """A callback is a cycle, and cycles do not overlap.
+    """Refuse a coroutine function, because each callback is a cycle and cycles do not overlap.
 
     Raises:
-        TypeError: it is a coroutine function.
+        TypeError: the callback is a coroutine function.
     """
     if inspect.iscoroutinefunction(callback):
         raise TypeError(
@@ -144,9 +144,9 @@ class TimerOf:
 
     Attributes:
         timer: rclpy's.
-        started: it runs, or is to run when its node becomes active.
-        period_ns: its own, while the timer was given another for one time.
-        taken: ticks that an executor's threads have taken, and that have not begun.
+        started: the timer runs, or will run when its node becomes active.
+        period_ns: the author's period, while the timer has another one for its first run.
+        taken: ticks taken by an executor's threads that have not begun.
     """
 
     timer: Any
@@ -155,30 +155,30 @@ class TimerOf:
     taken: int = 0
 
     def due_ns(self) -> int:
-        """Nanoseconds until it is due; -1: it is cancelled."""
+        """Return the nanoseconds until the timer is due; -1: it is cancelled."""
         if self.taken:
             return 0
         due = None if self.timer.is_canceled() else self.timer.time_until_next_call()
         return -1 if due is None else max(0, due)
 
     def follows_ros_time(self) -> bool:
-        """Whether its clock is a simulation's (`use_sim_time`)."""
+        """Return True if the timer's clock is simulated (`use_sim_time`)."""
         return bool(getattr(self.timer.clock, "ros_time_is_active", False))
 
     def start_in(self, seconds: float) -> None:
-        """Run first after so long, and in its own period from then on."""
+        """Run first after `seconds`, and in the author's period from then on."""
         self.period_ns = self.timer.timer_period_ns
         self.timer.timer_period_ns = max(1, int(seconds * 1e9))
         self.timer.reset()
 
     def back_in_step(self) -> None:
-        """It ran for the first time after `start_in`."""
+        """Restore the author's period after the first run that `start_in` set."""
         if self.period_ns:
             self.timer.timer_period_ns, self.period_ns = self.period_ns, 0
             self.timer.reset()
 
     def stop(self) -> None:
-        """Run no more, until it is started again."""
+        """Stop running until the next start."""
         if self.period_ns:
             self.timer.timer_period_ns, self.period_ns = self.period_ns, 0
         self.timer.cancel()
@@ -186,23 +186,23 @@ class TimerOf:
 
 @dataclass(frozen=True, slots=True)
 class Held:
-    """In place of an answer: the request came to a node that is not active."""
+    """A placeholder for an answer: the request reached a node that is not active."""
 
     request: Any
     response: Any
 
 
 class ServiceOf:
-    """One service of the author: a server that exists from when its node is active first.
+    """One service of the author, whose server exists from the node's first activation on.
 
-    A silent node executes nothing: its requests are held, with what it takes to answer them, until
-    it goes on, or for ever. No thread of an executor waits with them.
+    A silent node executes nothing. Its requests are held, with all that is needed to answer them,
+    until the node becomes active again, or forever. No executor thread waits for them.
 
-    It stands for rclpy's `Service` where the author keeps what `create_service` returned.
+    The author gets this object from `create_service` in place of rclpy's `Service`.
 
     Args:
         create: makes the server, for a callback.
-        destroy: takes it down.
+        destroy: destroys the server.
         name: as the author gave it.
         serve: answers a request, or returns it as `Held`.
     """
@@ -223,20 +223,20 @@ class ServiceOf:
         self.srv_name = name
 
     def open(self) -> None:
-        """Serve from now on."""
+        """Create the server, if it does not exist yet."""
         if self._service is None:
             self._service = self._create(self._serve)
             self._send, self._service.send_response = self._service.send_response, self._answer
 
     def _answer(self, answer: Any, header: Any) -> None:
-        """What rclpy calls with what `serve` returned."""
+        """Send an answer of `serve`, or hold the request; called by rclpy."""
         if isinstance(answer, Held):
             self._held.append((header, answer))
         else:
             self._send(answer, header)
 
     def serve_held(self) -> bool:
-        """Answer the oldest request that is held; False: there is none."""
+        """Answer the oldest held request; return False if there is none."""
         if not self._held:
             return False
         header, held = self._held.popleft()
@@ -244,29 +244,29 @@ class ServiceOf:
         return True
 
     def close(self) -> None:
-        """Take the server down."""
+        """Drop held requests and destroy the server."""
         self._held.clear()
         if self._service is not None:
             self._destroy(self._service)
             self._service = None
 
     def __getattr__(self, name: str) -> Any:
-        """What rclpy's object has, while there is one."""
+        """Return an attribute of rclpy's service while that exists."""
         if self._service is None:
             raise AttributeError(f"{name}: the service {self.srv_name} is not open in a shadow")
         return getattr(self._service, name)
 
 
 def _drop(_answer: Any, _header: Any) -> None:
-    """There is no server yet."""
+    """Drop an answer, because there is no server yet."""
 
 
 class OpeningOf:
-    """What the author has made when the node becomes active.
+    """An object that the author creates when the node becomes active.
 
     Args:
-        create: the author's function; what it returns is destroyed when the node falls silent,
-            where that has a `destroy`.
+        create: the author's function; if its result has a `destroy`, that is called when the node
+            falls silent.
     """
 
     def __init__(self, create: Callable[[], Any]) -> None:
@@ -275,13 +275,13 @@ class OpeningOf:
         self._is_open = False
 
     def open(self) -> None:
-        """Make it."""
+        """Create the object, if it does not exist yet."""
         if not self._is_open:
             self._is_open = True
             self._made = self._create()
 
     def close(self) -> None:
-        """Destroy it, where it can be."""
+        """Destroy the object, if it has a `destroy`."""
         self._is_open = False
         made, self._made = self._made, None
         destroy = getattr(made, "destroy", None)

@@ -1,4 +1,4 @@
-"""Which instance of which process this is: rosrm's slave says it in the environment."""
+"""Identity of this process's instance, from the environment that rosrm's slave sets."""
 
 from __future__ import annotations
 
@@ -7,24 +7,24 @@ from dataclasses import dataclass
 from math import inf
 from typing import Final
 
-#: Seconds by which a kept state may be behind, where nothing is said.
+#: Default bound in seconds on the age of a snapshot.
 KEEP_EVERY: Final = 1.0
 
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """Who a node is to rosrm.
+    """Identity of a node within rosrm.
 
     Attributes:
         process: name of the process.
         instance: its number.
-        node: fully qualified name under which others know it, whatever its alias; "": its own.
-        state_config: topic on which the master speaks.
-        cluster: name of the master that had it started.
+        node: fully qualified name that peers use, whatever its alias; "": the node's own name.
+        state_config: topic of the master's messages.
+        cluster: name of the master that started it.
         epoch: of that master.
         shadow: it starts as the destination of a handoff.
-        keep: directory in which its state is kept; "": it is not.
-        keep_every: seconds by which what is kept may be behind.
+        keep: directory of its snapshots; "": none are written.
+        keep_every: greatest age of a snapshot, seconds.
     """
 
     process: str
@@ -39,7 +39,7 @@ class Identity:
 
 
 def identity_from(environment: Mapping[str, str]) -> Identity | None:
-    """The identity that a slave gave; None: this process was not started by rosrm."""
+    """Return the identity set by a slave; None: rosrm did not start this process."""
     process, _, number = environment.get("ROSRM_INSTANCE", "").rpartition("#")
     topic = environment.get("ROSRM_STATE_CONFIG", "")
     if not process or not number.isdecimal() or not topic:

@@ -1,8 +1,8 @@
-"""A node that rosrm may move: what stands between the author's callbacks and ROS.
+"""A migratable node: the layer between the author's callbacks and ROS.
 
-At any time it is active (everything goes straight through), a shadow (its inputs are kept, nothing
-of it is heard), or silent (the same, of a source whose successor may be active). Each callback of
-the author is one cycle, and cycles never overlap, so that a state always lies between two of them.
+At any time the node is active (messages pass directly), a shadow (inputs are buffered, outputs
+dropped), or silent (the same, for a source whose successor may be active). Each callback of the
+author is one cycle, and cycles never overlap, so that a state always lies between two of them.
 """
 
 from __future__ import annotations
@@ -34,19 +34,19 @@ from rosrm.node.handoff.buffer import InputBuffer, Sent
 from rosrm.node.handoff.replay import Replay
 from rosrm.node.identity import Identity
 
-#: Most messages of one input, and most bytes of all, that are kept for a successor: a silent source
-#: whose destination is stuck may have to keep half a minute of a fast sensor.
+#: Most messages of one input, and most bytes of all inputs, that are buffered for a successor: a
+#: silent source with a stuck destination may have to buffer half a minute of a fast sensor.
 BUFFER_LIMIT: Final = 100_000
 BUFFER_BYTES: Final = 512 << 20
-#: rclpy's own, which every node has for itself.
+#: rclpy's own topics, which every node handles for itself.
 _INTERNAL: Final = frozenset({"/parameter_events", "/clock", "/rosout"})
-#: Seconds after becoming active in which a message may still come that the source has processed.
-#: Not longer: the clock of a publisher may be set back.
+#: Seconds after activation in which a message may arrive that the source has processed. The time is
+#: limited, because the clock of a publisher may be set back.
 _LATE: Final = 10.0
 
 
 class Mode(Enum):
-    """What a node does."""
+    """State of a node in a handoff."""
 
     ACTIVE = "active"
     SHADOW = "shadow"
@@ -59,15 +59,15 @@ class Member:
     Args:
         node: the author's.
         plain: rclpy's own methods of it.
-        identity: that rosrm gave this process.
-        resting: it is not active yet: a shadow, or it goes on from a kept state first.
+        identity: given by rosrm to this process.
+        resting: the node does not start active: a shadow, or a node that restores a snapshot first.
 
     Attributes:
         turn: held while a callback runs.
         sequence: cycles so far.
-        in_cycle: a callback of the author has begun and not ended; still so where it raised.
+        in_cycle: a callback of the author has begun and not ended; also True after it raised.
         on_cycle: called after each cycle.
-        on_overflow: called with the topic of an input for which there was no more room.
+        on_overflow: called with the topic of an input whose buffer is full.
     """
 
     def __init__(self, node: Any, plain: Any, identity: Identity, *, resting: bool) -> None:
@@ -91,11 +91,11 @@ class Member:
 
     @property
     def visible_node(self) -> str:
-        """Fully qualified name under which others know this node."""
+        """Fully qualified name by which peers know this node."""
         return self.identity.node or str(self.node.get_fully_qualified_name())
 
     def visible(self, name: str, resolve: Callable[[str], str]) -> str:
-        """A name as the author gave it, freed of the alias that this node may run under."""
+        """Return a name given by the author without the alias under which this node may run."""
         own = f"{self.node.get_fully_qualified_name()}/"
         resolved = resolve(name)
         if not resolved.startswith(own) or own == f"{self.visible_node}/":
@@ -105,7 +105,7 @@ class Member:
     def _new_buffer(self) -> InputBuffer:
         return InputBuffer(BUFFER_LIMIT, BUFFER_BYTES, time.monotonic())
 
-    # --- what the author creates -----------------------------------------------------------
+    # --- entities of the author ------------------------------------------------------------
 
     def create_publisher(self, message_type: Any, topic: str, qos: Any, **rest: Any) -> Any:
         """Create a publisher that can fall silent."""
@@ -125,7 +125,7 @@ class Member:
         self, message_type: Any, topic: str, callback: Callable[..., Any], qos: Any, *,
         buffer: bool, **rest: Any,
     ) -> Any:  # fmt: skip
-        """Create an input, whose messages are kept while this node is not active."""
+        """Create an input, whose messages are buffered while this node is not active."""
         if topic in _INTERNAL:
             return self.plain.create_subscription(message_type, topic, callback, qos, **rest)
         refuse_coroutine(callback, topic)
@@ -142,7 +142,7 @@ class Member:
         return one.subscription
 
     def _new_key(self, topic: str) -> str:
-        """A node may subscribe to a topic twice, and each of its inputs has every message."""
+        """Return a unique key: a node may subscribe to a topic twice, and both get all messages."""
         taken = {one.key for one in self.inputs}
         numbered = (f"{topic}#{number}" for number in itertools.count(2))
         return next(key for key in itertools.chain([topic], numbered) if key not in taken)
@@ -156,7 +156,7 @@ class Member:
         **named: Any,
     ) -> Any:
         """Create a timer that runs while this node is active."""
-        if callback is None:  # rclpy's Rate puts its own in later, and is no cycle
+        if callback is None:  # rclpy's Rate, which sets a callback of its own later: no cycle
             return self.plain.create_timer(period, None, *rest, autostart=autostart, **named)
         refuse_coroutine(callback, f"a timer of {period} s")
 
@@ -197,7 +197,7 @@ class Member:
         return service
 
     def when_active(self, create: Callable[[], Any]) -> None:
-        """Have something made that may exist only while this node is active."""
+        """Create an object that may exist only while this node is active."""
         self._add_opening(OpeningOf(create))
 
     def _add_opening(self, opening: ServiceOf | OpeningOf) -> None:
@@ -206,7 +206,7 @@ class Member:
             opening.open()
 
     def destroyed(self, entity: Any) -> None:
-        """The author destroyed a publisher, an input, a timer or a service."""
+        """Remove a publisher, input, timer or service that the author destroyed."""
         self.outputs = [one for one in self.outputs if one is not entity]
         self.inputs = [one for one in self.inputs if one.subscription is not entity]
         self.timers = [one for one in self.timers if one.timer is not entity]
@@ -232,7 +232,7 @@ class Member:
                 self._cycle(one.serve, message, info)
 
     def _is_late(self, one: Input, info: Any) -> bool:
-        """It was on its way when this node became active, and the source had processed it."""
+        """Return True if the source processed this message while it was on its way here."""
         if not self._late_until:
             return False
         if time.monotonic() >= self._late_until:
@@ -240,10 +240,10 @@ class Member:
             return False
         return self.buffer.is_marked(one.key, info["source_timestamp"])
 
-    # --- what is kept ----------------------------------------------------------------------
+    # --- buffering -------------------------------------------------------------------------
 
     def _keep(self, one: Input, message: Any, info: Any) -> None:
-        """For who goes on: this node when it becomes active, or again."""
+        """Buffer a message for the next active node: this one, or a successor."""
         sent = Sent(info["source_timestamp"], info["publication_sequence_number"] or None)
         if not one.is_ordered():
             self.buffer.mix(one.key)
@@ -252,7 +252,7 @@ class Member:
             self.on_overflow(one.topic)
 
     def _may_catch_up(self, one: Input) -> bool:
-        """No other thread holds an older message; and no node of too much work is given more."""
+        """Return True if no other thread holds an older message, and this node is not busy."""
         busy = self.mode is Mode.ACTIVE and time.monotonic() >= self._late_until
         return not busy and (self._is_one_thread() or one.is_ordered())
 
@@ -260,27 +260,27 @@ class Member:
         return not isinstance(self.node.executor, MultiThreadedExecutor)
 
     def _catch_up(self, one: Input) -> None:
-        """Keep what has come: a reader has less room than the buffer, and drops the oldest."""
+        """Buffer received messages, because a reader has less room and drops the oldest."""
         for message, info in waiting(one.subscription):
             self._keep(one, message, info)
 
     def catch_up(self) -> None:
-        """Keep what has come on every input that is kept at all, as far as that is known."""
+        """Buffer received messages of all buffered inputs, unless several threads take them."""
         if self._is_one_thread():
             for one in self.inputs:
                 if one.buffered:
                     self._catch_up(one)
 
     def input_with_gap(self) -> str:
-        """An input that is to have every message, and misses one for good; "": there is none."""
+        """Return an input that needs every message and has lost one for good; "": there is none."""
         wanting = (one for one in self.inputs if one.buffered and one.wants_all)
         return next((one.topic for one in wanting if self.buffer.misses_one(one.key)), "")
 
     def serve_what_has_come(self, then: Callable[[], None]) -> None:
-        """Before falling silent: a shadow that joined later never had what waits here since.
+        """Serve received messages before falling silent, because a later shadow never got them.
 
         Args:
-            then: called when it is served.
+            then: called when they are served.
         """
         if not self._replay.is_on:
             self.catch_up()
@@ -293,7 +293,7 @@ class Member:
         if self.mode is not Mode.ACTIVE:
             return False
         if time.monotonic() < self._late_until:
-            self.catch_up()  # later on, a reader's depth is what it is for a busy node
+            self.catch_up()  # afterwards only the reader's depth bounds a busy node's backlog
         kept = self.buffer.take()
         if kept is not None:
             one, message, info = kept.item
@@ -304,11 +304,11 @@ class Member:
     # --- changes of the mode ---------------------------------------------------------------
 
     def fall_silent(self) -> list[int]:
-        """Stop all that can be heard; returns what `timers_due` was (ns)."""
+        """Stop publishing and all timers; return `timers_due` from before (ns)."""
         due = self.timers_due()
         self.mode = Mode.SILENT
         self._gate.is_open = False
-        if not self.buffer:  # what came while the last was served is for who goes on
+        if not self.buffer:  # messages that came during the last cycle stay for the successor
             self.buffer = self._new_buffer()
         for timer in self.timers:
             timer.started = not timer.timer.is_canceled()
@@ -317,7 +317,7 @@ class Member:
         return due
 
     def close_services(self) -> None:
-        """The successor answers: what is still sent here would be lost."""
+        """Close all services: the successor answers, and requests to this node would be lost."""
         self._close_all(ServiceOf)
 
     def _close_all(self, kind: type[ServiceOf | OpeningOf]) -> None:
@@ -333,26 +333,27 @@ class Member:
             self.node.get_logger().error(f"falling silent, and closing raised {what}")
 
     def inherit(self, key: str, covered: Iterable[int]) -> None:
-        """What the source had processed of an input is processed here too."""
+        """Add time stamps that the source covered to those of the input here."""
         for one in self.inputs:
             if one.key == key:
                 one.covered.extend(covered)
 
     def timers_due(self) -> list[int]:
-        """Nanoseconds until each timer is due, in the order of creation; -1: cancelled."""
+        """Return the nanoseconds until each timer is due, in order of creation; -1: cancelled."""
         return [timer.due_ns() for timer in self.timers]
 
     def become_active(
         self, timers_due: list[float | None], announce: Callable[[], None],
         settle: Sequence[Callable[[], None]] = (),
     ) -> None:  # fmt: skip
-        """Go on: first say so, then serve what was kept.
+        """Become active: first announce it, then serve buffered messages.
 
         Args:
             timers_due: seconds until each timer is due, negative where it is late; None: it was
                 cancelled. Timers beyond the list start now.
-            announce: called at once, as serving may take long.
-            settle: called after the first slices of what was kept, when timers and services go on.
+            announce: called at once, because serving may take long.
+            settle: called after the first slices of buffered messages and the start of timers and
+                services.
         """
         self.mode = Mode.ACTIVE
         self._gate.is_open = True
@@ -363,7 +364,7 @@ class Member:
     def _go_on(
         self, timers_due: list[float | None], begun: float, settle: Sequence[Callable[[], None]]
     ) -> Iterator[None]:
-        """Timers and services, in steps of some ms: what comes meanwhile is served between them."""
+        """Start timers and services in steps of some ms; new messages are served between steps."""
         self._start_timers(timers_due, time.monotonic() - begun)
         for opening in list(self._openings):
             yield
@@ -385,14 +386,14 @@ class Member:
             if seconds is None:
                 timer.timer.cancel()
             elif timer.follows_ros_time():
-                timer.timer.reset()  # its seconds are not ours
+                timer.timer.reset()  # simulated seconds differ from monotonic ones
             else:
                 timer.start_in(seconds - passed)
 
 
 def _nothing() -> None:
-    """Nobody follows."""
+    """Do nothing, as long as no role is set."""
 
 
 def _ignore(_topic: str) -> None:
-    """Nobody follows."""
+    """Do nothing, as long as no role is set."""

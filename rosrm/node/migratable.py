@@ -25,17 +25,17 @@ _NODES: Final[dict[int, Any]] = {}
 
 
 class Migratable(_Base):  # type: ignore[misc]  # rclpy brings no types
-    """Makes a node migratable; stands before rclpy's node, or a subclass of it, among the bases.
+    """Makes a node migratable; a base class listed before rclpy's node, or a subclass of it.
 
-    Started by hand, by a launch file or by anything but rosrm, nothing is different from rclpy's
-    node: no topic, no callback, no cost. Under rosrm
+    Without rosrm (started by hand or by a launch file) the node equals rclpy's: no topic, no
+    callback, no cost. Under rosrm
 
     - each callback of a timer, an input or a service is a *cycle*, and cycles never overlap;
-    - after a cycle the state is saved and published, if somebody follows it;
-    - started as the destination of a handoff, the node is a shadow: its inputs are kept, its timers
-      rest, its services are not there and nothing that it publishes goes out, until it is active.
+    - after a cycle the state is saved and published, if it has a follower;
+    - a node started as the destination of a handoff is a shadow until it is active: inputs are
+      buffered, timers stopped, services absent, and published messages dropped.
 
-    `async` callbacks are refused under rosrm: a state lies between two callbacks.
+    rosrm refuses `async` callbacks, because a state lies between two callbacks.
     """
 
     _rosrm: Handoff | None = None
@@ -52,7 +52,7 @@ class Migratable(_Base):  # type: ignore[misc]  # rclpy brings no types
             self._rosrm.begin()
 
     def _be_the_only_one(self, identity: Identity) -> None:
-        """An instance has one state, so one node of its process can have it.
+        """Register the one migratable node of this process: an instance has one state.
 
         Raises:
             RuntimeError: another node of this process is migratable already.
@@ -74,13 +74,13 @@ class Migratable(_Base):  # type: ignore[misc]  # rclpy brings no types
         save: Callable[[], Any],
         restore: Callable[[Any], None],
     ) -> None:
-        """Name one topic of this node's state; several make a state of several parts.
+        """Name one topic of this node's state; several calls make a state of several parts.
 
         Args:
-            topic: on which the state is published after each cycle, to whoever listens.
+            topic: on which the state is published after each cycle, if it has subscribers.
             message_type: of the topic.
-            save: returns the state as a message, or None: it is what it was the last time.
-            restore: takes the message, and overwrites what the node had. It is called for every
+            save: returns the state as a message, or None: unchanged since the last time.
+            restore: takes the message, and overwrites the node's state. It is called for every
                 state that a shadow receives.
 
         Raises:
@@ -90,10 +90,10 @@ class Migratable(_Base):  # type: ignore[misc]  # rclpy brings no types
             self._rosrm.keep_state(topic, message_type, save, restore)
 
     def when_active(self, create: Callable[[], Any]) -> None:
-        """Have something made when this node becomes active: at once, unless it is a shadow.
+        """Call `create` when this node becomes active: at once, unless it is a shadow.
 
-        For what must exist in the active node only, such as an action server. What `create` returns
-        is destroyed (`.destroy()`) when the node falls silent, and made anew if it goes on.
+        For objects that must exist in the active node only, such as an action server. The node
+        destroys the result (`.destroy()`) when it falls silent, and creates it again if it resumes.
         """
         if self._rosrm is not None:
             self._rosrm.member.when_active(create)
@@ -103,7 +103,7 @@ class Migratable(_Base):  # type: ignore[misc]  # rclpy brings no types
     # --- rclpy's methods -------------------------------------------------------------------
 
     def create_publisher(self, msg_type: Any, topic: str, qos_profile: Any, **named: Any) -> Any:
-        """As rclpy's; what a shadow or a silent node publishes is dropped."""
+        """Create a publisher as rclpy's; messages of a shadow or a silent node are dropped."""
         if self._rosrm is None:
             return super().create_publisher(msg_type, topic, qos_profile, **named)
         return self._rosrm.member.create_publisher(msg_type, topic, qos_profile, **named)
@@ -112,12 +112,12 @@ class Migratable(_Base):  # type: ignore[misc]  # rclpy brings no types
         self, msg_type: Any, topic: str, callback: Callable[..., Any], qos_profile: Any, *,
         buffer: bool = True, **named: Any,
     ) -> Any:  # fmt: skip
-        """As rclpy's.
+        """Create a subscription as rclpy's.
 
         Args:
             msg_type, topic, callback, qos_profile, named: as rclpy has them.
             buffer: in a handoff every message is processed once, by the source or by the
-                destination; False: what comes while the node is not active is passed over.
+                destination; False: messages are skipped while the node is not active.
         """
         if self._rosrm is None:
             return super().create_subscription(msg_type, topic, callback, qos_profile, **named)
@@ -129,7 +129,7 @@ class Migratable(_Base):  # type: ignore[misc]  # rclpy brings no types
         self, timer_period_sec: float, callback: Callable[..., Any], *rest: Any,
         autostart: bool = True, **named: Any,
     ) -> Any:  # fmt: skip
-        """As rclpy's; it rests in a shadow, and goes on in step with the source's."""
+        """Create a timer as rclpy's; a shadow's is stopped, then in phase with the source's."""
         if self._rosrm is None:
             return super().create_timer(
                 timer_period_sec, callback, *rest, autostart=autostart, **named
@@ -141,19 +141,19 @@ class Migratable(_Base):  # type: ignore[misc]  # rclpy brings no types
     def create_service(
         self, srv_type: Any, srv_name: str, callback: Callable[..., Any], **named: Any
     ) -> Any:
-        """As rclpy's; the server is there while this node is active."""
+        """Create a service as rclpy's; the server exists while this node is active."""
         if self._rosrm is None:
             return super().create_service(srv_type, srv_name, callback, **named)
         return self._rosrm.member.create_service(srv_type, srv_name, callback, **named)
 
     def create_client(self, srv_type: Any, srv_name: str, **named: Any) -> Any:
-        """As rclpy's; a name below `~` is the one that others know."""
+        """Create a client as rclpy's; a name below `~` uses the node name that peers know."""
         if self._rosrm is not None:
             srv_name = self._rosrm.member.visible(srv_name, self.resolve_service_name)
         return super().create_client(srv_type, srv_name, **named)
 
     def destroy_service(self, service: Any) -> bool:
-        """As rclpy's."""
+        """Destroy a service as rclpy does."""
         if isinstance(service, ServiceOf):
             self._forget(service)
             service.close()
@@ -161,22 +161,22 @@ class Migratable(_Base):  # type: ignore[misc]  # rclpy brings no types
         return bool(super().destroy_service(service))
 
     def destroy_publisher(self, publisher: Any) -> bool:
-        """As rclpy's."""
+        """Destroy a publisher as rclpy does."""
         self._forget(publisher)
         return bool(super().destroy_publisher(publisher))
 
     def destroy_subscription(self, subscription: Any) -> bool:
-        """As rclpy's."""
+        """Destroy a subscription as rclpy does."""
         self._forget(subscription)
         return bool(super().destroy_subscription(subscription))
 
     def destroy_timer(self, timer: Any) -> bool:
-        """As rclpy's."""
+        """Destroy a timer as rclpy does."""
         self._forget(timer)
         return bool(super().destroy_timer(timer))
 
     def destroy_node(self) -> None:
-        """As rclpy's."""
+        """Destroy the node as rclpy does; a last snapshot is stored first."""
         if self._rosrm is not None:
             self._rosrm.close()
             _NODES.pop(self._rosrm.identity.instance, None)

@@ -1,4 +1,4 @@
-"""Timers of our own: no clock that can be set, or that is simulated, holds them up."""
+"""Timers by the monotonic clock, which no clock change or simulation delays."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from rclpy.clock_type import ClockType
 def steady_timer(
     plain: Any, period: float, callback: Callable[[], None], *, autostart: bool = True
 ) -> Any:
-    """A timer by the monotonic clock; rclpy's default goes by the node's, which follows the wall.
+    """Create a timer by the monotonic clock; rclpy's default follows the node's (wall) clock.
 
     Args:
         plain: rclpy's own methods of a node.
         period: seconds.
         callback: called at each period.
-        autostart: it runs from now on; else from its `reset`.
+        autostart: True: the timer runs from now on; False: from its `reset`.
     """
     clock = Clock(clock_type=ClockType.STEADY_TIME)
     return plain.create_timer(period, callback, clock=clock, autostart=autostart)

@@ -1,9 +1,9 @@
-"""The only place that imports rclpy, with `rosrm.node`: transport, graph, message <-> value."""
+"""ROS layer: transport, graph, message <-> value. Only it and `rosrm.node` import rclpy."""
 
 import sys
 from typing import Any
 
 _modules: dict[str, Any] = sys.modules
-# Generated messages import the code generator, which they do not use: 60 ms of every command. The
-# generator's package copes with an import that fails, and None makes this one fail.
+# Generated messages import the code generator, which they do not use: 60 ms of every command. None
+# makes this import fail, and the generator's package tolerates that.
 _modules.setdefault("rosidl_generator_py.generate_py_impl", None)

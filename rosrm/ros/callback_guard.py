@@ -1,7 +1,7 @@
-"""Keeps what a callback raises from ending the process.
+"""Guard that keeps exceptions inside callbacks.
 
 An exception that leaves a callback of rclpy's events executor ends the process, mostly by a
-segmentation fault that names no cause. So rosrm lets none out.
+segmentation fault that names no cause. So rosrm catches all of them.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ _LOGGED_EVERY: Final = 1.0
 
 
 class CallbackGuard:
-    """Calls callbacks: one that raises is logged and counted, and its caller continues.
+    """Calls callbacks; an exception is logged and counted, and the caller continues.
 
     Attributes:
         failures: callbacks that raised.
-        interrupted: Ctrl-C, or an exception of a signal handler, that came in a callback; the
+        interrupted: a Ctrl-C, or an exception of a signal handler, that arrived in a callback; the
             loop has to raise it.
     """
 
@@ -35,7 +35,7 @@ class CallbackGuard:
         self._places: dict[str, tuple[float, int]] = {}
 
     def call(self, callback: Callable[..., Any], *arguments: Any) -> str:
-        """Call a callback; returns "" or what was raised, with file and line."""
+        """Call a callback; return "" or the exception with file and line."""
         try:
             callback(*arguments)
         except (Exception, SystemExit, GeneratorExit) as fault:  # noqa: BLE001 - the guard
@@ -44,11 +44,11 @@ class CallbackGuard:
             self._note(place, getattr(callback, "__qualname__", str(callback)), reason)
             return reason
         except BaseException as interrupt:  # noqa: BLE001 - nothing may reach the executor
-            self.interrupted = interrupt  # it came from a signal, which may come only once
+            self.interrupted = interrupt  # caused by a signal, which may arrive only once
         return ""
 
     def raise_interrupt(self) -> None:
-        """Raise the Ctrl-C or signal that came in a callback, if one did."""
+        """Raise the Ctrl-C or signal that arrived in a callback, if there was one."""
         if self.interrupted is not None:
             interrupt, self.interrupted = self.interrupted, None
             raise interrupt

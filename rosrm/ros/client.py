@@ -24,33 +24,33 @@ from rosrm_msgs import srv
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-#: Seconds between two looks whether a service was discovered: rclpy has no event for it.
+#: Seconds between two checks for a service's discovery, for which rclpy has no event.
 _LOOK: Final = 0.005
-#: Seconds that a master which was found is given for a request, at least.
+#: Least seconds that a discovered master has for a request.
 _REQUEST: Final = 10.0
 #: Seconds after which a request without an answer is sent again.
 _AGAIN: Final = 2.0
-#: The same for a greeting, which costs the master nothing.
+#: The same for a handshake, which costs the master nothing.
 _GREET_AGAIN: Final = 0.5
-#: In an answer that does not say which run of the master gave it.
+#: Epoch in an answer that does not name the master's run.
 _UNKNOWN_EPOCH: Final = 0
-#: In messages.
+#: Name of the master in messages.
 _MASTER: Final = "the master"
 
 
 @dataclass(frozen=True, slots=True)
 class LogPart:
-    """A part of what an instance of a process wrote.
+    """A part of an instance's log.
 
     Attributes:
         number: of the instance.
         numbers: of all instances of the process whose logs the host holds, ascending.
         content: the bytes.
-        offset: of the content, from the first byte that the instance wrote. What lies between the
-            offset that was asked for and this one was dropped.
-        next_offset: where to read on.
-        ended: the instance has ended and nothing more will come.
-        marks: looks at the log: (unix time, offset, pid). Everything before the offset had been
+        offset: of the content, from the first byte that the instance wrote. Bytes between the
+            requested offset and this one were dropped.
+        next_offset: offset of the next part.
+        ended: the instance has ended, and the log is complete.
+        marks: checks of the log: (unix time, offset, pid). Everything before the offset had been
             written by that time; a pid not 0 is that of a process whose output begins there.
     """
 
@@ -64,7 +64,7 @@ class LogPart:
 
 
 def wait_for_service(participant: Participant, client: Any, deadline: float) -> bool:
-    """Whether a service is there before `deadline` (monotonic seconds)."""
+    """Return True if a service is discovered before `deadline` (monotonic seconds)."""
     while not client.service_is_ready():
         if time.monotonic() >= deadline:
             return False
@@ -73,7 +73,7 @@ def wait_for_service(participant: Participant, client: Any, deadline: float) -> 
 
 
 def wait_until(participant: Participant, done: Callable[[], bool], deadline: float) -> bool:
-    """Whether something is done before `deadline` (monotonic seconds)."""
+    """Return True if `done` becomes true before `deadline` (monotonic seconds)."""
     while not done():
         left = deadline - time.monotonic()
         if left <= 0.0:
@@ -84,7 +84,7 @@ def wait_until(participant: Participant, done: Callable[[], bool], deadline: flo
 
 @dataclass(slots=True)
 class _Answers:
-    """The first answer to a request, and how often that was sent."""
+    """The first answer to a request, and the number of times that the request was sent."""
 
     first: tuple[Any, ...] = ()
     sent: int = 0
@@ -94,17 +94,17 @@ class _Answers:
 
     @property
     def answer(self) -> Any:
-        """None: there is none."""
+        """The first answer; None: there is none."""
         return self.first[0] if self.first else None
 
 
 def is_unsure(answer: Any, epoch: int) -> bool:
-    """Whether who was asked first may have done what a repeated request is turned down for.
+    """Return True if a refused repetition may have been carried out the first time.
 
     Args:
-        answer: to the repeated request: another run's "in use already" may be the doing of the
-            first one.
-        epoch: of the run that was asked first.
+        answer: to the repeated request. If it comes from another run of the master, its "in use
+            already" may be an effect of the first request.
+        epoch: of the run that got the first request.
     """
     if answer.accepted:
         return False
@@ -114,14 +114,14 @@ def is_unsure(answer: Any, epoch: int) -> bool:
 def find_master(
     participant: Participant, who: str, timeout: float
 ) -> srv.Handshake.Response | None:
-    """Look for a master and shake hands.
+    """Find a master and shake hands.
 
     Args:
-        who: role and name of the asking side.
+        who: role and name of the caller.
         timeout: seconds.
 
     Returns:
-        What the master says of itself, or None: nobody answered in time.
+        The master's description of itself; None: no master answered in time.
     """
     deadline = time.monotonic() + timeout
     path = names.Names(participant.settings.namespace)(names.HANDSHAKE)
@@ -141,10 +141,10 @@ def find_master(
 def _ask_until_answered(
     participant: Participant, client: Any, request: Any, deadline: float, again: float
 ) -> _Answers:
-    """The first answer to a request that is repeated until `deadline`.
+    """Repeat a request until `deadline`; return the first answer.
 
-    A server answers nobody whose reader of answers it has not found yet, and a new client's request
-    may be there before.
+    A server sends no answer before it has discovered the client's reader, and a new client's
+    request may arrive earlier.
     """
     answers = _Answers()
     while not answers.first:
@@ -160,7 +160,7 @@ def _ask_until_answered(
 def _greet(
     participant: Participant, name: str, timeout: float, begun: float
 ) -> srv.Handshake.Response:
-    """The master's greeting; raises `NoMaster` or `Refused`."""
+    """Return the master's greeting; raises `NoMaster` or `Refused`."""
     hello = find_master(participant, f"client {name}", timeout)
     settings = participant.settings
     if hello is None:
@@ -185,8 +185,8 @@ def _to_check(settings: RosSettings) -> str:
 class MasterClient:
     """A connection to the master; a context manager.
 
-    Use `connect`. Every request raises `Refused` with the master's message when it is turned down,
-    and `NoMaster` when no answer comes in time.
+    Use `connect`. Every request raises `Refused` with the master's message when the master refuses
+    it, and `NoMaster` when no answer comes in time.
     """
 
     def __init__(
@@ -205,18 +205,18 @@ class MasterClient:
         cls, settings: RosSettings, *, name: str, timeout: float = 3.0,
         joined: Participant | None = None, begun: float | None = None,
     ) -> MasterClient:  # fmt: skip
-        """Find the master.
+        """Find the master and connect.
 
         Args:
-            settings: with which to join ROS.
+            settings: for joining ROS.
             name: of this client, for the master's messages.
-            timeout: seconds for finding it; a request is given as many, or 10.
-            joined: a participant that was made before, which the client then owns.
-            begun: since when the user waits (monotonic seconds), for the message; None: since now.
+            timeout: seconds for discovery; a request has the same time, at least 10 s.
+            joined: an existing participant, which the client then owns.
+            begun: start of the user's wait (monotonic seconds), for the message; None: now.
 
         Raises:
-            NoMaster: none answered; the message says what was looked for.
-            Refused: it is of another version.
+            NoMaster: none answered; the message says where it was searched.
+            Refused: the master has another version.
         """
         begun = time.monotonic() if begun is None else begun
         participant = joined or Participant(settings, names.client_node())
@@ -230,7 +230,7 @@ class MasterClient:
     # --- requests ------------------------------------------------------------------------
 
     def submit(self, specs: Sequence[ProcessSpec]) -> str:
-        """Queue processes, all or none; returns the master's message."""
+        """Queue processes, all or none; return the master's message."""
         request = srv.Submit.Request(processes=[convert.spec_to_msg(spec) for spec in specs])
         return str(self._ask(srv.Submit, names.SUBMIT, request).answer.message)
 
@@ -238,7 +238,7 @@ class MasterClient:
         """Queue processes without waiting for the answer; `spin` until `done` is called.
 
         Args:
-            done: called with "" or with why the processes were refused.
+            done: called with "" or with the reason of a refusal.
         """
         request = srv.Submit.Request(processes=[convert.spec_to_msg(spec) for spec in specs])
         request.envelope = self._envelope()
@@ -251,32 +251,32 @@ class MasterClient:
         self._control.call(client, request, time.monotonic() + self._timeout, finish)
 
     def spin(self, timeout: float) -> None:
-        """Take in what comes, at most `timeout` seconds."""
+        """Handle incoming messages for at most `timeout` seconds."""
         self._participant.spin(timeout)
         self._control.expire(time.monotonic())
 
     def cancel(self, processes: Sequence[str]) -> str:
-        """Take processes out of the queue, or stop them."""
+        """Remove processes from the queue, or stop them."""
         request = srv.Cancel.Request(processes=list(processes))
         return str(self._ask(srv.Cancel, names.CANCEL, request).answer.message)
 
     def restart(self, processes: Sequence[str]) -> str:
-        """Restart processes where they run; queue anew those that have ended."""
+        """Restart processes where they run; queue ended ones again."""
         request = srv.Restart.Request(processes=list(processes))
         return str(self._ask(srv.Restart, names.RESTART, request).answer.message)
 
     def migrate(self, name: str, host: str | None = None) -> str:
-        """Begin to move a process; without a host the core chooses one."""
+        """Begin the migration of a process; without a host the core chooses one."""
         request = srv.Migrate.Request(process=name, host=host or "")
         return str(self._ask(srv.Migrate, names.MIGRATE, request).answer.message)
 
     def checkpoint(self, name: str) -> str:
-        """Begin to dump a process into an image on its host, where it ends."""
+        """Begin to dump a process into a checkpoint image on its host; the process ends."""
         request = srv.Checkpoint.Request(process=name)
         return str(self._ask(srv.Checkpoint, names.CHECKPOINT, request).answer.message)
 
     def restore(self, name: str) -> str:
-        """Begin to have a process go on from its image, where that lies."""
+        """Begin to restore a process from its checkpoint image, on the host that holds it."""
         request = srv.Restore.Request(process=name)
         return str(self._ask(srv.Restore, names.RESTORE, request).answer.message)
 
@@ -290,14 +290,14 @@ class MasterClient:
         request = srv.Prune.Request(processes=list(processes), hosts=list(hosts))
         return str(self._ask(srv.Prune, names.PRUNE, request).answer.message)
 
-    # --- what can be read ----------------------------------------------------------------
+    # --- listings and logs ---------------------------------------------------------------
 
     def list(
         self, *, hosts: bool = False, processes: bool = False,
         plugins: bool | Literal["failing"] = False, events: bool = False, process: str = "",
         host: str = "", after: int = 0, newest: int = 0,
     ) -> Snapshot:  # fmt: skip
-        """The listings that are asked for, of plugins all or those that fail.
+        """Return the requested listings; `plugins="failing"` limits plugins to failing ones.
 
         The arguments after `events` narrow the events.
         """
@@ -317,7 +317,7 @@ class MasterClient:
         )  # fmt: skip
 
     def explain(self, name: str) -> Mapping[str, Any]:
-        """Why a process is where it is, or why it waits."""
+        """Return the reasons for a process's placement, or for its wait."""
         request = srv.Explain.Request(protocol_version=PROTOCOL_VERSION, process=name)
         answer = self._call(srv.Explain, self._names(names.EXPLAIN), request, _MASTER)
         story: Mapping[str, Any] = json.loads(answer.explanation)
@@ -331,12 +331,12 @@ class MasterClient:
 
         Args:
             host: of the slave.
-            process: that wrote.
+            process: that wrote the log.
             number: of the instance; 0: the newest on that host.
-            offset: where to begin, bytes.
+            offset: of the first byte.
             max_bytes: 0: as many as one answer holds.
-            tail: begin so many lines before the end instead; 0: at `offset`.
-            since: begin with what was written at this unix time or later; 0: at `offset`.
+            tail: start this many lines before the end instead; 0: at `offset`.
+            since: start with output written at this unix time or later; 0: at `offset`.
         """
         request = srv.ReadLog.Request(
             protocol_version=PROTOCOL_VERSION, process=process, number=number, offset=offset,
@@ -350,10 +350,10 @@ class MasterClient:
             answer.next_offset, answer.ended, tuple(marks),
         )  # fmt: skip
 
-    # --- how -----------------------------------------------------------------------------
+    # --- transport -----------------------------------------------------------------------
 
     def _envelope(self) -> Any:
-        """Heads a request; the beat is renewed while it is still young for the master."""
+        """Return a request's envelope; renew the beat before the master would reject it as old."""
         if time.monotonic() - self._heard > 1.0:
             hello = find_master(self._participant, self._control.sender, self._timeout)
             if hello is None:
@@ -369,7 +369,7 @@ class MasterClient:
             except Refused as refusal:
                 if greeted_anew or refusal.code != "stale":
                     raise
-                self._heard = -math.inf  # another run of the master than the one that greeted us
+                self._heard = -math.inf  # another run of the master than the one that greeted
         raise AssertionError("the second time it is answered or raised")
 
     def _silent(self, who: str, trouble: str = "", unknown: str = "") -> NoMaster:
@@ -398,16 +398,16 @@ class MasterClient:
         return client
 
     def _call(self, kind: Any, path: str, request: Any, who: str) -> Any:
-        """Ask until there is an answer: a lost one is given again to a repeated request.
+        """Send a request until an answer comes; the receiver repeats a lost answer.
 
-        Every request may be repeated: it reads only, or carries an id by which it is known.
+        Every request may be repeated: it only reads, or carries an id by which it is recognised.
         """
         client = self._client(kind, path, who)
         deadline = time.monotonic() + self._timeout
         answers = _ask_until_answered(self._participant, client, request, deadline, _AGAIN)
         response = answers.answer
         if response is None:
-            # What only reads has no envelope.
+            # Requests that only read have no envelope.
             acts = hasattr(request, "envelope")
             unknown = ". It is not known whether it was done" if acts else ""
             raise self._silent(who, self._trouble(kind), unknown)
@@ -421,7 +421,7 @@ class MasterClient:
         return response
 
     def _trouble(self, kind: Any) -> str:
-        """Why the master left a request open, if it says so: it may still carry it out."""
+        """Return the master's reason for an open request, if it has one: it may still act later."""
         if kind is srv.List:
             return ""
         request = srv.List.Request(protocol_version=PROTOCOL_VERSION)

@@ -1,8 +1,9 @@
-"""Every control request goes through here, in both directions.
+"""Envelope, age check and repetition of every control request, on both sides.
 
-A request carries an id, the epoch and the newest monotonic beat *of its receiver* that the sender
-has heard. The receiver alone judges its age, by its own clock: robots' clocks differ, and DDS
-delivers requests seconds late after a cut. Repeated ids are answered again, not carried out again.
+A request carries an id, the epoch, and the newest monotonic beat *of its receiver* that the sender
+has received. Only the receiver judges its age, by its own clock, because robots' clocks differ and
+DDS delivers requests seconds late after a network cut. A repeated id gets the same answer, and the
+request is not carried out again.
 """
 
 from __future__ import annotations
@@ -19,13 +20,13 @@ from rosrm.ros.participant import OpenRequest, Participant, failed_response
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs.msg import Answer, Envelope
 
-#: Ids remembered: more than can arrive within the greatest age of a request.
+#: Remembered ids: more than can arrive within the greatest age of a request.
 _REMEMBERED: Final = 10_000
 _NS: Final = 1e-9
 
 
 def version_refusal(version: int, who: str) -> str:
-    """Why a peer of another protocol version is refused; "" for our own."""
+    """Return the reason to refuse a peer of another protocol version; "" for the same version."""
     if version == PROTOCOL_VERSION:
         return ""
     return (
@@ -35,19 +36,19 @@ def version_refusal(version: int, who: str) -> str:
 
 
 def accepted(message: str = "", epoch: int = 0) -> Answer:
-    """The answer to a request that was carried out."""
+    """Return the answer to a request that was carried out."""
     return Answer(protocol_version=PROTOCOL_VERSION, accepted=True, message=message, epoch=epoch)
 
 
 def refused(code: str, message: str, epoch: int = 0) -> Answer:
-    """The answer to a request that changed nothing."""
+    """Return the answer to a request that changed nothing."""
     return Answer(
         protocol_version=PROTOCOL_VERSION, accepted=False, code=code, message=message, epoch=epoch
     )
 
 
 def check_answer(answer: Answer, who: str) -> None:
-    """Raise `Refused` where an answer says so, or is of another protocol version."""
+    """Raise `Refused` for a refusal or an answer of another protocol version."""
     fault = version_refusal(answer.protocol_version, who)
     if fault:
         raise Refused(fault, "version")
@@ -56,7 +57,7 @@ def check_answer(answer: Answer, who: str) -> None:
 
 
 class Gate:
-    """Judges requests at their receiver.
+    """Admits or refuses requests at their receiver, and remembers answers.
 
     Args:
         beat: the receiver's monotonic clock, ns.
@@ -70,7 +71,7 @@ class Gate:
         self._waiting: dict[str, list[OpenRequest]] = {}
 
     def refusal(self, envelope: Envelope, epoch: int | None = None) -> Answer | None:
-        """Why a request is refused, or None.
+        """Return the refusal of a request, or None.
 
         Args:
             epoch: older epochs than this are refused; None: the sender need not know it.
@@ -94,11 +95,11 @@ class Gate:
         return None
 
     def knows(self, envelope: Envelope) -> bool:
-        """Whether a request of this id was let through before; then its age matters no more."""
+        """Return True if a request of this id was admitted before; its age then does not matter."""
         return envelope.request_id in self._answers
 
     def repeated(self, envelope: Envelope, request: OpenRequest) -> bool:
-        """True for a request that came before: it gets the same answer, once there is one."""
+        """Return True for a repeated request: it gets the same answer, once there is one."""
         known = self._answers.get(envelope.request_id)
         if known is None:
             self._answers[envelope.request_id] = _PENDING
@@ -113,7 +114,7 @@ class Gate:
         return True
 
     def remember(self, envelope: Envelope, response: Any) -> None:
-        """Keep an answer for a repetition of its request, and give it to those that came."""
+        """Store an answer, and send it to the repetitions of its request that already wait."""
         self._answers[envelope.request_id] = response
         for request in self._waiting.pop(envelope.request_id, ()):
             request.answer(response)
@@ -126,9 +127,9 @@ class ControlServer:
     """Offers services behind a gate.
 
     Args:
-        participant: where they are offered.
-        gate: judges every request.
-        epoch: the current one, where older ones are to be refused.
+        participant: offers the services.
+        gate: admits or refuses every request.
+        epoch: returns the current one if older ones are to be refused.
     """
 
     def __init__(
@@ -149,7 +150,7 @@ class ControlServer:
         """Offer a service.
 
         Args:
-            handle: called with a request that was let through and the means to answer it.
+            handle: called with an admitted request and the means to answer it.
             remember: keep the answer for repetitions (not for long polls).
         """
         gate = self._gate
@@ -194,8 +195,8 @@ class ControlClient:
     """Sends requests; each ends by its answer or by its deadline.
 
     Attributes:
-        participant: from which they are sent.
-        sender: role and name, for people.
+        participant: sends the requests.
+        sender: role and name, for messages.
     """
 
     participant: Participant
@@ -203,7 +204,7 @@ class ControlClient:
     _calls: list[Call] = field(default_factory=list)
 
     def envelope(self, receiver_beat: int, epoch: int = 0) -> Envelope:
-        """The head of a new request."""
+        """Return the envelope of a new request."""
         return Envelope(
             protocol_version=PROTOCOL_VERSION, request_id=os.urandom(16).hex(), sender=self.sender,
             epoch=epoch, receiver_beat=receiver_beat,
@@ -215,7 +216,7 @@ class ControlClient:
         Args:
             client: an rclpy service client.
             deadline: monotonic seconds, compared with `expire`'s argument.
-            done: called with the response, or with None when the deadline has passed or the call
+            done: called with the response; with None when the deadline has passed, or when its call
                 with the response raised.
         """
         call = Call(client.call_async(request), client, deadline, done)
@@ -228,7 +229,7 @@ class ControlClient:
             self._calls.remove(call)
             guard = self.participant.guard
             if guard.call(lambda: call.done(call.future.result())):
-                guard.call(call.done, None)  # a response that cannot be taken in counts as none
+                guard.call(call.done, None)  # an unusable response counts as none
 
     def expire(self, now: float) -> None:
         """End the calls whose deadline has passed."""
@@ -238,5 +239,5 @@ class ControlClient:
             self.participant.guard.call(call.done, None)
 
     def forget(self) -> None:
-        """End every call without an answer: the other side is another run by now."""
+        """End every call without an answer, because the peer is another run by now."""
         self.expire(math.inf)

@@ -1,4 +1,4 @@
-"""Message <-> value. Nothing received is ever unpickled; free-form values travel as JSON."""
+"""Conversion message <-> value. Nothing received is unpickled; free-form values travel as JSON."""
 
 from __future__ import annotations
 
@@ -13,31 +13,31 @@ from rosrm_msgs import msg
 
 _INFINITE: Final = float("inf")
 
-# --- small things -----------------------------------------------------------------------------
+# --- pairs, instances, JSON -------------------------------------------------------------------
 
 
 def pairs(values: Mapping[str, Any]) -> list[msg.KeyValue]:
-    """A mapping of strings as messages."""
+    """Return a mapping of strings as messages."""
     return [msg.KeyValue(key=key, value=str(value)) for key, value in values.items()]
 
 
 def mapping(values: Iterable[msg.KeyValue]) -> dict[str, str]:
-    """The inverse of `pairs`."""
+    """Return the mapping in messages; the inverse of `pairs`."""
     return {pair.key: pair.value for pair in values}
 
 
 def instance_to_msg(instance: values.InstanceId) -> msg.InstanceId:
-    """One run of a process."""
+    """Return an instance as a message."""
     return msg.InstanceId(process=instance.process, number=instance.number)
 
 
 def instance_from_msg(message: msg.InstanceId) -> values.InstanceId:
-    """The inverse of `instance_to_msg`."""
+    """Return the inverse of `instance_to_msg`."""
     return values.InstanceId(message.process, message.number)
 
 
 def json_object(text: str, what: str) -> dict[str, Any]:
-    """A JSON object that came as text; raises `Refused` naming `what`."""
+    """Return the JSON object in a received text; raises `Refused` naming `what`."""
     if not text:
         return {}
     value = _json_value(text, what)
@@ -50,7 +50,7 @@ def json_object(text: str, what: str) -> dict[str, Any]:
 
 
 def spec_to_msg(spec: values.ProcessSpec) -> msg.ProcessSpec:
-    """A process spec."""
+    """Return a process spec as a message."""
     restart, readiness, stop = spec.restart, spec.readiness, spec.stop
     return msg.ProcessSpec(
         name=spec.name, ros_namespace=spec.namespace, package=spec.package or "",
@@ -93,7 +93,7 @@ def spec_to_msg(spec: values.ProcessSpec) -> msg.ProcessSpec:
 
 
 def spec_from_msg(message: msg.ProcessSpec) -> values.ProcessSpec:
-    """The inverse of `spec_to_msg`; raises `Refused` for what makes no process."""
+    """Return the inverse of `spec_to_msg`; raises `Refused` for an invalid spec."""
     fault = _spec_fault(message)
     if fault:
         raise Refused(f"process {message.name!r}: {fault}")
@@ -131,7 +131,7 @@ def spec_from_msg(message: msg.ProcessSpec) -> values.ProcessSpec:
 
 
 def _spec_fault(message: msg.ProcessSpec) -> str:
-    """What a client of ours would never send: somebody else's might."""
+    """Return a fault that rosrm's own clients would not send, though others might; "": none."""
     forms = [bool(message.package), bool(message.module), bool(message.command)]
     if not message.name:
         return "it has no name"
@@ -162,7 +162,7 @@ def _word_fault(message: msg.ProcessSpec) -> str:
 
 
 def _times_fault(message: msg.ProcessSpec) -> str:
-    """A wait that is no number would never end, or never begin."""
+    """Return an invalid time: a wait that is no number would never end, or never begin."""
     fault = _restart_fault(message.restart)
     if fault:
         return fault
@@ -182,7 +182,7 @@ def _times_fault(message: msg.ProcessSpec) -> str:
 
 
 def restart_to_msg(restart: values.RestartPolicy) -> msg.RestartPolicy:
-    """A restart policy."""
+    """Return a restart policy as a message."""
     return msg.RestartPolicy(
         when=restart.when, delay=float(restart.delay), max_delay=float(restart.max_delay),
         factor=float(restart.factor), attempts=restart.attempts, window=float(restart.window),
@@ -190,7 +190,7 @@ def restart_to_msg(restart: values.RestartPolicy) -> msg.RestartPolicy:
 
 
 def restart_from_msg(message: msg.RestartPolicy) -> values.RestartPolicy:
-    """The inverse of `restart_to_msg`; raises `Refused` for what makes no policy."""
+    """Return the inverse of `restart_to_msg`; raises `Refused` for an invalid policy."""
     fault = _restart_fault(message)
     if fault:
         raise Refused(f"a restart policy: {fault}")
@@ -223,7 +223,7 @@ def _json_value(text: str, what: str) -> Any:
 
 
 def assignment_to_msg(assignment: values.Assignment) -> msg.Assignment:
-    """An order to run an instance."""
+    """Return an order to run an instance as a message."""
     fence = assignment.fence or values.Fence(0.0, 0.0)
     return msg.Assignment(
         instance=instance_to_msg(assignment.instance), epoch=assignment.epoch,
@@ -237,7 +237,7 @@ def assignment_to_msg(assignment: values.Assignment) -> msg.Assignment:
 
 
 def assignment_from_msg(message: msg.Assignment) -> values.Assignment:
-    """The inverse of `assignment_to_msg`; raises `Refused`."""
+    """Return the inverse of `assignment_to_msg`; raises `Refused`."""
     for name in ("fence_after", "fence_grace"):
         if not 0.0 <= getattr(message, name) < _INFINITE:
             raise Refused(f"{message.instance.process}: {name} is {getattr(message, name)}")
@@ -255,7 +255,7 @@ def assignment_from_msg(message: msg.Assignment) -> values.Assignment:
 
 
 def host_to_msg(host: values.HostDescription) -> msg.HostDescription:
-    """A host."""
+    """Return a host's description as a message."""
     return msg.HostDescription(
         name=host.name, hostname=host.hostname, incarnation=host.incarnation, pid=host.pid,
         software_version=host.software_version, labels=pairs(host.labels),
@@ -272,7 +272,7 @@ def host_to_msg(host: values.HostDescription) -> msg.HostDescription:
 
 
 def host_from_msg(message: msg.HostDescription) -> values.HostDescription:
-    """The inverse of `host_to_msg`; raises `Refused` for what makes no host."""
+    """Return the inverse of `host_to_msg`; raises `Refused` for an invalid host."""
     resources = sorted(message.resources, key=lambda resource: int(resource.slot))
     if [resource.slot for resource in resources] != list(range(len(resources))):
         raise Refused(f"host {message.name!r}: its resources do not fill the slots 0, 1, 2, …")
@@ -297,7 +297,7 @@ def host_from_msg(message: msg.HostDescription) -> values.HostDescription:
 
 
 def status_to_msg(status: values.InstanceStatus) -> msg.ProcessStatus:
-    """What became of an instance."""
+    """Return an instance's status as a message."""
     return msg.ProcessStatus(
         instance=instance_to_msg(status.instance), state=status.state.value, pid=status.pid,
         exit_code=status.exit_code, exit_signal=status.exit_signal, restarts=status.restarts,
@@ -307,7 +307,7 @@ def status_to_msg(status: values.InstanceStatus) -> msg.ProcessStatus:
 
 
 def status_from_msg(message: msg.ProcessStatus) -> values.InstanceStatus:
-    """The inverse of `status_to_msg`; raises `Refused` for what makes no sense."""
+    """Return the inverse of `status_to_msg`; raises `Refused` for an invalid status."""
     try:
         state = values.InstanceState(message.state)
     except ValueError as error:
@@ -323,7 +323,7 @@ def status_from_msg(message: msg.ProcessStatus) -> values.InstanceStatus:
 
 
 def kept_to_msg(kept: values.KeptState) -> msg.KeptState:
-    """A state that a host keeps."""
+    """Return the description of a snapshot on a host as a message."""
     return msg.KeptState(
         process=kept.instance.process, number=kept.instance.number, sequence=kept.sequence,
         size=kept.size,
@@ -331,7 +331,7 @@ def kept_to_msg(kept: values.KeptState) -> msg.KeptState:
 
 
 def kept_from_msg(message: msg.KeptState) -> values.KeptState:
-    """The inverse of `kept_to_msg`."""
+    """Return the inverse of `kept_to_msg`."""
     instance = values.InstanceId(message.process, message.number)
     return values.KeptState(instance, message.sequence, message.size)
 
@@ -340,7 +340,7 @@ def kept_from_msg(message: msg.KeptState) -> values.KeptState:
 
 
 def host_row_to_msg(row: HostRow) -> msg.HostState:
-    """A row of `rosrm hosts`."""
+    """Return a row of `rosrm hosts` as a message."""
     return msg.HostState(
         description=host_to_msg(row.description), host_id=row.host_id, state=row.state,
         cordoned=row.cordoned, draining=row.draining, accepting=row.accepting,
@@ -351,12 +351,12 @@ def host_row_to_msg(row: HostRow) -> msg.HostState:
 
 
 def _fraction(value: float) -> float:
-    """A number that travelled as float32, without the digits that float32 does not have."""
+    """Return a number that travelled as float32, without digits beyond float32's precision."""
     return round(float(value), 6)
 
 
 def host_row_from_msg(message: msg.HostState) -> HostRow:
-    """The inverse of `host_row_to_msg`."""
+    """Return the inverse of `host_row_to_msg`."""
     resources = tuple(
         ResourceRow(
             resource.name, resource.unit, resource.capacity, resource.scope, _fraction(usage),
@@ -383,31 +383,31 @@ def host_row_from_msg(message: msg.HostState) -> HostRow:
 
 
 def process_row_to_msg(row: ProcessRow) -> msg.ProcessState:
-    """A row of `rosrm ps`."""
+    """Return a row of `rosrm ps` as a message."""
     fields = {name: getattr(row, name) for name in ProcessRow.__slots__}
     known = row.exit_code is not None
     return msg.ProcessState(**fields | {"exit_code": row.exit_code or 0, "exit_code_known": known})
 
 
 def process_row_from_msg(message: msg.ProcessState) -> ProcessRow:
-    """The inverse of `process_row_to_msg`."""
+    """Return the inverse of `process_row_to_msg`."""
     fields = {name: getattr(message, name) for name in ProcessRow.__slots__}
     fields["cpu"] = _fraction(message.cpu)
     return ProcessRow(**fields if message.exit_code_known else fields | {"exit_code": None})
 
 
 def plugin_row_to_msg(row: PluginRow) -> msg.PluginState:
-    """A row of `rosrm plugins`."""
+    """Return a row of `rosrm plugins` as a message."""
     return msg.PluginState(**{name: getattr(row, name) for name in PluginRow.__slots__})
 
 
 def plugin_row_from_msg(message: msg.PluginState) -> PluginRow:
-    """The inverse of `plugin_row_to_msg`."""
+    """Return the inverse of `plugin_row_to_msg`."""
     return PluginRow(**{name: getattr(message, name) for name in PluginRow.__slots__})
 
 
 def event_to_msg(row: EventRow) -> msg.Event:
-    """A line of the event record."""
+    """Return a line of the event record as a message."""
     return msg.Event(
         sequence=row.sequence, wall_time=row.wall_time, elapsed=row.elapsed, kind=row.kind,
         process=row.process, host=row.host, message=row.message, data=json.dumps(dict(row.facts)),
@@ -415,7 +415,7 @@ def event_to_msg(row: EventRow) -> msg.Event:
 
 
 def event_from_msg(message: msg.Event) -> EventRow:
-    """The inverse of `event_to_msg`."""
+    """Return the inverse of `event_to_msg`."""
     return EventRow(
         message.sequence, message.wall_time, message.elapsed, message.kind, message.process,
         message.host, message.message, json_object(message.data, "an event"),

@@ -1,4 +1,4 @@
-"""How Fast DDS is in the parts of rosrm, and in nodes that it moves (decisions 0009, 0015)."""
+"""Fast DDS settings of rosrm's components and of migratable nodes (decisions 0009, 0015)."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, MutableMapping
 from pathlib import Path
 from typing import Final, Literal
 
-#: The first is the one that Fast DDS 2.14 (Jazzy) reads. Whatever the user names there stands.
+#: The first is the one that Fast DDS 2.14 (Jazzy) reads. A value set by the user is not changed.
 _VARIABLES: Final = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 _PROFILES: Final = Path(__file__).parent / "profiles"
 
@@ -25,7 +25,7 @@ def announcements(environment: Mapping[str, str], pace: Pace, *, udp: bool) -> d
         pace: of the announcements.
         udp: receive by UDP alone, unless the user has set other transports. A killed process leaves
             ports in shared memory that delay its peers. Nodes may accept that for large messages;
-            the parts of rosrm must not.
+            rosrm's components must not.
     """
     if any(variable in environment for variable in _VARIABLES):
         return {}
@@ -37,10 +37,10 @@ def announcements(environment: Mapping[str, str], pace: Pace, *, udp: bool) -> d
 
 @contextlib.contextmanager
 def announcing(environment: MutableMapping[str, str], pace: Pace, *, udp: bool) -> Iterator[None]:
-    """Give Fast DDS a profile while a participant is made, unless the user has given one.
+    """Give Fast DDS a profile while a participant is created, unless the user has given one.
 
     Args:
-        environment: of this process; it is as it was afterwards, for who is started by it.
+        environment: of this process; restored afterwards, for the processes that it starts.
         pace: see `announcements`.
         udp: see `announcements`.
     """

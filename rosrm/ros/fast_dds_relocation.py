@@ -1,10 +1,10 @@
-"""Tells Fast DDS in this process that it may have come to another host.
+"""Update of Fast DDS in this process after a restore on another host.
 
-Fast DDS 2.14 looks once in the life of a process where it runs, and keeps that: the network
+Fast DDS 2.14 determines its location once in the life of a process, and keeps it: the network
 interfaces, an id of the host that is made from them, and the prefix of all GUIDs (host, pid and
-chance). After a restore on another host a new participant would come up on loopback alone; and
-after a second restore of one image with GUIDs that peers know already, whose samples they drop as
-repeated. There is no way to have it look again but its own C++ symbols (docs/decisions/0024).
+random number). After a restore on another host a new participant would use loopback only. After a
+second restore of one checkpoint image its GUIDs would be known to peers, which drop its samples as
+repeated. Only Fast DDS's own C++ symbols can start a new determination (docs/decisions/0024).
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from rosrm.ros.graph_remains import close_leaked, open_sockets
 
 _LIBRARIES: Final = ("libfastrtps.so", "libfastdds.so")
 _INTERFACES: Final = "_ZN8eprosima10SystemInfo17update_interfacesEv"
-#: Pairs of a constructor and the one object that it made. They hold numbers, nothing to destroy;
-#: the second takes over what the first found.
+#: Pairs of a constructor and the one object that it made. The objects hold numbers, nothing to
+#: destroy. The second takes over the results of the first.
 _PLACES: Final = (
     ("_ZN8eprosima4HostC1Ev", "_ZZN8eprosima4Host8instanceEvE9singleton"),
     (
@@ -31,7 +31,7 @@ _PLACES: Final = (
 
 
 def check() -> None:
-    """Whether `look_again` will be able to; called before a node leaves.
+    """Check that `look_again` can work; called before a node leaves.
 
     Raises:
         PortableError: this Fast DDS has no such symbol, so the node could not join elsewhere.
@@ -42,14 +42,14 @@ def check() -> None:
 
 
 def look_again() -> bool:
-    """Have Fast DDS look where it runs; there is no participant in this process just now.
+    """Let Fast DDS determine its location again, while this process has no participant.
 
     Returns:
-        Whether the GUIDs of the next participant are new as well. If not, all that is lost is that
-        an image can be restored only once.
+        True if the GUIDs of the next participant are new as well. False costs only this: the
+        checkpoint image can be restored only once.
 
     Raises:
-        PortableError: it cannot; a participant would be heard on loopback alone.
+        PortableError: it is impossible; a participant would be reachable on loopback only.
     """
     library = _library()
     if library is None:
@@ -60,7 +60,7 @@ def look_again() -> bool:
 
 
 def _library() -> ctypes.CDLL | None:
-    """Fast DDS, if it is loaded."""
+    """Return the loaded Fast DDS; None: it is not loaded."""
     maps = Path("/proc/self/maps").read_text(encoding="utf-8", errors="replace")
     for line in maps.splitlines():
         path = line.partition("/")[2]

@@ -1,4 +1,4 @@
-"""What of ROS is still in a process whose nodes and context are gone."""
+"""ROS resources left in a process whose nodes and context are gone."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Final
 
-#: How Fast DDS names its threads, and its files in shared memory.
+#: Prefixes of Fast DDS's threads and of its files in shared memory.
 _THREADS: Final = "dds."
 _OF_SHARED: Final = "dds.shm"
 _SHARED: Final = "/dev/shm/fastrtps_"  # noqa: S108 - not a file of ours
-#: Standard input, output and error are the supervisor's, and whoever restores takes care of them.
+#: Standard input, output and error belong to the supervisor; the restore replaces them.
 _STANDARD: Final = frozenset({0, 1, 2})
 
 
 def what_is_left() -> str:
-    """Why this process cannot be dumped as it is, and what to do; "": nothing is in the way."""
+    """Return the obstacle to a dump of this process, with its remedy; "": there is none."""
     threads = sorted(one for one in _thread_names() if one.startswith(_THREADS))
     if any(thread.startswith(_OF_SHARED) for thread in threads):
         return (
@@ -45,17 +45,17 @@ def what_is_left() -> str:
 
 
 def open_sockets() -> dict[int, str]:
-    """By number, what each socket is: `socket:[INODE]`, which no other has."""
+    """Return open sockets by file descriptor; a value `socket:[INODE]` is unique."""
     return {number: one for number, one in _open_files().items() if one.startswith("socket:")}
 
 
 def close_leaked(sockets: Mapping[int, str]) -> None:
-    """Close those of these sockets that are still open and nobody uses: not bound, not connected.
+    """Close those of these sockets that are still open and unused: not bound, not connected.
 
-    Fast DDS 2.14 leaves one for each network interface, by which it asked for its MAC address.
+    Fast DDS 2.14 leaves one for each network interface, from its query of the MAC address.
 
     Args:
-        sockets: that were opened while Fast DDS was at work.
+        sockets: opened while Fast DDS was at work.
     """
     now = open_sockets()
     for number, one in sockets.items():
@@ -73,17 +73,17 @@ def _thread_names() -> Iterable[str]:
     for task in Path("/proc/self/task").iterdir():
         try:
             yield (task / "comm").read_text(encoding="utf-8", errors="replace").strip()
-        except OSError:  # it has just ended
+        except OSError:  # the thread has just ended
             continue
 
 
 def _open_files() -> dict[int, str]:
-    """By number, but for the standard three."""
+    """Return open files by file descriptor, without the standard three."""
     found = {}
     for one in Path("/proc/self/fd").iterdir():
         if int(one.name) not in _STANDARD:
             try:
                 found[int(one.name)] = str(one.readlink())
-            except OSError:  # the one that lists them
+            except OSError:  # the descriptor of the listing itself
                 continue
     return found

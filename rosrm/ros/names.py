@@ -14,10 +14,10 @@ _LONGEST: Final = 64
 
 
 def token(name: str) -> str:
-    """A name of a host or a process as one token of a ROS name ("robot-1" -> "robot_1_bd82fad2").
+    """Return a host's or process's name as a ROS name token: "robot-1" -> "robot_1_bd82fad2".
 
-    Different names stay different, by a digest where one must be changed: in DDS all servers of a
-    name execute a request, so that robot-1 would do what robot_1 is told.
+    A changed name gets a digest, so that different names stay different. In DDS all servers of a
+    name execute a request, so otherwise robot-1 would execute the orders for robot_1.
     """
     if _FIT.fullmatch(name) and len(name) <= _LONGEST:
         return name
@@ -27,7 +27,7 @@ def token(name: str) -> str:
 
 
 def client_node() -> str:
-    """Return the name of the node of this process, if it is a client of the master."""
+    """Return the node name of this process as a client of the master."""
     return f"rosrm_client_{os.getpid()}"
 
 
@@ -38,15 +38,15 @@ class Names:
     namespace: str
 
     def __call__(self, name: str) -> str:
-        """A name that all parts share."""
+        """Return a name that all components share."""
         return f"{self.namespace}/{name}"
 
     def of_host(self, host: str, name: str) -> str:
-        """A name that belongs to one host."""
+        """Return a name that belongs to one host."""
         return f"{self.namespace}/host/{token(host)}/{name}"
 
     def of_handoff(self, process: str, destination: int) -> str:
-        """The channel of one handoff, named by its destination's instance number."""
+        """Return the channel of one handoff, named by its destination's instance number."""
         return f"{self.namespace}/handoff/{token(process)}_{destination}"
 
 

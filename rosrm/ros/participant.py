@@ -1,8 +1,8 @@
-"""One DDS participant with one node and one executor: all that a part of rosrm has of ROS.
+"""One DDS participant with one node and one executor: all ROS entities of a rosrm component.
 
-The EventsExecutor costs a third of the others' CPU a message, but its `spin()` does nothing in the
-Jazzy wheels: we loop over `spin_once`. It cannot await an asynchronous service callback; `serve`
-therefore defers every response, so that a request may stay open until there is an answer.
+The EventsExecutor costs a third of the others' CPU per message, but its `spin()` does nothing in
+the Jazzy wheels. So this module loops over `spin_once`. The executor cannot await an asynchronous
+service callback. So `serve` defers every response, and a request may stay open until its answer.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 
-#: Seconds after which what comes without an end no longer keeps a part from its other work.
+#: Seconds after which `spin` returns although messages still arrive.
 _FLOOD: Final = 0.05
 
 
 @dataclass(slots=True)
 class OpenRequest:
-    """A request that waits for its response; `answer` may be called at any time, once."""
+    """A request that waits for its response; `answer` may be called once, at any time."""
 
     _send: Callable[[Any, Any], None]
     _header: Any
@@ -49,15 +49,15 @@ class OpenRequest:
 
 
 class Participant:
-    """A context, a lean node and its executor.
+    """A context, a minimal node and its executor.
 
     Args:
-        settings: applied to the environment before the context is made.
+        settings: applied to the environment before the context is created.
         name: of the node.
-        pace: how often it announces itself: "eager" or "steady" (docs/decisions/0009).
+        pace: frequency of DDS announcements: "eager" or "steady" (docs/decisions/0009).
 
     Attributes:
-        guard: calls everything that ROS calls.
+        guard: calls every callback of ROS.
     """
 
     def __init__(self, settings: RosSettings, name: str, *, pace: Pace = "eager") -> None:
@@ -90,7 +90,7 @@ class Participant:
         )
 
     def unwatched_node(self, name: str) -> Node:
-        """A node of the same participant outside the executor, whose messages are polled."""
+        """Return a node of the same participant outside the executor; its messages are polled."""
         node = self._lean_node(name)
         self._unwatched.append(node)
         return node
@@ -98,7 +98,7 @@ class Participant:
     # --- the loop ------------------------------------------------------------------------
 
     def counted(self, callback: Callable[..., None]) -> Callable[..., None]:
-        """Wrap a callback: `spin` knows when nothing more is ready, and nothing is raised."""
+        """Wrap a callback: `spin` counts its calls to notice activity, and it raises nothing."""
 
         def call(*arguments: Any) -> None:
             self._executed += 1
@@ -107,9 +107,9 @@ class Participant:
         return call
 
     def spin(self, timeout: float) -> None:
-        """Wait for something to do, at most `timeout` seconds, then do all that is ready.
+        """Wait for an event, at most `timeout` seconds, then handle all that are ready.
 
-        A flood ends it as well: what is done in every cycle must not wait for the end of a flood.
+        Continuous events end it after `_FLOOD` seconds, because periodic work must not wait longer.
         """
         before = self._executed
         self.executor.spin_once(timeout_sec=timeout)
@@ -120,7 +120,7 @@ class Participant:
         self.guard.raise_interrupt()
 
     def wake(self) -> None:
-        """End a `spin` that waits; may be called from any thread."""
+        """End a waiting `spin`; may be called from any thread."""
         self.executor.create_task(_nothing)
 
     # --- services ------------------------------------------------------------------------
@@ -128,14 +128,14 @@ class Participant:
     def serve(
         self, service_type: Any, name: str, handle: Callable[[Any, OpenRequest], None]
     ) -> None:
-        """Offer a service whose responses may come later.
+        """Offer a service with deferred responses.
 
         Args:
-            handle: called with each request and the means to answer it. Where it raises before
-                it has answered, the request is answered as failed.
+            handle: called with each request and the means to answer it. If it raises before it
+                has answered, the request is answered as failed.
         """
-        # The executor passes what the callback returns to `send_response` with the header that is
-        # needed for the answer: the callback hands the request through, and the answer comes later.
+        # The executor passes the callback's result to `send_response` with the header that an
+        # answer needs. So the callback returns the request, and `take` receives both.
         service = self.node.create_service(
             service_type, name, lambda request, _response: request, qos_profile=qos.SERVICE
         )
@@ -151,7 +151,7 @@ class Participant:
         service.send_response = take
 
     def close(self) -> None:
-        """Leave ROS."""
+        """Destroy nodes, executor and context."""
         self.executor.remove_node(self.node)
         self.executor.shutdown()
         for node in (*self._unwatched, self.node):
@@ -173,7 +173,7 @@ class Participant:
 def failed_response(service_type: Any, reason: str) -> Any:
     """Return the response to a request whose handler raised."""
     response = service_type.Response()
-    answer = getattr(response, "answer", response)  # of a handshake the response is the answer
+    answer = getattr(response, "answer", response)  # a handshake's response is itself the answer
     answer.protocol_version, answer.accepted = PROTOCOL_VERSION, False
     answer.message = f"an error of the receiver: {reason}"
     if hasattr(answer, "code"):
@@ -182,4 +182,4 @@ def failed_response(service_type: Any, reason: str) -> Any:
 
 
 def _nothing() -> None:
-    """What a wake-up does: the executor's own `wake` does not end a waiting `spin_once`."""
+    """Do nothing; running it ends a waiting `spin_once`, which the executor's `wake` does not."""

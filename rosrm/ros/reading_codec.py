@@ -1,6 +1,6 @@
-"""`resource_info` as bytes: a thousand messages are decoded by one numpy call.
+"""Codec of `resource_info`: one numpy call decodes a thousand messages.
 
-The message has a fixed size, so its CDR form is a C struct behind a header of four bytes; the test
+The message has a fixed size, so its CDR form is a C struct behind a header of four bytes. The test
 of this module compares every field with rclpy's own serialisation.
 """
 
@@ -32,18 +32,18 @@ LAYOUT: Final = np.dtype(
 )  # fmt: skip
 
 ACCEPTING: Final = 1
-#: Bits 8 to 15 of the flags: cycles since the message before that brought nothing new.
+#: Bits 8 to 15 of the flags: cycles without news since the message before.
 _QUIET_SHIFT: Final = 8
 MOST_QUIET: Final = 255
 
 
 @dataclass(frozen=True, slots=True)
 class Runs:
-    """What a batch says of each run of a slave, in parallel arrays (R,).
+    """Accounts of each run of a slave in a batch, in parallel arrays (R,).
 
     Attributes:
-        host_id, incarnation: which run.
-        first: sequence of the earliest cycle that is told.
+        host_id, incarnation: identify the run.
+        first: sequence of the earliest cycle in its messages.
         sequence, beat: of its newest message; the beat in ns.
         cycles: of the slave, that its messages in this batch account for.
     """
@@ -61,10 +61,10 @@ class Decoded:
     """A batch of messages.
 
     Attributes:
-        readings: the newest of each run of a host; None: there is none.
-        runs: beside the readings, row by row.
-        strangers: one line for each kind of message that was refused.
-        received: messages of our version.
+        readings: the newest of each run of a host; None: the batch has none.
+        runs: parallel to the readings, row by row.
+        strangers: one line for each kind of refused message.
+        received: messages of this protocol version.
     """
 
     readings: ReadingsReceived | None = None
@@ -74,17 +74,17 @@ class Decoded:
 
 
 def flags(*, accepting: bool, quiet: int) -> int:
-    """The flags of a message.
+    """Return the flags of a message.
 
     Args:
-        accepting: the slave is under all its limits and takes work.
-        quiet: cycles since the message before that brought nothing new, at most `MOST_QUIET`.
+        accepting: the slave is under all its limits and accepts work.
+        quiet: cycles without news since the message before, at most `MOST_QUIET`.
     """
     return (ACCEPTING if accepting else 0) | quiet << _QUIET_SHIFT
 
 
 def encode(row: npt.NDArray[np.void]) -> bytes:
-    """The serialised message of one record of `LAYOUT` (shape ())."""
+    """Return the serialised message of one record of `LAYOUT` (shape ())."""
     row["header"] = _HEADER
     raw = bytearray(row.tobytes())
     raw[:4] = _HEADER  # numpy strips trailing zeros of a byte string
@@ -92,7 +92,7 @@ def encode(row: npt.NDArray[np.void]) -> bytes:
 
 
 def decode(messages: Sequence[bytes]) -> Decoded:
-    """Take in serialised messages, oldest first.
+    """Decode serialised messages, oldest first.
 
     Messages of another size, byte order or protocol version are refused, never misread.
     """
@@ -118,10 +118,10 @@ def decode(messages: Sequence[bytes]) -> Decoded:
 
 
 def _by_run(rows: npt.NDArray[np.void]) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
-    """A former run that still speaks must not hide the readings of the present one.
+    """Group rows by run, so that a former run's late messages do not hide the present run's.
 
     Returns:
-        The order of the rows by run of a slave, the oldest of each first, and where runs begin.
+        The order of the rows by run of a slave, oldest first in each, and the start of each run.
     """
     run = rows["host_id"].astype(np.uint64) << np.uint64(32)
     run |= rows["incarnation"] & np.uint64(0xFFFFFFFF)

@@ -1,6 +1,6 @@
-"""The entry of both runtimes: settings handed over by a command, signals, logging, errors.
+"""Entry point of both runtimes: settings passed by a command, signals, logging, errors.
 
-Settings and the list of plugins travel on an inherited file descriptor.
+Settings and the list of plugins are passed on an inherited file descriptor.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _OPTION: Final = "--settings-fd"
 
 @dataclass(frozen=True, slots=True)
 class Handover:
-    """What a runtime begins with.
+    """The input of a runtime.
 
     Attributes:
         settings: JSON of `ClusterConfig` or `HostConfig`.
@@ -36,7 +36,7 @@ class Handover:
 
 
 def hand_over(settings: str) -> int:
-    """Write what the runtime begins with; returns a file descriptor that it is to inherit.
+    """Write the input of a runtime; return the file descriptor that the runtime is to inherit.
 
     Args:
         settings: JSON of the checked settings.
@@ -49,15 +49,15 @@ def hand_over(settings: str) -> int:
 
 
 def arguments(descriptor: int) -> list[str]:
-    """The runtime's command line."""
+    """Return the runtime's command line."""
     return [_OPTION, str(descriptor)]
 
 
 @contextlib.contextmanager
 def interrupts_held() -> Iterator[None]:
-    """Within, a runtime is started: until it has its own handlers, a Ctrl-C is kept for it.
+    """Block SIGINT while a runtime is started, so that it reaches the runtime's own handlers.
 
-    Else Python, which handles it from its first moment on, would answer with a traceback.
+    Otherwise Python, which handles a Ctrl-C from its first moment on, would print a traceback.
     """
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
@@ -67,7 +67,7 @@ def interrupts_held() -> Iterator[None]:
 
 
 def take_over(command_line: Sequence[str]) -> Handover:
-    """Read what the command handed over; raises `ConfigError` for another command line."""
+    """Read the input that the command passed; raise `ConfigError` for another command line."""
     if len(command_line) != 2 or command_line[0] != _OPTION:
         raise ConfigError(f"usage: {_OPTION} N; use `rosrm master` or `rosrm slave` to start one")
     with os.fdopen(int(command_line[1])) as source:
@@ -77,7 +77,7 @@ def take_over(command_line: Sequence[str]) -> Handover:
 
 
 def handle_stop_signals(handler: Callable[[int, FrameType | None], None]) -> None:
-    """Have SIGINT, SIGTERM and SIGHUP (the terminal was closed) handled alike.
+    """Install one handler for SIGINT, SIGTERM and SIGHUP (the terminal was closed).
 
     A SIGHUP that is ignored, as by `nohup`, stays ignored.
     """
@@ -87,13 +87,13 @@ def handle_stop_signals(handler: Callable[[int, FrameType | None], None]) -> Non
 
 
 def run(role: str, serve: Callable[[Handover], int]) -> int:
-    """Take over what the command handed over, and serve; returns the exit code.
+    """Read the input that the command passed, and serve; return the exit code.
 
     Args:
         role: "master" or "slave".
-        serve: runs until it is told to stop; what it raises for the user is printed.
+        serve: runs until a stop signal; the message of a `RosrmError` that it raises is printed.
     """
-    # Who started us held them back (see `interrupts_held`); by now they end us without a word.
+    # The starting process blocked SIGINT (see `interrupts_held`); from now on it ends this one.
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     logging.basicConfig(
         level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(name)s: %(message)s",

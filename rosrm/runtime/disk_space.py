@@ -1,4 +1,4 @@
-"""Where a file lies and how much room is there, in words for people."""
+"""Free space on the file system of a file, as text for messages."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 def room_for(path: Path) -> str:
-    """How much is free on the file system of a file; "" where nobody can tell."""
+    """Return the free and total size of a file's file system; "" where it cannot be read."""
     try:
         usage = shutil.disk_usage(path.parent)
         place = path.parent.resolve()

@@ -1,8 +1,8 @@
-"""Undoes what the ROS wheels' bootstrapper did to the environment, for processes that we start.
+"""Removal of the changes that the ROS wheels' bootstrapper made to the environment of children.
 
-The wheels' `.pth` file executes Python anew with their library folders in LD_LIBRARY_PATH and with
-a guard variable. A child that inherits both, and runs from another virtual environment, would load
-the libraries of this one; without them its own bootstrapper does the right thing.
+The wheels' `.pth` file executes Python a second time, with their library folders in LD_LIBRARY_PATH
+and with a guard variable. A child that inherits both, and runs from another virtual environment,
+would load the libraries of this one. Without them the child's own bootstrapper sets up its own.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Final
 
 _GUARD: Final = "_ROS_WHEELS_BOOTSTRAP_COMPLETE"
 _LIBRARIES: Final = "LD_LIBRARY_PATH"
-#: PREFIX/lib/pythonX.Y/site-packages/ros_NAME.libs: a folder that the bootstrapper adds.
+#: PREFIX/lib/pythonX.Y/site-packages/ros_NAME.libs: a folder added by the bootstrapper.
 _WHEEL_FOLDER: Final = re.compile(
     r"(?P<prefix_lib>.*/lib)/python[0-9.]+/site-packages/ros_[^/]*\.libs"
 )
@@ -23,12 +23,12 @@ _WHEEL_FOLDER: Final = re.compile(
 def without_bootstrapper(
     environment: Mapping[str, str], prefix: str = sys.prefix
 ) -> dict[str, str]:
-    """Undo what the ROS wheels' bootstrapper put there; without its guard nothing is touched.
+    """Return an environment without the bootstrapper's changes; without its guard, unchanged.
 
-    The bootstrapper keeps what LD_LIBRARY_PATH held before, though in no order: that stays.
+    The bootstrapper keeps earlier folders of LD_LIBRARY_PATH, though in no order; those stay.
 
     Args:
-        environment: to be cleaned; it stays as it is.
+        environment: to be cleaned; it is not modified.
         prefix: of this Python.
     """
     cleaned = dict(environment)

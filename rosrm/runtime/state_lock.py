@@ -1,4 +1,4 @@
-"""The directory in which a master or slave keeps its state: held by one of them at a time."""
+"""Lock of the state directory of a master or slave: one process holds it at a time."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ def only_one(directory: Path, role: str, *, code: str, remedy: str) -> Iterator[
     """Hold a state directory for one process of a role on this machine.
 
     Args:
-        directory: made where it is missing.
+        directory: created where it is missing.
         role: "master" or "slave".
-        code: of the refusal.
-        remedy: settings with which a second one can run beside it; "": it cannot.
+        code: error code of the refusal.
+        remedy: settings that allow a second process beside the first; "": none do.
 
     Raises:
-        Refused: another one holds it; the message names its pid.
-        ConfigError: it cannot be used.
+        Refused: another process holds the directory; the message names its pid.
+        ConfigError: the directory cannot be used.
     """
     try:
         directory.mkdir(parents=True, exist_ok=True, mode=0o700)
@@ -43,7 +43,7 @@ def only_one(directory: Path, role: str, *, code: str, remedy: str) -> Iterator[
                 f"Stop it first{remedy and f', or give this one {remedy}'}",
                 code,
             ) from None
-        with contextlib.suppress(OSError):  # a full disk: nobody will read who holds it
+        with contextlib.suppress(OSError):  # a full disk: only a refusal's message lacks the pid
             os.ftruncate(lock.fileno(), 0)
             os.write(lock.fileno(), str(os.getpid()).encode())
         yield

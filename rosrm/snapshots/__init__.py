@@ -1,8 +1,8 @@
-"""States that are kept: the files of one process, as its node and its slave write and read them.
+"""Snapshots: the files of one process, as its node and its slave write and read them.
 
 A directory belongs to one process. Its node writes `state.0` and `state.1` in turn, so that one of
-them is whole whenever it is killed; its slave writes `copy`, a state that came from another host.
-The newest whole one counts. docs/reference/handoff-protocol.md has the format.
+them is complete even after a kill. Its slave writes `copy`, a replica from another host. The newest
+complete file counts. docs/reference/handoff-protocol.md has the format.
 """
 
 from rosrm.snapshots.format import (

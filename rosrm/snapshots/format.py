@@ -1,4 +1,4 @@
-"""The form of a kept state: one file, or the same bytes on their way to another host. Pure."""
+"""Format of a snapshot: one file, or the same bytes in transfer to another host. Pure."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, NamedTuple
 
-#: Most bytes of a file, and most blocks: what is larger is no state of ours.
+#: Most bytes of a file, and most blocks; a larger file is no snapshot.
 LARGEST: Final = 2 << 30
 _MOST_BLOCKS: Final = 1000
 
@@ -22,11 +22,11 @@ _CRC: Final = struct.Struct("<I")
 
 
 class Damaged(Exception):
-    """A file that holds no whole state: which, and why."""
+    """A file holds no complete snapshot; the text gives the reason."""
 
 
 class Block(NamedTuple):
-    """A part of the content, with its CRC-32."""
+    """One block of the content, with its CRC-32."""
 
     data: bytes
     digest: int
@@ -34,14 +34,14 @@ class Block(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Head:
-    """What a file says of itself.
+    """The header of a snapshot file.
 
     Attributes:
         process: name of the process.
         instance: number of the instance that was in this state.
-        sequence: cycles that it covers.
+        sequence: cycles that the snapshot covers.
         blocks: bytes and CRC-32 of each.
-        size: bytes of the whole, this head included.
+        size: bytes of the whole file, header included.
     """
 
     process: str
@@ -52,17 +52,17 @@ class Head:
 
     @property
     def age(self) -> tuple[int, int]:
-        """The larger, the newer."""
+        """Sort key: the larger, the newer."""
         return self.instance, self.sequence
 
 
 @dataclass(frozen=True, slots=True)
 class Kept:
-    """A whole state.
+    """A complete snapshot.
 
     Attributes:
         blocks: the mark, then each part of the state, serialised.
-        path: where it was read.
+        path: of the file that it was read from.
     """
 
     head: Head
@@ -71,11 +71,11 @@ class Kept:
 
 
 class Part(NamedTuple):
-    """A part of a state on its way.
+    """A part of a snapshot in transfer to another host.
 
     Attributes:
-        number, sequence: of the instance, and of the state.
-        offset: bytes, where it begins.
+        number, sequence: of the instance, and of the snapshot.
+        offset: bytes before this part.
         total: bytes of the whole.
         digest: CRC-32 of the whole.
     """
@@ -90,17 +90,17 @@ class Part(NamedTuple):
 
     @property
     def age(self) -> tuple[int, int]:
-        """The larger, the newer."""
+        """Sort key: the larger, the newer."""
         return self.number, self.sequence
 
     @property
     def is_last(self) -> bool:
-        """Nothing comes after it."""
+        """Return True if no part follows."""
         return self.offset + len(self.data) >= self.total
 
 
 def encoded_head(process: str, instance: int, sequence: int, blocks: Sequence[Block]) -> bytes:
-    """The head of a file."""
+    """Return the header of a file."""
     name = process.encode()
     head = b"".join(
         [
@@ -113,10 +113,10 @@ def encoded_head(process: str, instance: int, sequence: int, blocks: Sequence[Bl
 
 
 def decoded_head(data: bytes) -> tuple[Head, int]:
-    """What a file begins with, and where its blocks begin.
+    """Return the header of a file, and the offset of its first block.
 
     Raises:
-        Damaged: it is no head, or not a whole one.
+        Damaged: the bytes are no header, or not a complete one.
     """
     try:
         magic, instance, sequence, name_size, count = _FIXED.unpack_from(data)
@@ -138,11 +138,11 @@ def decoded_head(data: bytes) -> tuple[Head, int]:
 
 
 def checked(data: bytes) -> tuple[Head, int]:
-    """As `decoded_head`, of a file that is whole; raises `Damaged` for any other."""
+    """Return the same as `decoded_head` for a complete file; raise `Damaged` for any other."""
     head, start = decoded_head(data)
     if len(data) < head.size:
         raise Damaged(f"it ends after {len(data)} of {head.size} bytes")
-    at, view = start, memoryview(data)  # no copies: it may have hundreds of megabytes
+    at, view = start, memoryview(data)  # no copies: a file may have hundreds of megabytes
     for size, digest in head.blocks:
         if zlib.crc32(view[at : at + size]) != digest:
             raise Damaged("its content does not match its checksum")
@@ -151,7 +151,7 @@ def checked(data: bytes) -> tuple[Head, int]:
 
 
 def decoded(data: bytes, path: Path = Path()) -> Kept:
-    """A whole file; raises `Damaged`."""
+    """Return the snapshot in a complete file; raises `Damaged`."""
     head, at = checked(data)
     blocks = []
     for size, _ in head.blocks:

@@ -1,4 +1,4 @@
-"""Finds the newest whole state in the directory of a process."""
+"""Lookup of the newest complete snapshot in the directory of a process."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from rosrm.snapshots.format import LARGEST, Damaged, Head, Kept, checked, decode
 SLOTS: Final = ("state.0", "state.1")
 #: Written by the slave.
 COPY: Final = "copy"
-#: With every file that is opened.
+#: Flags of every file that is opened.
 OPEN: Final = os.O_CLOEXEC | os.O_NOFOLLOW
-#: More than any head of ours.
+#: Bytes that are read for a header; no header is larger.
 HEAD_ROOM: Final = 64 << 10
 
 
 def peek(path: Path) -> Head | None:
-    """The head of a file alone, its content unseen; None: there is no such file, or no head."""
+    """Return the header of a file without reading its content; None: no such file, or no header."""
     try:
         descriptor = os.open(path, os.O_RDONLY | OPEN)
     except OSError:
@@ -35,29 +35,29 @@ def peek(path: Path) -> Head | None:
 
 
 def files(directory: Path) -> list[tuple[Path, Head]]:
-    """Files with a sound head, the newest first."""
+    """Return the files with a sound header, newest first."""
     found = [(path, head) for path in paths_of(directory) if (head := peek(path)) is not None]
     return sorted(found, key=lambda one: one[1].age, reverse=True)
 
 
 def paths_of(directory: Path) -> Iterable[Path]:
-    """The files that may hold a state."""
+    """Return the files that may hold a snapshot."""
     return (directory / name for name in (*SLOTS, COPY))
 
 
 def newest_head(directory: Path) -> Head | None:
-    """What the newest file says of itself; None: there is none."""
+    """Return the header of the newest file; None: there is none."""
     found = files(directory)
     return found[0][1] if found else None
 
 
 def read(path: Path) -> Kept:
-    """A whole state; raises `Damaged`."""
+    """Return the snapshot in a file; raises `Damaged`."""
     return decoded(content_of(path), path)
 
 
 def content_of(path: Path) -> bytes:
-    """All bytes of a file; raises `Damaged`."""
+    """Return all bytes of a file; raises `Damaged`."""
     try:
         descriptor = os.open(path, os.O_RDONLY | OPEN)
         with os.fdopen(descriptor, "rb") as file:
@@ -67,10 +67,10 @@ def content_of(path: Path) -> bytes:
 
 
 def newest(directory: Path, up_to: int) -> tuple[Kept | None, list[str]]:
-    """The newest whole state of a directory, and what is wrong with those that are not whole.
+    """Return the newest complete snapshot of a directory, and the faults of damaged files.
 
     Args:
-        up_to: highest number of an instance whose state counts.
+        up_to: highest instance number whose snapshot counts.
     """
     found = files(directory)
     sound = {path for path, _ in found}
@@ -90,7 +90,7 @@ def newest(directory: Path, up_to: int) -> tuple[Kept | None, list[str]]:
 
 
 def newest_content(directory: Path) -> tuple[Head, bytes] | None:
-    """The newest whole state as it lies in its file; None: there is none."""
+    """Return the newest complete snapshot with the bytes of its file; None: there is none."""
     for path, _ in files(directory):
         with contextlib.suppress(Damaged):
             data = content_of(path)

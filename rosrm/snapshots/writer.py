@@ -1,4 +1,4 @@
-"""Writes states: a node into two slots in turn, a slave those of other hosts; and deletes them."""
+"""Writers of snapshots (a node's two slots, a slave's replica), and their deletion."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from rosrm.snapshots.reader import COPY, HEAD_ROOM, OPEN, SLOTS, content_of, pat
 
 
 class SlotWriter:
-    """Writes a node's states into its two slots in turn, never over the newest one.
+    """Writes a node's snapshots into its two slots in turn, never over the newest one.
 
     Args:
-        directory: of the process; it is made where it does not exist.
+        directory: of the process; created where it does not exist.
         process: its name.
-        instance: number of the instance that writes.
+        instance: number of the writing instance.
 
     Raises:
         OSError: the files cannot be opened.
@@ -45,22 +45,22 @@ class SlotWriter:
             raise
 
     def write(self, sequence: int, blocks: Sequence[Block]) -> bool:
-        """Write a state over the older one; killed at any instant, the newer one is still whole.
+        """Write a snapshot over the older one; a kill at any instant leaves the newer one complete.
 
         Returns:
             False: a newer instance writes here; nothing was changed.
 
         Raises:
-            OSError: it cannot be written; the newer one is still whole.
+            OSError: the snapshot cannot be written; the newer one is still complete.
         """
         if not self._files or any(os.fstat(one).st_nlink == 0 for one in self._files):
-            self._open()  # what is kept of an instance before this one was deleted meanwhile
+            self._open()  # the slots were deleted with the snapshots of earlier instances
         file = self._files[self._next]
         if self._is_of_newer(file):
             return False
         head = encoded_head(self._process, self._instance, sequence, blocks)
         size = len(head) + sum(len(block.data) for block in blocks)
-        # The head goes last: a file that was begun and not ended never looks like the newest.
+        # The header is written last, so an interrupted write never looks like the newest snapshot.
         _write_all(file, [block.data for block in blocks], len(head))
         _write_all(file, [head], 0)
         if os.fstat(file).st_size > 2 * size:
@@ -102,10 +102,10 @@ def _write_all(file: int, parts: Sequence[bytes], at: int) -> None:
 
 
 class CopyWriter:
-    """Takes a state that comes from another host, part by part; the copy before it stays till then.
+    """Receives a replica from another host in parts; the earlier replica stays until `finish`.
 
     Args:
-        directory: of the process; it is made where it does not exist.
+        directory: of the process; created where it does not exist.
 
     Raises:
         OSError: the file cannot be opened.
@@ -120,16 +120,16 @@ class CopyWriter:
         self.size = 0
 
     def append(self, data: bytes) -> None:
-        """Take the next part; raises `OSError`."""
+        """Append the next part; raises `OSError`."""
         _write_all(self._file, [data], self.size)
         self.size += len(data)
 
     def finish(self) -> Head:
-        """It is whole: keep it.
+        """Check the replica, and replace the earlier one by it.
 
         Raises:
-            Damaged: it is not; nothing is left of it.
-            OSError: it cannot be kept.
+            Damaged: the replica is not complete; it is deleted.
+            OSError: the replica cannot be stored.
         """
         try:
             head, _ = checked(content_of(self._begun))
@@ -141,12 +141,12 @@ class CopyWriter:
         return head
 
     def abandon(self) -> None:
-        """Nothing more comes of it."""
+        """Delete the unfinished replica."""
         self._close()
         with contextlib.suppress(OSError):
             self._begun.unlink(missing_ok=True)
         with contextlib.suppress(OSError):
-            self._directory.rmdir()  # where nothing else is kept
+            self._directory.rmdir()  # fails, as intended, where other files are kept
 
     def _close(self) -> None:
         if self._file >= 0:
@@ -155,7 +155,7 @@ class CopyWriter:
 
 
 def write_copy(directory: Path, data: bytes) -> None:
-    """Keep a state that came from another host; raises as `CopyWriter` does."""
+    """Store a replica from another host; raises the errors of `CopyWriter`."""
     copy = CopyWriter(directory)
     try:
         copy.append(data)
@@ -166,7 +166,7 @@ def write_copy(directory: Path, data: bytes) -> None:
 
 
 def drop(directory: Path, up_to: int) -> bool:
-    """Delete the states of instances up to a number; True: nothing is kept any more."""
+    """Delete the snapshots of instances up to a number; return True if none is left."""
     left = False
     for path in paths_of(directory):
         head = peek(path)

@@ -1,19 +1,19 @@
-"""The supervisor of one host: parent of its processes, without ROS; it outlives the slave.
+"""Supervisor of one host: parent of its processes, without ROS; it outlives the slave.
 
-    __main__.py           starts it: subreaper, daemon, then the bare interpreter
-    bare_interpreter.py   where that interpreter begins
-    server.py             its event loop, the imperative shell around `rosrm.core.supervisor`
-    spawn.py              spawns, signals and reaps
-    process_tree.py       the process tree of an instance
-    procfs.py             reads in /proc which processes belong to an instance
-    instance_record.py    what survives its own death: instances.jsonl
-    lease_file.py         the last contact with the master, for after a restart
+    __main__.py           start: subreaper, daemon, then the bare interpreter
+    bare_interpreter.py   entry point of the bare interpreter
+    server.py             event loop, the imperative shell around `rosrm.core.supervisor`
+    spawn.py              spawning of one process
+    process_tree.py       process trees of the instances: signals, reaping
+    procfs.py             lookup in /proc of the processes of an instance
+    instance_record.py    the record that survives the supervisor's own death: instances.jsonl
+    lease_file.py         the last contact with the master, for a restart
     logs.py, log_index.py the processes' log files: rotated, bounded, indexed by time
-    messages.py           what travels between it and the slave, as json_lines.py
-    discovery.py          finds the supervisor of a host, or starts one
-    takeover.py           a new supervisor takes over the processes of one that was killed
+    messages.py           protocol between supervisor and slave, as json_lines.py
+    discovery.py          lookup of the supervisor of a host, or its start
+    takeover.py           take-over of the processes of a killed supervisor
     client.py             the slave's side, with client_values.py
 
-All but the slave's side is imported by the supervisor itself, which must stay small: standard
-library only, and of that only what is light.
+The supervisor imports all but the slave's side, and must stay small. So these modules import only
+the standard library, and of that only light modules.
 """

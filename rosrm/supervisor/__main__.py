@@ -1,11 +1,12 @@
-"""Starts the supervisor of one host: `python -m rosrm.supervisor --state DIR`.
+"""Start of the supervisor of one host: `python -m rosrm.supervisor --state DIR`.
 
-First stage: it becomes a daemon of its own session, so that neither a terminal's Ctrl-C nor the
-end of the slave reaches it, and a subreaper, which only ctypes can ask for. Then it executes the
-bare interpreter (`bare_interpreter.py`), which keeps the subreaper's role and frees this memory.
+First stage: this process becomes a daemon with a session of its own, so that neither a terminal's
+Ctrl-C nor the end of the slave reaches it. It also becomes a subreaper, by ctypes, the only way.
+Then it executes the bare interpreter (`bare_interpreter.py`), which stays a subreaper and frees
+this memory.
 
 The slave runs this file by its path in an interpreter without site-packages, which starts faster
-and past the ROS wheels' bootstrapper: so it imports the standard library only.
+and skips the ROS wheels' bootstrapper. So this file imports the standard library only.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ _PR_SET_CHILD_SUBREAPER = 36
 
 
 def main() -> None:
-    """Parse the command line, detach, and go on as the bare interpreter."""
+    """Parse the command line, detach, and execute the bare interpreter."""
     parser = argparse.ArgumentParser(
         prog="python -m rosrm.supervisor",
         description="The parent of one host's processes; it outlives the slave.",
@@ -47,7 +48,7 @@ def main() -> None:
 
 
 def _detach() -> None:
-    """Go on as an orphan in a session that has no terminal and can get none."""
+    """Continue as an orphan in a session that has no terminal and can get none."""
     if os.fork():
         os._exit(0)
     os.setsid()
@@ -57,7 +58,7 @@ def _detach() -> None:
 
 
 def _become_subreaper() -> None:
-    """The children's orphans become this process's own; kept over exec, not over fork."""
+    """Adopt the orphans of this process's descendants; an exec keeps the role, a fork does not."""
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0):
         number = ctypes.get_errno()

@@ -1,9 +1,9 @@
-"""Where the bare interpreter of the supervisor begins: `-I -S bare_interpreter.py STATE LIMITS`.
+"""Entry point of the supervisor's bare interpreter: `-I -S bare_interpreter.py STATE LIMITS`.
 
 Without site-packages (-S) no `.pth` file runs: neither the ROS wheels' bootstrapper nor an
-environment's imports. So this file finds the `rosrm` package itself, which it lies in.
+environment's imports. So this file finds the `rosrm` package, which contains it, by its own path.
 
-It writes one line to its standard output, "ready" or what is wrong, and then lets go of it.
+The process writes one line to its standard output, "ready" or an error, and then closes it.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ import sys
 
 
 def main() -> None:
-    """Listen in the state directory, say so, and serve until the shutdown."""
+    """Listen in the state directory, report readiness, and serve until the shutdown."""
     package = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
-    sys.path.append(os.path.dirname(package))  # last: the standard library goes first
+    sys.path.append(os.path.dirname(package))  # last: the standard library takes precedence
 
     # ruff: noqa: PLC0415 - these can be imported only now
     from rosrm.supervisor import endpoint

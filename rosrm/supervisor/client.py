@@ -1,4 +1,4 @@
-"""The slave's side of its supervisor."""
+"""Client of the supervisor, used by the slave."""
 
 from __future__ import annotations
 
@@ -59,22 +59,22 @@ _CHUNK: Final = 1 << 16
 
 
 class SupervisorGone(SupervisorError):
-    """The connection was lost: the supervisor was killed, or takes no orders.
+    """The connection was lost: the supervisor was killed, or reads no orders.
 
-    Connect again: a new one takes over, or the same tells what it has taken.
+    Connect again: a new supervisor takes over, or the same one reports the orders that it received.
     """
 
 
 class SupervisorSilent(SupervisorError):
-    """It is there and does not answer: it is stopped, or its machine is too busy. Try again."""
+    """The supervisor exists but does not answer: it is stopped, or its machine is busy. Retry."""
 
 
 class SupervisorEnded(SupervisorError):
-    """The shutdown that was asked for is complete: nothing runs any more."""
+    """The ordered shutdown is complete: no process runs any more."""
 
 
 def log_path(state_directory: Path, instance: InstanceId) -> Path:
-    """The file that an instance writes its output to; older parts: `.1`, `.2`, ... behind it."""
+    """Return the log file of an instance; older parts have `.1`, `.2`, ... appended."""
     return Path(paths.log_file(str(state_directory), instance.process, instance.number))
 
 
@@ -87,7 +87,7 @@ def logged_instances(state_directory: Path, process: str) -> list[int]:
 
 
 def newest_log(state_directory: Path, process: str) -> InstanceId | None:
-    """The newest instance of a process that has a log; None: there is none (any more)."""
+    """Return the newest instance of a process that has a log; None: there is none (any more)."""
     numbers = logged_instances(state_directory, process)
     return InstanceId(process, numbers[-1]) if numbers else None
 
@@ -95,15 +95,15 @@ def newest_log(state_directory: Path, process: str) -> InstanceId | None:
 class SupervisorClient:
     """A connection to the supervisor of this host.
 
-    To order never waits: what the supervisor does not take at once is sent when it does, in order.
-    One thread may wait in `receive` while others order.
+    Sending an order never blocks: orders that the supervisor does not read at once are queued and
+    sent later, in order. One thread may wait in `receive` while others send orders.
 
     Attributes:
-        instances: what the supervisor knew when the connection was made: every instance that has
-            not been forgotten, final statuses included.
-        memos: what an earlier client wanted to be remembered of those that have not ended.
-        fenced: those that have a fence.
-        notes: what the supervisor found wrong with its record, for people.
+        instances: statuses at the time of connecting: every instance that has not been forgotten,
+            final statuses included.
+        memos: texts that an earlier client stored for instances that have not ended.
+        fenced: instances that have a fence.
+        notes: faults that the supervisor found in its record, as text for the user.
         pid: of the supervisor.
     """
 
@@ -136,8 +136,8 @@ class SupervisorClient:
         """Connect to the supervisor of a state directory, and start one where none listens.
 
         Raises:
-            SupervisorSilent: there is one, and it does not answer in time.
-            SupervisorError: there is none and none can be started in time, or it turned us down.
+            SupervisorSilent: a supervisor exists, and does not answer in time.
+            SupervisorError: there is none and none can be started in time, or it refused.
         """
         state = Path(os.path.abspath(state_directory))
         deadline = time.monotonic() + timeout
@@ -146,7 +146,7 @@ class SupervisorClient:
             try:
                 client._introduce(log, deadline)
             except SupervisorGone:
-                # A supervisor that is just dying still takes connections for an instant.
+                # A dying supervisor still accepts connections for an instant.
                 client.close()
                 if time.monotonic() > deadline:
                     raise
@@ -159,88 +159,88 @@ class SupervisorClient:
     # --- orders -------------------------------------------------------------------------------
 
     def start(self, orders: Sequence[LaunchOrder]) -> None:
-        """Have instances started; repeating an order starts nothing twice."""
+        """Start instances; a repeated order starts nothing twice."""
         with self._sending:
             if orders and self._base is None:
                 self._choose_base(orders[0].environment)
             self._send(b"".join(messages.encode_order(self._launch(order)) for order in orders))
 
     def stop(self, instance: InstanceId) -> None:
-        """SIGINT, SIGTERM, SIGKILL to all of it; never heard of: it will never be started."""
+        """Send SIGINT, SIGTERM, SIGKILL to the tree; bar a later start of an unknown instance."""
         self._order(StopOrdered(key_of(instance)))
 
     def fence(self, instance: InstanceId) -> None:
-        """SIGKILL to all of it, and no restart; never heard of: it will never be started."""
+        """Send SIGKILL to the tree, no restart; bar a later start of an unknown instance."""
         self._order(FenceOrdered(key_of(instance)))
 
     def heard(self, at: float, alive: float) -> None:
-        """Fences wait: the master is known to have heard this host, and this slave was at work.
+        """Renew the fences: the master received a message of this host, and this slave was at work.
 
         Args:
-            at, alive: monotonic times of that.
+            at, alive: monotonic times of these two.
 
-        Left out while the supervisor does not read (it is stopped): a newer one will follow.
+        Skipped while the supervisor does not read (it is stopped), because a newer renewal follows.
         """
         if self._outgoing.is_free:
             self._order(Heard(at, alive))
 
     def restart(self, instance: InstanceId) -> None:
-        """Stop it, then start it again; the restart policy does not count this."""
+        """Stop an instance, then start it again; the restart policy does not count this."""
         self._order(RestartOrdered(key_of(instance)))
 
     def fail(self, instance: InstanceId, pid: int, reason: str, *, kill: bool) -> None:
-        """A run of it counts as failed: stop it, then do as its restart policy says.
+        """Count a run of an instance as failed: stop it, then apply its restart policy.
 
         Args:
-            pid: of the run; where it has ended meanwhile nothing is done.
-            reason: for people.
-            kill: SIGKILL at once; otherwise it is asked first.
+            pid: of the run; nothing happens if that run has ended.
+            reason: text for the user.
+            kill: SIGKILL at once; otherwise SIGINT and SIGTERM first.
         """
         self._order(FailOrdered(key_of(instance), pid, reason, kill))
 
     def amend(
         self, instance: InstanceId, restart: RestartPolicy, changes: Mapping[str, str | None]
     ) -> None:
-        """Give it another restart policy; answered by `Amended`, of what has ended too.
+        """Replace the restart policy of an instance, even an ended one; the answer is `Amended`.
 
         Args:
-            changes: of its environment when it starts again; None: without this variable.
+            changes: of its environment at the next start; None: unset the variable.
         """
         order = AmendOrdered(key_of(instance), restart_rule(restart))
         self._order(messages.Amend(order, changes))
 
     def remember(self, instance: InstanceId, memo: str) -> None:
-        """Keep another text for a later run of the client."""
+        """Replace the text that the supervisor stores for a later run of the client."""
         self._order(messages.Remember(key_of(instance), memo))
 
     def forget(self, instances: Iterable[InstanceId]) -> None:
-        """Their final statuses are kept elsewhere now: the supervisor need not."""
+        """Let the supervisor forget final statuses that the caller has stored."""
         forgotten = tuple(Forgotten(key_of(instance)) for instance in instances)
         if forgotten:
             self._order(messages.Forget(forgotten))
 
     def shutdown(self) -> None:
-        """Stop everything, then end the supervisor; `receive` tells all of it."""
+        """Stop everything, then end the supervisor; `receive` reports the progress."""
         self._order(ShutdownOrdered())
 
     # --- answers ------------------------------------------------------------------------------
 
     @property
     def waits(self) -> float:
-        """Seconds for which it has taken none of the orders that wait for it; 0.0: none waits."""
+        """Seconds since the supervisor last read any of the queued orders; 0.0: none is queued."""
         return self._outgoing.waits
 
     def fileno(self) -> int:
-        """Readable when `receive` has something; for a selector."""
+        """Return the descriptor for a selector; readable when `receive` has something."""
         return self._peer.fileno()
 
     def receive(self, timeout: float | None = None) -> list[Told]:
-        """What the supervisor has told, oldest first; [] when nothing came in time.
+        """Return the supervisor's messages, oldest first; [] when none came in time.
 
         Raises:
             SupervisorEnded: the shutdown is complete.
-            SupervisorGone: it was killed; its processes go on.
-            SupervisorError: it turned us down, or cannot be understood.
+            SupervisorGone: the supervisor was killed; its processes keep running.
+            SupervisorError: the supervisor refused, or sent an unreadable message.
         """
         deadline = None if timeout is None else time.monotonic() + timeout
         while not self._received:
@@ -254,15 +254,15 @@ class SupervisorClient:
         return received
 
     def close(self) -> None:
-        """Leave; the instances go on."""
+        """Close the connection; the instances keep running."""
         self._outgoing.close()
 
     def __enter__(self) -> Self:
-        """The connection is closed with the block."""
+        """Return this client; the block's end closes the connection."""
         return self
 
     def __exit__(self, *exception: object) -> None:
-        """Close it."""
+        """Close the connection."""
         self.close()
 
     # --- sending ------------------------------------------------------------------------------
@@ -287,7 +287,7 @@ class SupervisorClient:
         )
 
     def _choose_base(self, environment: Mapping[str, str]) -> None:
-        """Environments differ little: send one whole, and of the others what differs from it."""
+        """Send an environment as the base: others differ little, and are sent as changes."""
         self._base = dict(environment)
         self._base_id = os.urandom(8).hex()
         self._send(messages.encode_order(messages.Environment(self._base_id, self._base)))
@@ -302,7 +302,7 @@ class SupervisorClient:
         except Overfull:
             most = f"{MOST_UNSENT >> 20} MiB"
             full = SupervisorGone(f"{self._name()} takes no orders, and {most} of them wait for it")
-            self._fail(full)  # before the reader sees that the connection has ended
+            self._fail(full)  # before the reader notices the end of the connection
             self._outgoing.drop()
             raise full from None
         except OSError as error:
@@ -336,7 +336,7 @@ class SupervisorClient:
             self._fail(SupervisorError(f"{self._name()} cannot be understood: {error}"))
 
     def _lose(self, reason: str) -> None:
-        """Note that the connection has ended: after `ended`, also by orders that nobody read."""
+        """Record the end of the connection; after `ended` it means a complete shutdown."""
         if self._ending:
             self._fail(SupervisorEnded(f"{self._name()} has ended, and all its processes"))
         else:
@@ -377,7 +377,7 @@ class SupervisorClient:
         self.memos = {InstanceId(*messages.read_key(key)): str(memo) for key, memo in memos}
 
     def _fail(self, failure: SupervisorError) -> None:
-        """Remember what ends the connection; what came before it is delivered first."""
+        """Store the error that ends the connection; `receive` delivers earlier messages first."""
         if self._failure is None:
             self._failure = failure
 

@@ -1,4 +1,4 @@
-"""What a slave says to its supervisor and hears of it, in the core's values."""
+"""Values of the core in the slave's messages to and from its supervisor."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from rosrm.supervisor import messages
 
 @dataclass(frozen=True, slots=True)
 class LaunchOrder:
-    """What is to be started.
+    """A start order.
 
     Attributes:
         argv: the command line; its first word is looked up in the PATH of `environment`.
-        environment: the whole of it, nothing is inherited.
-        working_directory: None: one of its own, below the state directory.
+        environment: the whole environment; nothing is inherited.
+        working_directory: None: the default one, below the state directory.
         memo: kept by the supervisor for a later run of the client; see `SupervisorClient.memos`.
-        fence: when the supervisor ends it by itself; None: never.
-        heard: when the master last heard this host, monotonic; 0.0: just now.
+        fence: rule by which the supervisor ends the instance without an order; None: never.
+        heard: last contact of the master with this host, monotonic; 0.0: now.
     """
 
     instance: InstanceId
@@ -43,38 +43,38 @@ class LaunchOrder:
 
 @dataclass(frozen=True, slots=True)
 class Amended:
-    """The supervisor has recorded that an instance has this restart policy from now on."""
+    """The supervisor has recorded a new restart policy of an instance."""
 
     instance: InstanceId
     restart: RestartPolicy
 
 
-#: What the supervisor tells of an instance.
+#: Messages of the supervisor about an instance.
 Told = InstanceStatus | Amended
 
 
 def key_of(instance: InstanceId) -> tuple[str, int]:
-    """As the supervisor names it."""
+    """Return the supervisor's key of an instance."""
     return (instance.process, instance.number)
 
 
 def fence_rule(fence: Fence | None) -> FenceRule | None:
-    """As the supervisor has it."""
+    """Return a fence as the supervisor's rule."""
     return None if fence is None else FenceRule(fence.after, fence.grace, fence.alive)
 
 
 def restart_rule(restart: RestartPolicy) -> RestartRule:
-    """As the supervisor has it."""
+    """Return a restart policy as the supervisor's rule."""
     return RestartRule(*(getattr(restart, name) for name in RestartRule._fields))
 
 
 def stop_rule(stop: StopPolicy) -> StopRule:
-    """As the supervisor has it."""
+    """Return a stop policy as the supervisor's rule."""
     return StopRule(*(getattr(stop, name) for name in StopRule._fields))
 
 
 def status_from(value: object) -> InstanceStatus:
-    """What the supervisor says of an instance."""
+    """Return an instance's status from its JSON list."""
     assert isinstance(value, list)
     status = messages.read_status(value)
     return InstanceStatus(InstanceId(*status.instance), InstanceState(status.state), *status[2:])

@@ -1,4 +1,4 @@
-"""One connection to the supervisor: lines in, lines out, never waiting."""
+"""One connection of the supervisor: lines in, lines out, never blocking."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Final
 from rosrm.supervisor import own_log
 from rosrm.supervisor.json_lines import Lines
 
-#: A client that leaves so many bytes unread is cut off; it hears everything anew when it returns.
+#: Unread bytes at which a client is disconnected; it receives all statuses when it reconnects.
 MOST_UNREAD: Final = 8 << 20
 _CHUNK: Final = 1 << 16
 
@@ -18,11 +18,11 @@ class Connection:
     """A peer at the socket.
 
     Attributes:
-        pid: of the peer, as the kernel says.
-        uid: of the peer, as the kernel says.
-        closing: it is closed as soon as what is to be sent has been.
-        gone: nothing more can come from it or go to it.
-        environment: the base that its launches name.
+        pid: of the peer, from the kernel.
+        uid: of the peer, from the kernel.
+        closing: the connection is closed once all unsent bytes have been sent.
+        gone: no further bytes can be received or sent.
+        environment: the base environment that its launches refer to.
     """
 
     def __init__(self, peer: socket.socket) -> None:
@@ -37,16 +37,16 @@ class Connection:
         self._unsent = b""
 
     def fileno(self) -> int:
-        """For the selector."""
+        """Return the descriptor for the selector."""
         return self._peer.fileno()
 
     @property
     def has_unsent(self) -> bool:
-        """Something waits until the peer reads."""
+        """Return True if bytes wait until the peer reads."""
         return bool(self._unsent)
 
     def read(self) -> list[bytes]:
-        """The lines that have come. Raises ProtocolError where one is too long."""
+        """Return the lines received so far. Raises ProtocolError for one that is too long."""
         parts = []
         while not self.gone:
             try:
@@ -62,22 +62,22 @@ class Connection:
         return self._lines.feed(b"".join(parts))
 
     def send(self, data: bytes) -> None:
-        """Send now what the peer can take, and the rest with later calls."""
+        """Send the bytes that the peer can take now, and the rest in later calls."""
         self._unsent += data
         try:
             while self._unsent and not self.gone:
                 self._unsent = self._unsent[self._peer.send(self._unsent) :]
         except BlockingIOError:
             self.gone = len(self._unsent) > MOST_UNREAD
-        except OSError:  # it is gone; what it was told is told again to the next
+        except OSError:  # the peer is gone; the next client receives every status again
             self.gone = True
         if self.closing and not self._unsent:
             self.gone = True
 
     def finish(self, data: bytes, timeout: float) -> None:
-        """Send the last that it is told, waiting at most `timeout` seconds for it to read.
+        """Send the last bytes, waiting at most `timeout` seconds for the peer to read.
 
-        The connection stays open: its end is to mean that this process is gone.
+        The connection stays open, because its end must mean the end of this process.
         """
         self._peer.settimeout(timeout)
         try:

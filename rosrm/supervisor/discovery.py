@@ -1,4 +1,4 @@
-"""Finding the supervisor of a state directory, or starting one."""
+"""Lookup of the supervisor of a state directory, or its start."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _CHUNK: Final = 1 << 16
 
 
 def connect_or_start(state: Path, start: bool, log: LogLimits, deadline: float) -> socket.socket:
-    """A connection to the one that serves a state directory; raises `SupervisorError`."""
+    """Return a connection to the supervisor of a state directory; raises `SupervisorError`."""
     while True:
         try:
             return endpoint.connect(str(state))
@@ -34,12 +34,12 @@ def connect_or_start(state: Path, start: bool, log: LogLimits, deadline: float) 
         if problem and "another supervisor" not in problem:
             raise SupervisorError(f"the supervisor of {state} did not start: {problem}")
         if problem:
-            # Somebody else's is about to listen or about to end: neither can be awaited from here.
+            # Another supervisor is about to listen or to end: neither can be awaited from here.
             time.sleep(0.02)
 
 
 def _start(state: Path, log: LogLimits, deadline: float) -> str:
-    """Start a supervisor and wait for its first line; "" when it is ready, else what is wrong."""
+    """Start a supervisor and wait for its first line; return "" if ready, else the error."""
     main = Path(__file__).with_name("__main__.py")
     names = ("--log-max-bytes", "--log-keep", "--log-instances", "--log-processes")
     limits = [f"{name}={value}" for name, value in zip(names, log, strict=True)]
@@ -67,12 +67,12 @@ def _start(state: Path, log: LogLimits, deadline: float) -> str:
 
 
 def readable(file: socket.socket | object, timeout: float | None) -> bool:
-    """Whether there is something to read, within so many seconds; None: however long."""
+    """Return True if there is something to read within `timeout` seconds; None: no limit."""
     return _poll(file, select.POLLIN, timeout)
 
 
 def writable(file: socket.socket, timeout: float | None) -> bool:
-    """Whether there is room to write, within so many seconds; None: however long."""
+    """Return True if there is room to write within `timeout` seconds; None: no limit."""
     return _poll(file, select.POLLOUT, timeout)
 
 

@@ -1,4 +1,4 @@
-"""Both ends of `supervisor.sock`, and the lock that lets one supervisor serve a state directory."""
+"""Both ends of `supervisor.sock`, and the lock that admits one supervisor to a state directory."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from typing import Final
 
 from rosrm.supervisor import paths
 
-#: Its own log is begun anew at the next start when it has grown so large.
+#: Bytes of the supervisor's own log beyond which the next start empties it.
 MOST_OWN_LOG: Final = 1 << 20
 
 
 class EndpointError(Exception):
-    """The state directory cannot be served; its text says why."""
+    """The state directory cannot be served; the text gives the reason."""
 
 
 def listen(state: str) -> socket.socket:
-    """Become the one supervisor of a state directory. Raises EndpointError."""
+    """Lock the state directory and return the listening socket. Raises EndpointError."""
     try:
         os.makedirs(state, mode=0o700, exist_ok=True)
         os.chmod(state, 0o700)
@@ -45,7 +45,7 @@ def connect(state: str) -> socket.socket:
 
 
 def let_go_of_terminal(state: str) -> None:
-    """Say "ready" to whoever waits for it; from here on troubles go to the supervisor's own log."""
+    """Write "ready" to standard output, then redirect all errors to the supervisor's own log."""
     os.write(1, b"ready\n")
     path = os.path.join(state, paths.OWN_LOG)
     null = os.open(os.devnull, os.O_RDWR)
@@ -59,7 +59,7 @@ def let_go_of_terminal(state: str) -> None:
 
 
 def _lock(state: str) -> None:
-    """Hold the lock until the process ends; the kernel gives it back, even after a SIGKILL."""
+    """Hold the lock until the process ends; the kernel releases it, even after a SIGKILL."""
     file = os.open(os.path.join(state, paths.LOCK), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -75,7 +75,7 @@ def _lock(state: str) -> None:
 def _bind(state: str) -> socket.socket:
     path = os.path.join(state, paths.SOCKET)
     if os.path.lexists(path):
-        os.unlink(path)  # of a supervisor that was killed: the lock is ours
+        os.unlink(path)  # left by a killed supervisor, because this process holds the lock
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     directory = os.open(state, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
     umask = os.umask(0o177)
@@ -90,5 +90,5 @@ def _bind(state: str) -> socket.socket:
 
 
 def _short_path(directory: int) -> str:
-    """A socket's path holds 108 bytes; a state directory's may be longer."""
+    """Return a short path: a socket's path holds 108 bytes; a state directory's may be longer."""
     return f"/proc/self/fd/{directory}/{paths.SOCKET}"

@@ -1,4 +1,4 @@
-"""The durable record of one host's instances: `instances.jsonl`, append-only, one JSON a line.
+"""Durable record of one host's instances: `instances.jsonl`, append-only, one JSON object a line.
 
     {"record": "header", "version": 1, "boot": ID}
     {"record": "environment", "id": ID, "variables": {...}}
@@ -7,9 +7,10 @@
     {"record": "state", "key": [process, number], "phase": ..., ...}   the fields of `Instance`
     {"record": "dead", "process": NAME, "number": N}        up to N they never start again
 
-The last line about a thing counts. What was written survives the supervisor's own SIGKILL, as one
-`write` hands it to the kernel; it is not forced to the disk, since after a loss of power none of
-the processes is left anyway. A tail torn by a full disk, or a damaged line, is left out and said.
+The last line about an item counts. Each line survives the supervisor's own SIGKILL, because one
+`write` passes it to the kernel. No line is forced to the disk, because after a loss of power none
+of the processes is left anyway. A tail torn by a full disk, or a damaged line, is skipped and
+reported in the notes.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from rosrm.supervisor import json_lines, messages, paths, procfs
 from rosrm.supervisor.messages import Launch
 
 VERSION: Final = 1
-#: The file is written anew when it has grown to this, and to as many times what it then held.
+#: The file is compacted beyond this size, and beyond this multiple of its size after the last time.
 COMPACT_BYTES: Final = 1 << 20
 COMPACT_FACTOR: Final = 4
 
@@ -32,16 +33,16 @@ _APPEND: Final = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC
 
 
 class RecordError(Exception):
-    """The record is there, but cannot be read."""
+    """The record exists, but cannot be read."""
 
 
 class Recorded:
-    """What a record holds.
+    """The content of a record.
 
     Attributes:
         spawning: instances whose last spawn may have been tried, with no outcome recorded.
-        same_boot: it was written since this machine's start.
-        notes: what was wrong with it, for people.
+        same_boot: the record was written since this machine's start.
+        notes: faults of the record, as text for the user.
     """
 
     def __init__(self) -> None:
@@ -56,7 +57,7 @@ class Recorded:
 
 
 def read(state: str) -> Recorded:
-    """What the record of a state directory holds; nothing where there is none."""
+    """Return the content of a state directory's record; empty where there is none."""
     recorded = Recorded()
     path = os.path.join(state, paths.RECORD)
     try:
@@ -126,15 +127,15 @@ def _take_state(recorded: Recorded, fields: Mapping[str, Any]) -> None:
 _PLAIN_FIELDS: Final = tuple(
     name for name in Instance.__slots__ if name not in ("key", "restart", "stop", "fence")
 )
-#: Older records have not all of these.
+#: Fields that may be missing in older records.
 _NEW_FIELDS: Final = frozenset({"fault", "fenced", "heard", "kill_by", "withdrawn"})
 
 
 class Record:
-    """Appends to the record; nothing is lost while the disk is full, only late.
+    """Appends to the record; while the disk is full, lines are delayed but not lost.
 
     Attributes:
-        trouble: why the last write failed; "": it did not.
+        trouble: reason of the last write's failure; "": it succeeded.
     """
 
     def __init__(self, state: str) -> None:
@@ -146,27 +147,27 @@ class Record:
         self._waiting: list[bytes] = []
 
     def environment(self, identity: str, variables: Mapping[str, str]) -> None:
-        """A base environment that launches refer to."""
+        """Add a base environment that launches refer to."""
         self._add({"record": "environment", "id": identity, "variables": dict(variables)})
 
     def launch(self, launch: Launch) -> None:
-        """An order to start."""
+        """Add an order to start."""
         self._add({"record": "order", **messages.launch_fields(launch)})
 
     def spawning(self, keys: Iterable[Key]) -> None:
-        """These spawns will be tried next."""
+        """Add the spawns that will be tried next."""
         self._add({"record": "spawning", "instances": list(keys)})
 
     def state(self, instance: Instance, birth: int) -> None:
-        """All that is known of an instance; `birth`: see `members.was_born`."""
+        """Add the whole state of an instance; `birth`: see `procfs.was_born`."""
         self._add(_state(instance, birth))
 
     def dead(self, key: Key, number: int) -> None:
-        """An instance was forgotten; its process starts no number up to `number` any more."""
+        """Add a forgotten instance; its process starts no number up to `number` any more."""
         self._add({"record": "dead", "key": key, "process": key[0], "number": number})
 
     def flush(self) -> bool:
-        """Hand everything to the kernel in one write; False, with `trouble`, where it failed."""
+        """Pass all lines to the kernel in one write; return False, with `trouble`, if it failed."""
         if not self._waiting:
             return True
         text = b"".join(self._waiting)
@@ -185,7 +186,7 @@ class Record:
         return True
 
     def is_large(self) -> bool:
-        """It is time to `rewrite` it."""
+        """Return True if the record should be compacted by `rewrite`."""
         return self._size >= self._compact_at
 
     def rewrite(
@@ -195,7 +196,7 @@ class Record:
         environments: Mapping[str, Mapping[str, str]],
         birth: Callable[[Key], int],
     ) -> None:
-        """Replace the record by one that holds only what counts now, if the disk has room.
+        """Replace the record by one that holds only the current state, if the disk has room.
 
         Args:
             environments: all that launches refer to now or may later; one may be missing, where a
@@ -243,7 +244,7 @@ class Record:
         self._file = file
 
     def _open_old(self) -> None:
-        """Go on with the record as it is, behind a tail that may be torn."""
+        """Keep using the existing record, behind a tail that may be torn."""
         if self._file < 0:
             self._file = os.open(self._path, _APPEND, 0o600)
             self._waiting.insert(0, b"\n")

@@ -1,4 +1,4 @@
-"""JSON objects, one a line: how slave and supervisor speak, and how the record is written."""
+"""JSON objects, one a line: encoding of the slave's and supervisor's messages and of the record."""
 
 from __future__ import annotations
 
@@ -6,23 +6,23 @@ import json
 from collections.abc import Mapping
 from typing import Any, Final
 
-#: Longest line that is read.
+#: Longest accepted line, bytes.
 LONGEST_LINE: Final = 8 << 20
 
 _encoder: Final = json.JSONEncoder(separators=(",", ":"))
 
 
 class ProtocolError(Exception):
-    """The peer sent what cannot be understood; its text is meant for the peer."""
+    """The peer sent an unreadable message; the text is meant for the peer."""
 
 
 def line(fields: Mapping[str, Any]) -> bytes:
-    """A JSON object in one line."""
+    """Return a JSON object as one line."""
     return _encoder.encode(fields).encode() + b"\n"
 
 
 def parse(text: bytes) -> dict[str, Any]:
-    """The JSON object in one line. Raises ProtocolError."""
+    """Return the JSON object in one line. Raises ProtocolError."""
     try:
         fields = json.loads(text)
     except ValueError as error:
@@ -33,13 +33,13 @@ def parse(text: bytes) -> dict[str, Any]:
 
 
 class Lines:
-    """Cuts a stream into lines."""
+    """Splits a stream into lines."""
 
     def __init__(self) -> None:
         self._rest = b""
 
     def feed(self, data: bytes) -> list[bytes]:
-        """The lines that `data` completes. Raises ProtocolError where one does not end."""
+        """Return the lines that `data` completes. Raises ProtocolError for one that is too long."""
         *lines, self._rest = (self._rest + data).split(b"\n")
         if len(self._rest) > LONGEST_LINE:
             raise ProtocolError(f"a line is longer than {LONGEST_LINE} bytes")

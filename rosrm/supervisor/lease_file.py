@@ -1,8 +1,8 @@
-"""When the master last heard this host, and the slave was at work: for one that has to take over.
+"""Times of the last contact with the master and of the slave's last activity, for a take-over.
 
 The file `heard` of the state directory holds one line of fixed length, which is overwritten: the
 id of this boot, and the two times by its CLOCK_MONOTONIC. So it needs no room on a full disk, and
-no compaction. Where it is missing, what the record says of each instance counts: its start.
+no compaction. Where it is missing, the recorded start of each instance counts.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from rosrm.supervisor import own_log, paths, procfs
 
 
 class LastHeard:
-    """Keeps the newest time."""
+    """Stores the newest times."""
 
     def __init__(self, state: str) -> None:
         self._path = os.path.join(state, paths.HEARD)
@@ -24,7 +24,7 @@ class LastHeard:
         self._trouble = ""
 
     def keep(self, heard: Heard) -> None:
-        """Hand it to the kernel, so that it survives this process."""
+        """Write newer times to the file, so that they survive this process."""
         newest = Heard(*map(max, heard, self._newest))
         if newest == self._newest:
             return
@@ -47,7 +47,7 @@ def _line(boot: str, newest: Heard) -> bytes:
 
 
 def read(state: str) -> Heard:
-    """The times that were kept since this machine's start; 0.0: none."""
+    """Return the times stored since this machine's start; 0.0: none."""
     try:
         with open(os.path.join(state, paths.HEARD), encoding="ascii") as file:
             boot, at, alive = file.read(100).split()

@@ -1,13 +1,13 @@
-"""Index of a log: by which time which bytes were written, and where a program was started.
+"""Index of a log: bytes written by a time, and the starts of programs.
 
 Beside each log file lies `FILE.times`: records of 24 bytes, ascending::
 
     time      float64   unix time by this host's clock, seconds
     offset    uint64    bytes that the instance had written by then, since its first start
-    pid       uint64    of the process that was started there; 0: a mere look at the log
+    pid       uint64    of the process that was started there; 0: a mere check of the log
 
-The offset of the first record is that of the file's first byte: a rotation changes no offset, and
-the reader sees what was dropped.
+The offset of the first record is that of the file's first byte. So a rotation changes no offset,
+and the reader notices dropped output.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ class Index:
         return Mark(*_RECORD.unpack(os.pread(self._file, _RECORD.size, at)))
 
     def find(self, is_late: Callable[[Mark], bool]) -> int:
-        """Return the number of the first record that is late enough, or `count`."""
+        """Return the number of the first record for which `is_late` is true, or `count`."""
         low, high = 0, self.count
         while low < high:
             middle = (low + high) // 2
@@ -118,12 +118,12 @@ class Index:
         return low
 
     def bytes_from(self, first: int) -> bytes:
-        """Return the records from one on, as they lie in the file."""
+        """Return the records from `first` on as the bytes of the index file."""
         length = (self.count - first) * _RECORD.size
         return os.pread(self._file, length, first * _RECORD.size) if length > 0 else b""
 
     def marks(self, first: int, most: int) -> list[Mark]:
-        """Return so many records from one on, or fewer."""
+        """Return at most `most` records from `first` on."""
         most = min(most, self.count - first)
         if most <= 0:
             return []

@@ -1,9 +1,10 @@
-"""The processes' log files: rotated and bounded, with nothing but `stat` while they are quiet.
+"""Log files of the processes: rotated, bounded, and checked with a mere `stat` while quiet.
 
-A process holds its log open for appending, so a full log is copied and then cut to nothing; what it
-writes between the two is lost. A process that floods can exceed the bound by what it writes in one
-interval. What is dropped shows in the offsets of the index beside each file (`log_index`), which
-also says when what was written: each look that finds a log grown adds a record.
+A process holds its log open for appending. So the supervisor copies a full log and then truncates
+it; output between the copy and the truncation is lost. A flooding process can exceed the bound by
+its output of one interval. Dropped output shows in the offsets of the index beside each file
+(`log_index`). The index also holds the time of output: each check that finds a log grown adds a
+record.
 """
 
 from __future__ import annotations
@@ -17,17 +18,17 @@ from rosrm.core.supervisor.reducer import Key
 from rosrm.supervisor import log_index, own_log, paths
 from rosrm.supervisor.log_index import Mark
 
-#: Seconds between two looks while logs grow, and while they do not.
+#: Seconds between two checks while logs grow, and while they do not.
 BUSY: Final = 0.2
 QUIET: Final = 1.0
-#: As many processes too many are borne before the logs of the oldest are removed.
+#: Excess of processes at which the logs of the oldest ones are removed.
 PROCESSES_AT_ONCE: Final = 50
-#: What may lie beside a log and goes with it.
+#: Suffixes of files that may lie beside a log and are removed with it.
 FILES_BESIDE: Final = (".parameters.yaml",)
 
 
 class LogLimits(NamedTuple):
-    """How much log is kept.
+    """Limits of the logs that are kept.
 
     Attributes:
         max_bytes: of one file, and of its index; beyond either the log is rotated.
@@ -43,7 +44,7 @@ class LogLimits(NamedTuple):
 
 
 class LogKeeper:
-    """Looks after the logs below one state directory."""
+    """Opens, watches, rotates and removes the logs below one state directory."""
 
     def __init__(self, state: str, limits: LogLimits) -> None:
         self.limits = limits
@@ -54,10 +55,10 @@ class LogKeeper:
         self._shelf = Shelf(state)
 
     def open(self, instance: Key, known: Collection[Key]) -> int:
-        """The descriptor that an instance is to write to; makes room by removing old logs.
+        """Open the log of an instance and return its descriptor; remove old logs to make room.
 
         Args:
-            instance: that is about to start.
+            instance: about to start.
             known: instances whose logs stay.
         """
         log = os.open(
@@ -71,10 +72,10 @@ class LogKeeper:
         return log
 
     def watch(self, instance: Key, now: float, started: int = 0) -> None:
-        """Look after the log of an instance that runs.
+        """Begin to check the log of a running instance.
 
         Args:
-            instance: that runs.
+            instance: running.
             now: monotonic seconds.
             started: pid of the process that was started after `open`; 0: it ran before.
         """
@@ -85,7 +86,7 @@ class LogKeeper:
         self._due = now + BUSY
 
     def release(self, instance: Key) -> None:
-        """The instance has ended: a last look at its log."""
+        """Check the log of an ended instance a last time and stop watching it."""
         self._opened.pop(instance, None)
         log = self._logs.pop(instance, None)
         if log is not None:
@@ -94,11 +95,11 @@ class LogKeeper:
             self._due = None
 
     def deadline(self) -> float | None:
-        """When the next look is due; None: no process runs."""
+        """Return the monotonic time of the next check; None: no process runs."""
         return self._due
 
     def look(self, now: float) -> None:
-        """Rotate what has grown too large."""
+        """Check all logs if a check is due, and rotate those that exceed the limits."""
         if self._due is None or now < self._due:
             return
         grown = [log for log in self._logs.values() if log.look(self.limits)]
@@ -106,7 +107,7 @@ class LogKeeper:
 
 
 class _Log:
-    """The log of one instance that runs.
+    """The log of a running instance.
 
     Attributes:
         base: bytes that the instance had written before the first one in the current file.
@@ -121,11 +122,11 @@ class _Log:
             self._has_index = index.count > 0
 
     def look(self, limits: LogLimits) -> bool:
-        """Note growth, and rotate what is too large; return True if the log has grown."""
+        """Record growth in the index, and rotate a log over its limits; True: it has grown."""
         try:
             size = os.stat(self.path).st_size
         except OSError:
-            return False  # it was removed; the process writes into a file without a name
+            return False  # the log was removed; the process writes into a file without a name
         if size == self.size:
             return False
         self.note(size, 0)
@@ -138,10 +139,10 @@ class _Log:
         return True
 
     def note(self, size: int, pid: int) -> None:
-        """Put into the index that the log has so many bytes now."""
+        """Record in the index that the log file now has `size` bytes."""
         now = time.time()
         if size < self.size:
-            # The log was cut by hand, or by a supervisor that was killed before it noted so.
+            # The log was truncated by hand, or by a supervisor killed before a new index.
             self.base += self.size
             self._has_index = False
         self.size = size
@@ -155,9 +156,9 @@ class _Log:
 
 
 class Shelf:
-    """Which instances have files in the folder of logs; removes those of old ones.
+    """The instances that have files in the log folder; removes the files of old instances.
 
-    The folder is read once; from then on the supervisor knows what it put there.
+    The folder is read once; from then on the supervisor tracks the files that it creates.
     """
 
     def __init__(self, state: str) -> None:
@@ -168,7 +169,7 @@ class Shelf:
             self._place(name, number)
 
     def add(self, instance: Key, known: Container[Key], limits: LogLimits) -> None:
-        """A new log; makes room for it, but not with the logs of `known` instances."""
+        """Add a new log; make room for it, but keep the logs of `known` instances."""
         process, number = instance
         numbers = self._place(paths.safe_name(process), number)
         for old in numbers[: max(0, len(numbers) - limits.instances)]:
@@ -177,7 +178,7 @@ class Shelf:
                 self._remove(paths.safe_name(process), old)
 
     def remove_old_processes(self, known: Iterable[Key], limits: LogLimits) -> None:
-        """Now and then: the logs of the processes that were started longest ago."""
+        """Remove the logs of the processes started longest ago, once the excess is large enough."""
         excess = len(self._numbers) - limits.processes
         if excess < PROCESSES_AT_ONCE:
             return
@@ -187,7 +188,7 @@ class Shelf:
                 self._remove(name, number)
 
     def _place(self, name: str, number: int) -> list[int]:
-        """Note a log; its process is now the newest."""
+        """Add a log, mark its process as the newest, and return its instance numbers."""
         numbers = self._numbers[name] = self._numbers.pop(name, [])
         if number not in numbers:
             numbers.append(number)
@@ -207,12 +208,12 @@ class Shelf:
 
 
 def rotate(path: str, size: int, limits: LogLimits) -> None:
-    """Keep the newest `max_bytes` of a log aside and cut it to nothing.
+    """Copy the newest `max_bytes` of a log to a file beside it, and truncate the log.
 
     Args:
         path: of the log.
         size: bytes in it.
-        limits: how much is kept.
+        limits: number and size of the files that are kept.
     """
     base = log_index.base(path) or 0
     start = max(0, size - limits.max_bytes)
@@ -227,7 +228,7 @@ def rotate(path: str, size: int, limits: LogLimits) -> None:
         finally:
             _unlink(f"{path}.new")
             written = os.fstat(log.fileno()).st_size
-            log.truncate(0)  # above all when the disk is full
+            log.truncate(0)  # also when the copy failed, above all because the disk is full
             log_index.begin(path, Mark(time.time(), base + written, 0))
 
 
@@ -244,14 +245,14 @@ def _copy(log: int, target: str, offset: int, end: int) -> None:
 
 
 def _rename(log: str, to: str) -> None:
-    """Rename a log file with its index, if there is one."""
+    """Rename a log file together with its index, where one exists."""
     for source, target in ((log, to), (log_index.path_of(log), log_index.path_of(to))):
         if os.path.exists(source):
             os.replace(source, target)
 
 
 def _unlink(path: str) -> bool:
-    """Remove a file; False: there is none."""
+    """Remove a file; return False if there is none."""
     try:
         os.unlink(path)
     except FileNotFoundError:

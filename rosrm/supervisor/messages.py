@@ -1,51 +1,53 @@
-"""What travels between the slave (client) and its host's supervisor.
+"""Protocol between the slave (client) and its host's supervisor.
 
-One JSON object a line over the Unix stream socket `supervisor.sock`; several lines may come in one
-write. An instance is `[process, number]`. Times are seconds, sizes bytes.
+One JSON object per line over the Unix stream socket `supervisor.sock`; one write may carry several
+lines. An instance is `[process, number]`. Times are seconds, sizes bytes.
 
-The client orders, by the key `do`:
+The client sends orders; the key `do` names the order:
 
-    hello        protocol, pid, log             first of all; log: the limits of `LogLimits`
-    environment  id, variables                  a base that later `start`s name
+    hello        protocol, pid, log             the first order; log: the limits of `LogLimits`
+    environment  id, variables                  a base environment that later `start`s refer to
     start        instance, argv, environment, changes, directory, restart, stop, fence,
                  heard, memo
                                                 environment: id of a base; changes: variable to
                                                 value, or null to leave it out; restart and stop:
                                                 the fields of the policies, in their order
                                                 fence: null, or [after, grace, alive]: see
-                                                `heard`, of which the start has one as well; 0: now
+                                                `heard`; heard: last contact; 0: now
                                                 memo: a text that is kept for the client
-    stop         instance                       SIGINT, SIGTERM, SIGKILL; never heard of: a start
-                                                that comes late will be refused
-    fence        instance                       SIGKILL to all of it; never heard of: as with stop
-    heard        at, alive                      the master is known to have heard this host at one
-                                                time (by CLOCK_MONOTONIC), the client was at work at
-                                                the other; `after` seconds after the newest that
-                                                counts (a fence that is `alive` counts both) what
-                                                has a fence ends, by SIGKILL `grace` later
+    stop         instance                       SIGINT, SIGTERM, SIGKILL; for an unknown instance:
+                                                refuse a `start` that arrives later
+    fence        instance                       SIGKILL to the process tree; for an unknown
+                                                instance: as with stop
+    heard        at, alive                      last contact: the master received a message of this
+                                                host at `at`, the client worked at `alive`
+                                                (CLOCK_MONOTONIC). An instance with a fence is
+                                                ended `after` seconds after the newest `at` (with
+                                                `alive` in the fence: after the newest of both),
+                                                by SIGKILL `grace` seconds later
     restart      instance                       stop, then start again
-    fail         instance, pid, reason, kill    this run of it counts as failed: stop it, at once by
-                                                SIGKILL where kill is true; then its restart policy
-    amend        instance, restart, changes     from now on it has this restart policy, and these
-                                                changes on top of its own when it starts again
-    remember     instance, memo                 another text to keep
-    forget       instances                      their final statuses are kept by the client now
+    fail         instance, pid, reason, kill    count this run as failed: stop it (kill: at once by
+                                                SIGKILL), then apply the restart policy
+    amend        instance, restart, changes     replace the restart policy, and apply these changes
+                                                on top of the earlier ones at the next start
+    remember     instance, memo                 replace the memo
+    forget       instances                      the client has stored their final statuses
     shutdown                                    stop everything, then end
 
-The supervisor tells, by the key `tell`:
+The supervisor sends messages; the key `tell` names the message:
 
     welcome      protocol, pid, notes, instances, memos, fenced
                                                    the answer to hello; instances: their statuses;
                                                    memos: [instance, text] of those that have one
                                                    fenced: those that have a fence
-    status       status                            something has changed, or was ordered again
-    amended      instance, restart                 the order is recorded; its status came before
-    refused      message                           the connection is closed after it
+    status       status                            a change, or the answer to a repeated order
+    amended      instance, restart                 the amendment is recorded; its status came before
+    refused      message                           the supervisor closes the connection after it
     ended                                          the shutdown is complete; closed after it
 
-A status is the list of the fields of `Status`, in their order. It is recorded durably before it is
-told, and a final one is told at each connection until it is forgotten.
-A line that is not understood is refused, never guessed at; so is another protocol number.
+A status is the list of the fields of `Status`, in their order. The supervisor records a status
+durably before it sends it, and sends a final status at each connection until a `forget`.
+The supervisor refuses a line that it cannot decode, and another protocol number.
 """
 
 from __future__ import annotations
@@ -75,7 +77,7 @@ PROTOCOL: Final = 3
 
 
 class Hello(NamedTuple):
-    """The client introduces itself."""
+    """The first message of a client."""
 
     protocol: int
     pid: int
@@ -83,14 +85,14 @@ class Hello(NamedTuple):
 
 
 class Environment(NamedTuple):
-    """A base environment, under the name by which `Launch` refers to it."""
+    """A base environment with the id by which `Launch` refers to it."""
 
     id: str
     variables: Mapping[str, str]
 
 
 class Launch(NamedTuple):
-    """Everything that is needed to start an instance, again and again."""
+    """Everything needed to start an instance any number of times."""
 
     instance: Key
     argv: tuple[str, ...]
@@ -104,27 +106,27 @@ class Launch(NamedTuple):
     heard: float = 0.0
 
     def amended(self, amendment: Amend) -> Launch:
-        """How it is started after an amendment."""
+        """Return this launch with the restart policy and environment changes of an amendment."""
         changes = {**self.changes, **amendment.changes}
         return self._replace(changes=changes, restart=amendment.order.restart)
 
 
 class Amend(NamedTuple):
-    """Another restart policy, and another environment when it starts again."""
+    """A new restart policy, and environment changes for the next start."""
 
     order: AmendOrdered
     changes: Mapping[str, str | None]
 
 
 class Remember(NamedTuple):
-    """What the client wants to know of an instance after its own restart."""
+    """A text about an instance that the client reads back after its own restart."""
 
     instance: Key
     memo: str
 
 
 class Forget(NamedTuple):
-    """The client has kept these final statuses."""
+    """The client has stored these final statuses."""
 
     instances: tuple[Forgotten, ...]
 
@@ -161,7 +163,7 @@ class Status(NamedTuple):
 
     @classmethod
     def of(cls, instance: Instance) -> Status:
-        """What is told of an instance."""
+        """Return the status that is sent for an instance."""
         return cls(
             instance.key,
             instance.phase,
@@ -180,7 +182,7 @@ class Status(NamedTuple):
 
 
 def encode_order(order: Order) -> bytes:
-    """One line."""
+    """Return an order as one line."""
     return line(_order_fields(order))
 
 
@@ -214,7 +216,7 @@ def _order_fields(order: Order) -> dict[str, Any]:
 
 
 def launch_fields(launch: Launch) -> dict[str, Any]:
-    """A launch as JSON can hold it; the record keeps it so too."""
+    """Return a launch in values that JSON can hold; the record stores the same form."""
     return {
         "instance": launch.instance,
         "argv": launch.argv,
@@ -230,7 +232,7 @@ def launch_fields(launch: Launch) -> dict[str, Any]:
 
 
 def decode_order(text: bytes) -> Order:
-    """The order in one line. Raises ProtocolError."""
+    """Return the order in one line. Raises ProtocolError."""
     fields = parse(text)
     kind = fields.get("do")
     try:
@@ -262,8 +264,8 @@ def read_launch(fields: Mapping[str, Any]) -> Launch:
         directory,
         read_restart(fields["restart"]),
         read_stop(fields["stop"]),
-        _text(fields.get("memo", "")),  # records of before protocol 2 have none
-        read_fence(fields.get("fence")),  # and before protocol 3 none of these
+        _text(fields.get("memo", "")),  # records from before protocol 2 have no memo
+        read_fence(fields.get("fence")),  # before protocol 3 neither of these
         float(fields.get("heard", 0.0)),
     )
 
@@ -297,13 +299,13 @@ _READERS: Final[Mapping[str, Callable[[Mapping[str, Any]], Order]]] = {
 
 
 def read_key(value: Any) -> Key:
-    """An instance from its JSON list."""
+    """Return an instance from its JSON list."""
     process, number = value
     return _text(process), int(number)
 
 
 def read_restart(value: Sequence[Any]) -> RestartRule:
-    """A restart policy from its JSON list."""
+    """Return a restart policy from its JSON list."""
     when, delay, max_delay, factor, attempts, window = value
     if when not in ("never", "on-failure", "always"):
         raise ValueError(f"restart when {when!r}")
@@ -313,13 +315,13 @@ def read_restart(value: Sequence[Any]) -> RestartRule:
 
 
 def read_stop(value: Sequence[Any]) -> StopRule:
-    """A stop policy from its JSON list."""
+    """Return a stop policy from its JSON list."""
     interrupt_grace, terminate_grace = value
     return StopRule(float(interrupt_grace), float(terminate_grace))
 
 
 def read_fence(value: Sequence[Any] | None) -> FenceRule | None:
-    """A fence from its JSON list."""
+    """Return a fence from its JSON list."""
     if value is None:
         return None
     after, grace, alive = value
@@ -347,7 +349,7 @@ def _texts(value: Any) -> dict[str, str]:
     return {_text(name): _text(text) for name, text in value.items()}
 
 
-# --- what is told -----------------------------------------------------------------------------
+# --- messages of the supervisor ---------------------------------------------------------------
 
 
 def encode_welcome(
@@ -357,33 +359,33 @@ def encode_welcome(
     memos: Mapping[Key, str],
     fenced: Sequence[Key],
 ) -> bytes:
-    """The answer to `hello`."""
+    """Return the answer to `hello`."""
     welcome = {"tell": "welcome", "protocol": PROTOCOL, "pid": pid, "notes": list(notes)}
     known = {"instances": statuses, "memos": list(memos.items()), "fenced": fenced}
     return line({**welcome, **known})
 
 
 def encode_status(status: Status) -> bytes:
-    """One line for one change."""
+    """Return the line for one changed status."""
     return line({"tell": "status", "status": status})
 
 
 def encode_amended(order: AmendOrdered) -> bytes:
-    """It is in the record."""
+    """Return the line that confirms a recorded amendment."""
     return line({"tell": "amended", "instance": order.instance, "restart": order.restart})
 
 
 def encode_refusal(message: str) -> bytes:
-    """The last line of a connection that is turned down."""
+    """Return the last line of a refused connection."""
     return line({"tell": "refused", "message": message})
 
 
 def encode_ended() -> bytes:
-    """The last line of all."""
+    """Return the last line after a complete shutdown."""
     return line({"tell": "ended"})
 
 
 def read_status(value: Sequence[Any]) -> Status:
-    """A status from its JSON list."""
+    """Return a status from its JSON list."""
     status = Status(*value)
     return status._replace(instance=read_key(status.instance))

@@ -1,4 +1,4 @@
-"""The supervisor's own troubles, for people: `supervisor.log` is its standard error."""
+"""Log of the supervisor's own problems: `supervisor.log`, which is its standard error."""
 
 from __future__ import annotations
 
@@ -7,6 +7,6 @@ import time
 
 
 def say(text: str) -> None:
-    """One line, with the time by this host's clock."""
+    """Write one line, with the time by this host's clock."""
     sys.stderr.write(f"{time.strftime('%Y-%m-%dT%H:%M:%S')} {text}\n")
     sys.stderr.flush()

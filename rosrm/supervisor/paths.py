@@ -1,18 +1,18 @@
-"""Where the supervisor keeps its files, below the state directory of its host.
+"""Paths of the supervisor's files below the state directory of its host.
 
-One folder holds all of one host::
+One folder holds all files of one host::
 
     supervisor.sock                the slave connects here
     supervisor.lock                held by the one live supervisor; holds its pid
-    supervisor.log                 its own troubles
+    supervisor.log                 the supervisor's own problems
     instances.jsonl                the durable record
-    heard                          when the master last heard this host
-    logs/PROCESS.NUMBER.log        what an instance writes; .log.1 is older, and so on
-    logs/PROCESS.NUMBER.log*.times when what was written (`log_index`)
+    heard                          time of the last contact with the master
+    logs/PROCESS.NUMBER.log        output of an instance; .log.1 is older, and so on
+    logs/PROCESS.NUMBER.log*.times time index of that output (`log_index`)
     logs/PROCESS.NUMBER.*          further files of that instance (its parameters)
-    work/                          working directory of the processes that name none
+    work/                          default working directory of processes
 
-The logs lie in one folder, for a folder of its own made a short job half as expensive again.
+All logs lie in one folder, because a folder per instance made a short job half as expensive again.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _SAFE = frozenset("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ012345678
 
 
 def safe_name(process: str) -> str:
-    """A process's name as the name of one file; different names stay different."""
+    """Return the name of a process as a file name; different names stay different."""
     safe = "".join(
         c if c in _SAFE else "".join(f"%{b:02X}" for b in os.fsencode(c)) for c in process
     )
@@ -39,21 +39,21 @@ def safe_name(process: str) -> str:
 
 
 def log_folder(state: str) -> str:
-    """Where the logs of all processes are."""
+    """Return the folder of the logs of all processes."""
     return os.path.join(state, "logs")
 
 
 def log_file(state: str, process: str, number: int) -> str:
-    """The log of one instance."""
+    """Return the path of the current log of an instance."""
     return os.path.join(log_folder(state), f"{safe_name(process)}.{number}.log")
 
 
 def log_number(name: str) -> tuple[str, int] | None:
-    """The safe name and the number in the name of a log; None: it is no instance's current log."""
+    """Return the safe name and number in a log's file name; None: no instance's current log."""
     found = _LOG_NAME.fullmatch(name)
     return (found[1], int(found[2])) if found else None
 
 
 def work_directory(state: str) -> str:
-    """Where the processes run that name no working directory."""
+    """Return the working directory of processes that name none."""
     return os.path.join(state, "work")

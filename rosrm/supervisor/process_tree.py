@@ -1,8 +1,9 @@
-"""Who belongs to which instance while the supervisor runs: parenthood, adoption, reaping.
+"""Process trees of all instances while the supervisor runs: parenthood, adoption, reaping.
 
-The supervisor is a subreaper: a process whose parent ends becomes its child. So the last member of
-an instance always dies as its child, and SIGCHLD says so. Only after a take-over (an earlier
-supervisor was killed) are members nobody's children here; then a pidfd tells their end.
+The supervisor is a subreaper: a process whose parent ends becomes its child. So the last process of
+an instance always dies as the supervisor's child, and SIGCHLD reports it. An exception follows a
+take-over (an earlier supervisor was killed): the processes are not children of the new supervisor,
+which detects their end by a pidfd.
 """
 
 from __future__ import annotations
@@ -21,9 +22,9 @@ class Family:
     """The living processes of all instances.
 
     Args:
-        state: the state directory: the supervisor's mark.
-        selector: where pidfds are watched; the data of each is a function to call.
-        happened: is told what has happened to an instance.
+        state: the state directory, which is also the supervisor's mark in environments.
+        selector: watches the pidfds; the data of each is a function to call.
+        happened: receives an event for each change of an instance.
     """
 
     def __init__(
@@ -40,26 +41,26 @@ class Family:
         self._adopted: dict[int, Key | None] = {}
         self._strays: dict[Key, dict[int, int]] = {}
 
-    # --- a leader's life ----------------------------------------------------------------------
+    # --- session leaders --------------------------------------------------------------------------
 
     def add_child(self, key: Key, pid: int, birth: int) -> None:
-        """A session leader that was spawned here, at `birth` in clock ticks or a little later."""
+        """Add a session leader spawned here at `birth` (clock ticks) or slightly later."""
         self._children[pid] = key
         self._add(key, pid, birth)
 
     def take_over(self, key: Key, leader: Stat) -> None:
-        """A session leader that an earlier supervisor spawned."""
+        """Add a session leader that an earlier supervisor spawned."""
         pidfd = os.pidfd_open(leader.pid)
         self._taken_over[leader.pid] = pidfd
         self._add(key, leader.pid, leader.start)
         self._watch(pidfd, lambda: self._taken_over_ended(key, leader.pid))
 
     def birth(self, key: Key) -> int:
-        """Start time of its leader in clock ticks; 0: not known."""
+        """Return the start time of the instance's leader in clock ticks; 0: not known."""
         return self._births.get(key, 0)
 
     def release(self, key: Key) -> None:
-        """The instance has ended, or starts anew."""
+        """Remove the leader of an instance that has ended or starts again."""
         session = self._sessions.pop(key, 0)
         self._owners.pop(session, None)
         self._births.pop(key, None)
@@ -79,7 +80,7 @@ class Family:
     # --- reaping ------------------------------------------------------------------------------
 
     def reap(self) -> None:
-        """Take the exit status of every child that has ended."""
+        """Take the exit status of every child that has ended, and report the ends of leaders."""
         ended = []
         while True:
             try:
@@ -98,7 +99,7 @@ class Family:
                     max(-code, 0),
                     usage.ru_maxrss * 1024.0,
                     usage.ru_utime + usage.ru_stime,
-                    # Asked at once: until its group is empty the pid is not used again.
+                    # Checked at once: the pid is not reused until its group is empty.
                     procfs.group_is_alive(pid),
                 )
                 ended.append((pid, exited))
@@ -117,7 +118,7 @@ class Family:
         self._happened(exited._replace(leftovers=bool(left)))
 
     def _look_at_adopted(self) -> None:
-        """Find out whose the children are that were not spawned here."""
+        """Find the instance of each adopted child; kill it if that has no leader."""
         for pid in procfs.own_children():
             if pid not in self._children and pid not in self._adopted:
                 key = self._owner(pid)
@@ -136,10 +137,10 @@ class Family:
         process, _, number = instance.rpartition("#")
         return (process, int(number)) if supervisor == self._state and number.isdigit() else None
 
-    # --- strays: members whose leader is gone -------------------------------------------------
+    # --- strays: processes of an instance whose leader has ended ----------------------------------
 
     def watch_strays(self, key: Key, found: Iterable[Stat]) -> None:
-        """Report `Cleared` when none of them, and of those that they fork, is left."""
+        """Watch these processes; report `Cleared` when they and their forks have ended."""
         watched = self._strays.setdefault(key, {})
         for stat in found:
             if stat.pid not in watched:
@@ -166,14 +167,14 @@ class Family:
 
     def _find(self, key: Key) -> list[Stat]:
         session = self._sessions.get(key)
-        if session is None:  # its leader ended before this supervisor began
+        if session is None:  # the leader ended before this supervisor started
             return procfs.find_marked(self._state).get(mark(key), [])
         return procfs.find_members(session, mark(key), self._state)
 
     # --- signals ------------------------------------------------------------------------------
 
     def signal(self, key: Key, number: int) -> None:
-        """To every process of the instance."""
+        """Send a signal to every process of the instance."""
         session = self._sessions.get(key, 0)
         if session in self._children or session in self._taken_over:
             _send_to_group(session, number)
@@ -183,7 +184,7 @@ class Family:
                 _send_by_pidfd(pidfd, number)
 
     def kill(self, found: Iterable[Stat]) -> None:
-        """SIGKILL to processes that belong to no instance any more."""
+        """Send SIGKILL to processes that belong to no instance any more."""
         for stat in found:
             send_signal(stat.pid, signal.SIGKILL)
 
@@ -198,12 +199,12 @@ class Family:
 
 
 def mark(key: Key) -> str:
-    """An instance as the environment of its processes names it."""
+    """Return the value by which the environment of its processes names an instance."""
     return f"{key[0]}#{key[1]}"
 
 
 def send_signal(pid: int, number: int) -> None:
-    """To one process; one that is gone already is no trouble, nor is one of another user."""
+    """Send a signal to one process; ignore one that is gone, and log one of another user."""
     try:
         os.kill(pid, number)
     except ProcessLookupError:

@@ -1,8 +1,8 @@
-"""Reads in /proc which processes belong to an instance.
+"""Lookup in /proc of the processes that belong to an instance.
 
-An instance is its session leader and what descends from it: processes in the leader's group or
-session, and those that left it (a daemon of their own) but carry the marks which the supervisor
-puts into each environment. Only a daemon that also cleans its environment escapes.
+An instance is its session leader and the leader's descendants. These are the processes in the
+leader's group or session, and those that left both (a daemon of their own) but carry the marks that
+the supervisor puts into each environment. Only a daemon that also cleans its environment escapes.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ _TICKS_PER_SECOND: Final = os.sysconf("SC_CLK_TCK")
 INSTANCE_MARK = "ROSRM_INSTANCE"
 SUPERVISOR_MARK = "ROSRM_SUPERVISOR"
 
-#: Seconds within which an execve ends, and between two looks at it.
+#: Longest duration of an execve, and the interval between two checks of one, seconds.
 _EXECVE: Final = 1.0
 _LOOK: Final = 0.001
 
 
 class Stat(NamedTuple):
-    """What /proc/PID/stat says; `start` (clock ticks since boot) tells a reused pid apart."""
+    """The fields of /proc/PID/stat; `start` (clock ticks since boot) tells a reused pid apart."""
 
     pid: int
     state: str
@@ -36,18 +36,18 @@ class Stat(NamedTuple):
 
     @property
     def alive(self) -> bool:
-        """It is not just waiting to be reaped."""
+        """Return True unless the process is a zombie that waits to be reaped, or dead."""
         return self.state not in "ZX"
 
 
 def read_stat(pid: int) -> Stat | None:
-    """None: there is no such process."""
+    """Return the fields of /proc/PID/stat; None: there is no such process."""
     try:
         with open(f"/proc/{pid}/stat", "rb") as file:
             text = file.read()
     except OSError:
         return None
-    # The second field, the name in brackets, may hold spaces and brackets itself.
+    # The second field, the name in brackets, may itself hold spaces and brackets.
     fields = text[text.rindex(b")") + 2 :].split()
     return Stat(
         pid, fields[0].decode(), int(fields[1]), int(fields[2]), int(fields[3]), int(fields[19])
@@ -69,14 +69,14 @@ def inner_pid(pid: int, thread: int = 0) -> int:
 
 
 def ticks_now() -> int:
-    """The time that /proc would give as the start of a process that starts now."""
+    """Return the start time that /proc would show for a process started now, in clock ticks."""
     return int(time.clock_gettime(time.CLOCK_BOOTTIME) * _TICKS_PER_SECOND)
 
 
 def was_born(stat: Stat, birth: int) -> bool:
-    """It started within a second of `birth`: a pid is not reused so soon.
+    """Return True if the process started within a second of `birth`: pids are not reused so soon.
 
-    Taking the time at each spawn is some 100 us cheaper than reading it back from /proc.
+    Taking the time at each spawn is some 100 us cheaper than reading the start time from /proc.
     """
     return birth - 1 <= stat.start <= birth + _TICKS_PER_SECOND
 
@@ -85,10 +85,10 @@ def read_environment(pid: int) -> list[bytes]:
     """Return the variables that a process got from its last execve.
 
     During an execve /proc shows none, because the kernel has dropped the old ones and not yet
-    copied the new ones. So the end of the execve is awaited.
+    copied the new ones. So this function waits for the end of the execve.
 
     Raises:
-        OSError: the process has ended, is not ours to look at, or its execve did not end.
+        OSError: the process has ended, may not be read by us, or its execve did not end.
     """
     deadline = time.monotonic() + _EXECVE
     while True:
@@ -114,7 +114,7 @@ def _has_no_environment(pid: int) -> bool:
 
 
 def read_marks(pid: int) -> tuple[str, str]:
-    """The instance and supervisor that a process's environment names; "" where it names none."""
+    """Return instance and supervisor from a process's environment; "" for each that is missing."""
     try:
         variables = read_environment(pid)
     except OSError:
@@ -130,7 +130,7 @@ def read_marks(pid: int) -> tuple[str, str]:
 
 
 def everyone() -> Iterator[Stat]:
-    """Every process that is alive; a walk over /proc, so only for rare occasions."""
+    """Yield every living process; a walk over /proc, so only for rare occasions."""
     for name in os.listdir("/proc"):
         if name.isdigit():
             stat = read_stat(int(name))
@@ -139,10 +139,10 @@ def everyone() -> Iterator[Stat]:
 
 
 def find_members(leader: int, mark: str, supervisor: str) -> list[Stat]:
-    """Who is alive of the instance whose session leader was `leader` and has ended.
+    """Return the living processes of the instance whose session leader `leader` has ended.
 
-    A pid is not used again while it names a session or group. So where a process has it now, nobody
-    of the old session is left, and its new one is a stranger's.
+    The kernel does not reuse a pid that still names a session or group. So where another process
+    has this pid now, the old session is empty, and the session of this number is a stranger's.
     """
     stats = list(everyone())
     is_reused = any(stat.pid == leader for stat in stats)
@@ -155,9 +155,9 @@ def find_members(leader: int, mark: str, supervisor: str) -> list[Stat]:
 
 
 def find_marked(supervisor: str) -> dict[str, list[Stat]]:
-    """Who is alive of each instance of a supervisor, by the mark.
+    """Return the living processes of a supervisor's instances, by instance mark.
 
-    By the marks alone: it is for instances whose leader's pid may have been reused since.
+    Only the marks count, because the pid of an instance's leader may have been reused.
     """
     found: dict[str, list[Stat]] = {}
     for stat in everyone():
@@ -168,18 +168,18 @@ def find_marked(supervisor: str) -> dict[str, list[Stat]]:
 
 
 def group_is_alive(leader: int) -> bool:
-    """Some process of the group exists; ask right after the leader was reaped."""
+    """Return True if the group has a process; call this right after the leader was reaped."""
     try:
         os.killpg(leader, 0)
     except ProcessLookupError:
         return False
     except PermissionError:
-        return True  # it exists, though it runs as somebody else
+        return True  # a process exists, though it runs as another user
     return True
 
 
 def own_children() -> list[int]:
-    """The pids of this process's children, those that it adopted included."""
+    """Return the pids of this process's children, adopted ones included."""
     me = os.getpid()
     try:
         with open(f"/proc/self/task/{me}/children", "rb") as file:
@@ -189,6 +189,6 @@ def own_children() -> list[int]:
 
 
 def boot_id() -> str:
-    """Another one after each boot: what was recorded before it runs no more."""
+    """Return the id of this boot; a process recorded under another id does not run any more."""
     with open("/proc/sys/kernel/random/boot_id") as file:
         return file.read().strip()

@@ -1,4 +1,4 @@
-"""Bytes to a peer that may not read just now: whoever sends them never waits for it."""
+"""Send buffer for a peer that may stop reading: a sender never blocks."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from typing import Final
 
 from rosrm.supervisor.discovery import writable
 
-#: Bytes that may wait for the peer, beside what its socket holds.
+#: Most bytes that may wait for the peer, beside those in its socket.
 MOST_UNSENT: Final = 8 << 20
-#: Seconds for a thread that was woken to end.
+#: Seconds that `close` waits for the sending thread.
 _LAST_WORDS: Final = 5.0
 _FLAGS: Final = socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL
 
 
 class Overfull(Exception):
-    """Too much waits for the peer; nothing was added."""
+    """Too many bytes wait for the peer; nothing was added."""
 
 
 class Outgoing:
-    """What a socket does not take at once a thread sends, in order, when it does.
+    """A queue of bytes for a socket; a thread sends in order what the socket does not take at once.
 
     Args:
-        peer: the connected socket; it is closed with this.
+        peer: the connected socket; `close` closes it too.
     """
 
     def __init__(self, peer: socket.socket) -> None:
@@ -40,21 +40,21 @@ class Outgoing:
 
     @property
     def waits(self) -> float:
-        """Seconds for which the peer has taken nothing of what waits for it; 0.0: nothing waits."""
+        """Seconds since the peer last took any of the waiting bytes; 0.0: nothing waits."""
         with self._lock:
             return time.monotonic() - self._took_at if self._unsent else 0.0
 
     @property
     def is_free(self) -> bool:
-        """What is sent now goes out at once; or the peer is gone, and sending tells that."""
+        """Return True if bytes would go out at once or the peer is gone (`send` raises)."""
         return not self.waits and (self._gone or writable(self._peer, 0.0))
 
     def send(self, data: bytes) -> None:
-        """Send now what the peer takes, and the rest when it takes it.
+        """Send the bytes that the peer takes now, and the rest as it reads.
 
         Raises:
             Overfull: the peer has not read for so long that too much waits for it.
-            OSError: it is gone.
+            OSError: the peer is gone.
         """
         with self._lock:
             if self._gone:
@@ -78,19 +78,19 @@ class Outgoing:
             self._thread.start()
 
     def _send_rest(self) -> None:
-        """Runs in a thread of its own, until nothing waits."""
+        """Send the waiting bytes; runs in a thread of its own until nothing waits."""
         while writable(self._peer, None):
             with self._lock:
                 if not self._send_some():
                     return
 
     def _send_some(self) -> bool:
-        """Whether something is left to be sent."""
+        """Send what the socket takes; return True if bytes are left."""
         try:
             sent = 0 if self._gone else self._peer.send(self._unsent, _FLAGS)
         except BlockingIOError:
             return True
-        except OSError:  # whoever reads from it, or sends next, hears of that
+        except OSError:  # the next read or send on this connection fails too, and reports it
             self._gone = True
         else:
             del self._unsent[:sent]
@@ -100,10 +100,10 @@ class Outgoing:
         return bool(self._unsent)
 
     def drop(self) -> None:
-        """Break the connection, and wake whoever waits for it; the peer can read what was sent."""
+        """Break the connection and wake its waiting threads; the peer can still read sent bytes."""
         with self._lock:
             self._gone = True
-            with contextlib.suppress(OSError):  # it may be broken already
+            with contextlib.suppress(OSError):  # the connection may be broken already
                 self._peer.shutdown(socket.SHUT_RDWR)
 
     def close(self) -> None:

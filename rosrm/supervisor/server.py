@@ -1,7 +1,7 @@
-"""The event loop of the supervisor: carries out what `rosrm.core.supervisor.reducer` decides.
+"""Event loop of the supervisor: executes the commands of `rosrm.core.supervisor.reducer`.
 
-One thread. Each round: take what came in, let the core decide, record, spawn a few, tell. What is
-told was recorded before; what is spawned was recorded as about to be.
+One thread. Each round: read input, let the core decide, record, spawn a few, send statuses. A
+status is recorded before it is sent; a spawn is recorded as imminent before it is tried.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from rosrm.supervisor.logs import LogKeeper, LogLimits
 from rosrm.supervisor.process_tree import Family, mark
 from rosrm.supervisor.procfs import INSTANCE_MARK, SUPERVISOR_MARK
 
-#: Spawns between two looks at everything else.
+#: Most spawns before the loop looks at other events.
 SPAWNS_A_ROUND: Final = 8
 #: Seconds between attempts to write the record while the disk is full.
 RECORD_AGAIN: Final = 1.0
-#: Seconds that the client has for reading what it is told at the end.
+#: Seconds that the client has to read the last messages.
 LAST_WORDS: Final = 1.0
 
 
@@ -62,9 +62,9 @@ class Server:
         self._leaving = False
 
     def run(self) -> None:
-        """Until the shutdown is complete, or until there is nothing to do and nobody to do it for.
+        """Serve until the shutdown is complete, or until no instance and no client is left.
 
-        What has ended stays on record; whoever connects then starts another supervisor.
+        Ended instances stay in the record; the next client to connect starts another supervisor.
         """
         self._watch(self._listener, self._accept)
         self._watch_signals()
@@ -77,15 +77,15 @@ class Server:
         self._leave()
 
     def _take_in(self, timeout: float | None) -> None:
-        """Whatever comes first within so many seconds; None: however long."""
+        """Handle the events that arrive within `timeout` seconds; None: wait for the first."""
         for key, _ in self._selector.select(timeout):
             call: Callable[[], None] = key.data
             call()
 
     def _round(self) -> None:
-        """Everything that is due without waiting."""
+        """Do everything that is due, without waiting."""
         if self._is_due():
-            # This process may have been stopped meanwhile: what was said in time counts first.
+            # After a SIGSTOP of this process: messages that came in time count first.
             self._take_in(0.0)
         if self._is_due():
             self._happened(reducer.TimePassed())
@@ -235,7 +235,7 @@ class Server:
     def _rewrite_record(self) -> None:
         used = {launch.environment for launch in self._launches.values()}
         if self._client is not None:
-            used.add(self._client.environment)  # it is sent once: later launches refer to it
+            used.add(self._client.environment)  # sent once; later launches refer to it
         for identity in self._environments.keys() - used:
             del self._environments[identity]
         self._record.rewrite(self._core, self._launches, self._environments, self._family.birth)
@@ -296,7 +296,7 @@ class Server:
         self._client = connection
         self._served = True
         self._logs.limits = hello.log
-        self._telling.clear()  # all that it would say is in the statuses
+        self._telling.clear()  # the welcome's statuses hold all of these changes
         statuses = [messages.Status.of(instance) for instance in self._core.instances.values()]
         memos = {key: launch.memo for key, launch in self._launches.items() if launch.memo}
         fenced = [one.key for one in self._core.instances.values() if one.fence is not None]
@@ -304,7 +304,7 @@ class Server:
         connection.send(messages.encode_welcome(os.getpid(), self._notes, statuses, memos, fenced))
 
     def _client_is_gone(self, client: Connection) -> bool:
-        """Its end may have come in the same round as its successor."""
+        """Return True if the client is gone, also if it left in this very round."""
         self._heard(client)
         return client.gone
 
@@ -341,7 +341,7 @@ class Server:
 
     def _remember(self, order: messages.Remember) -> None:
         launch = self._launches.get(order.instance)
-        if launch is not None:  # of what has ended there is nothing to keep
+        if launch is not None:  # an ended instance has no launch, so no memo to keep
             self._keep_launch(launch._replace(memo=order.memo))
 
     def _keep_launch(self, launch: messages.Launch) -> None:
@@ -354,7 +354,7 @@ class Server:
         connection.send(messages.encode_refusal(message))
 
     def _send(self, connection: Connection, data: bytes) -> None:
-        """Send, and wait for the peer to read or drop it as need be."""
+        """Send, then either watch the peer for room to write, or drop it if it is gone."""
         if not connection.gone:
             connection.send(data)
         if connection.gone:
@@ -376,7 +376,7 @@ class Server:
     # --- signals ------------------------------------------------------------------------------
 
     def _watch_signals(self) -> None:
-        """SIGCHLD and SIGTERM wake the loop through a pipe; a terminal's signals do not count."""
+        """Let SIGCHLD and SIGTERM wake the loop by a pipe; ignore SIGINT and SIGHUP."""
         heard, wakeup = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
         signal.set_wakeup_fd(wakeup, warn_on_full_buffer=False)
         for number in (signal.SIGCHLD, signal.SIGTERM):

@@ -1,7 +1,7 @@
-"""Starts one process: a session leader, its output in a file, nothing inherited but that.
+"""Start of one process: a session leader with its output in a file, inheriting nothing else.
 
 `os.posix_spawn` shares the parent's memory until the exec (vfork), so a spawn costs half a
-millisecond. It cannot change the directory: the supervisor, which has one thread, goes there.
+millisecond. It cannot change the directory, so the supervisor (one thread) changes its own.
 """
 
 from __future__ import annotations
@@ -12,23 +12,23 @@ import signal
 from collections.abc import Mapping
 from typing import Final
 
-#: A failure that may pass: the same spawn is tried again where the restart policy says so.
+#: Errors that may pass: the same spawn is tried again where the restart policy allows.
 _TRANSIENT: Final = frozenset(
     {errno.EAGAIN, errno.ENOMEM, errno.EMFILE, errno.ENFILE, errno.ETXTBSY}
 )
-#: Python ignores some signals; a process starts with each at its default.
+#: Python ignores some signals, so each is reset: a process starts with all at their default.
 _EVERY_SIGNAL: Final = [
     number for number in signal.valid_signals() if number not in (signal.SIGKILL, signal.SIGSTOP)
 ]
 
 
 class SpawnError(Exception):
-    """The process cannot be started; its text says what was tried, where, and what is wrong.
+    """The process cannot be started; the text says what was tried, where, and what is wrong.
 
     Only the first line is the reason: details such as a whole PATH go into further lines.
 
     Attributes:
-        transient: the same may work later.
+        transient: the same spawn may succeed later.
     """
 
     def __init__(self, message: str, *, transient: bool = False) -> None:
@@ -42,9 +42,9 @@ def spawn(
     """Start a process and return its pid. Raises SpawnError.
 
     Args:
-        argv: its command line; the first word is looked up in its own PATH.
-        environment: the whole of it.
-        directory: where it runs.
+        argv: command line; the first word is looked up in the PATH of `environment`.
+        environment: the whole environment.
+        directory: working directory.
         null: descriptor that becomes its standard input.
         log: descriptor that becomes its standard output and error.
     """
@@ -70,7 +70,7 @@ def spawn(
     except ValueError as error:  # a NUL byte in an argument, a "=" in a variable's name
         raise SpawnError(f"{argv[0]!r} cannot be started: {error}") from None
     finally:
-        os.chdir("/")  # hold no mount of a user's busy
+        os.chdir("/")  # otherwise the supervisor would keep a user's mount busy
 
 
 def _enter(directory: str) -> None:
@@ -82,7 +82,7 @@ def _enter(directory: str) -> None:
 
 
 def find_executable(word: str, environment: Mapping[str, str]) -> str:
-    """The file that a command's first word stands for. Raises SpawnError."""
+    """Return the path of the program that a command's first word names. Raises SpawnError."""
     if "/" in word:
         return word
     search = environment.get("PATH", os.defpath)

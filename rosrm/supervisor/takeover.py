@@ -1,12 +1,12 @@
-"""A new supervisor takes over what an earlier one of the same host recorded.
+"""Take-over by a new supervisor of the instances that an earlier one of the same host recorded.
 
-A process is known again by its pid together with its start time. Nothing is started that may run or
-may have run already; whose end nobody saw has an unknown exit code.
+The supervisor identifies a process by its pid and start time. It starts no instance that may run
+or may have run already. An instance whose end no supervisor saw has an unknown exit code.
 
-The clocks of fences go on from the newest time at which the master is known to have heard this
-host: who is killed in between puts no fence off. After a restart of the machine nobody knows how
-long it was away, and whether there is a successor elsewhere: what has a fence is fenced. What has
-none has failed with its machine, and its restart policy decides.
+The clocks of fences continue from the recorded last contact with the master, so killing the
+supervisor postpones no fence. After a reboot the length of the outage is unknown, and a successor
+may run elsewhere. So an instance with a fence is fenced. One without has failed with its machine,
+and its restart policy decides.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from rosrm.supervisor.procfs import Stat
 
 
 def restore(state: str, core: Supervision, family: Family) -> Recorded:
-    """Read the record into the core, and find the leaders that live on."""
+    """Read the record into the core, and take over the leaders that still run."""
     recorded = instance_record.read(state)
     core.dead.update(recorded.dead)
     newest = lease_file.read(state)
@@ -51,7 +51,7 @@ def restore(state: str, core: Supervision, family: Family) -> Recorded:
 
 
 def _begin_clock_anew(instance: Instance, now: float) -> None:
-    """It began anew with this boot."""
+    """Restart the clock of an instance recorded in an earlier boot; its deadlines are due now."""
     instance.recent.clear()  # times of the former boot may lie ahead, and would count for hours
     if instance.pid:
         instance.fault = "its machine was restarted"
@@ -66,7 +66,7 @@ def _begin_clock_anew(instance: Instance, now: float) -> None:
 def what_happened(
     recorded: Recorded, state: str, core: Supervision, family: Family
 ) -> Iterator[Event]:
-    """What became of each instance while no supervisor ran."""
+    """Yield the changes of each instance while no supervisor ran."""
     waiting = [
         instance
         for instance in core.instances.values()
@@ -82,7 +82,7 @@ def what_happened(
 
 
 def _start_of(instance: Instance, found: list[Stat], recorded: Recorded, family: Family) -> Event:
-    """A start was ordered, and no outcome recorded."""
+    """Return the outcome of a start that was ordered but has no recorded outcome."""
     leaders = [stat for stat in found if stat.pid == stat.session]
     if instance.key not in recorded.spawning:
         return Resumed(instance.key)
@@ -95,7 +95,7 @@ def _start_of(instance: Instance, found: list[Stat], recorded: Recorded, family:
 
 
 def _end_of(instance: Instance, left: list[Stat], family: Family) -> Iterator[Event]:
-    """It ran, and its leader is no more."""
+    """Yield the events for an instance that ran and whose leader has ended."""
     family.watch_strays(instance.key, left)
     if instance.pid:
         yield Exited(instance.key, UNKNOWN_EXIT, leftovers=bool(left))

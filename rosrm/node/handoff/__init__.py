@@ -1,1 +1,1 @@
-"""Handoff of a node's state from its source instance to its destination, by topics alone."""
+"""Handoff of a node's state from its source instance to its destination, over ROS topics only."""

@@ -1,4 +1,4 @@
-"""The inputs that a shadow, or a silent source, keeps until one of them is to go on. Pure."""
+"""Buffer of inputs that a shadow or a silent source keeps until one of them is active. Pure."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
 
-#: Covered time stamps of one input that are remembered for messages which come after their mark.
+#: Covered time stamps per input that are remembered for messages that arrive after their mark.
 _REMEMBERED: Final = 4096
 
 
 class Sent(NamedTuple):
-    """When a message was sent.
+    """Time and order of one sent message.
 
     Attributes:
         stamp: source time stamp, ns.
-        number: in the order of its publisher, which leaves none out; None: not known.
+        number: position in its publisher's gapless order; None: not known.
     """
 
     stamp: int
@@ -29,7 +29,7 @@ class Kept(NamedTuple):
     Attributes:
         topic: of the input.
         stamp: source time stamp, ns.
-        item: the message with all that is needed to serve it.
+        item: the message with all data needed to serve it.
         size: bytes.
     """
 
@@ -41,18 +41,18 @@ class Kept(NamedTuple):
 
 @dataclass(slots=True)
 class _Track:
-    """What is known of one input.
+    """State of one input.
 
     Attributes:
-        covered: newest covered time stamps, in the order in which they were told.
-        newest: covered; None: none was.
-        mixed: time stamps are not in one order: several publishers, or one that was started again
-            where the clock is behind.
+        covered: newest covered time stamps, in the order in which they were reported.
+        newest: newest covered time stamp; None: none was covered.
+        mixed: time stamps are not in one order: several publishers, or one that was restarted
+            with its clock behind.
         overlap: a message was received that the source has processed too.
-        heard_at: when the last message came, here or to the source, seconds.
+        heard_at: arrival of the last message, here or at the source, seconds.
         held: messages in the buffer.
-        last: message of the one publisher.
-        after_gap: time stamp of the message before which one is missing; None: none is.
+        last: the last message received of the one publisher.
+        after_gap: time stamp of the message after a missing one; None: none is missing.
     """
 
     heard_at: float
@@ -66,11 +66,11 @@ class _Track:
 
 
 class InputBuffer:
-    """Messages of all inputs, in the order in which they came.
+    """Messages of all inputs, in order of arrival.
 
     Args:
         limit: most messages of one input.
-        room: most bytes of all.
+        room: most bytes of all inputs together.
         now: monotonic seconds.
     """
 
@@ -88,14 +88,14 @@ class InputBuffer:
         return track
 
     def mix(self, topic: str) -> None:
-        """The messages of an input come in no certain order: several threads take them."""
+        """Mark an input as unordered, because several threads take its messages."""
         self._track(topic).mixed = True
 
     def add(self, topic: str, sent: Sent, item: Any, now: float, size: int = 0) -> bool:
-        """Keep a message, unless a state covers it already.
+        """Add a message, unless a state covers it already.
 
         Returns:
-            False: there is no room for it.
+            False: the buffer has no room for it.
         """
         track = self._track(topic)
         track.heard_at = now
@@ -111,13 +111,13 @@ class InputBuffer:
         return True
 
     def cover(self, topic: str, stamps: Iterable[int], *, single: bool, now: float) -> None:
-        """A state covers these messages of an input: they are dropped, now or when they come.
+        """Record that a state covers these messages; drop them now, or when they arrive.
 
         Args:
             topic: of the input.
             stamps: source time stamps, ns.
-            single: one publisher alone speaks there, so that its stamps are in order, and a message
-                that is older than the newest covered was passed over by the source.
+            single: the topic has one publisher. So its stamps are in order, and the source skipped
+                any message older than the newest covered one.
             now: monotonic seconds.
         """
         track = self._track(topic)
@@ -148,32 +148,32 @@ class InputBuffer:
         self._kept = left
 
     def overlaps(self, topic: str) -> bool:
-        """Whether a message was received that the state covers: from there on none is missing."""
+        """Return True if a received message is covered too: from there on none is missing."""
         return self._track(topic).overlap
 
     def misses_one(self, topic: str) -> bool:
-        """Whether a message was sent that has not come, and no state covers it."""
+        """Return True if a sent message has not arrived and no state covers it."""
         track = self._track(topic)
         if track.after_gap is None or track.mixed:
             return False
         return track.newest is None or track.newest < track.after_gap
 
     def is_idle(self, topic: str, now: float, since: float, for_seconds: float) -> bool:
-        """Whether nothing waits, and nothing came for so long, `since` then at the earliest.
+        """Return True if the input is quiet: empty buffer, and no message for `for_seconds`.
 
-        Neither here nor to the source: what it is sent may have been lost on its way here, and come
-        later.
+        The quiet time begins at `since` at the earliest. Messages that reached only the source
+        count too, because such a message may have been lost on its way here and arrive later.
         """
         track = self._track(topic)
         return not track.held and now - max(track.heard_at, since) >= for_seconds
 
     def is_marked(self, topic: str, stamp: int) -> bool:
-        """Whether a mark has named this very message."""
+        """Return True if a mark has named exactly this message."""
         track = self._tracks.get(topic)
         return track is not None and stamp in track.covered
 
     def take(self) -> Kept | None:
-        """The oldest message, out of the buffer; None: it is empty."""
+        """Remove and return the oldest message; None: the buffer is empty."""
         if not self._kept:
             return None
         kept = self._kept.popleft()
@@ -182,7 +182,7 @@ class InputBuffer:
         return kept
 
     def __len__(self) -> int:
-        """How many messages wait."""
+        """Return the number of waiting messages."""
         return len(self._kept)
 
 

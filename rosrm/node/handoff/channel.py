@@ -22,26 +22,27 @@ def _latched(depth: int) -> QoSProfile:
 STATE_CONFIG: Final = _latched(100)
 CHANNEL: Final = _latched(20)
 STATE: Final = _latched(1)
-#: Of who follows a state of several parts: newer ones of one must not hide the one that belongs to
-#: the others.
+#: For a follower of a state of several parts, because a newer message of one part must not replace
+#: the one that belongs to the other parts.
 STATE_FOLLOWED: Final = _latched(10)
 MARK: Final = _latched(100)
 
 
-#: What comes and goes with a handoff has no events: an rclpy executor of several threads raises
-#: InvalidHandle where an event handler is destroyed while it gathers what it waits for.
+#: Entities that are created and destroyed with a handoff have no event handlers. Otherwise an rclpy
+#: executor of several threads raises InvalidHandle if a handler is destroyed as the executor
+#: collects the entities to wait for.
 NO_SUBSCRIPTION_EVENTS: Final = SubscriptionEventCallbacks(use_default_callbacks=False)
 NO_PUBLISHER_EVENTS: Final = PublisherEventCallbacks(use_default_callbacks=False)
 
 
 class Channel:
-    """Where source, destination and master tell one another how far a handoff is.
+    """Topic on which source, destination and master report the progress of a handoff.
 
     Args:
         plain: rclpy's own methods of the node.
         topic: as the master named it.
         destination: instance number that names the handoff.
-        instance: our own number.
+        instance: this node's own number.
         peer: instance number of the other side.
         heard: called with each report of the other side.
     """
@@ -75,7 +76,7 @@ class Channel:
             self._heard(report)
 
     def say(self, phase: int, sequence: int = 0, message: str = "") -> None:
-        """Tell the others, unless it is what they were told last."""
+        """Publish a report, unless it repeats the last one."""
         last = self._last
         if last is not None and (last.phase, last.message) == (phase, message):
             return
@@ -86,11 +87,11 @@ class Channel:
         self.repeat()
 
     def repeat(self) -> None:
-        """Say again what was said last."""
+        """Publish the last report again."""
         if self._last is not None:
             self._publisher.publish(self._last)
 
     def close(self) -> None:
-        """Leave the channel."""
+        """Destroy publisher and subscription of the channel."""
         self._plain.destroy_subscription(self._subscription)
         self._plain.destroy_publisher(self._publisher)

@@ -1,4 +1,4 @@
-"""The shadow: it follows the source's state, and becomes active when the source is silent."""
+"""Shadow: follows the source's state, and becomes active when the source is silent."""
 
 from __future__ import annotations
 
@@ -20,18 +20,19 @@ from rosrm_msgs.msg import HandoffReport, StateConfig, StateMark
 
 #: Seconds without a message after which an input counts as idle.
 _IDLE: Final = 1.0
-#: Seconds without a part or mark after which nothing more of an ended source is to come.
+#: Seconds without a part or mark after which nothing more is expected of an ended source.
 _QUIET: Final = 0.2
-#: Seconds for which all readers have to be matched. A reader learns of a writer after the writer
-#: of it: 0.4 s later on a busy machine, and where the word of it got lost, as late as Fast DDS says
-#: it again (with 0.5 s here, outputs came 1.3 to 1.9 s late in 5 of 200 moves beside other load).
+#: Seconds for which all readers have to be matched. A reader discovers a writer later than the
+#: writer discovers the reader: 0.4 s on a busy machine, and after a lost announcement only when
+#: Fast DDS repeats it (with 0.5 s here, outputs came 1.3 to 1.9 s late in 5 of 200 migrations
+#: beside other load).
 _MATCHED: Final = 1.5
-#: Seconds between two looks at what is still waited for.
+#: Seconds between two checks of the conditions that a shadow waits for.
 _REVIEW: Final = 0.1
 
 
 class Destination:
-    """What a shadow does until it is active.
+    """The role of a shadow until it is active.
 
     Args:
         member: the node.
@@ -65,15 +66,15 @@ class Destination:
         self._fault = ""
         member.on_overflow = self._overflowed
 
-    # --- the master's word -----------------------------------------------------------------
+    # --- messages of the master ------------------------------------------------------------
 
     def configure(self, config: StateConfig) -> None:
-        """The master says something of the handoff to here."""
+        """Handle a message of the master about the handoff to this node."""
         channel = self._channel
         if channel is None:
             channel = self._open(config)
         else:
-            channel.repeat()  # perhaps another master asks, after the first was lost
+            channel.repeat()  # a new master may be asking, after the first was lost
         if config.phase == StateConfig.DONE:
             self.close()
         elif self._over:
@@ -98,7 +99,7 @@ class Destination:
             channel.say(HandoffReport.FAILED, 0, self._fault)
             return channel
         self._assembler = CutAssembler()
-        # Marks first, also in catching up: they say which parts are worth keeping.
+        # Marks first, also in `_catch_up`: they name the parts that are worth keeping.
         self._follow(StateMark, self._mark_topic, self._take_mark, topics.MARK)
         for part in self._parts:
             self.follow_part(part)
@@ -108,7 +109,7 @@ class Destination:
         return channel
 
     def follow_part(self, part: Part) -> None:
-        """A part of the state, perhaps one that the author names later than the others."""
+        """Subscribe to a part of the state, also to one that the author names later."""
         if self._assembler is not None:
             take = partial(self._assembler.add_part, part.topic)
             self._assembler.expect(part.topic)
@@ -131,7 +132,7 @@ class Destination:
             # An entity of the author's may have another type on that topic.
             self._end(HandoffReport.FAILED, f"{topic} cannot be followed: {error}")
 
-    # --- the source's word -----------------------------------------------------------------
+    # --- messages of the source ------------------------------------------------------------
 
     def _heard(self, report: HandoffReport) -> None:
         with self._member.turn:
@@ -155,7 +156,7 @@ class Destination:
             self._go_on()
 
     def _catch_up(self) -> None:
-        """Take all that has come: one by one, a source of many cycles would always be ahead."""
+        """Take all received messages; one at a time, a shadow would stay behind a fast source."""
         for subscription, take in self._followed:
             for message, _ in waiting(subscription):
                 if self._over:
@@ -171,7 +172,7 @@ class Destination:
             self._assembler.add_mark(mark, time.monotonic())
 
     def _fault_of(self, mark: StateMark) -> str:
-        """Why the source's state cannot be this node's; "": it can."""
+        """Return a reason why this node cannot use the source's state; "": there is none."""
         if mark.protocol_version != PROTOCOL_VERSION:
             return (
                 f"the source speaks protocol version {mark.protocol_version}, this node "
@@ -197,7 +198,7 @@ class Destination:
                 self._review()
 
     def _go_on(self) -> None:
-        """Restore the newest state, if there is a new one, and see what follows."""
+        """Restore the newest state, if there is a new one, then check the next step."""
         if self._over or self._assembler is None:
             return
         cut = self._assembler.take()
@@ -222,7 +223,7 @@ class Destination:
         return True
 
     def _review(self) -> None:
-        """Say how far it is, ask for silence when it may, and become active on it."""
+        """Report progress, request silence when allowed, and become active after it."""
         if self._channel is None or self._over:
             return
         if self._alone:
@@ -243,14 +244,14 @@ class Destination:
             self._channel.say(HandoffReport.SWITCHING, self._sequence())
 
     def _is_last(self, cut: Cut) -> bool:
-        """Of this handoff: what an earlier one ended with is latched too."""
+        """Return True for this handoff's last state; an earlier handoff's may be latched too."""
         return bool(cut.mark.last) and cut.mark.sequence == self._silent_at
 
     def _sequence(self) -> int:
         return int(self._cut.mark.sequence) if self._cut is not None else 0
 
     def _still_missing(self) -> str:
-        """What keeps this node from being ready, in words; "": nothing."""
+        """Return the condition that keeps this node from being ready; "": there is none."""
         if not self._attached:
             return "for the source to answer: is it up, and does it use rosrm.node?"
         if self._cut is None:
@@ -272,7 +273,7 @@ class Destination:
         return ""
 
     def _missing_peers(self, mark: StateMark) -> str:
-        """Who is matched with the source, and not with this node."""
+        """Return the topic and number of peers matched with the source but not with this node."""
         readers = {one.topic_name: one.get_subscription_count() for one in self._member.outputs}
         for output in mark.outputs:
             if readers.get(output.topic, output.subscriptions) < output.subscriptions:
@@ -296,7 +297,7 @@ class Destination:
         return f"for the first state, marked on {self._mark_topic}"
 
     def _follows(self, topic: str, now: float) -> bool:
-        """Whether no message of an input can be missing both here and in the state."""
+        """Return True if no message of an input can be missing both here and in the state."""
         buffer = self._member.buffer
         if all(one.key != topic for one in self._member.inputs) or buffer.overlaps(topic):
             return True
@@ -305,7 +306,7 @@ class Destination:
     # --- the end ---------------------------------------------------------------------------
 
     def _take_over_when_quiet(self) -> None:
-        """The source is no more: what of its state is on its way still counts."""
+        """Become active after the source's end, once the last of its messages have arrived."""
         if time.monotonic() - self._heard_at < _QUIET:
             return
         if self._cut is None:
@@ -335,7 +336,7 @@ class Destination:
             member.inherit(covered.topic, covered.covered)
         passed = time.monotonic() - cut.arrived
         due = [None if ns < 0 else ns / 1e9 - passed for ns in cut.mark.timers_due]
-        # What waits is served first: to let go of the source, and to become one, takes its time.
+        # Buffered messages are served first, because `_unfollow` and `_activated` take time.
         member.become_active(due, self._say_active, (self._unfollow, self._activated))
 
     def _say_active(self) -> None:
@@ -343,7 +344,7 @@ class Destination:
             self._channel.say(HandoffReport.ACTIVE, self._sequence())
 
     def _end(self, phase: int, message: str) -> None:
-        """It will never be active; only its slave ends it."""
+        """Give up for good; this process then runs until its slave stops it."""
         self._over, self._fault = True, message
         self._member.node.get_logger().warning(f"will not take over: {message}")
         if self._channel is not None:
@@ -369,7 +370,7 @@ class Destination:
         self._cut = None
 
     def close(self) -> None:
-        """The handoff is over."""
+        """Leave the channel of a finished handoff."""
         if self._channel is not None:
             self._channel.close()
             self._channel = None

@@ -1,4 +1,4 @@
-"""Serves what was kept for a node that goes on, in slices: its timers go on meanwhile."""
+"""Replay of buffered messages in an active node, in slices, so that its timers keep running."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from typing import Any, Final
 
 from rosrm.node.steady_timer import steady_timer
 
-#: Seconds of one slice; a callback that is begun is finished.
+#: Seconds of one slice; a callback that has begun is finished.
 _SLICE: Final = 0.02
-#: There is no further step.
+#: Marks the end of the steps.
 _OVER: Final = object()
 
 
 class Replay:
-    """What was kept is served by the executor, as all else: what a callback raises is the author's.
+    """Serves buffered messages in the executor, so a callback's exception reaches the author.
 
     Args:
         plain: rclpy's own methods of the node.
         turn: held while a callback runs.
-        serve_next: serves what was kept longest; False: nothing is left.
+        serve_next: serves the oldest buffered message; False: none is left.
     """
 
     def __init__(self, plain: Any, turn: Any, serve_next: Callable[[], bool]) -> None:
@@ -34,20 +34,20 @@ class Replay:
 
     @property
     def is_on(self) -> bool:
-        """There is, or may be, something that was kept: what comes now has to wait behind it."""
+        """True while buffered messages may be left; new messages then have to queue behind them."""
         return self._timer is not None
 
     def begin(self, beside: Iterator[None]) -> None:
-        """Serve all that is kept, from the executor's next round on.
+        """Serve all buffered messages, from the executor's next round on.
 
         Args:
-            beside: does what else there is to be done; it is taken a step further after each slice.
+            beside: further work, advanced by one step after each slice.
         """
         self._beside = beside
         self._start()
 
     def serve(self, count: int, then: Callable[[], None]) -> None:
-        """Serve so many, then call; what is left, and comes meanwhile, is served after it."""
+        """Serve `count` messages, then call `then`; serve the remaining and new ones after that."""
         self._counted, self._then = count, then
         self._start()
 
@@ -71,7 +71,7 @@ class Replay:
                 self._timer = None
 
     def _serve_until(self, end: float) -> bool:
-        """Whether there may be more."""
+        """Serve messages until `end`; return True if more may be left."""
         while self._serve_next():
             self._counted -= 1
             if self._counted == 0 or time.monotonic() >= end:
@@ -80,4 +80,4 @@ class Replay:
 
 
 def _nothing() -> None:
-    """Nobody waits for it."""
+    """Do nothing, because no caller waits."""

@@ -1,4 +1,4 @@
-"""What a node that can be moved hears of the master, and which role it has."""
+"""Handoff role of a migratable node, and its subscription to the master's messages."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ _PARAMETERS: Final = "_rosrm/parameters"
 
 
 class Handoff:
-    """One node in its handoffs: first perhaps as a destination, later as a source.
+    """The handoffs of one node: first perhaps as a destination, later as a source.
 
     Args:
         node: the author's.
         plain: rclpy's own methods of it.
-        identity: that rosrm gave this process.
+        identity: given by rosrm to this process.
     """
 
     def __init__(self, node: Any, plain: Any, identity: Identity) -> None:
@@ -41,7 +41,7 @@ class Handoff:
         self._subscription: Any = None
 
     def begin(self) -> None:
-        """The node is made; its author's constructor may go on."""
+        """Take the first role; called by the node's constructor, before the author's continues."""
         node = self.member.node
         for fault in self._damaged:
             node.get_logger().warning(f"ignoring a damaged snapshot: {fault}")
@@ -68,7 +68,7 @@ class Handoff:
     def keep_state(
         self, topic: str, message_type: Any, save: Callable[[], Any], restore: Callable[[Any], None]
     ) -> None:
-        """The author names a topic of the state."""
+        """Add a part of the state on a topic that the author names."""
         resolve = self.member.node.resolve_topic_name
         full = resolve(self.member.visible(topic, resolve))
         if any(part.topic == full for part in self._parts):
@@ -97,12 +97,12 @@ class Handoff:
         with self.member.turn:
             try:
                 role.configure(config)
-            except Exception as error:  # noqa: BLE001 - no word of the master ends the author's node
+            except Exception as error:  # noqa: BLE001 - no message of the master ends the node
                 what = f"{type(error).__name__}: {error}"
                 self.member.node.get_logger().error(f"a state_config cannot be followed: {what}")
 
     def _fault_of(self, config: StateConfig) -> str:
-        """Why this is not our master's word; "": it is."""
+        """Return a reason to ignore this message; "": it comes from this node's master."""
         if config.protocol_version != PROTOCOL_VERSION:
             return (
                 f"its protocol version is {config.protocol_version}, this node's {PROTOCOL_VERSION}"
@@ -121,7 +121,7 @@ class Handoff:
             self.member.node.get_logger().warning(f"a state_config is left alone: {fault}")
 
     def close(self) -> None:
-        """The node is destroyed."""
+        """End all roles, because the node is destroyed."""
         for role in (self._source, self._destination):
             if role is not None:
                 role.close()

@@ -1,4 +1,4 @@
-"""Puts states together from marks and parts, whatever comes first. Pure."""
+"""Assembly of states from marks and parts, in any order of arrival. Pure."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _KEPT: Final = 16
 
 
 class PartKey(NamedTuple):
-    """The content of one serialised message, in short.
+    """Size and digest that identify the content of one serialised message.
 
     Attributes:
         size: bytes.
@@ -24,7 +24,7 @@ class PartKey(NamedTuple):
 
 
 def part_key(data: bytes) -> PartKey:
-    """What a mark says of a part."""
+    """Return the key by which a mark names a part."""
     return PartKey(len(data), zlib.crc32(data))
 
 
@@ -33,10 +33,10 @@ class Cut:
     """A complete state.
 
     Attributes:
-        mark: as it came.
-        passed: marks before it that were given up; what they cover, it covers too.
+        mark: as received.
+        passed: skipped earlier marks; this state covers everything that they cover.
         parts: serialised messages by topic.
-        arrived: of the mark, monotonic seconds.
+        arrived: arrival of the mark, monotonic seconds.
     """
 
     mark: Any
@@ -46,21 +46,21 @@ class Cut:
 
 
 class CutAssembler:
-    """Finds the newest state of which every part is at hand."""
+    """Finds the newest state of which every part has arrived."""
 
     def __init__(self) -> None:
         self._at_hand: dict[str, dict[PartKey, bytes]] = {}
         self._waiting: list[tuple[Any, float]] = []
 
     def expect(self, topic: str) -> None:
-        """The state has a part on this topic."""
+        """Add a topic that carries a part of the state."""
         self._at_hand.setdefault(topic, {})
 
     def add_part(self, topic: str, data: bytes) -> None:
-        """A message came on a state topic."""
+        """Add a message of a state topic."""
         at_hand = self._at_hand[topic]
         key = part_key(data)
-        at_hand.pop(key, None)  # it counts as new again
+        at_hand.pop(key, None)  # insert it again as the newest
         at_hand[key] = data
         marked = {_key_of(mark, topic) for mark, _ in self._waiting}
         for old in list(at_hand)[:-_KEPT]:
@@ -68,11 +68,11 @@ class CutAssembler:
                 del at_hand[old]
 
     def add_mark(self, mark: Any, now: float) -> None:
-        """A mark came, newer than those before."""
+        """Add a mark, newer than all before."""
         self._waiting.append((mark, now))
 
     def take(self) -> Cut | None:
-        """The newest complete state that was not taken before; older ones are given up."""
+        """Return the newest complete state not taken before; drop older ones."""
         for index in range(len(self._waiting) - 1, -1, -1):
             mark, arrived = self._waiting[index]
             wanted = {part.topic: PartKey(part.size, part.digest) for part in mark.parts}
@@ -86,7 +86,7 @@ class CutAssembler:
         return None
 
     def missing(self) -> list[str]:
-        """Topics of the newest mark whose part has not come."""
+        """Return the topics of the newest mark whose part has not arrived."""
         if not self._waiting:
             return []
         mark, _ = self._waiting[-1]
@@ -97,7 +97,7 @@ class CutAssembler:
         ]
 
     def _forget_older(self, wanted: Mapping[str, PartKey]) -> None:
-        """Parts come in order: what lies before the one in use is never marked again."""
+        """Drop parts older than those in use: parts come in order, so no mark names them again."""
         for topic, key in wanted.items():
             at_hand = self._at_hand[topic]
             while next(iter(at_hand)) != key:
@@ -105,6 +105,6 @@ class CutAssembler:
 
 
 def _key_of(mark: Any, topic: str) -> PartKey | None:
-    """What a mark says of the part on a topic."""
+    """Return a mark's key of the part on a topic; None: the mark has no such part."""
     part = next((part for part in mark.parts if part.topic == topic), None)
     return None if part is None else PartKey(part.size, part.digest)

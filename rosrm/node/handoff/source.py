@@ -1,4 +1,4 @@
-"""The active node: it shows its state to whoever follows, and falls silent when it is asked to."""
+"""Active node: publishes its state to followers, and falls silent on request."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from rosrm.node.steady_timer import steady_timer
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs.msg import CoveredInput, HandoffReport, MatchedOutput, StateConfig, StateMark
 
-#: Seconds that a silent source waits for its last outputs to be acknowledged: readers are asked
-#: every 3 s by Fast DDS's default.
+#: Seconds that a silent source waits until its last outputs are acknowledged; by default Fast DDS
+#: sends its readers a heartbeat every 3 s.
 _LAST_WORDS: Final = 4.0
-#: Seconds between two looks.
+#: Seconds between two checks for acknowledgements.
 _LOOK: Final = 0.05
 _AT_ONCE: Final = Duration(nanoseconds=0)
 
 
 class Source:
-    """What the active node does for a successor.
+    """The role of the active node towards a successor.
 
     Args:
         member: the node.
@@ -59,7 +59,7 @@ class Source:
         member.on_overflow = self._overflowed
 
     def add_part(self, part: Part) -> None:
-        """The author names another topic of the state."""
+        """Add another part of the state that the author names."""
         part.publisher = self._member.plain.create_publisher(
             part.message_type, part.topic, topics.STATE
         )
@@ -80,10 +80,10 @@ class Source:
             self._show_single_parts()
 
     def _show(self, *, last: bool = False) -> bool:
-        """Publish the state between two cycles, and the mark that says what it covers.
+        """Publish the state between two cycles, and the mark that lists the covered inputs.
 
         Returns:
-            False: it cannot be shown; the master has been told why.
+            False: the state cannot be published; the master has received the reason.
         """
         try:
             for part in self._parts:
@@ -103,7 +103,7 @@ class Source:
                     self._member.node.get_logger().error(str(error), throttle_duration_sec=10.0)
 
     def _failed(self, fault: str) -> None:
-        """The state cannot be shown: this handoff fails, the node goes on."""
+        """Report that the state cannot be published: this handoff fails, the node stays active."""
         if not self._fault:
             self._member.node.get_logger().error(f"{fault}. This node stays where it is")
         self._fault = fault
@@ -133,14 +133,14 @@ class Source:
         )  # fmt: skip
 
     def _still_due(self) -> list[int]:
-        """To save a large state takes its time."""
+        """Return the timers' due times less the time that saving a large state has taken."""
         passed = int((time.monotonic() - self._silent_since) * 1e9)
         return [due if due < 0 else max(0, due - passed) for due in self._timers_due]
 
     # --- a handoff -------------------------------------------------------------------------
 
     def configure(self, config: StateConfig) -> None:
-        """The master says something of a handoff away from here."""
+        """Handle a message of the master about a handoff away from this node."""
         if self._channel is None or self._channel.topic != config.channel:
             if config.phase not in (StateConfig.SHADOW, StateConfig.SWITCH, StateConfig.RESUME):
                 return
@@ -181,7 +181,7 @@ class Source:
             self._channel.say(HandoffReport.ATTACHED, self._member.sequence)
 
     def _switch(self) -> None:
-        """Fall silent, once both the master and the destination want it."""
+        """Fall silent, once both the master and the destination have requested it."""
         if self._channel is None or not (self._may_switch and self._asked) or self._fault:
             return
         if self._member.mode is Mode.ACTIVE and not self._finishing:
@@ -192,7 +192,7 @@ class Source:
         member, wanted = self._member, self._finishing
         self._finishing = False
         if self._channel is None or not wanted or self._fault:
-            return  # called off meanwhile
+            return  # the handoff was called off
         self._timers_due = member.fall_silent()
         self._silent_since = time.monotonic()
         if not self._show(last=True):
@@ -202,7 +202,7 @@ class Source:
         self._look_again = steady_timer(member.plain, _LOOK, self._release_when_heard)
 
     def _release_when_heard(self) -> None:
-        """What is not acknowledged is lost when this node is stopped."""
+        """Report RELEASED when all outputs are acknowledged (a stop loses others) or time is up."""
         with self._member.turn:
             heard = all(one.wait_for_all_acked(_AT_ONCE) for one in self._member.outputs)
             if heard or time.monotonic() - self._silent_since >= _LAST_WORDS:
@@ -219,7 +219,7 @@ class Source:
         self._may_switch = self._asked = self._attached = self._finishing = False
         self._look_no_more()
         if self._member.mode is Mode.SILENT:
-            # A shadow of a later handoff must not take the last mark for its own.
+            # Otherwise the shadow of a later handoff would take the last mark for its own.
             self._marks.publish(self._mark(last=False))
             self._go_on(self._say_resumed)
         else:
@@ -241,7 +241,7 @@ class Source:
         )
 
     def close(self) -> None:
-        """The handoff is over."""
+        """Leave the channel of a finished handoff."""
         self._fault = ""
         self._look_no_more()
         self._may_switch = self._asked = self._attached = self._finishing = False
@@ -250,10 +250,10 @@ class Source:
             self._channel = None
 
     def end(self) -> None:
-        """The node is destroyed."""
+        """Store the last snapshot, because the node is destroyed."""
         if self._keeper is not None:
             self._keeper.close()
 
 
 def _nothing() -> None:
-    """The failure has been told."""
+    """Do nothing, because the failure has been reported."""

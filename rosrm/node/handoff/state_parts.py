@@ -15,7 +15,7 @@ from rosrm_msgs.msg import StatePart
 
 
 class StateError(Exception):
-    """A state that cannot be saved or restored: what, and why."""
+    """A state cannot be saved or restored; the text names it and the reason."""
 
 
 class Part:
@@ -23,12 +23,12 @@ class Part:
 
     Args:
         topic: fully qualified.
-        message_type: what travels.
+        message_type: of the topic.
         save: returns the message, or None: unchanged since the last time.
-        restore: takes the message, and overwrites what the node had.
+        restore: takes the message, and overwrites the node's state.
 
     Attributes:
-        retained: what was saved is held also when it was published: it is kept elsewhere too.
+        retained: the saved message is held after publishing too, because snapshots store it.
     """
 
     def __init__(
@@ -52,17 +52,17 @@ class Part:
         self.publisher: Any = None
 
     def has_reader(self) -> bool:
-        """Whether anybody listens to this part by itself."""
+        """Return True if the topic has a subscriber."""
         return self.publisher is not None and self.publisher.get_subscription_count() > 0
 
     def publish(self, largest: int) -> None:
-        """Publish it, if it has changed.
+        """Publish the part, if it has changed.
 
         Args:
             largest: bytes of one message.
 
         Raises:
-            StateError: it cannot be saved, or is too large.
+            StateError: the part cannot be saved, or is too large.
         """
         self.refresh(largest)
         if self._key != self._published:
@@ -72,11 +72,11 @@ class Part:
             self._data = None
 
     def refresh(self, largest: int) -> None:
-        """Save it, if it has changed; otherwise as `publish`."""
+        """Save the part, if it has changed; arguments and errors as those of `publish`."""
         try:
             data = self._saved(largest)
         except StateError as error:
-            self._key = self._data = None  # "unchanged" would speak of what nobody has
+            self._key = self._data = None  # a later "unchanged" would refer to a state never saved
             self._refused = self._refused or str(error)
             raise
         if data is not None:
@@ -87,7 +87,7 @@ class Part:
                 self._key, self._data = key, data
 
     def _saved(self, largest: int) -> bytes | None:
-        """The state now, serialised; None: it is what it was the last time."""
+        """Return the current state, serialised; None: unchanged since the last time."""
         try:
             message = self._save()
             self._check(message)
@@ -96,7 +96,7 @@ class Part:
             return self._sized(bytes(serialize_message(message)), largest)
         except StateError:
             raise
-        except Exception as error:  # the author's code: anything may come
+        except Exception as error:  # the author's code may raise anything
             raise StateError(
                 f"saving {self.topic} raised {type(error).__name__}: {error}"
             ) from error
@@ -104,7 +104,7 @@ class Part:
     def _check(self, message: Any) -> None:
         if message is None and self._key is None:
             if self._refused:
-                raise StateError(self._refused)  # it is still what it was then
+                raise StateError(self._refused)  # the state is still the refused one
             raise StateError(
                 f"saving {self.topic} returned None (unchanged) before it had returned any state"
             )
@@ -122,44 +122,44 @@ class Part:
         return data
 
     def block(self) -> Block:
-        """What is kept of it. It was refreshed before, and is retained."""
+        """Return the part's block of a snapshot; the part must be refreshed and retained."""
         if self._data is None or self._key is None:
             raise StateError(f"the state on {self.topic} was not saved")
         return Block(self._data, self._key.digest)
 
     def described(self) -> StatePart:
-        """What a mark says of it. It was saved before."""
+        """Return the part's entry in a mark; the part must have been saved."""
         size, digest = self._key or (0, 0)
         return StatePart(topic=self.topic, type=self.type_name, size=size, digest=digest)
 
     def restore_changed(self, data: bytes) -> None:
-        """Take over a serialised message, unless it is what was taken over last.
+        """Restore a serialised message, unless it equals the last restored one.
 
         Raises:
-            StateError: it cannot be read, or the author's function raised.
+            StateError: the message cannot be read, or the author's function raised.
         """
         key = part_key(data)
         if key == self._restored:
             return
         try:
             self._restore(deserialize_message(data, self.message_type))
-        except Exception as error:  # the author's code: anything may come
+        except Exception as error:  # the author's code may raise anything
             raise StateError(
                 f"restoring {self.topic} raised {type(error).__name__}: {error}"
             ) from error
         self._restored = key
-        # "Unchanged" may be the first that the author says of it.
+        # The author's next `save` may return None (unchanged), which refers to this state.
         self._key, self._data, self._published = key, data, None
 
 
 def type_name(message_type: Any) -> str:
-    """`std_msgs/msg/Int64` of the Python class."""
+    """Return the ROS name of a Python message class, such as `std_msgs/msg/Int64`."""
     package, kind = message_type.__module__.split(".")[:2]
     return f"{package}/{kind}/{message_type.__name__}"
 
 
 class ParametersPart(Part):
-    """The parameters of a node, as they were set at run time.
+    """The parameters of a node, with values set at run time.
 
     Args:
         topic: fully qualified.
@@ -169,7 +169,7 @@ class ParametersPart(Part):
     def __init__(self, topic: str, node: Any) -> None:
         super().__init__(topic, ParameterEvent, self._all, self._take_over)
         self._node = node
-        self._name = node.get_fully_qualified_name()  # at the end ROS may not know it any more
+        self._name = node.get_fully_qualified_name()  # read now: not available at shutdown
         self._changed = True
         self._count = 0
         node.add_post_set_parameters_callback(self._note)
@@ -193,7 +193,7 @@ class ParametersPart(Part):
             if not self._node.has_parameter(parameter.name):
                 self._node.declare_parameter(parameter.name, parameter.value)
         differing = [one for one in parameters if not self._has(one)]
-        # At once: they may be valid only together.
+        # In one call, because the values may be valid only together.
         result = self._node.set_parameters_atomically(differing)
         if not result.successful:
             names = ", ".join(one.name for one in differing)
@@ -205,7 +205,7 @@ class ParametersPart(Part):
 
 
 def _content(parameter: Parameter) -> tuple[Any, str]:
-    """Its type and value, by which it equals itself: NaN does not, nor do serialised messages."""
+    """Return type and value in comparable form: NaN and serialised messages equal no copy."""
     value = parameter.value
     if hasattr(value, "__len__") and not isinstance(value, str):
         value = list(value)  # rclpy has lists, arrays or tuples

@@ -1,4 +1,4 @@
-"""A node that goes on from the state that was kept of its process, before its first cycle."""
+"""Restore of a process's newest snapshot by a new node, before its first cycle."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from rosrm.snapshots import Kept, newest
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs.msg import StateMark
 
-#: Seconds in which the author's constructor names all parts, should it spin before; between looks.
+#: Seconds for the author's constructor to name all parts if it spins first; check interval.
 _PATIENCE: Final = 10.0
 _LOOK: Final = 0.02
 _REMEDY: Final = (
@@ -27,22 +27,22 @@ _REMEDY: Final = (
 
 
 def kept_state(identity: Identity) -> tuple[Kept | None, list[str]]:
-    """What a process is to go on from, None for nothing; and which files of it are damaged."""
+    """Return a process's snapshot, or None, and the faults of its damaged files."""
     if identity.shadow or not identity.keep:
         return None, []
     return newest(Path(identity.keep), up_to=identity.instance)
 
 
 class Revival:
-    """Restores a kept state in the executor's first round; until then the node is like a shadow.
+    """Restores a snapshot in the executor's first round; until then the node is like a shadow.
 
-    The author's constructor is over by then (or has named all parts), and no callback of the author
-    has run.
+    By then the author's constructor has returned (or has named all parts), and no callback of the
+    author has run.
 
     Args:
         member: the node, at rest.
-        parts: of its state; those that the author names later are added to this very list.
-        kept: the state.
+        parts: of its state; parts that the author names later are added to this very list.
+        kept: the snapshot.
         done: called when the node is active.
     """
 
@@ -72,7 +72,7 @@ class Revival:
             self._go_on(mark)
 
     def _is_incomplete(self) -> bool:
-        """The author's constructor spins, and has not named all parts yet."""
+        """Return True if the author's constructor spins and has not named all parts yet."""
         return len(self._parts) < len(self._kept.blocks) - 1
 
     def _restored(self) -> StateMark:

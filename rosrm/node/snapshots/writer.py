@@ -1,6 +1,6 @@
-"""Keeps the newest state of an active node in a file, for the next start of its process.
+"""Storage of an active node's newest snapshot in a file, for the next start of its process.
 
-In the author's cycle the state is only saved, as for a successor that follows; a thread writes it.
+In the author's cycle the state is only saved, as for a following shadow; a thread writes the file.
 """
 
 from __future__ import annotations
@@ -23,22 +23,22 @@ from rosrm.snapshots import LARGEST, Block, SlotWriter
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs.msg import CoveredInput, StateMark
 
-#: Most bytes of one part. Fast DDS carried 400 MB, but a node takes 3 s to make 200 MB of them.
+#: Most bytes of one part. Fast DDS carried 400 MB, but a node takes 3 s to serialise 200 MB.
 LARGEST_PART: Final = 256 << 20
-#: Of a node's time that saving its state may take, where it is kept as often as that allows.
+#: Share of a node's time for saving its state; `keep_every` may require a larger one.
 _SHARE: Final = 0.02
-#: Seconds in which the last state is written at the end.
+#: Seconds for the last snapshot at the end, first for its lock, then for its writing.
 _LAST_WORDS: Final = 5.0
-#: Seconds between two words about the same trouble.
+#: Seconds between two log lines about the same fault.
 _TOLD_EVERY: Final = 60.0
 
 
 class Keeper:
-    """Saves the state between two cycles: as often as costs little, and every so many seconds.
+    """Saves snapshots between cycles, as often as `_SHARE` allows, at least each `keep_every` s.
 
     Args:
         member: the node, whose identity names the directory.
-        parts: of its state; those that the author names later are added to this very list.
+        parts: of its state; parts that the author names later are added to this very list.
         run: random number of this run of the node.
     """
 
@@ -53,17 +53,17 @@ class Keeper:
         self._due: list[int] = []
         self._publishers: dict[str, int] = {}
         self._writer = _Writer(member)
-        # What is not saved after its cycle is saved later, though no cycle follows.
+        # A state not saved right after its cycle is saved later, even if no cycle follows.
         self._late = steady_timer(
             member.plain, max(self._every, 1e-3), self._keep_late, autostart=False
         )
         self._armed = False
         atexit.register(self.close)
-        if member.sequence:  # it went on from another's state, which lies elsewhere
+        if member.sequence:  # the state came from another instance, so this one has no file of it
             self._arm()
 
     def after_cycle(self) -> None:
-        """A cycle has ended: save the state, or see to it that it is saved later."""
+        """Save the state after a cycle, or schedule a later save."""
         now = time.monotonic()
         if now >= self._next:
             self._keep(now)
@@ -82,7 +82,7 @@ class Keeper:
                 self._keep(time.monotonic())
 
     def _may_keep(self) -> bool:
-        """There is something new, and it lies between two cycles of an active node."""
+        """Return True if the state is new, and lies between two cycles of an active node."""
         member = self._member
         new = member.sequence != self._kept
         return new and member.mode is Mode.ACTIVE and not member.in_cycle
@@ -129,24 +129,24 @@ class Keeper:
     def _publishers_of(self, one: Any) -> int:
         try:
             self._publishers[one.key] = one.subscription.get_publisher_count()
-        except Exception:  # noqa: BLE001 - at the end ROS may be gone already
+        except Exception:  # noqa: BLE001 - at shutdown ROS may be gone already
             self._publishers.setdefault(one.key, 1)
         return self._publishers[one.key]
 
     def _timers_due(self) -> list[int]:
         try:
             self._due = self._member.timers_due()
-        except Exception:  # noqa: BLE001 - at the end ROS may be gone already
+        except Exception:  # noqa: BLE001 - at shutdown ROS may be gone already
             return self._due
         return self._due
 
     def close(self) -> None:
-        """An orderly end: keep the last state."""
+        """Store the last state at an orderly end."""
         if self._closed:
             return
         self._closed = True
         atexit.unregister(self.close)
-        # Another thread of the executor may be stuck in a callback: that is no reason to stay.
+        # Another thread of the executor may be stuck in a callback: waiting for it has a limit.
         if self._member.turn.acquire(timeout=_LAST_WORDS):
             try:
                 if self._may_keep():
@@ -157,7 +157,7 @@ class Keeper:
 
 
 class _Writer:
-    """A thread that writes the newest state it was given; older ones that wait are passed over."""
+    """A thread that writes the newest snapshot; newer ones replace any that still wait."""
 
     def __init__(self, member: Member) -> None:
         self._member = member
@@ -169,16 +169,16 @@ class _Writer:
         self._thread: threading.Thread | None = None
 
     def put(self, sequence: int, blocks: Sequence[Block]) -> None:
-        """Have a state written; returns at once."""
+        """Queue a snapshot for writing; return at once."""
         with self._changed:
             self._waiting = sequence, blocks
             self._changed.notify()
-        if self._thread is None:  # not sooner: a successor has no time for it before it speaks
+        if self._thread is None:  # not sooner, because it would delay a successor's announcement
             self._thread = threading.Thread(target=self._work, name="rosrm keeper", daemon=True)
             self._thread.start()
 
     def close(self) -> None:
-        """Write what waits, and end."""
+        """Write the waiting snapshot, and end the thread."""
         if self._thread is None:
             return
         with self._changed:
@@ -199,7 +199,7 @@ class _Writer:
             self._slots.close()
 
     def _write(self, sequence: int, blocks: Sequence[Block]) -> bool:
-        """False: a newer instance keeps its state there, and this one has no business any more."""
+        """Write a snapshot; return False if a newer instance writes there: this one then stops."""
         identity = self._member.identity
         try:
             if self._slots is None:
@@ -216,7 +216,7 @@ class _Writer:
     def _written(self, sequence: int) -> None:
         if self._fault:
             self._fault = ""
-            # A line of code of its own: rclpy takes one severity from each, and raises at another.
+            # This call needs its own line: rclpy binds one severity to a line, else it raises.
             self._member.node.get_logger().info(f"its state is saved again, up to cycle {sequence}")
 
     def _not_written(self, error: OSError) -> None:

@@ -1,8 +1,8 @@
-"""The master's side of the wire: messages become events, commands become messages.
+"""Master endpoint: messages become events, commands become messages.
 
-Put together here; each part stands in a file of its own:
+Its parts are in files of their own:
 
-- `subscriptions.py`: what slaves publish;
+- `subscriptions.py`: messages published by slaves;
 - `services.py`: requests of slaves and clients;
 - `slave_links.py`: orders to slaves;
 - `handoff.py`: reports and signals of handoffs.
@@ -29,17 +29,17 @@ from rosrm_msgs import msg
 
 __all__ = ["Identity", "MasterEndpoint", "Queries"]
 
-#: Seconds between two words about how the master keeps up.
+#: Seconds between two load messages of the master.
 _LOAD_EVERY: Final = 1.0
 
 
 class MasterEndpoint:
-    """Everything that the master says and hears.
+    """All messages of the master, sent and received.
 
     Attributes:
-        events: what happened since the runtime took them last.
-        handoffs: what is said and heard of handoffs.
-        rival: the newest beat of another master; None: none was heard since it was judged.
+        events: received since the runtime took them last.
+        handoffs: messages of handoffs.
+        rival: newest beat of another master; None: none since the last one was judged.
         incarnation: random number of this run of the master.
     """
 
@@ -90,10 +90,10 @@ class MasterEndpoint:
         if message.incarnation != self._identity.incarnation:
             self.rival = message
 
-    # --- what is heard -------------------------------------------------------------------
+    # --- received ------------------------------------------------------------------------
 
     def poll_readings(self) -> None:
-        """Look at the readings, also when nothing else happens; called in every tick."""
+        """Take new readings, even when no other event occurs; called in every tick."""
         self._take_readings()
         self._oldest.append(self._links.ledger.ages(time.monotonic())[1])
 
@@ -103,17 +103,17 @@ class MasterEndpoint:
     def _take_new_readings(self) -> None:
         readings = self._hearing.poll_readings()
         if readings is not None:
-            # Before all else: a usage must not be judged by readings that are older than it.
+            # Placed first, because a usage must not be judged by readings older than it.
             self.events.insert(0, readings)
 
     def take_events(self) -> list[happened.Event]:
-        """What happened since the last call, in order; decided by the newest readings there are."""
+        """Return the events since the last call, in order, preceded by the newest readings."""
         if self.events and not isinstance(self.events[0], happened.ReadingsReceived):
             self._take_readings()
         events, self.events = self.events, []
         return events
 
-    # --- what is said --------------------------------------------------------------------
+    # --- sent ----------------------------------------------------------------------------
 
     def reply(self, command: Reply) -> None:
         """Answer a request."""
@@ -124,15 +124,15 @@ class MasterEndpoint:
         self._links.assign(command)
 
     def flush(self, journal: int) -> None:
-        """Answer the open requests of hosts for which there are assignments.
+        """Answer the open requests of hosts that have assignments.
 
         Args:
-            journal: sequence of the newest record that is written.
+            journal: sequence of the newest written record.
         """
         self._links.flush(journal)
 
     def withdraw(self, command: Withdraw, now: float) -> None:
-        """Take an assignment back, or order its end."""
+        """Remove an assignment that was not yet fetched, or order its end."""
         self._links.withdraw(command, now)
 
     def redeliver(self, command: Redeliver, now: float) -> None:
@@ -140,20 +140,20 @@ class MasterEndpoint:
         self._links.redeliver(command, now)
 
     def order(self, command: Order, now: float) -> None:
-        """Ask a slave for something; the answer, or none in time, comes back as an event."""
+        """Send an order to a slave; the answer, or its absence in time, becomes an event."""
         self._links.order(command, now)
 
     def expire(self, now: float) -> None:
-        """End what was not answered in time."""
+        """End the orders and requests that got no answer in time."""
         self._links.expire(now)
 
     def beat(self, uptime: float, unheard: Sequence[int], journal: int) -> None:
-        """Say that the master lives, and now and then how it keeps up.
+        """Publish the master's beat, and its load at most once a second.
 
         Args:
             uptime: seconds.
-            unheard: numbers of the hosts that it does not hear.
-            journal: sequence of the newest record that is written.
+            unheard: numbers of the hosts whose messages it does not receive.
+            journal: sequence of the newest written record.
         """
         identity = self._identity
         self._beats.publish(
@@ -168,7 +168,7 @@ class MasterEndpoint:
             self._say_load(uptime)
 
     def _say_load(self, uptime: float) -> None:
-        """Publish what tells whether this master takes in all that its slaves say."""
+        """Publish statistics that show if the master keeps up with its slaves' messages."""
         ledger = self._links.ledger
         hosts, _ = ledger.ages(time.monotonic())
         oldest, self._oldest = self._oldest, []

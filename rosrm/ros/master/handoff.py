@@ -1,4 +1,4 @@
-"""The master's side of handoffs on the wire: `state_config`, and what the nodes answer to it."""
+"""Handoffs in the master's endpoint: `state_config`, and the nodes' reports about it."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from rosrm_msgs import msg
 
 
 class HandoffEndpoint:
-    """Speaks to the nodes of a handoff, and listens to them until it is done.
+    """Sends messages to the nodes of a handoff, and receives theirs until it is done.
 
     Args:
         participant: of the master.
         cluster: the master's name.
         epoch: of this run of it.
         take: called with each event.
-        refuse: called with who was turned away, and why.
+        refuse: called with a refused peer and the reason.
     """
 
     def __init__(
@@ -46,7 +46,7 @@ class HandoffEndpoint:
         self._channels: dict[str, Any] = {}
 
     def publish(self, command: PublishStateConfig) -> None:
-        """Say where a handoff stands; from the first word to DONE its channel is listened to."""
+        """Publish a handoff's phase; subscribe to its channel from the first phase to DONE."""
         channel = self._names.of_handoff(command.process, command.destination)
         if command.phase is HandoffPhase.DONE:
             self._leave(channel)

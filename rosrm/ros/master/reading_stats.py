@@ -1,8 +1,8 @@
-"""What has come of every slave's cycles: accounted for, missed, and how old the oldest reading is.
+"""Statistics of slaves' readings: received cycles, missed cycles, age of the oldest reading.
 
-A slave counts its cycles (`sequence`), and each message says for how many of them it stands. So
-what was lost shows in the next message that comes, and is told apart from quiet cycles; a message
-that comes late after all is no longer missed.
+A slave counts its cycles (`sequence`), and each message states how many of them it covers. So the
+next message reveals lost ones, and quiet cycles do not count as lost. A late message that arrives
+after all no longer counts as missed.
 """
 
 from __future__ import annotations
@@ -14,18 +14,18 @@ import numpy.typing as npt
 
 from rosrm.ros.reading_codec import Runs
 
-#: Seconds of silence after which a host's reading no longer counts as one that is awaited.
+#: Seconds of silence after which a host's reading is no longer expected.
 _GONE: Final = 10.0
 _FIRST_ROOM: Final = 16
 
 
 class Ledger:
-    """The books of the readings, by host id.
+    """Received cycles, missed cycles and newest beats, by host id.
 
     Attributes:
-        cycles: of all slaves, accounted for since the start.
-        missed: of all slaves, that were never heard of.
-        beat: (H,) newest beat of the run that registered last, ns; 0: none was heard yet.
+        cycles: of all slaves, covered by messages since the start.
+        missed: of all slaves, covered by no message.
+        beat: (H,) newest beat of the last registered run, ns; 0: none was received yet.
     """
 
     def __init__(self) -> None:
@@ -40,7 +40,7 @@ class Ledger:
         self._heard: npt.NDArray[np.float64] = np.full(hosts, -np.inf)
 
     def begin(self, host_id: int, incarnation: int) -> None:
-        """A run of a slave registered: its counting begins with its first message."""
+        """Start the count of a newly registered run with its first message."""
         if host_id >= len(self.beat):
             self._grow(2 * host_id)
         self._incarnation[host_id] = incarnation
@@ -57,22 +57,22 @@ class Ledger:
             line[: len(before)] = before
 
     def forget(self, host_id: int) -> None:
-        """A host left: nothing of it is awaited."""
+        """Stop expecting readings of a host that left."""
         if host_id < len(self.beat):
             self._heard[host_id] = -np.inf
 
     def take(self, runs: Runs, now: float) -> npt.NDArray[np.int64]:
-        """Enter a batch; of runs that are not registered nothing is entered.
+        """Enter a batch; skip runs that are not registered.
 
         Returns:
-            The host ids that were heard.
+            The ids of the hosts that sent readings.
         """
         known = (runs.host_id > 0) & (runs.host_id < len(self.beat))
         at = np.where(known, runs.host_id, 0)
         known &= self._incarnation[at] == runs.incarnation
         at, sequence, cycles = at[known], runs.sequence[known], runs.cycles[known]
         before = self._sequence[at]
-        # Of a run that is heard for the first time nothing was expected before.
+        # No cycle before the first message of a run was expected.
         expected = np.maximum(sequence - np.where(before, before, runs.first[known] - 1), 0)
         self.cycles += int(cycles.sum())
         self.missed += int((expected - cycles).sum())
@@ -83,7 +83,7 @@ class Ledger:
         return at
 
     def ages(self, now: float) -> tuple[int, float]:
-        """How many hosts are heard, and the age of the oldest of their newest readings, seconds."""
+        """Return the number of reporting hosts, and the greatest age of a newest reading, s."""
         age = now - self._heard
         age = age[age < _GONE]
         return (len(age), float(age.max())) if len(age) else (0, 0.0)

@@ -1,4 +1,4 @@
-"""What slaves and clients ask of the master: requests become events, replies become answers."""
+"""Master services for slaves and clients: requests become events, replies become answers."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _Respond = Callable[[Any], None]
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """Which master this is."""
+    """Identity of this master."""
 
     name: str
     hostname: str
@@ -33,27 +33,27 @@ class Identity:
 
 
 class Queries(Protocol):
-    """What may be read of the master at any time."""
+    """Interface of the master for read-only requests."""
 
     def snapshot(self, request: srv.List.Request) -> Snapshot:
-        """The listings that were asked for."""
+        """Return the requested listings."""
 
     def explain(self, name: str) -> str | None:
-        """The story of a process as JSON; None: there is none of that name."""
+        """Return the story of a process as JSON; None: there is no process of that name."""
 
 
 class MasterServices:
     """All services of the master.
 
     Args:
-        participant: where they are offered.
+        participant: offers the services.
         links: to the slaves.
         identity: of this master.
-        queries: what may be read.
+        queries: answers read-only requests.
         beat: this master's clock, ns.
-        control: how old a request may be, and what slaves are told of beats.
-        tell: takes in what happened.
-        refuse: takes in who was turned away, and why.
+        control: greatest age of a request, and the beat period for slaves.
+        tell: receives the events.
+        refuse: receives refused peers, and reasons.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class MasterServices:
             (srv.Prune, names.PRUNE, _pruned),
         ):
             offer(kind, path(name), self._as_event(kind, event))
-        # Last, as DDS tells of them in this order: who can shake hands can ask for all the others.
+        # Offered last, and DDS announces in this order: after a handshake all others are usable.
         serve(srv.Handshake, path(names.HANDSHAKE), self._take_handshake)
 
     # --- answers -------------------------------------------------------------------------
@@ -104,7 +104,7 @@ class MasterServices:
             self._participant.guard.call(answer, command)
 
     def _keep(self, answer: Callable[[Reply], None]) -> int:
-        """Keep the way to answer a request; returns the number of the request."""
+        """Store the means to answer a request; return the request's number."""
         token = self._next_request
         self._next_request += 1
         self._open[token] = answer
@@ -113,7 +113,7 @@ class MasterServices:
     def _as_event(
         self, kind: Any, make: Callable[[Any, int], happened.Event]
     ) -> Callable[[Any, _Respond], None]:
-        """A handler that turns a request into an event and keeps the way to answer it."""
+        """Return a handler that turns a request into an event and stores the means to answer it."""
 
         def take(request: Any, respond: _Respond) -> None:
             token = self._keep(lambda reply: respond(self._response(kind, reply)))
@@ -187,7 +187,7 @@ class MasterServices:
             answer = refused("unknown", "register first", self._identity.epoch)
             respond(srv.RequestProcess.Response(answer=answer))
             return
-        # Before its first reading its limits are not known, and so not what it may be given.
+        # Before its first reading the slave's limits, and so its possible load, are not known.
         self._links.when_heard(link, lambda: self._open_poll(link, request, respond))
 
     def _open_poll(
@@ -204,7 +204,7 @@ class MasterServices:
     def _drop(self, token: int) -> None:
         self._open.pop(token, None)
 
-    # --- what may be read ----------------------------------------------------------------
+    # --- read-only requests --------------------------------------------------------------
 
     def _take_list(self, request: srv.List.Request, open_request: OpenRequest) -> None:
         fault = version_refusal(request.protocol_version, "a listing")
@@ -275,5 +275,5 @@ def _pruned(request: srv.Prune.Request, token: int) -> happened.Event:
 
 
 def _requester(request: Any) -> str:
-    """The name of the client that sent a request, for records."""
+    """Return the name of the client that sent a request, for records."""
     return str(request.envelope.sender).removeprefix("client ")

@@ -1,8 +1,8 @@
-"""The master's link to each slave: orders and work on their way to it, and its newest beat.
+"""The master's link to each slave: pending orders and assignments, and the slave's newest beat.
 
-A slave judges the age of an order by its own clock, so nothing can be ordered before its first beat
-is received; what is meant for it waits until then. An order also waits until DDS has discovered the
-service of the slave, because it would be lost otherwise.
+A slave judges the age of an order by its own clock. So the master cannot send orders before it has
+received the slave's first beat, and queues them until then. An order also waits until DDS has
+discovered the slave's service, because it would be lost otherwise.
 """
 
 from __future__ import annotations
@@ -53,14 +53,14 @@ class _Unheard:
 
 @dataclass(slots=True)
 class HostLink:
-    """What is kept of one slave.
+    """Pending orders and assignments of one slave.
 
     Attributes:
-        incarnation: of the run that registered last; what a former run says is not heard.
-        unheard: what waits for its first beat.
+        incarnation: of the run that registered last; messages of a former run are ignored.
+        unheard: orders and requests that wait for its first beat.
         outbox: assignments for the answer to its open request.
         poll: answers that request; None: none is open.
-        forget_poll: takes the open request out of those that may be turned away.
+        forget_poll: removes the open request from those that the master may still refuse.
     """
 
     host_id: int
@@ -72,7 +72,7 @@ class HostLink:
     forget_poll: Callable[[], None] = lambda: None
 
     def close_poll(self) -> None:
-        """The open request is answered, or its answer can reach nobody."""
+        """Close the open request: it is answered, or its answer can reach no slave."""
         self.forget_poll()
         self.poll, self.forget_poll = None, lambda: None
 
@@ -81,11 +81,11 @@ class HostLinks:
     """The links to all slaves that have registered.
 
     Args:
-        participant: from which orders are sent.
-        sender: of the orders, for people.
+        participant: sends the orders.
+        sender: of the orders, for messages.
         epoch: of this master.
         order_timeout: seconds beyond an order's own time for its answer.
-        tell: takes in what happened.
+        tell: receives the events.
     """
 
     def __init__(
@@ -103,20 +103,20 @@ class HostLinks:
         self._names = names.Names(participant.settings.namespace)
         self._client = ControlClient(participant, sender)
         self._links: dict[int, HostLink] = {}
-        # Of a thousand links few have something under way: only those are looked at.
+        # Of a thousand links few have pending work, so only those are checked.
         self._waiting: set[int] = set()
         self._with_work: set[int] = set()
         self.ledger = Ledger()
 
-    # --- who is there --------------------------------------------------------------------
+    # --- registered slaves ---------------------------------------------------------------
 
     def find(self, host_id: int, incarnation: int) -> HostLink | None:
-        """The link of a host, if this is the run of it that registered last."""
+        """Return the link of a host, if this is its last registered run."""
         link = self._links.get(host_id)
         return link if link is not None and link.incarnation == incarnation else None
 
     def renew(self, host_id: int, description: HostDescription) -> None:
-        """A slave registered: what waited for its former run is void."""
+        """Create or renew the link of a registered slave; void the queue of a former run."""
         link = self._links.get(host_id)
         if link is None:
             path = self._names.of_host(description.name, names.CONTROL)
@@ -126,8 +126,8 @@ class HostLinks:
             link = self._links[host_id] = HostLink(host_id, control, 0)
         link.close_poll()
         if link.incarnation == description.incarnation:
-            # The same run once more: what it has not fetched is still meant for it. But it has
-            # been out of reach: with the beat that was heard before, an order would be stale.
+            # The same run again: assignments that it has not fetched stay valid. But it was
+            # unreachable, so an order with the last received beat would be stale.
             self.ledger.beat[host_id] = 0
             return
         link.incarnation = description.incarnation
@@ -138,12 +138,12 @@ class HostLinks:
             order.done(None)
 
     def left(self, link: HostLink) -> None:
-        """A slave stops in good order: it asks for nothing more."""
+        """Close the open request of a slave that stops in an orderly way."""
         link.close_poll()
         self.ledger.forget(link.host_id)
 
     def heard(self, host_ids: Iterable[int]) -> None:
-        """Readings of these hosts have come: what waited for them goes out."""
+        """Send the orders that waited for readings of these hosts."""
         for host_id in self._waiting.intersection(host_ids) if self._waiting else ():
             self._waiting.discard(host_id)
             link = self._links[host_id]
@@ -158,11 +158,11 @@ class HostLinks:
         deadline: float = math.inf,
         done: Callable[[None], None] = lambda _: None,
     ) -> None:
-        """Carry something out now, or when the first beat of a slave has come.
+        """Call `send` now, or when the first beat of the slave has come.
 
         Args:
             deadline: monotonic seconds.
-            done: called with None when the deadline has passed before.
+            done: called with None when the deadline passes first.
         """
         if self.ledger.beat[link.host_id]:
             send()
@@ -183,17 +183,17 @@ class HostLinks:
     def open_poll(
         self, link: HostLink, respond: Callable[[Any], None], forget: Callable[[], None]
     ) -> None:
-        """A slave asks for work; a request of it that was open is never answered."""
+        """Open a slave's request for work; an earlier open one of it is never answered."""
         link.close_poll()
         link.poll, link.forget_poll = respond, forget
         if link.outbox:
             self._with_work.add(link.host_id)
 
     def flush(self, journal: int) -> None:
-        """Answer the open requests of hosts for which there are assignments.
+        """Answer the open requests of hosts that have assignments.
 
         Args:
-            journal: sequence of the newest record that is written.
+            journal: sequence of the newest written record.
         """
         while self._with_work:
             link = self._links[self._with_work.pop()]
@@ -212,7 +212,7 @@ class HostLinks:
             )
 
     def withdraw(self, command: Withdraw, now: float) -> None:
-        """Take an assignment back, or order its end."""
+        """Remove an assignment that was not yet fetched, or order its end."""
         link = self._links.get(command.host_id)
         waiting = link.outbox if link is not None else []
         kept = [one for one in waiting if one.instance != command.instance]
@@ -233,9 +233,9 @@ class HostLinks:
     # --- orders --------------------------------------------------------------------------
 
     def order(self, command: Order, now: float) -> None:
-        """Ask a slave for something; the answer, or none in time, comes back as an event."""
+        """Send an order to a slave; the answer, or its absence in time, becomes an event."""
         link = self._links.get(command.host_id)
-        if link is None:  # expected from the journal, not heard yet
+        if link is None:  # expected from the journal, not registered yet
             self._tell(
                 happened.OrderAnswered(command.order, False, "timeout", "the host does not report")
             )
@@ -257,7 +257,7 @@ class HostLinks:
         self.when_heard(link, send, deadline, done)
 
     def expire(self, now: float) -> None:
-        """End what was not answered in time."""
+        """End the orders and requests that got no answer in time."""
         self._client.expire(now)
         for host_id in list(self._waiting):
             link = self._links[host_id]
@@ -270,7 +270,7 @@ class HostLinks:
 
 
 def _order_request(command: Order) -> srv.ControlHost.Request:
-    """An order as a message, its envelope still to be filled in."""
+    """Return an order as a message without its envelope."""
     request = srv.ControlHost.Request(
         action=_ACTIONS[command.action], executor=command.executor, timeout=float(command.timeout),
         keep_on=list(command.keep_on), keep_every=float(command.keep_every),

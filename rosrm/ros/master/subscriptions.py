@@ -1,4 +1,4 @@
-"""What slaves say without being asked: readings, statuses, usages, as events for the core."""
+"""Subscriptions to slaves' unrequested messages (readings, statuses, usages), as core events."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from rosrm.ros.participant import Participant
 from rosrm.ros.reading_codec import decode
 from rosrm_msgs import msg
 
-#: Seconds between two records of the same refusal, and refusals that are told apart.
+#: Seconds between two records of the same refusal, and most different refusals remembered.
 _REFUSED_EVERY: Final = 10.0
 _REFUSED_KEPT: Final = 1000
 
 
 class Refusals:
-    """Peers that were turned away: recorded, but not ten times a second.
+    """Records refused peers, but not ten times a second.
 
     Args:
-        tell: takes in what happened.
+        tell: receives the events.
     """
 
     def __init__(self, tell: Callable[[happened.Event], None]) -> None:
@@ -34,7 +34,7 @@ class Refusals:
         self._told: dict[tuple[str, str], float] = {}
 
     def __call__(self, who: str, reason: str) -> None:
-        """Record a refusal, unless it was recorded a moment ago."""
+        """Record a refusal, unless the same one was recorded within the last seconds."""
         now = time.monotonic()
         if now - self._told.get((who, reason), -_REFUSED_EVERY) < _REFUSED_EVERY:
             return
@@ -45,13 +45,13 @@ class Refusals:
 
 
 class Hearing:
-    """The subscriptions to what slaves say.
+    """The subscriptions to the messages of slaves.
 
     Args:
-        participant: where they are made.
-        links: told who was heard.
-        tell: takes in what happened.
-        refuse: takes in who was turned away, and why.
+        participant: creates the subscriptions.
+        links: receives the ids of hosts whose readings arrived.
+        tell: receives the events.
+        refuse: receives refused peers, and reasons.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class Hearing:
         self._tell = tell
         self._refuse = refuse
         node, path = participant.node, names.Names(participant.settings.namespace)
-        # Readings come by the thousand: they are taken raw, in batches, past the executor.
+        # Thousands of readings arrive: they are taken raw, in batches, without the executor.
         intake = participant.unwatched_node(f"{node.get_name()}_intake")
         self._readings = intake.create_subscription(
             msg.ResourceInfo, path(names.RESOURCE_INFO), _never_called, qos.READINGS, raw=True
@@ -78,7 +78,7 @@ class Hearing:
             node.create_subscription(kind, path(topic), participant.counted(take), qos.STATUSES)
 
     def poll_readings(self) -> happened.ReadingsReceived | None:
-        """Take all readings that have come; None: none has."""
+        """Take all received readings; None: there are none."""
         handle, kind = self._readings.handle, self._readings.msg_type
         taken = []
         with handle:

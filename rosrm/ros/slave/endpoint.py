@@ -1,4 +1,4 @@
-"""The slave's side of the wire: it finds the master, registers, asks, reports."""
+"""Slave endpoint: finds the master, registers, requests work, reports."""
 
 from __future__ import annotations
 
@@ -29,46 +29,47 @@ __all__ = ["Host", "Link", "LogQuery", "LogSlice", "SlaveEndpoint"]
 
 #: Seconds for one request to the master.
 _PATIENCE: Final = 3.0
-#: A long poll is asked anew after this, so that one that was lost does not last, seconds. The first
-#: after a registration sooner, as it may have gone out before DDS knew its way, then ever later.
+#: Seconds after which a long poll is repeated, because it may have been lost. The first poll after
+#: a registration is repeated sooner, because it may have been sent before DDS discovery was
+#: complete; the interval then doubles.
 _POLL_ANEW: Final = 30.0
 _FIRST_POLL_ANEW: Final = 1.0
-#: Seconds after a request for work that was refused until the next one.
+#: Seconds between a refused request for work and the next one.
 _ASK_AGAIN: Final = 0.2
-#: Seconds for which a name that is taken is asked for again: the former run of this slave may
-#: have been killed a moment ago.
+#: Seconds for which registration is retried while the name is taken: the former run of this slave
+#: may have been killed a moment ago.
 _NAME_TAKEN: Final = 5.0
-#: The same where that run has left processes behind: they are not given up before a master with a
-#: long `liveness.suspect` has noticed that it is gone.
+#: The same if that run left processes behind. They are not given up before a master with a long
+#: `liveness.suspect` has noticed its end.
 _NAME_TAKEN_BY_FORMER: Final = 60.0
 #: Seconds for the last statuses to reach the master.
 _LAST_WORDS: Final = 2.0
-#: Beats of a master in its silence before it counts as gone; and before another run of a master
-#: that has no newer epoch is believed: of two at once the younger gives way.
+#: Missed beats after which a master counts as gone; and missed beats before another run without a
+#: newer epoch is accepted: of two masters at once the younger gives way.
 _MISSED_BEATS: Final = 10
 _MISSED_BY_ANOTHER: Final = 3
 
 
 class Link(Enum):
-    """How far this slave is with its master."""
+    """State of the connection to the master."""
 
     SEARCHING = "searching"
     GREETING = "greeting"
-    LISTENING = "listening"  # for a beat of who greeted us: it alone tells which run that is
+    LISTENING = "listening"  # for a beat of the greeting master, which alone identifies its run
     REGISTERING = "registering"
     REGISTERED = "registered"
 
 
 class SlaveEndpoint:
-    """Everything that a slave says and hears.
+    """The slave's publishers, subscriptions and requests to its master.
 
     Attributes:
-        link: how far it is with its master.
-        failure: why it must give up; "" while it need not.
-        superseded: it must because another slave lives under its name.
-        cluster: name of the master that greeted us last; "" before the first one.
-        failing: kind and name of each plugin that fails here, and why; goes with the statuses. A
-            probe goes by the resource that it reads.
+        link: state of the connection to the master.
+        failure: reason to give up; "": there is none.
+        superseded: the reason is another live slave with its name.
+        cluster: name of the last master that greeted this slave; "" before the first one.
+        failing: kind and name of each failing plugin on this host, with the reason; sent with the
+            statuses. A probe is named by the resource that it reads.
     """
 
     def __init__(
@@ -94,11 +95,11 @@ class SlaveEndpoint:
         self._asked_at = 0.0
         self._beat_clock = core.BeatClock()
         self._newest_beat: msg.MasterBeat | None = None
-        self._incarnation = 0  # of the master that we are registered with, or about to be
-        self._registered_with = 0  # the incarnation of the newest that took us in
+        self._incarnation = 0  # of the master of this registration, complete or in progress
+        self._registered_with = 0  # incarnation of the last master that accepted the registration
         self._taken_since: float | None = None
         self._waits_since: float | None = None
-        self._leaves: Sequence[InstanceStatus] | None = None  # what it keeps running as it leaves
+        self._leaves: Sequence[InstanceStatus] | None = None  # left running when the slave leaves
         self._poll: Call | None = None
         self._poll_at = 0.0
         self._poll_anew = _FIRST_POLL_ANEW
@@ -164,7 +165,7 @@ class SlaveEndpoint:
 
     def _take_greeting(self, answer: srv.Handshake.Response | None) -> None:
         now = time.monotonic()
-        if answer is None or now - self._asked_at >= _PATIENCE:  # we were stopped meanwhile
+        if answer is None or now - self._asked_at >= _PATIENCE:  # this process was stopped
             self.link = Link.SEARCHING
             return
         fault = version_refusal(answer.protocol_version, f"the master on {answer.hostname}")
@@ -179,7 +180,7 @@ class SlaveEndpoint:
         self._register_if_known()
 
     def _register_if_known(self) -> None:
-        """Register as soon as a beat has told which run of the master it was that greeted us."""
+        """Register once a beat identifies the run of the master that greeted this slave."""
         beat = self._newest_beat
         if beat is None or _speaker(beat) != _speaker(self._greeting):
             return
@@ -229,18 +230,18 @@ class SlaveEndpoint:
             f"registered with master {greeting.master} (pid {greeting.pid} on {greeting.hostname}) "
             f"as host {self.host_id}"
         )
-        if self._leaves is not None:  # the former master was gone before it took note
+        if self._leaves is not None:  # the former master was gone before it recorded this
             self._send_leave(self._leaves, lambda: None)
 
     def _wait_for_journal(self, why: str, now: float) -> None:
-        """The master can take nobody in just now: ask again, and say so once."""
+        """Retry while the master's journal stalls, and log the wait once."""
         self.link = Link.SEARCHING
         if self._waits_since is None:
             self._waits_since = now
             self._host.say(f"the master takes no host in, asking on: {why}")
 
     def _turned_down(self, answer: msg.Answer, now: float) -> None:
-        """A name may still be held by a former run of this very slave: ask again for a moment."""
+        """Retry for a while if the name is taken, as a former run of this slave may hold it."""
         if self._taken_since is None:
             self._taken_since = now
             if answer.code == "name_taken":
@@ -268,7 +269,7 @@ class SlaveEndpoint:
 
     def _take_beat(self, beat: msg.MasterBeat) -> None:
         if version_refusal(beat.protocol_version, "the master"):
-            return  # the handshake says it clearly
+            return  # the handshake reports the version mismatch
         now = time.monotonic()
         if self.link is Link.REGISTERED and beat.incarnation != self._incarnation:
             if beat.epoch <= self._epoch and not self._missed(_MISSED_BY_ANOTHER, now):
@@ -284,11 +285,11 @@ class SlaveEndpoint:
             self._register_if_known()
 
     def _missed(self, beats: int, now: float) -> bool:
-        """Whether our master has been silent for longer than so many beats."""
+        """Return True if the master has been silent for longer than this number of beats."""
         return now - self._beat_at > beats * self._beat_period
 
     def _note_beat(self, beat: int, now: float) -> float:
-        """Remember it; returns when it was said, by our clock."""
+        """Store a beat; return the time of its sending by this host's clock."""
         self._master_beat, self._beat_at = beat, now
         self._reporter.note_master(beat)
         return self._beat_clock.said_at(beat / 1e9, now)
@@ -322,7 +323,7 @@ class SlaveEndpoint:
         self._poll_at, self._poll_anew = 0.0, _POLL_ANEW
         answer = response.answer
         if not answer.accepted:
-            self._poll_at = time.monotonic() + _ASK_AGAIN  # not with every turn of the loop
+            self._poll_at = time.monotonic() + _ASK_AGAIN  # not in every round of the loop
             if answer.code in ("unknown", "stale"):
                 self._lose_master(f"the master does not know this host any more: {answer.message}")
             return
@@ -335,24 +336,24 @@ class SlaveEndpoint:
         given_at = response.slave_beat / 1e9 if response.slave_beat else None
         self._host.take(core.AssignmentsReceived(work, given_at))
 
-    # --- what is said --------------------------------------------------------------------
+    # --- reports ---------------------------------------------------------------------------
 
     def publish_reading(
         self, usage: npt.NDArray[np.float32], limit: npt.NDArray[np.float32], present: int,
         stale: int, *, accepting: bool, processes: int,
     ) -> None:  # fmt: skip
-        """Say the utilisation and limits of this host, (slots,) fractions, once in every cycle.
+        """Publish utilisation and limits of this host, (slots,) fractions, once in every cycle.
 
-        What brings nothing new goes out with a later cycle (`rosrm.ros.slave.reporter`).
+        A reading without news is sent with a later cycle (`rosrm.ros.slave.reporter`).
         """
         if self.link is Link.REGISTERED:
             facts = (accepting, processes, present, stale, self._status_sequence)
             self._reporter.cycle(usage, limit, facts)
 
     def publish_statuses(self, statuses: Sequence[InstanceStatus], *, complete: bool) -> None:
-        """Say what became of instances."""
+        """Publish statuses of instances."""
         if self.link is not Link.REGISTERED:
-            return  # all of it goes with the registration
+            return  # the next registration includes all statuses
         self._status_sequence += 1
         self._statuses.publish(
             msg.ProcessStatusBatch(
@@ -369,9 +370,10 @@ class SlaveEndpoint:
     def publish_usage(
         self, numbers: Sequence[int], cpu: Sequence[float], memory: Sequence[int]
     ) -> None:
-        """Say what each instance uses: cores and bytes, in parallel.
+        """Publish each instance's use: cores and bytes, in parallel sequences.
 
-        The newest reading goes first: a need that is met must show in the readings.
+        The newest reading is sent first: the master reduces reservations by these usages, so its
+        readings must already include that load.
         """
         if self.link is Link.REGISTERED:
             self._reporter.tell()
@@ -384,7 +386,7 @@ class SlaveEndpoint:
             )  # fmt: skip
 
     def publish_kept(self, states: Sequence[KeptState]) -> bool:
-        """Say all the states that this host keeps; False: there is no master to hear it."""
+        """Publish all snapshots that this host holds; False: it is not registered."""
         if self.link is not Link.REGISTERED:
             return False
         self._kept.publish(
@@ -397,7 +399,7 @@ class SlaveEndpoint:
         return True
 
     def wait_until_heard(self) -> None:
-        """Give the last words time to arrive: what is not acknowledged is lost when we leave."""
+        """Wait until the last statuses are acknowledged: others are lost when this slave leaves."""
         if self.link is not Link.REGISTERED:
             return
         if not self._statuses.wait_for_all_acked(Duration(seconds=_LAST_WORDS)):
@@ -412,7 +414,7 @@ class SlaveEndpoint:
 
         Args:
             done: called once.
-            kept: all instances, where the slave leaves them running; (): it stops them.
+            kept: all instances, if the slave leaves them running; (): it stops them.
         """
         self._leaves = kept
         if self.link is Link.REGISTERED:
@@ -432,5 +434,5 @@ class SlaveEndpoint:
 
 
 def _speaker(said: msg.MasterBeat | srv.Handshake.Response) -> tuple[str, int, int]:
-    """Which master said something, as far as a greeting tells."""
+    """Return the identity of a master as far as a greeting contains it."""
     return said.hostname, said.pid, said.epoch

@@ -1,8 +1,8 @@
-"""Whether one very instance is in the ROS graph: a node's name alone does not tell namesakes apart.
+"""Presence of an instance's nodes in the ROS graph, also where other nodes have the same name.
 
-Every rclcpp and rclpy node publishes `/parameter_events`; the endpoint's GID tells its participant.
-Fast DDS writes the machine and the process id into the GID, so there an instance is recognised by
-its own pids; with another vendor an endpoint counts that was not there when the instance started.
+Every rclcpp and rclpy node publishes `/parameter_events`; the endpoint's GID names its participant.
+Fast DDS writes the machine and the process id into the GID, so an instance is recognised by its own
+pids. With another vendor, any endpoint counts that did not exist when the instance started.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from rclpy.node import Node
 
 _TOPIC: Final = "/parameter_events"
 _FAST_DDS: Final = b"\x01\x0f"
-#: Vendor, host, process: the rest of a GID's prefix is chance and counters.
+#: Vendor, host, process: the rest of a GID's prefix is random numbers and counters.
 _HOST: Final = slice(2, 4)
 _PID: Final = slice(4, 6)
 
 
 class GraphWatch:
-    """Looks for instances in the graph, from one node.
+    """Finds instances in the graph, seen from one node.
 
     Args:
         node: any node of this participant.
@@ -32,21 +32,22 @@ class GraphWatch:
         self._host = b""
 
     def endpoints(self, name: str) -> frozenset[bytes]:
-        """GIDs of the endpoints of all nodes of a fully qualified name, as known now."""
+        """Return the GIDs of all nodes' endpoints under a fully qualified name, as known now."""
         return frozenset(gid for owner, gid in self._all() if owner == name)
 
     def sees(self, name: str, pids: Iterable[int], before: frozenset[bytes]) -> bool:
-        """Whether the instance that runs as one of `pids` has a node of this name.
+        """Return True if the instance that runs as one of `pids` has a node of this name.
 
         Args:
             name: fully qualified.
+            pids: of the instance.
             before: endpoints of that name when the instance was started.
         """
         own = {pid & 0xFFFF for pid in pids}
         return any(self._belongs(gid, own, before) for gid in self.endpoints(name))
 
     def is_of(self, gid: bytes, pids: Iterable[int]) -> bool:
-        """Whether an endpoint is known to be one of these processes of this host."""
+        """Return True if an endpoint is known to belong to one of these processes of this host."""
         return self._belongs(gid, {pid & 0xFFFF for pid in pids}, frozenset((gid,)))
 
     def _belongs(self, gid: bytes, own: set[int], before: frozenset[bytes]) -> bool:
@@ -55,7 +56,7 @@ class GraphWatch:
         return gid[_HOST] == self._own_host() and int.from_bytes(gid[_PID], "little") in own
 
     def _own_host(self) -> bytes:
-        """By our own node: another host may have a process with our very pid."""
+        """Return the host in this node's own GID: another host may have a process with any pid."""
         if not self._host:
             own, name = os.getpid() & 0xFFFF, self._node.get_fully_qualified_name()
             for owner, gid in self._all():

@@ -1,8 +1,9 @@
-"""Looks whether nodes do what their health asks for: publish a topic, be in a lifecycle state.
+"""Health checks of nodes: publication of a topic, and lifecycle state.
 
-All of it is polled from a node outside the executor, a few times a second: messages of a topic cost
-the slave no callback each, and of those that come faster than is asked for DDS keeps the newest.
-What it drops, and what best effort loses of large messages, the publisher's numbers tell.
+Both are polled from a node outside the executor, a few times a second. So messages of a topic cost
+the slave no callback each, and DDS keeps only the newest of messages faster than the required rate.
+The publisher's sequence numbers count messages that DDS drops or, as with large messages over best
+effort, loses.
 """
 
 from __future__ import annotations
@@ -25,25 +26,25 @@ from rclpy.qos import (
 from rosrm.core.slave.reducer import Watch
 from rosrm.ros.slave.graph import GraphWatch
 
-#: Seconds between two looks at the graph while a topic is listened to.
+#: Seconds between two checks of the graph while a topic is subscribed.
 _GRAPH_PERIOD: Final = 1.0
-#: Seconds between two questions for a lifecycle state, and for which one may stay unanswered.
+#: Seconds between two requests for a lifecycle state, and until no answer counts as silence.
 _ASK_PERIOD: Final = 1.0
 _PATIENCE: Final = 1.0
-#: A state is asked for at least so often within the time for which it may be amiss.
+#: Least number of requests within the time for which the state may be wrong.
 _ASKS: Final = 4
-#: Seconds' worth of messages that are kept between two looks, and the most of them.
+#: Seconds' worth of messages that are kept between two checks, and the most messages.
 _KEPT: Final = 1.0
 _MOST_KEPT: Final = 1000
 
 
 class HealthEar:
-    """Listens to one run of one instance.
+    """Checks the health of one run of one instance.
 
     Args:
         node: outside every executor.
-        graph: tells whose a publisher is.
-        watch: what is asked of it.
+        graph: finds the process of a publisher.
+        watch: the required health.
         now: monotonic seconds.
     """
 
@@ -52,7 +53,7 @@ class HealthEar:
         self._state = _StateEar(node, watch, now) if watch.services else None
 
     def topic(self, pids: Iterable[int], now: float) -> tuple[int | None, str]:
-        """Messages since the look before, or None and why it cannot be listened to.
+        """Return the messages since the last check, or None and why the topic cannot be checked.
 
         Args:
             pids: of the instance.
@@ -61,11 +62,11 @@ class HealthEar:
         return (None, "") if self._topic is None else self._topic.look(pids, now)
 
     def state(self, now: float) -> str | None:
-        """The lifecycle state; "": it does not answer; None: that is not known yet."""
+        """Return the lifecycle state; "": the node does not answer; None: not known yet."""
         return None if self._state is None else self._state.look(now)
 
     def close(self) -> None:
-        """Listen no more."""
+        """Destroy the subscription and the clients."""
         for ear in (self._topic, self._state):
             if ear is not None:
                 ear.close()
@@ -81,7 +82,7 @@ class _TopicEar:
             reliability=ReliabilityPolicy.BEST_EFFORT, durability=DurabilityPolicy.VOLATILE,
         )  # fmt: skip
         self._subscription: Any = None
-        self._source = ("", "")  # topic and type that are listened to
+        self._source = ("", "")  # subscribed topic and its type
         self._kind: Any = None
         self._last = 0
         self._looked_at_graph = -math.inf
@@ -99,7 +100,7 @@ class _TopicEar:
         return self._subscription is not None and self._subscription.get_publisher_count() > 0
 
     def _follow_graph(self, pids: Iterable[int]) -> str:
-        """Listen to what the instance publishes by the graph; why that cannot be, or ""."""
+        """Subscribe to the instance's topic in the graph; return an obstacle, or ""."""
         try:
             name, types = self._published(pids)
             if len(types) == 1:
@@ -123,7 +124,7 @@ class _TopicEar:
         self._source = (name, type_name)
 
     def _published(self, pids: Iterable[int]) -> tuple[str, Sequence[str]]:
-        """The first of the names that is published, and as what; others count if it is not."""
+        """Return the first published name and its types; those of other nodes if it has none."""
         for name in self._names:
             found: list[Any] = self._node.get_publishers_info_by_topic(name)
             own = [info for info in found if self._graph.is_of(bytes(info.endpoint_gid), pids)]
@@ -132,7 +133,7 @@ class _TopicEar:
         return "", ()
 
     def _take(self) -> int:
-        """Messages since the last look, with those that were lost where numbers tell of them."""
+        """Return the messages since the last check, with lost ones as far as numbers show them."""
         alone = self._subscription.get_publisher_count() == 1
         count, handle = 0, self._subscription.handle
         with handle:
@@ -144,7 +145,7 @@ class _TopicEar:
         return count
 
     def _since_last(self, number: int, alone: bool) -> int:
-        """By the publisher's own numbers; those of several would be mixed up."""
+        """Return 1 and the gap in the publisher's numbers; those of several have no order."""
         lost = number - self._last - 1 if alone and 0 < self._last < number else 0
         self._last = number if alone else 0
         return 1 + lost
@@ -165,7 +166,7 @@ class _StateEar:
         self._answered = now
         self._kind = import_module("lifecycle_msgs.srv").GetState
         for name in watch.services:
-            with contextlib.suppress(Exception):  # no name of a service: it does not answer
+            with contextlib.suppress(Exception):  # an invalid name counts as no answer
                 client = node.create_client(
                     self._kind, name, qos_profile=qos_profile_services_default
                 )
@@ -184,7 +185,7 @@ class _StateEar:
         return self._state
 
     def _hear(self, client: Any, now: float) -> None:
-        """Every answer that has come; the newest counts, to whichever question."""
+        """Take every received answer; the newest counts, to whichever request."""
         while True:
             with client.handle:
                 header, response = client.handle.take_response(self._kind.Response)

@@ -1,8 +1,8 @@
-"""What a slave has been told of its master's journal: whoever is told less later has lost a part.
+"""Journal watermark: the newest record of its master's journal that a slave knows of.
 
-The file `journal_seen` of the slave's state directory holds one line, which is overwritten in its
-place: so it needs no room on a full disk. It survives the slave, not a fall of its machine; nor
-do the processes that it may be asked about.
+A master that later reports less has a journal gap. The file `journal_seen` of the slave's state
+directory holds one line, overwritten in place, so it needs no room on a full disk. It survives the
+slave, but not a crash of its machine; nor do the processes that a gap would concern.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ _LONGEST: Final = 1000
 
 
 class Seen(NamedTuple):
-    """What one run of a master has said of its journal.
+    """Watermark of the journal of one run of a master.
 
     Attributes:
         sequence: of its newest record.
@@ -33,10 +33,10 @@ _NOTHING: Final = Seen(0, 0, "")
 
 
 class JournalSeen:
-    """Remembers the newest record that the master has told of.
+    """Stores the newest record that the master has reported.
 
     Args:
-        path: of the file; None: it is remembered in memory alone.
+        path: of the file; None: only in memory.
     """
 
     def __init__(self, path: Path | None = None) -> None:
@@ -45,7 +45,7 @@ class JournalSeen:
         self._newest = _read(path) if path is not None else _NOTHING
 
     def note(self, newest: Seen) -> None:
-        """The master that this slave is registered with has said how far its journal is."""
+        """Store the journal's watermark from the master that this slave is registered with."""
         known = self._newest
         if newest.incarnation == known.incarnation and newest.sequence <= known.sequence:
             return
@@ -55,7 +55,7 @@ class JournalSeen:
         try:
             self._keep(self._path, newest)
         except OSError:
-            return  # it is remembered in memory, and tried again with the next one
+            return  # stored in memory; the next watermark is written to the file again
 
     def _keep(self, path: Path, newest: Seen) -> None:
         if self._file < 0:
@@ -65,7 +65,7 @@ class JournalSeen:
         os.ftruncate(self._file, len(line))
 
     def of_former_run(self, master: str, incarnation: int) -> int:
-        """The newest record that another run of this master has told of; 0: none."""
+        """Return the newest record reported by another run of this master; 0: none."""
         newest = self._newest
         former = newest.master == master and newest.incarnation != incarnation
         return newest.sequence if former else 0

@@ -1,7 +1,8 @@
-"""Listens to a topic until a second publisher speaks there.
+"""Wait for the second publisher of a topic.
 
-A message does not say who sent it (its info has no GID in Jazzy), but each writer counts what it
-writes: two that speak in turn are heard as a count that falls. Who they are, the graph says.
+A message does not name its sender (its info has no GID in Jazzy), but each writer numbers its
+messages. So the messages of two alternating writers show falling numbers. The graph names the
+writers.
 """
 
 from __future__ import annotations
@@ -16,21 +17,21 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 
-#: The least that can be asked for: it matches every publisher.
+#: The weakest requirements: they match every publisher.
 _ANY: Final = QoSProfile(
     history=HistoryPolicy.KEEP_LAST, depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT,
     durability=DurabilityPolicy.VOLATILE,
 )  # fmt: skip
-#: What the graph says of a node of which it knows only the endpoints.
+#: The graph's name of a node of which only the endpoints are known.
 _UNKNOWN: Final = "_NODE_NAME_UNKNOWN_"
-#: Seconds between two looks.
+#: Seconds between two polls.
 _EVERY: Final = 0.005
 
 
 def await_second_publisher(
     topic: str, type_name: str, source: str, destination: str, timeout: float
 ) -> Mapping[str, Any]:
-    """Block until both source and destination have been heard on a topic, and nobody else is there.
+    """Block until both source and destination publish a topic, and no other node does.
 
     Args:
         topic: absolute name.
@@ -39,10 +40,10 @@ def await_second_publisher(
         timeout: seconds.
 
     Returns:
-        How many messages were heard, and after how many seconds.
+        The number of messages received, and the seconds that passed.
 
     Raises:
-        TimeoutError: with what was heard instead.
+        TimeoutError: the message says what was received instead.
         ValueError: another node publishes there too, or there is no such type.
     """
     begun = time.monotonic()
@@ -70,7 +71,7 @@ def await_second_publisher(
 def _listen(
     node: Node, topic: str, kind: Any, names: frozenset[str], deadline: float
 ) -> tuple[int, bool]:
-    """How many messages were heard, and whether of both publishers."""
+    """Return the number of messages received, and True if they came from both publishers."""
     subscription = node.create_subscription(kind, topic, _never_called, _ANY, raw=True)
     heard, last, two = 0, 0, False
     handle = subscription.handle
@@ -90,7 +91,7 @@ def _listen(
 
 
 def _are_alone(node: Node, topic: str, names: frozenset[str]) -> bool:
-    """Whether these nodes publish there; a node's name is known a little later than its topics."""
+    """Return True if just these nodes publish there; the graph learns node names after topics."""
     found = {info.node_name for info in node.get_publishers_info_by_topic(topic)}
     strangers = sorted(found - names - {_UNKNOWN})
     if strangers:

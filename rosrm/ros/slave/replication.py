@@ -1,4 +1,4 @@
-"""How slaves give each other kept states: two services of each, and clients of those of others."""
+"""Snapshot replication between slaves: two services of each, and clients for those of others."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from rosrm.snapshots import Part
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs import srv
 
-#: Seconds after which a client that was not used is given up.
+#: Seconds without use after which a client is destroyed.
 _IDLE: Final = 60.0
-#: Most bytes that are given in one answer.
+#: Most bytes of one answer.
 MOST: Final = 256 << 10
 
 
 class KeptHost(Protocol):
-    """What the endpoint asks of the slave."""
+    """Interface of the slave for its replication endpoint."""
 
     def take_part(self, part: Part, answer: Callable[[str, str], None]) -> None:
-        """A part of a state came; `answer` with a code and a message, both "" when it is taken."""
+        """Store a part of a replica; `answer` with a code and a message, both "" when accepted."""
 
     def read_part(
         self, process: str, age: tuple[int, int], offset: int, size: int,
         answer: Callable[[Part | None], None],
     ) -> None:  # fmt: skip
-        """A part of a state is wanted; `answer` with it, or with None."""
+        """Read a part of a snapshot; `answer` with it, or with None."""
 
 
 @dataclass(slots=True)
@@ -40,10 +40,10 @@ class _Peer:
 
 
 class KeptEndpoint:
-    """The services of one slave, and its clients.
+    """The replication services of one slave, and its clients.
 
     Args:
-        participant: where they are made.
+        participant: creates services and clients.
         name: of the host.
     """
 
@@ -90,14 +90,14 @@ class KeptEndpoint:
         self._participant.serve(srv.KeepState, own(self._name, names.KEEP_STATE), take)
         self._participant.serve(srv.ReadKept, own(self._name, names.READ_KEPT), read)
 
-    # --- what is asked of others ---------------------------------------------------------
+    # --- requests to other slaves --------------------------------------------------------
 
     def finds_keeper(self, host: str, now: float) -> bool:
-        """Whether the slave of a host is there to be given a state."""
+        """Return True if a host's slave is discovered and can receive a replica."""
         return bool(self._peer(srv.KeepState, names.KEEP_STATE, host, now).service_is_ready())
 
     def finds_source(self, host: str, now: float) -> bool:
-        """Whether the slave of a host is there to be asked for a state."""
+        """Return True if a host's slave is discovered and can send a snapshot."""
         return bool(self._peer(srv.ReadKept, names.READ_KEPT, host, now).service_is_ready())
 
     def _peer(self, kind: Any, name: str, host: str, now: float) -> Any:
@@ -114,7 +114,7 @@ class KeptEndpoint:
         self, host: str, part: Part, now: float, timeout: float,
         done: Callable[[str, str], None],
     ) -> None:  # fmt: skip
-        """Give a part to another slave; `done` with a code and a message, both "" when taken."""
+        """Send a part to a slave; `done` gets a code and a message, both "" when accepted."""
         request = srv.KeepState.Request(
             protocol_version=PROTOCOL_VERSION, sender=self._name, process=part.process,
             number=part.number, sequence=part.sequence, offset=part.offset, total=part.total,
@@ -135,9 +135,9 @@ class KeptEndpoint:
         self, host: str, wanted: Part, now: float, timeout: float,
         done: Callable[[Part | str], None],
     ) -> None:  # fmt: skip
-        """Ask another slave for a part; `done` with it, or with why there is none.
+        """Request a part from another slave; `done` gets it, or the reason why there is none.
 
-        `wanted` has no data; with number 0 it is the newest state.
+        `wanted` has no data; number 0 means the newest snapshot.
         """
         request = srv.ReadKept.Request(
             protocol_version=PROTOCOL_VERSION, process=wanted.process, number=wanted.number,
@@ -155,7 +155,7 @@ class KeptEndpoint:
         self._client.call(client, request, now + timeout, answered)
 
     def expire(self, now: float) -> None:
-        """End what was not answered in time, and clients of which nothing is wanted any more."""
+        """End requests without an answer in time, and destroy idle clients."""
         self._client.expire(now)
         for key in [key for key, peer in self._peers.items() if now - peer.used >= _IDLE]:
             self._participant.node.destroy_client(self._peers.pop(key).client)

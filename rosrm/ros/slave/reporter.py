@@ -1,9 +1,9 @@
-"""What a slave says of its cycles: at once what decides something, the rest before long.
+"""Readings of a slave: published on change, and at least once per beat period of the master.
 
-A reading goes out in the cycle in which it brings something new: a limit is reached or left, work
-is taken or no longer, a probe is late, a process more or less, a batch of statuses, or a usage that
-has moved by `RESOLUTION`. Cycles that bring nothing new are told with the next message, after at
-most one beat period of the master: so both sides are heard that often.
+A reading is published in its cycle if it brings news. These are: a limit is reached or left, the
+slave starts or stops accepting work, a probe is late, the number of processes changes, there is a
+batch of statuses, or a usage has moved by `RESOLUTION`. Cycles without news are counted in the next
+message, after at most one beat period of the master, so both sides hear from each other that often.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ import numpy.typing as npt
 from rosrm.ros.reading_codec import LAYOUT, MOST_QUIET, encode, flags
 from rosrm.version import PROTOCOL_VERSION
 
-#: Part of a resource's capacity by which a usage must have moved to be said at once.
+#: Part of a resource's capacity by which a usage must have moved to be published at once.
 RESOLUTION: Final = 0.01
 
-#: What is compared as one with the message before: accepting, processes, present, stale, statuses.
+#: Facts compared as one with the last message: accepting, processes, present, stale, statuses.
 _Facts = tuple[bool, int, int, int, int]
 
 
@@ -48,25 +48,25 @@ class Reporter:
         self._told_over = np.zeros(0, np.bool_)
 
     def begin(self, host_id: int, beat_period: float) -> None:
-        """A master took this host in: the next reading goes out whatever it says.
+        """Start reporting to a master that accepted this host; the next reading is always sent.
 
         Args:
             host_id: the number under which this host reports.
             beat_period: seconds, of that master.
         """
         self._row["host_id"] = host_id
-        # A little more than a quotient: three periods of 0.1 s are not quite 0.3 s.
+        # The summand rounds up, because three periods of 0.1 s are slightly less than 0.3 s.
         self._every = min(max(1, int(beat_period / self._period + 1e-6)), MOST_QUIET + 1)
         self._told = None
 
     def note_master(self, beat: int) -> None:
-        """The newest beat of the master that was heard, ns."""
+        """Store the newest received beat of the master, ns, for the next reading."""
         self._row["master_beat"] = beat
 
     def cycle(
         self, usage: npt.NDArray[np.float32], limit: npt.NDArray[np.float32], facts: _Facts
     ) -> None:
-        """One cycle of the slave.
+        """Enter one cycle of the slave; send its reading if that brings news or is due.
 
         Args:
             usage, limit: (slots,) fractions.
@@ -81,7 +81,7 @@ class Reporter:
             self.tell()
 
     def _tells_more(self, usage: npt.NDArray[np.float32], limit: npt.NDArray[np.float32]) -> bool:
-        """Whether somebody may decide otherwise by this reading than by the one before."""
+        """Return True if a decision may differ between this reading and the last published one."""
         if self._facts != self._told:
             return True
         return bool(
@@ -91,7 +91,7 @@ class Reporter:
         )
 
     def tell(self) -> None:
-        """Send the newest reading, unless it has gone out."""
+        """Send the newest reading, unless it has been sent."""
         if not self._untold:
             return
         row = self._row

@@ -1,4 +1,4 @@
-"""What the master and clients ask of a slave: orders become events of its core, logs are read."""
+"""Services of a slave for the master and clients: orders become core events, logs are read."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from rosrm_msgs import srv
 
 @dataclass(frozen=True, slots=True)
 class LogQuery:
-    """Which part of a log is wanted; the fields are those of `ReadLog`."""
+    """Requested part of a log; the fields are those of `ReadLog`."""
 
     process: str
     number: int = 0
@@ -29,7 +29,7 @@ class LogQuery:
 
 @dataclass(frozen=True, slots=True)
 class LogSlice:
-    """A part of a log, as `ReadLog` answers it; a mark is (time, offset, pid)."""
+    """A part of a log as in the answer of `ReadLog`; a mark is (time, offset, pid)."""
 
     number: int
     numbers: Sequence[int]
@@ -41,28 +41,28 @@ class LogSlice:
 
 
 class Host(Protocol):
-    """What the endpoint asks of the slave's runtime."""
+    """Interface of the slave's runtime for its endpoint."""
 
     def take(self, event: core.Event) -> None:
-        """Something happened."""
+        """Handle an event."""
 
     def statuses(self) -> Sequence[InstanceStatus]:
-        """All that this host holds."""
+        """Return the statuses of all instances on this host."""
 
     def kept_states(self) -> Sequence[KeptState]:
-        """All the states that this host keeps."""
+        """Return all snapshots that this host holds."""
 
     def read_log(self, query: LogQuery) -> LogSlice:
-        """A part of a log; raises `Refused`."""
+        """Return a part of a log; raises `Refused`."""
 
     def set_restart(
         self, instance: InstanceId, restart: RestartPolicy, settled: Callable[[str], None]
     ) -> None:
-        """Give an instance another restart policy.
+        """Replace the restart policy of an instance.
 
         Args:
-            settled: called in the loop's thread; with "" when the policy survives whatever is
-                killed, else with the reason why there is no such instance.
+            settled: called in the loop's thread; with "" when the policy is durable, whichever
+                process is killed, else with the reason why there is no such instance.
         """
 
     def execute(
@@ -71,29 +71,29 @@ class Host(Protocol):
     ) -> None:  # fmt: skip
         """Run an executor; `done(code, message, result)` is called in the loop's thread.
 
-        The code is "" where the executor did its work. Its strategy counts as failing, if it takes
-        longer than `timeout` seconds.
+        The code is "" after a success. If the executor takes longer than `timeout` seconds, its
+        strategy counts as failing.
         """
 
     def keep(self, instance: InstanceId, hosts: Sequence[str], every: float) -> None:
-        """Ship the state of an instance to these hosts from now on; seconds between two times."""
+        """Replicate an instance's snapshot to these hosts from now on, every `every` seconds."""
 
     def drop_kept(self, instance: InstanceId) -> None:
-        """Delete what is kept of a process, of instances up to this one."""
+        """Delete the snapshots of a process, of instances up to this one."""
 
     def say(self, message: str) -> None:
-        """Tell the user."""
+        """Show a message to the user."""
 
 
 class SlaveServices:
     """The services of one slave.
 
     Args:
-        participant: where they are offered.
-        host: carries out what is asked.
+        participant: offers the services.
+        host: carries out the requests.
         name: of the host.
-        gate: judges every order.
-        epoch: the newest that is known of the master; older orders are refused.
+        gate: admits or refuses every order.
+        epoch: newest known epoch of the master; older orders are refused.
     """
 
     def __init__(
@@ -176,7 +176,7 @@ class SlaveServices:
 
 
 def _ordered(request: srv.ControlHost.Request) -> core.Event:
-    """What an order means for the core; raises `Refused`."""
+    """Return the core event of an order; raises `Refused`."""
     kind = srv.ControlHost.Request
     if request.action == kind.START:
         given_at = request.envelope.receiver_beat / 1e9
