@@ -1,4 +1,4 @@
-"""The plugins that the reference shows as a whole keep their contracts."""
+"""Contracts of the complete plugins shown in docs/reference/plugins.md."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class TestCheckpointPolicyThatIsShown(CheckpointContract):
 
 
 def test_both_are_found_by_their_hooks():
-    """With the mark and the name that a hook needs."""
+    """Both plugins carry the hook marker and the function name that discovery needs."""
     registry = Registry.of(probe=PROBE, policy=POLICY)
     assert not registry.broken
     assert registry.names("probe") == ("open_files",)
