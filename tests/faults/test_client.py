@@ -66,8 +66,8 @@ def test_a_request_to_another_run_of_the_master_is_made_anew(make_cluster) -> No
     ("answer", "unsure"),
     [
         (accepted(epoch=2), False),  # done, by either run
-        (refused("exists", "p is in use already", 1), False),  # by the first run
-        (refused("exists", "p is in use already", 2), True),  # perhaps by its own retry
+        (refused("exists", "p is in use already", 1), False),  # by the run that was asked first
+        (refused("exists", "p is in use already", 2), True),  # perhaps by its own first try
         (refused("stale", "too old"), True),
         (refused("invalid", "no such field"), False),  # independent of the run
     ],

@@ -99,7 +99,7 @@ def test_the_source_is_killed(scene, moment):
 
 
 def test_a_source_that_will_not_die_is_killed(deaf):
-    """The source ignores SIGINT and SIGTERM; SIGKILL ends it after its grace periods."""
+    """The source blocks SIGINT and SIGTERM; SIGKILL ends it after its grace periods."""
     deaf.move(("source stopping", deaf.leave_alone))
     assert deaf.end() == "moved"
     assert deaf.is_gapless()

@@ -24,7 +24,7 @@ def scene(make_shared):
 
 @pytest.mark.parametrize("victim", ["master", "source's slave", "destination's slave"])
 def test_killed_at_take_over(scene, victim):
-    """The source is dead: its successor continues the count, and the source's slave is informed."""
+    """The source is dead: its successor continues the count, and its slave is informed."""
     scene.move(
         *scene.source_held(),
         ("SWITCHING", scene.kill("source")),

@@ -137,7 +137,7 @@ def test_a_client_of_another_version_is_refused(cluster, stranger) -> None:
 
 @pytest.mark.parametrize("kind", ["submit", "list", "explain", "read_log"])
 def test_a_request_of_another_version_is_refused(cluster, stranger, kind) -> None:
-    """The services without a handshake also refuse the request."""
+    """The services without a handshake also refuse the request, without effect."""
     if kind == "submit":
         answer = stranger.submit(
             job("futuristic", "true"), envelope=stranger.envelope(protocol_version=99)
@@ -471,7 +471,7 @@ def test_a_slave_that_is_not_there_is_said(cluster) -> None:
 
 
 def test_callbacks_that_raise_end_nothing() -> None:
-    """Exceptions in callbacks of topics, requests and answers do not end the process."""
+    """Exceptions in callbacks (topic, request, answer) end no process, unlike in bare rclpy."""
     domain, claim = claim_domain()
     settings = settings_on_this_machine(domain)
     ends: list[object] = []

@@ -39,7 +39,7 @@ def end(part, number) -> int:
 
 @pytest.mark.parametrize("number", STOPS)
 def test_a_slave_that_is_stopped_stops_its_processes(make_cluster, number) -> None:
-    """A stopped slave exits with 0, leaves no process, and its processes are queued again.
+    """A stopped slave exits with 0, no traceback, no process left; its processes are queued.
 
     The master acknowledges the last statuses at once, so the slave waits less than its 2 s for
     that.
@@ -295,7 +295,7 @@ def test_a_state_directory_that_cannot_be_used_is_said(make_cluster, tmp_path) -
 
 
 def test_a_master_that_is_killed(make_cluster) -> None:
-    """The next master finds the same pids, starts nothing twice, and keeps the queue in order."""
+    """The next master keeps pids and the order of the queue; nothing is lost or started twice."""
     cluster = make_cluster(host("h0", max_processes=3), host("h1", max_processes=3))
     cluster.submit(*(service(f"s{n}") for n in range(6)))
     for n in range(6):
@@ -347,7 +347,7 @@ def test_a_master_that_is_killed_again_and_again(make_cluster) -> None:
 
 
 def test_a_slave_that_is_killed(make_cluster) -> None:
-    """The next slave finds the same pids, and reports exit codes of processes ended since."""
+    """The next slave finds the same pids, reports exits since, with codes, and takes new work."""
     cluster = make_cluster(host("h0"))
     go = cluster.directory / "go"
     script = f"while [ ! -e {go} ]; do sleep 0.05; done; exit 5"
@@ -369,7 +369,7 @@ def test_a_slave_that_is_killed(make_cluster) -> None:
 
 
 def test_a_supervisor_that_is_killed(make_cluster) -> None:
-    """The slave starts another supervisor, with the same pids, and exits are still reported."""
+    """The slave starts another supervisor: same pids, exits are reported, new work runs."""
     cluster = make_cluster(host("h0"))
     cluster.submit(service("p"))
     before = cluster.wait("p", "running")

@@ -332,7 +332,7 @@ def test_a_node_goes_on_where_nothing_can_be_kept(make_cluster):
 
 
 def test_a_master_that_was_started_again_knows_where_states_lie(make_cluster):
-    """Slaves report their replicas to a restarted master, because its journal has none."""
+    """Slaves report replicas to a restarted master, which informs them; its journal has none."""
     cluster = make_cluster(host("h0"), host("h1"), liveness=QUICK_LEASE)
     cluster.submit(counter(host_loss=ELSEWHERE))
     row = cluster.wait("counter", "running")

@@ -152,7 +152,7 @@ def loyal(name: str, home: Path, *, overlap: bool):
 
 
 def test_a_destination_that_never_gets_ready_changes_nothing(cluster) -> None:
-    """A migration to a destination that never becomes ready is undone, with an event.
+    """The process stays, or restarts, on the source host; the migration is undone, with an event.
 
     Two run at once: one that starts the destination first, and one that stops the source first.
     """
@@ -246,7 +246,7 @@ def grower(cluster, name: str, where: str, mib: int, **options):
 
 
 def test_a_host_over_its_limit_is_relieved(make_cluster) -> None:
-    """After the hysteresis the host evicts the process that helps most and fits elsewhere."""
+    """After the hysteresis the process that helps most and fits elsewhere leaves; others stay."""
     hysteresis = 4.0  # seconds; by then the master knows the size of each process
     limits = {"memory": 0.5, "cpu": 1.0}
     cluster = make_cluster(
@@ -265,7 +265,7 @@ def test_a_host_over_its_limit_is_relieved(make_cluster) -> None:
     cluster.client.set_host_state("free", "uncordon")
     go.touch()
     over = cluster.wait_for_event("over_limit", host="full")
-    # 510 MiB would put the other host over its limit, so the small process leaves.
+    # 510 MiB would put the other host over its limit, so only the small process fits there.
     begun = cluster.wait_for_event("migration_begun")
     assert begun.elapsed - over.elapsed >= hysteresis - 0.05
     assert begun.process == "small"

@@ -35,7 +35,7 @@ def on(view, name: str) -> int:
 
 
 def test_sixty_equal_processes_are_spread_evenly(make_cluster) -> None:
-    """Three equal hosts get 20 of 60 processes each, give or take one."""
+    """Three equal hosts get 20 of 60 simultaneously submitted processes each, give or take one."""
     hosts = [host(f"h{n}", memory=4096 * MIB) for n in range(3)]
     cluster = make_cluster(*hosts, liveness=STEADY)
     specs = [service(f"p{n:02}") for n in range(60)]

@@ -32,7 +32,7 @@ while True: signal.pause()
 
 
 def test_exit_codes_and_signals_are_the_commands(lab):
-    """Exit codes and fatal signals of the command are those of the relay."""
+    """The relay ends with the exit code or the fatal signal of the command."""
     for code in (0, 1, 42, 255):
         assert lab.exec("host1", ["sh", "-c", f"exit {code}"], check=False).returncode == code
     for number in (signal.SIGTERM, signal.SIGKILL, signal.SIGSEGV, signal.SIGINT):

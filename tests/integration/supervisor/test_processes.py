@@ -178,7 +178,10 @@ time.sleep(0.3)
     ],
 )
 def test_what_cannot_be_started_says_why(host, client, tmp_path, argv, directory, said):
-    """The refusal has a clear message, at once, under any restart policy; other hosts may do."""
+    """The start is refused at once with a reason, because another host may have the program.
+
+    The restart policy does not apply.
+    """
     for name, text in (("orphaned-script", "#!/no/such/interpreter\n"), ("nonsense", "x\n")):
         (tmp_path / name).write_text(text)
         (tmp_path / name).chmod(0o700)
